@@ -1,0 +1,63 @@
+"""What a thinking machine is given, and what it asks its shell to do.
+
+Place: ground floor; pure. A machine holds no socket and no clock: a shell feeds it arrivals and the time, and takes out
+frames to send and the moment at which it wants to be called again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple, Protocol
+
+__all__ = ["BROADCAST", "Arrival", "Instant", "Machine", "Transmit"]
+
+BROADCAST: Final = b"\xff" * 6
+
+
+class Instant(NamedTuple):
+    """One moment on two clocks."""
+
+    mono_s: float  # monotonic: leases and timers
+    unix_s: float  # wall clock: validity of certificates only
+
+
+class Arrival(NamedTuple):
+    """A frame that was handed up."""
+
+    port: int
+    mac: bytes  # the sender's, 6 bytes
+    frame: bytes  # from the header on, without the Ethernet header; may end in padding
+
+
+class Transmit(NamedTuple):
+    """Frames to one neighbour, in order."""
+
+    port: int
+    mac: bytes  # the receiver's, 6 bytes
+    frames: Sequence[bytes]  # each from the header on
+
+
+class Machine(Protocol):
+    """A switch, a RIB or a member of the overlay, as a shell or a simulated network drives it."""
+
+    def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Instant) -> None:
+        """Begin to use a port.
+
+        Args:
+            mtu: bytes after the Ethernet header.
+        """
+
+    def receive(self, arrivals: Sequence[Arrival], now: Instant) -> None:
+        """Take frames in; never raises for what they contain."""
+
+    def port_changed(self, port: int, up: bool, now: Instant) -> None:
+        """Learn that a port's link came or went."""
+
+    def timeout(self, now: Instant) -> None:
+        """Do what is due; harmless when nothing is."""
+
+    def next_timeout(self) -> float | None:
+        """Return the monotonic second of the next timer, or None."""
+
+    def take(self) -> list[Transmit]:
+        """Return, once, what is to be sent."""

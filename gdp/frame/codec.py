@@ -1,0 +1,98 @@
+"""The frame header as a struct: the fast twin of the Scapy layer.
+
+Place: pure; the only codec that a data path imports. ``gdp/frame/layers.py`` is the normative definition; generated
+tests hold the two together. Offsets count from the first byte after the EtherType (see ``spec.md``)::
+
+    0 version  1 kind  2 flags  3 hops left  4 key epoch (2)  6 payload length (2)  8 message number (8)
+    16 part (4)  20 parts (4)  24 incarnation (8)  32 destination (32)  64 source (32)  96 payload
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Final, NamedTuple
+
+from gdp.errors import DropReason, FrameError
+from gdp.frame.kinds import ETHERTYPE, VERSION
+from gdp.limits import PARTS_MAX
+
+__all__ = [
+    "AAD_BYTES",
+    "DESTINATION_AT",
+    "ETHER_BYTES",
+    "HEADER_BYTES",
+    "HOPS_AT",
+    "KIND_AT",
+    "OVERHEAD_BYTES",
+    "SOURCE_AT",
+    "Header",
+    "authenticated",
+    "decode",
+    "encode",
+    "ethernet",
+]
+
+ETHER_BYTES: Final = 14
+HEADER_BYTES: Final = 96
+OVERHEAD_BYTES: Final = ETHER_BYTES + HEADER_BYTES
+KIND_AT: Final = 1
+HOPS_AT: Final = 3
+DESTINATION_AT: Final = 32
+SOURCE_AT: Final = 64
+AAD_BYTES: Final = HEADER_BYTES - 1
+
+_HEADER: Final = struct.Struct("!BBBBHHQIIQ32s32s")
+_ETHERTYPE: Final = ETHERTYPE.to_bytes(2, "big")
+assert _HEADER.size == HEADER_BYTES
+
+
+class Header(NamedTuple):
+    """One frame's header; a tuple because it stands on the hot path. Field meanings: ``spec.md``."""
+
+    kind: int
+    flags: int
+    hops_left: int
+    epoch: int
+    length: int  # payload bytes
+    number: int
+    part: int
+    parts: int
+    incarnation: int
+    destination: bytes
+    source: bytes
+
+
+def encode(header: Header) -> bytes:
+    """Return the 96 bytes of a header (version 1)."""
+    return _HEADER.pack(VERSION, *header)
+
+
+def decode(frame: bytes | bytearray | memoryview, at: int = 0) -> Header:
+    """Read the header at ``frame[at:]`` (the byte after the EtherType); what follows the payload is Ethernet padding.
+
+    Raises:
+        FrameError: truncated, another version, or a part that cannot be; never anything else, whatever the bytes.
+    """
+    if len(frame) - at < HEADER_BYTES:
+        raise FrameError(DropReason.TRUNCATED, "header")
+    fields = _HEADER.unpack_from(frame, at)
+    header = Header._make(fields[1:])
+    if fields[0] != VERSION:
+        raise FrameError(DropReason.BAD_VERSION, str(fields[0]))
+    if len(frame) - at - HEADER_BYTES < header.length:
+        raise FrameError(DropReason.TRUNCATED, "payload")
+    if not header.part < header.parts <= PARTS_MAX:
+        raise FrameError(DropReason.BAD_PARTS, f"{header.part} of {header.parts}")
+    return header
+
+
+def authenticated(header: bytes | bytearray | memoryview) -> bytes:
+    """Return the 95 bytes that a seal covers: a header without hops left, which switches change."""
+    return bytes(header[:HOPS_AT]) + bytes(header[HOPS_AT + 1 : HEADER_BYTES])
+
+
+def ethernet(destination_mac: bytes, source_mac: bytes) -> bytes:
+    """Return the 14-byte Ethernet II header (two 6-byte addresses and our EtherType)."""
+    return destination_mac + source_mac + _ETHERTYPE
+
+

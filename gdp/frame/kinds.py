@@ -1,0 +1,46 @@
+"""The one registry of frame kinds and flags.
+
+Place: pure. Below 0x80 a frame goes end to end and the table forwards it; from 0x80 on it is for the neighbour itself
+and every data plane hands it up.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum, IntFlag
+from typing import Final
+
+__all__ = ["CONTROL_FROM", "ETHERTYPE", "VERSION", "Flag", "Kind"]
+
+ETHERTYPE: Final = 0x88B5  # IEEE 802 local experimental EtherType 1; IEEE 802-2014, clause 9.2.4
+VERSION: Final = 1
+CONTROL_FROM: Final = 0x80
+
+
+class Kind(IntEnum):
+    """What a frame carries. Unknown kinds below 0x80 are forwarded; at the end they are dropped and counted."""
+
+    DATA = 0x01  # a sealed message part, publisher to readers
+    STATUS = 0x02  # sealed: what a publisher still holds, and the topic's description
+    REPORT = 0x03  # sealed: what a reader has and lacks, to the publisher
+    RIB_REQUEST = 0x10  # a statement to a RIB
+    RIB_ANSWER = 0x11  # a statement from a RIB
+    ECHO_REQUEST = 0x20
+    ECHO_REPLY = 0x21
+    HELLO = 0x80  # to the neighbour: who I am
+    LINK_STATE = 0x81
+    JOIN = 0x82  # to the neighbour: send me this tree
+    LEAVE = 0x83
+    ADVERTISE = 0x84  # an attached node's claim, to its switch
+    WITHDRAW = 0x85
+    VERDICT = 0x86  # the switch's answer to an attached node: taken, or refused and why
+
+
+class Flag(IntFlag):
+    """Set once by the source; part of what is authenticated."""
+
+    NONE = 0
+    LAST = 0x01  # the last part, which carries the signature
+    RELIABLE = 0x02  # readers ask for what they miss
+    BUNDLE = 0x04  # several messages under one seal
+    ALL_REPLICAS = 0x08
+    LATCHED = 0x10  # late joiners want it too

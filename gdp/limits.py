@@ -1,0 +1,68 @@
+"""Every bound of the system, in one place.
+
+Place: ground floor; imports nothing of ours. Units end the names.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+# Frames
+HOPS_MAX: Final = 64  # hops left at the source
+FRAME_MAX_BYTES: Final = 65_535  # largest Ethernet frame any port may carry, header included
+MTU_MIN_BYTES: Final = 576  # a link below this is refused: a signed hello would no longer fit in a few parts
+
+# Messages
+MESSAGE_MAX_BYTES: Final = 64 << 20  # serialised message, before sealing
+PARTS_MAX: Final = 1 << 17  # 64 MiB over the smallest link
+JOIN_SOURCE_BYTES: Final = 64 << 20  # reassembly memory of one source
+JOIN_TOTAL_BYTES: Final = 64 << 20  # reassembly memory of a node
+JOIN_MESSAGES_MAX: Final = 1_024  # unfinished messages of one source
+JOIN_PATIENCE_S: Final = 5.0  # an unfinished best-effort message is given back after this long without a new part
+REPLAY_WINDOW_MESSAGES: Final = 16_384
+
+# Repair
+WINDOW_BYTES: Final = 32 << 20  # what a reliable publisher keeps for repairs
+FLIGHT_MIN_BYTES: Final = 192 << 10  # above twice REPORT_EVERY_BYTES, so that a window never waits for a timer
+FLIGHT_START_BYTES: Final = 256 << 10
+FLIGHT_MAX_BYTES: Final = 4 << 20
+FLIGHT_MESSAGES_MAX: Final = 8_192  # below REPLAY_WINDOW_MESSAGES
+REPORT_EVERY_BYTES: Final = 80 << 10  # a reader reports after this much that is new
+REPORT_DELAY_S: Final = 0.02  # ... or this long after the first part it has not reported
+REPORT_GAP_S: Final = 0.002  # ... or this long after it saw a gap: frames may overtake each other
+PROBE_MIN_S: Final = 0.03
+PROBE_MAX_S: Final = 0.25
+REPORT_IDLE_S: Final = 1.0  # a live reader reports at least this often
+READER_LEASE_S: Final = 6.0  # a reader that does not report for this long no longer holds its publisher
+NACKS_PER_REPORT: Final = 128  # ranges
+
+# Control plane
+CONTROL_MAX_BYTES: Final = 16 << 10  # one statement with its evidence
+CONTROL_PARTS_MAX: Final = 64
+CONTROL_JOIN_BYTES: Final = 1 << 20  # reassembly of control messages, per node
+CONTROL_JOIN_SOURCE_BYTES: Final = 64 << 10
+CONTROL_PATIENCE_S: Final = 2.0
+CBOR_DEPTH_MAX: Final = 16
+CHAIN_MAX: Final = 4  # delegations between an owner's key and a node
+CLOCK_SKEW_S: Final = 120.0
+
+# Leases
+LEASE_MIN_S: Final = 1.0
+LEASE_MAX_S: Final = 3_600.0
+NEGATIVE_LEASE_S: Final = 2.0
+
+# Neighbours and link state
+HELLO_S: Final = 0.25
+DEAD_S: Final = 0.9
+LINK_STATE_REFRESH_S: Final = 30.0
+LINK_STATE_LEASE_S: Final = 100.0
+JOIN_REFRESH_S: Final = 2.0
+JOIN_LEASE_S: Final = 7.0
+
+# Tables
+TABLE_MAX: Final = 1 << 20
+PARKED_FRAMES_MAX: Final = 2_048
+PARKED_BYTES_MAX: Final = 4 << 20
+PARKED_S: Final = 1.5
+RIB_NAMES_PER_SENDER: Final = 200_000
+RIB_WATCHES_MAX: Final = 500_000
