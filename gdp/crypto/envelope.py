@@ -1,0 +1,167 @@
+"""Sealing a message into frames, and opening its parts one by one.
+
+Place: pure; no clock, no memory of messages (that is ``gdp/message``).
+Source: DESIGN section 4; NIST SP 800-38D (GCM), RFC 5869 (HKDF), FIPS 186-5 (ECDSA). Byte-exact text: ``frame/spec.md``.
+
+::
+
+    part 0            part 1                  last part
+    header|c0|tag     header|c1|tag    ...    header|cn|tag|signature
+
+Each part is AES-256-GCM under a key that belongs to (topic secret, kind, source, incarnation, destination); the nonce is
+message number || part, the additional data the header without hops left. The signature covers SHA-256 over the header
+fields that all parts share and every payload (ciphertext and tag) in order.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from typing import Final, Protocol
+
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+
+from gdp.errors import DropReason, EnvelopeError, LocalError
+from gdp.frame.codec import HEADER_BYTES, HOPS_AT, Header, authenticated
+from gdp.frame.kinds import VERSION, Flag
+from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, PARTS_MAX
+
+__all__ = ["SIGNATURE_BYTES", "TAG_BYTES", "Opener", "Sealer", "Signer", "digest_of", "part_room", "seal_key"]
+
+TAG_BYTES: Final = 16
+SIGNATURE_BYTES: Final = 64
+SECRET_BYTES: Final = 32
+_NONCE: Final = struct.Struct("!QI")
+_AAD: Final = struct.Struct("!BBBHHQIIQ32s32s")
+_COMMON: Final = struct.Struct("!BBBHQIQ32s32s")
+_HOPS: Final = bytes([HOPS_MAX])
+
+
+class Signer(Protocol):
+    """What the envelope needs of a writer's private key."""
+
+    def sign_digest(self, digest: bytes) -> bytes:
+        """Return 64 bytes, r || s, over a SHA-256 digest."""
+
+
+def seal_key(secret: bytes, kind: int, source: bytes, incarnation: int, destination: bytes) -> bytes:
+    """Return the 32-byte AES key of one source's incarnation towards one destination.
+
+    A restarted source has a new incarnation, hence a new key: no nonce can come twice under one key, whatever crashed.
+
+    Args:
+        secret: topic secret of the epoch, 32 bytes.
+    """
+    if len(secret) != SECRET_BYTES:
+        raise LocalError(f"a topic secret has {SECRET_BYTES} bytes, not {len(secret)}")
+    info = b"gdp-seal-1" + bytes([kind]) + source + incarnation.to_bytes(8, "big") + destination
+    return HKDF(algorithm=hashes.SHA256(), length=32, salt=None, info=info).derive(secret)
+
+
+def part_room(mtu: int) -> int:
+    """Return the plaintext bytes that one part carries where links take ``mtu`` bytes after the Ethernet header."""
+    room = min(mtu, FRAME_MAX_BYTES) - HEADER_BYTES - TAG_BYTES
+    if room <= SIGNATURE_BYTES:
+        raise LocalError(f"an MTU of {mtu} bytes carries no sealed part")
+    return room
+
+
+def digest_of(header: Header) -> hashlib._Hash:
+    """Return the running SHA-256 of a message, fed with the header fields that all its parts share."""
+    return hashlib.sha256(
+        b"gdp-message-1"
+        + _COMMON.pack(
+            VERSION,
+            header.kind,
+            header.flags & ~Flag.LAST,
+            header.epoch,
+            header.number,
+            header.parts,
+            header.incarnation,
+            header.destination,
+            header.source,
+        )
+    )
+
+
+class Sealer:
+    """Seals one kind of message of one source towards one destination, under one epoch's key."""
+
+    def __init__(
+        self, secret: bytes, epoch: int, kind: int, source: bytes, incarnation: int, destination: bytes, signer: Signer
+    ) -> None:
+        self._aead = AESGCM(seal_key(secret, kind, source, incarnation, destination))
+        self._signer = signer
+        self._fixed = (epoch, kind, incarnation, destination, source)
+        self._last_number = -1
+
+    def seal(self, number: int, flags: int, message: bytes | bytearray | memoryview, mtu: int) -> list[bytes]:
+        """Return the frames of a message, each from the header on and at most ``mtu`` bytes long.
+
+        Args:
+            number: message number; above every number this sealer was given before.
+            flags: without ``Flag.LAST``.
+
+        Raises:
+            LocalError: a number that is not newer (its nonces would come twice), or a message above the limits.
+        """
+        if number <= self._last_number:
+            raise LocalError(f"message number {number} was sealed before")
+        size = len(message)
+        room = part_room(mtu)
+        parts = -(-(size + SIGNATURE_BYTES) // room)
+        if size > MESSAGE_MAX_BYTES or parts > PARTS_MAX:
+            raise LocalError(f"a message of {size} bytes in {parts} parts is above the limit")
+        self._last_number = number
+        epoch, kind, incarnation, destination, source = self._fixed
+        running = digest_of(Header(kind, flags, 0, epoch, 0, number, 0, parts, incarnation, destination, source))
+        encrypt, update, view = self._aead.encrypt, running.update, memoryview(message)
+        pack, pack_nonce = _AAD.pack, _NONCE.pack
+        frames = []
+        last = parts - 1
+        for part in range(parts):
+            plain = view[part * room : (part + 1) * room]
+            length = len(plain) + TAG_BYTES
+            if part == last:
+                flags |= Flag.LAST
+                length += SIGNATURE_BYTES
+            aad = pack(VERSION, kind, flags, epoch, length, number, part, parts, incarnation, destination, source)
+            sealed = encrypt(pack_nonce(number, part), plain, aad)
+            update(sealed)
+            frames.append(aad[:HOPS_AT] + _HOPS + aad[HOPS_AT:] + sealed)
+        frames[last] += self._signer.sign_digest(running.digest())
+        return frames
+
+
+class Opener:
+    """Opens the parts of one kind of message of one source's incarnation, under one epoch's key."""
+
+    def __init__(self, secret: bytes, kind: int, source: bytes, incarnation: int, destination: bytes) -> None:
+        self._aead = AESGCM(seal_key(secret, kind, source, incarnation, destination))
+
+    def open(self, header: Header, frame: bytes) -> tuple[bytes, bytes, bytes]:
+        """Return plaintext, payload as the signature covers it, and signature (empty but for the last part).
+
+        Args:
+            header: of this frame, already decoded.
+            frame: from the header on; Ethernet padding may follow the payload.
+
+        Raises:
+            EnvelopeError: too short, flagged wrongly, or altered; the part is worth nothing.
+        """
+        end = HEADER_BYTES + header.length
+        is_last = header.part == header.parts - 1
+        if is_last != bool(header.flags & Flag.LAST):
+            raise EnvelopeError(DropReason.BAD_PARTS, "the last part is flagged as such, and no other")
+        sealed_end = end - SIGNATURE_BYTES if is_last else end
+        if sealed_end - HEADER_BYTES < TAG_BYTES:
+            raise EnvelopeError(DropReason.TRUNCATED, "shorter than a tag")
+        sealed = frame[HEADER_BYTES:sealed_end]
+        try:
+            plain = self._aead.decrypt(_NONCE.pack(header.number, header.part), sealed, authenticated(frame))
+        except InvalidTag:
+            raise EnvelopeError(DropReason.BAD_TAG) from None
+        return plain, sealed, frame[sealed_end:end]

@@ -1,0 +1,36 @@
+"""Which message numbers are finished: a sliding window.
+
+Place: pure.
+Source: the anti-replay window of RFC 4303, section 3.4.3, with messages for packets.
+"""
+
+from __future__ import annotations
+
+from gdp.limits import REPLAY_WINDOW_MESSAGES
+
+__all__ = ["ReplayWindow"]
+
+
+class ReplayWindow:
+    """Remembers the last ``size`` message numbers of one incarnation; what is older counts as finished."""
+
+    __slots__ = ("_bits", "_size", "_top")
+
+    def __init__(self, size: int = REPLAY_WINDOW_MESSAGES) -> None:
+        self._size = size
+        self._top = -1  # highest finished number
+        self._bits = 0  # bit i: number top - i is finished
+
+    def is_finished(self, number: int) -> bool:
+        """Return whether a message was finished, or is too old to tell."""
+        behind = self._top - number
+        return behind >= 0 and (behind >= self._size or bool(self._bits >> behind & 1))
+
+    def finish(self, number: int) -> None:
+        """Note a message as finished: opened, or given up for good."""
+        ahead = number - self._top
+        if ahead > 0:
+            self._bits = (self._bits << ahead | 1) & ((1 << self._size) - 1) if ahead < self._size else 1
+            self._top = number
+        elif -ahead < self._size:
+            self._bits |= 1 << -ahead

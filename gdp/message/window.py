@@ -1,0 +1,260 @@
+"""What a reliable publisher keeps, how much of it may be under way, and what it sends again.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Source: window growth and halving after RFC 5681, sections 3.1 and 3.2; round-trip estimate after RFC 6298, section 2,
+with Karn's rule. Positions count bytes of frames from the first message on.
+
+::
+
+    released | kept, acknowledged by some | under way | waiting to go
+             oldest                    acked        sent          end
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from dataclasses import dataclass
+from itertools import chain, islice
+
+from gdp.limits import (
+    FLIGHT_MAX_BYTES,
+    FLIGHT_MESSAGES_MAX,
+    FLIGHT_MIN_BYTES,
+    FLIGHT_START_BYTES,
+    PROBE_MAX_S,
+    PROBE_MIN_S,
+    READER_LEASE_S,
+    WINDOW_BYTES,
+)
+from gdp.message.report import Report
+
+__all__ = ["SendWindow"]
+
+
+@dataclass(slots=True)
+class _Kept:
+    frames: list[bytes]
+    begin_at: int
+    size: int
+
+    def position(self, part: int) -> int:
+        """Return where a part begins; all parts but the last have one length."""
+        return self.begin_at + min(part * len(self.frames[0]), self.size)
+
+
+@dataclass(slots=True)
+class _Reader:
+    acked_at: int
+    next_number: int
+    heard_s: float
+
+
+class SendWindow:
+    """The frames of a reliable topic, from the oldest that a reader may still lack to the newest.
+
+    Args:
+        keep_last: messages that are kept for late joiners, acknowledged or not.
+        budget_bytes: how much is kept; when full, ``has_room`` is false, and past twice that ``add`` lets the oldest go.
+    """
+
+    def __init__(self, keep_last: int = 0, budget_bytes: int = WINDOW_BYTES) -> None:
+        self._keep_last = keep_last
+        self._budget_bytes = budget_bytes
+        self._kept: OrderedDict[int, _Kept] = OrderedDict()
+        self._readers: dict[bytes, _Reader] = {}
+        self._next = deque[tuple[int, int]]()  # (number, first part not sent), oldest first
+        self._repairs: OrderedDict[tuple[int, int], None] = OrderedDict()
+        self._repaired_s: dict[tuple[int, int], float] = {}
+        self._end_at = 0
+        self._sent_at = 0
+        self._kept_bytes = 0
+        self._flight_bytes = FLIGHT_START_BYTES
+        self._threshold_bytes = FLIGHT_MAX_BYTES
+        self._rtt_s: float | None = None
+        self._rtt_deviation_s = 0.0
+        self._sample: tuple[int, float] | None = None  # (position, when it was sent)
+        self._halved_s = float("-inf")
+        self._quiet_s = 0.0  # since when nothing was acknowledged
+        self._probe_s = PROBE_MIN_S
+        self.repairs = 0
+        self.let_go = 0  # messages dropped from a full window before every reader had them
+
+    @property
+    def oldest(self) -> int | None:
+        """Return the lowest message number still kept, or None."""
+        return next(iter(self._kept), None)
+
+    @property
+    def readers(self) -> int:
+        """Return how many readers hold the window."""
+        return len(self._readers)
+
+    def has_reader(self, reader: bytes) -> bool:
+        """Return whether a reader is known."""
+        return reader in self._readers
+
+    def has_room(self) -> bool:
+        """Return whether another message may be added without letting an older one go."""
+        return self._end_at - self._acked_at() < self._budget_bytes
+
+    def is_acknowledged(self) -> bool:
+        """Return whether every reader has everything."""
+        return self._acked_at() == self._end_at
+
+    def add(self, number: int, frames: list[bytes]) -> None:
+        """Queue a sealed message; numbers rise."""
+        size = sum(map(len, frames))
+        while self._kept and self._kept_bytes + size > 2 * self._budget_bytes:
+            self._release(next(iter(self._kept)))
+            self.let_go += 1
+        self._kept[number] = _Kept(frames, self._end_at, size)
+        self._kept_bytes += size
+        self._end_at += size
+        self._next.append((number, 0))
+
+    def add_reader(self, reader: bytes, first_number: int, now_s: float) -> None:
+        """Let a reader hold the window from a message on."""
+        kept = self._kept.get(first_number)
+        self._readers[reader] = _Reader(kept.begin_at if kept else self._end_at, first_number, now_s)
+
+    def drop_reader(self, reader: bytes) -> None:
+        """Let a reader hold nothing any more."""
+        if self._readers.pop(reader, None) is not None:
+            self._release_acknowledged()
+
+    def expire_readers(self, now_s: float) -> list[bytes]:
+        """Drop and return the readers that have not reported for ``READER_LEASE_S``."""
+        silent = [name for name, reader in self._readers.items() if now_s - reader.heard_s > READER_LEASE_S]
+        for name in silent:
+            self.drop_reader(name)
+        return silent
+
+    def report(self, reader: bytes, report: Report, now_s: float) -> None:
+        """Take a known reader's report: release, grow or shrink, and queue repairs."""
+        state = self._readers[reader]
+        state.heard_s = now_s
+        state.next_number = max(state.next_number, report.next_number)
+        kept = self._kept.get(report.next_number)
+        position = kept.position(report.next_part) if kept else self._position_of(report.next_number)
+        before = self._acked_at()
+        state.acked_at = max(state.acked_at, min(position, self._sent_at))
+        self._grow(self._acked_at() - before, now_s)
+        if self._queue_repairs(report, now_s) and now_s - self._halved_s > (self._rtt_s or PROBE_MIN_S):
+            self._threshold_bytes = max(self._flight_bytes // 2, FLIGHT_MIN_BYTES)
+            self._flight_bytes = self._threshold_bytes
+            self._halved_s = now_s
+        self._release_acknowledged()
+
+    def take(self, now_s: float, limit: int = 1 << 30) -> list[bytes]:
+        """Return the frames that may go now: repairs first, then new ones as far as the flight allows."""
+        frames: list[bytes] = []
+        while self._repairs and len(frames) < limit:
+            (number, part), _ = self._repairs.popitem(last=False)
+            if (kept := self._kept.get(number)) is not None:
+                frames.append(kept.frames[part])
+                self._repaired_s[number, part] = now_s
+                self.repairs += 1
+                self._sample = None  # Karn: nothing is learnt from what was sent twice
+        if self._sent_at == self._acked_at():
+            self._quiet_s = now_s
+        may_reach = self._acked_at() + self._flight_bytes
+        below = self._least_number() + FLIGHT_MESSAGES_MAX
+        while self._next and self._sent_at < may_reach and len(frames) < limit and self._next[0][0] < below:
+            number, part = self._next[0]
+            kept = self._kept[number]
+            size = len(kept.frames[0])
+            count = min(max(1, (may_reach - self._sent_at) // size), limit - len(frames))
+            batch = kept.frames[part : part + count]
+            frames += batch
+            self._sent_at += sum(map(len, batch))
+            if part + len(batch) < len(kept.frames):
+                self._next[0] = (number, part + len(batch))
+            else:
+                self._next.popleft()
+        if frames and self._sample is None and not self._repaired_s:
+            self._sample = (self._sent_at, now_s)
+        return frames
+
+    def probe_due(self, now_s: float) -> bool:
+        """Return whether readers have been silent for too long while something is under way; backs off."""
+        if not self._readers or now_s < self._quiet_s + self._probe_s or self._sent_at == self._acked_at():
+            return False
+        self._quiet_s = now_s
+        self._probe_s = min(2 * self._probe_s, PROBE_MAX_S)
+        return True
+
+    def next_probe(self) -> float | None:
+        """Return when ``probe_due`` may be true next, or None."""
+        if not self._readers or self._sent_at == self._acked_at():
+            return None
+        return self._quiet_s + self._probe_s
+
+    def _acked_at(self) -> int:
+        return min((reader.acked_at for reader in self._readers.values()), default=self._sent_at)
+
+    def _least_number(self) -> int:
+        return min((reader.next_number for reader in self._readers.values()), default=1 << 64)
+
+    def _position_of(self, number: int) -> int:
+        """Return where a message that is not kept begins or would begin."""
+        oldest = self.oldest
+        return self._kept[oldest].begin_at if oldest is not None and number < oldest else self._end_at
+
+    def _grow(self, acknowledged_bytes: int, now_s: float) -> None:
+        if acknowledged_bytes <= 0:
+            return
+        self._quiet_s = now_s
+        if self._flight_bytes < self._threshold_bytes:
+            self._flight_bytes += acknowledged_bytes
+        else:
+            self._flight_bytes += acknowledged_bytes * 1500 // self._flight_bytes
+        self._flight_bytes = min(self._flight_bytes, FLIGHT_MAX_BYTES)
+        if self._sample is not None and self._acked_at() >= self._sample[0]:
+            self._learn_rtt(now_s - self._sample[1])
+            self._sample = None
+        self._probe_s = min(max(3 * (self._rtt_s or 0.0) + 4 * self._rtt_deviation_s, PROBE_MIN_S), PROBE_MAX_S)
+
+    def _learn_rtt(self, sample_s: float) -> None:
+        if self._rtt_s is None:
+            self._rtt_s, self._rtt_deviation_s = sample_s, sample_s / 2
+            return
+        self._rtt_deviation_s += (abs(sample_s - self._rtt_s) - self._rtt_deviation_s) / 4
+        self._rtt_s += (sample_s - self._rtt_s) / 8
+
+    def _queue_repairs(self, report: Report, now_s: float) -> bool:
+        """Queue what is missing and was sent, but not sent again within a round trip; return whether any was."""
+        again_s = now_s - max(1.5 * (self._rtt_s or 0.0), PROBE_MIN_S / 3)
+        budget = self._flight_bytes
+        queued = False
+        for missing in report.missing:
+            kept = self._kept.get(missing.number)
+            if kept is None:
+                continue
+            for part in range(missing.first, min(missing.last + 1, len(kept.frames))):
+                if budget <= 0 or kept.position(part) >= self._sent_at:
+                    break
+                key = (missing.number, part)
+                if key in self._repairs or self._repaired_s.get(key, float("-inf")) > again_s:
+                    continue
+                self._repairs[key] = None
+                budget -= len(kept.frames[part])
+                queued = True
+        return queued
+
+    def _release_acknowledged(self) -> None:
+        least = self._least_number()
+        spare = len(self._kept) - self._keep_last
+        for number in list(islice(self._kept, max(spare, 0))):
+            if number >= least:
+                break
+            self._release(number)
+
+    def _release(self, number: int) -> None:
+        kept = self._kept.pop(number)
+        self._kept_bytes -= kept.size
+        self._sent_at = max(self._sent_at, kept.begin_at + kept.size)
+        while self._next and self._next[0][0] <= number:
+            self._next.popleft()
+        for key in [key for key in chain(self._repairs, self._repaired_s) if key[0] == number]:
+            self._repairs.pop(key, None)
+            self._repaired_s.pop(key, None)
