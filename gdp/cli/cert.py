@@ -1,0 +1,133 @@
+"""``gdp cert``: memberships: issue them, install them, look at them, take them back.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+from gdp.cli import options
+from gdp.cli.output import show, span
+from gdp.crypto.certificates import Membership
+from gdp.crypto.x509_form import to_pem
+from gdp.errors import LocalError
+from gdp.stores.files import public, read_public, write_all
+from gdp.stores.issue import MEMBER_DAYS, admit, admit_node, install_membership
+from gdp.stores.keyring import CARD, NODE_CERTIFICATE, load_domain, load_root, parsed
+from gdp.trust.revocation import Revocation
+
+__all__ = ["app"]
+
+app = typer.Typer(no_args_is_help=True, help="Memberships: issue, install, show, revoke.")
+
+Domain = Annotated[Path, typer.Option("--domain", metavar="DIR", help="the domain's directory, with its root key")]
+Node = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option("--node", metavar="DIR", help="a node's directory at hand; it is completed in place"),
+]
+Request = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option("--request", metavar="FILE", help="a node.csr from elsewhere; needs --out"),
+]
+RootFile = Annotated[Path, typer.Option("--root", metavar="FILE", help="the domain's root certificate")]
+CertificateFile = Annotated[Path, typer.Argument(metavar="FILE", help="a membership, PEM or DER")]
+OutFile = Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="where to write it")]
+
+
+@app.command("issue")
+def issue(
+    domain: Domain,
+    node: Node = None,
+    request: Request = None,
+    out: options.Out = None,
+    days: options.Days = MEMBER_DAYS,
+    force: options.Force = False,
+    as_json: options.Json = False,
+) -> None:
+    """Admit a node to a domain.
+
+    \b
+    Examples:
+      gdp cert issue --domain keys/school --node keys/robot
+      gdp cert issue --domain keys/school --request node.csr --out node.crt
+    """
+    if node is not None and request is None and out is None:
+        member = admit_node(domain, node, days=days, force=force).member
+        written = {"certificate": str(node / NODE_CERTIFICATE), "card": str(node / CARD)}
+    elif node is None and request is not None and out is not None:
+        asked = read_public(request)
+        member = parsed(request, lambda wire: admit(domain, wire, days=days), asked)
+        write_all(out.parent, {out.name: public(to_pem(member.wire))}, force=force)
+        written = {"certificate": str(out)}
+    else:
+        raise LocalError("cert issue: give either --node, or --request with --out")
+    show({**_described(member), **written}, as_json=as_json)
+
+
+@app.command("install")
+def install(
+    node: options.Directory,
+    certificate: Annotated[Path, typer.Option("--cert", metavar="FILE", help="the membership that came back")],
+    root: RootFile,
+    force: options.Force = False,
+    as_json: options.Json = False,
+) -> None:
+    """Complete a node's directory with a membership that was issued elsewhere.
+
+    \b
+    Example:
+      gdp cert install keys/robot --cert node.crt --root root.crt
+    """
+    trusted, wire = load_root(root), read_public(certificate)
+    identity = parsed(certificate, lambda data: install_membership(node, data, trusted, force=force), wire)
+    show({**_described(identity.member), "card": str(node / CARD)}, as_json=as_json)
+
+
+@app.command("show")
+def show_(file: CertificateFile, root: RootFile, as_json: options.Json = False) -> None:
+    """Verify a membership under a root and say whose it is.
+
+    \b
+    Example:
+      gdp cert show keys/robot/node.crt --root keys/school/root.crt
+    """
+    show(_described(_member(file, root)), as_json=as_json)
+
+
+@app.command("revoke")
+def revoke(
+    file: CertificateFile, domain: Domain, out: OutFile, force: options.Force = False, as_json: options.Json = False
+) -> None:
+    """Take a membership back: write the statement that RIBs are to be given.
+
+    \b
+    Example:
+      gdp cert revoke keys/robot/node.crt --domain keys/school --out robot.revoke
+    """
+    authority = load_domain(domain)
+    member = parsed(file, lambda wire: Membership.from_wire(wire, authority.root, time.time()), read_public(file))
+    subject = authority.root.subject
+    statement = Revocation.make(authority.key, subject, member.fingerprint, member.not_after_unix_s)
+    write_all(out.parent, {out.name: public(statement)}, force=force)
+    show({**_described(member), "revocation": str(out)}, as_json=as_json)
+
+
+def _member(file: Path, root: Path) -> Membership:
+    trusted = load_root(root)
+    return parsed(file, lambda wire: Membership.from_wire(wire, trusted, time.time()), read_public(file))
+
+
+def _described(member: Membership) -> dict[str, object]:
+    return {
+        "name": member.name.to_text(),
+        "role": member.role.value,
+        "label": member.label,
+        "domain": member.domain.to_text(),
+        **span(member.validity),
+        "fingerprint": member.fingerprint.hex(),
+    }

@@ -1,0 +1,174 @@
+"""``gdp delegate``: an owner lets a node act on a name; a node lets a switch attract its traffic.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+from gdp.cli import options
+from gdp.cli.output import (
+    epochs_from_text,
+    metadata_from_options,
+    rights_from_text,
+    show,
+    span,
+)
+from gdp.crypto.statements import parse
+from gdp.crypto.validity import Validity
+from gdp.errors import LocalError
+from gdp.names import Name
+from gdp.stores.files import private, public, write_all
+from gdp.stores.issue import DELEGATION_DAYS, delegate, delegate_route, install_delegation
+from gdp.stores.keyring import load_card, load_delegation, load_owner, load_root
+from gdp.trust.adcert import AdCert
+from gdp.trust.delegation import Delegation
+
+__all__ = ["app"]
+
+app = typer.Typer(no_args_is_help=True, help="Let a node act on a name, or a switch attract a node's traffic.")
+
+OwnerDir = Annotated[Path, typer.Option("--owner", metavar="DIR", help="the owner's directory")]
+CardFile = Annotated[Path, typer.Option("--card", metavar="FILE", help="the node's card (node.card)")]
+Rights = Annotated[list[str], typer.Option("--right", help="publish, serve or read; may be repeated")]
+Epochs = Annotated[str, typer.Option("--epochs", help="whose secrets it gets, such as 0 or 0-3")]
+MayDelegate = Annotated[bool, typer.Option("--may-delegate", help="the node may pass the rights on")]
+TrustedRoot = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option("--root", metavar="FILE", help="refuse a card that is not of this domain"),
+]
+OutFile = Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="where to write it")]
+NodeDir = Annotated[Path, typer.Option("--node", metavar="DIR", help="the node's directory")]
+
+
+@app.command("name")
+def name(
+    owner: OwnerDir,
+    card: CardFile,
+    right: Rights,
+    kind: options.Kind,
+    out: OutFile,
+    name: options.Name = None,
+    type_: options.Type = None,
+    author: options.Author = None,
+    maintainer: options.Maintainer = None,
+    description: options.Description = None,
+    pin: options.Pin = None,
+    more: options.More = [],  # noqa: B006 (the library copies it)
+    epochs: Epochs = "0",
+    days: options.Days = DELEGATION_DAYS,
+    may_delegate: MayDelegate = False,
+    root: TrustedRoot = None,
+    force: options.Force = False,
+    as_json: options.Json = False,
+) -> None:
+    """Let a node publish, serve or read a name (AdCert), with the secrets it needs (grants).
+
+    \b
+    Example:
+      gdp delegate name --owner keys/lab --card robot.card --right publish --kind topic --name /camera/image \\
+          --type sensor_msgs/msg/Image --author lab --epochs 0-3 --out camera.delegation
+    """
+    metadata = metadata_from_options(
+        kind=kind,
+        name=name,
+        type_=type_,
+        author=author,
+        maintainer=maintainer,
+        description=description,
+        pin=pin,
+        more=more,
+    )
+    face = load_card(card)
+    if root is not None:
+        face.member_of(load_root(root), time.time())
+    made = delegate(
+        owner, face, metadata, rights_from_text(right), epochs_from_text(epochs), days=days, may_delegate=may_delegate
+    )
+    write_all(out.parent, {out.name: private(made.to_wire())}, force=force)
+    show({**_described(made), "label": face.label, "delegation": str(out)}, as_json=as_json)
+
+
+@app.command("install")
+def install(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="a delegation, as its owner wrote it")],
+    node: NodeDir,
+    force: options.Force = False,
+    as_json: options.Json = False,
+) -> None:
+    """Check that a delegation is for this node and opens, and put it where the node finds it.
+
+    \b
+    Example:
+      gdp delegate install camera.delegation --node keys/robot
+    """
+    given = load_delegation(file)
+    path = install_delegation(node, given, force=force)
+    show({**_described(given), "delegation": str(path)}, as_json=as_json)
+
+
+@app.command("route")
+def route(
+    node: NodeDir,
+    switch: Annotated[str, typer.Option("--switch", metavar="NAME", help="the switch's name, 64 hex digits")],
+    out: OutFile,
+    days: options.Days = 1.0,
+    force: options.Force = False,
+    as_json: options.Json = False,
+) -> None:
+    """Let a switch attract a node's traffic (RtCert). A running proxy makes its own; this is for those that cannot.
+
+    \b
+    Example:
+      gdp delegate route --node keys/robot --switch $(cat switch.name) --out robot.rtcert
+    """
+    target = Name.from_text(switch)
+    wire = delegate_route(node, target, days=days)
+    write_all(out.parent, {out.name: public(wire)}, force=force)
+    statement = parse(wire)
+    result = {
+        "node": statement.signer.to_text(),
+        "switch": target.to_text(),
+        **span(Validity.from_fields(statement.fields)),
+        "rtcert": str(out),
+    }
+    show(result, as_json=as_json)
+
+
+@app.command("revoke")
+def revoke(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="the delegation to take back")],
+    owner: OwnerDir,
+    out: OutFile,
+    force: options.Force = False,
+    as_json: options.Json = False,
+) -> None:
+    """Take a delegation back: write the statement that RIBs are to be given.
+
+    \b
+    Example:
+      gdp delegate revoke camera.delegation --owner keys/lab --out camera.revoke
+    """
+    given = load_delegation(file)
+    if not given.chain:
+        raise LocalError(f"{file}: nothing was delegated: the node owns the name itself")
+    link = AdCert.from_statement(parse(given.chain[0]))
+    statement = load_owner(owner).revoke(given.subject, link.fingerprint, link.validity.not_after_unix_s)
+    write_all(out.parent, {out.name: public(statement)}, force=force)
+    show({**_described(given), "revocation": str(out)}, as_json=as_json)
+
+
+def _described(delegation: Delegation) -> dict[str, object]:
+    validity = AdCert.from_statement(parse(delegation.chain[-1])).validity if delegation.chain else None
+    return {
+        "name": delegation.name.to_text(),
+        "node": delegation.node.to_text(),
+        "rights": sorted(right.value for right in delegation.rights),
+        "epochs": sorted(delegation.grants),
+        **(span(validity) if validity is not None else {}),
+    }

@@ -1,0 +1,56 @@
+"""``gdp domain``: found a trust domain, or look at one.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gdp.cli import options
+from gdp.cli.output import show, span
+from gdp.crypto.certificates import Root
+from gdp.stores.issue import ROOT_DAYS, make_domain
+from gdp.stores.keyring import ROOT_CERTIFICATE, load_root
+
+__all__ = ["app"]
+
+app = typer.Typer(no_args_is_help=True, help="Found a trust domain, or look at one.")
+
+RootFile = Annotated[Path, typer.Argument(metavar="FILE", help="a root certificate, PEM or DER")]
+
+
+@app.command("init")
+def init(
+    directory: options.Directory,
+    label: options.Label,
+    days: options.Days = ROOT_DAYS,
+    force: options.Force = False,
+    as_json: options.Json = False,
+) -> None:
+    """Found a domain: a root key, and the certificate that others put among those they trust.
+
+    \b
+    Example:
+      gdp domain init keys/school --label school
+    """
+    root = make_domain(directory, label, days=days, force=force).root
+    show({**_described(root), "root": str(directory / ROOT_CERTIFICATE)}, as_json=as_json)
+
+
+@app.command("show")
+def show_(file: RootFile, as_json: options.Json = False) -> None:
+    """Check a root certificate and say whose it is.
+
+    \b
+    Example:
+      gdp domain show keys/school/root.crt
+    """
+    show(_described(load_root(file)), as_json=as_json)
+
+
+def _described(root: Root) -> dict[str, object]:
+    return {"domain": root.domain.to_text(), "label": root.label, **span(root.validity)}

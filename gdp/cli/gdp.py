@@ -1,0 +1,47 @@
+"""The ``gdp`` command: names, keys, trust domains, memberships and delegations.
+
+Place: shell; each sub-command has a file of its own. Exit 0 when done, 2 when the input is wrong.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+import typer
+
+from gdp.cli import cert, delegate, domain, keygen
+from gdp.cli.name import name
+from gdp.errors import GdpError
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    name="gdp",
+    help="Names, keys and proofs of the Global Data Plane.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+app.command("name", no_args_is_help=True)(name)
+app.add_typer(keygen.app, name="keygen")
+app.add_typer(domain.app, name="domain")
+app.add_typer(cert.app, name="cert")
+app.add_typer(delegate.app, name="delegate")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command and leave with its exit code.
+
+    Args:
+        arguments: as after the program's name; those of this process if not given.
+    """
+    try:
+        app(args=None if arguments is None else list(arguments), prog_name="gdp")
+    except GdpError as error:
+        typer.echo(f"gdp: {error}", err=True)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

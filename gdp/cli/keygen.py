@@ -1,0 +1,60 @@
+"""``gdp keygen``: keys for an owner, keys for a node.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from gdp.cli import options
+from gdp.cli.output import items_from_text, show
+from gdp.crypto.certificates import Role
+from gdp.stores.issue import make_node_keys, make_owner
+from gdp.stores.keyring import OWNER_PUBLIC, REQUEST
+
+__all__ = ["app"]
+
+app = typer.Typer(no_args_is_help=True, help="Make keys for an owner of names, or for a node.")
+
+RoleOption = Annotated[Role, typer.Option("--role", help="what the node is")]
+
+
+@app.command("owner")
+def owner(directory: options.Directory, force: options.Force = False, as_json: options.Json = False) -> None:
+    """Make an owner's keys: owner.pub goes to whoever derives names, the rest stays private.
+
+    \b
+    Example:
+      gdp keygen owner keys/lab
+    """
+    made = make_owner(directory, force=force)
+    path = directory / OWNER_PUBLIC
+    show({"owner": made.key.public.compressed.hex(), "public": str(path)}, as_json=as_json)
+
+
+@app.command("node")
+def node(
+    directory: options.Directory,
+    role: RoleOption,
+    label: options.Label,
+    more: options.More = [],  # noqa: B006 (the library copies it)
+    force: options.Force = False,
+    as_json: options.Json = False,
+) -> None:
+    """Make the keys of a switch, a RIB or a proxy, and its request to belong to a domain.
+
+    \b
+    Example:
+      gdp keygen node keys/robot --role proxy --label robot --meta site=roof
+    """
+    made = make_node_keys(directory, role, label, more=items_from_text(more), force=force)
+    result = {
+        "name": made.subject.name.to_text(),
+        "role": role.value,
+        "label": label,
+        "request": str(directory / REQUEST),
+    }
+    show(result, as_json=as_json)

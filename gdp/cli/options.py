@@ -1,0 +1,45 @@
+"""Options that several sub-commands of ``gdp`` share.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+__all__ = [
+    "Author",
+    "Days",
+    "Description",
+    "Directory",
+    "Force",
+    "Json",
+    "Kind",
+    "Label",
+    "Maintainer",
+    "More",
+    "Name",
+    "Out",
+    "Pin",
+    "Type",
+]
+
+Kind = Annotated[str, typer.Option("--kind", help="topic, service, action, switch, rib, proxy, ...")]
+# The command line's library reads these annotations at run time, on Python 3.10 too: hence Optional.
+Name = Annotated[Optional[str], typer.Option("--name", help="its ROS name, such as /camera/image")]  # noqa: UP045
+Type = Annotated[Optional[str], typer.Option("--type", help="its type, such as sensor_msgs/msg/Image")]  # noqa: UP045
+Author = Annotated[Optional[str], typer.Option("--author", help="who made it")]  # noqa: UP045
+Maintainer = Annotated[Optional[str], typer.Option("--maintainer", help="who looks after it")]  # noqa: UP045
+Description = Annotated[Optional[str], typer.Option("--description", help="what it is")]  # noqa: UP045
+Pin = Annotated[Optional[int], typer.Option("--pin", help="a number that people remember")]  # noqa: UP045
+More = Annotated[list[str], typer.Option("--meta", metavar="KEY=VALUE", help="further metadata; may be repeated")]
+
+Json = Annotated[bool, typer.Option("--json", help="print one JSON object")]
+Force = Annotated[bool, typer.Option("--force", help="replace what is there")]
+Days = Annotated[float, typer.Option("--days", min=0.001, help="how long it is valid")]
+Label = Annotated[str, typer.Option("--label", help="its name for people")]
+Directory = Annotated[Path, typer.Argument(metavar="DIR", help="where its files are, or are made")]
+Out = Annotated[Optional[Path], typer.Option("--out", "-o", metavar="FILE", help="write it to this file")]  # noqa: UP045

@@ -1,0 +1,132 @@
+"""What the ``gdp`` command prints, and how it reads what several of its sub-commands share.
+
+Place: shell. Results go to stdout, as ``key: value`` lines or as one JSON object; complaints go to stderr.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import datetime, timezone
+
+import typer
+
+from gdp.crypto.validity import Validity
+from gdp.errors import LocalError
+from gdp.metadata import Metadata
+from gdp.trust.grants import EPOCH_MAX
+from gdp.trust.right import Right
+
+__all__ = ["epochs_from_text", "items_from_text", "metadata_from_options", "moment", "rights_from_text", "show", "span"]
+
+
+def show(result: Mapping[str, object], *, as_json: bool, plain: str | None = None) -> None:
+    """Print a result; ``plain`` is all that people get to see, if given."""
+    if as_json:
+        typer.echo(json.dumps(result, ensure_ascii=False))
+    elif plain is not None:
+        typer.echo(plain)
+    else:
+        width = max(map(len, result))
+        for key, value in result.items():
+            typer.echo(f"{key:<{width}}  {_text(value)}")
+
+
+def moment(unix_s: int) -> str:
+    """Return a time as people and JSON read it, in UTC."""
+    return datetime.fromtimestamp(unix_s, timezone.utc).isoformat().replace("+00:00", "Z")
+
+
+def span(validity: Validity) -> dict[str, str]:
+    """Return both ends of a validity, for a result."""
+    return {"from": moment(validity.not_before_unix_s), "until": moment(validity.not_after_unix_s)}
+
+
+def metadata_from_options(
+    *,
+    kind: str,
+    name: str | None,
+    type_: str | None,
+    author: str | None,
+    maintainer: str | None,
+    description: str | None,
+    pin: int | None,
+    more: Sequence[str],
+) -> Metadata:
+    """Return the metadata that the options of ``gdp name`` describe; what is not given is not in them.
+
+    Raises:
+        LocalError: an unknown kind, a key given twice, or a value of the wrong form.
+    """
+    given: dict[str, str | int | None] = {
+        "kind": kind,
+        "name": name,
+        "type": type_,
+        "author": author,
+        "maintainer": maintainer,
+        "description": description,
+        "pin": pin,
+    }
+    items = {key: value for key, value in given.items() if value is not None}
+    for key, value in items_from_text(more).items():
+        if key in items:
+            raise LocalError(f"metadata {key!r} is given twice")
+        items[key] = value
+    return Metadata(items)
+
+
+def items_from_text(texts: Iterable[str]) -> dict[str, str]:
+    """Read ``key=value`` options.
+
+    Raises:
+        LocalError: one without ``=``, or a key twice.
+    """
+    items: dict[str, str] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals or not key:
+            raise LocalError(f"--meta {text!r}: expected key=value")
+        if key in items:
+            raise LocalError(f"metadata {key!r} is given twice")
+        items[key] = value
+    return items
+
+
+def rights_from_text(texts: Iterable[str]) -> frozenset[Right]:
+    """Read the rights to delegate.
+
+    Raises:
+        LocalError: one that is none.
+    """
+    known = {right.value: right for right in Right}
+    for text in texts:
+        if text not in known:
+            raise LocalError(f"--right {text!r}: expected publish, serve or read")
+    return frozenset(known[text] for text in texts)
+
+
+def epochs_from_text(text: str) -> list[int]:
+    """Read epochs, such as ``0``, ``0-3`` or ``0,2,7-9``.
+
+    Raises:
+        LocalError: anything else.
+    """
+    epochs: set[int] = set()
+    for part in text.split(","):
+        first, dash, last = part.partition("-")
+        ends = (first, last if dash else first)
+        if not all(end.isascii() and end.isdigit() and len(end) <= 5 for end in ends):
+            raise LocalError(f"--epochs {text!r}: expected numbers or spans, such as 0,2,7-9")
+        low, high = int(ends[0]), int(ends[1])
+        if not low <= high <= EPOCH_MAX:
+            raise LocalError(f"--epochs {text!r}: epochs go from 0 to {EPOCH_MAX}, the lower first")
+        epochs.update(range(low, high + 1))
+    return sorted(epochs)
+
+
+def _text(value: object) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(map(str, value)) or "-"
+    if isinstance(value, dict):
+        return "  ".join(f"{key}={each}" for key, each in value.items())
+    return "-" if value is None else str(value)

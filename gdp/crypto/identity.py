@@ -1,0 +1,137 @@
+"""A node as it knows itself: its keys, its membership, its domain's root.
+
+Place: pure; ``gdp/stores/files`` reads and writes the directory it lives in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from gdp.crypto.certificates import Membership, Role, Root
+from gdp.crypto.issuing import DomainAuthority, request_membership
+from gdp.crypto.kem import KemPrivateKey
+from gdp.crypto.keys import SigningKey
+from gdp.crypto.statements import StatementType, sign
+from gdp.crypto.subject import Subject
+from gdp.crypto.validity import Validity
+from gdp.errors import LocalError
+from gdp.metadata import Metadata
+from gdp.names import Name
+
+__all__ = ["Identity", "NodeKeys", "node_metadata"]
+
+
+@dataclass(frozen=True, slots=True)
+class NodeKeys:
+    """A node that belongs to no domain yet.
+
+    Args:
+        role: what it asks to be.
+        label: its name for people.
+        digest: that of the metadata which name it.
+        key: signs what it says.
+        kem: opens what is sealed to it.
+    """
+
+    role: Role
+    label: str
+    digest: bytes
+    key: SigningKey
+    kem: KemPrivateKey
+
+    @classmethod
+    def generate(cls, role: Role, label: str, more: Mapping[str, str | int] | None = None) -> NodeKeys:
+        """Return new keys from the system's randomness; ``more`` is added to the node's metadata.
+
+        Raises:
+            LocalError: metadata of the wrong form, or a library without the KEM.
+        """
+        digest = node_metadata(role, label, more).digest()
+        return cls(role, label, digest, SigningKey.generate(), KemPrivateKey.generate())
+
+    @property
+    def subject(self) -> Subject:
+        """Return the node's name and what proves it."""
+        return Subject(self.digest, self.key.public.compressed)
+
+    def request(self) -> bytes:
+        """Return the request for a membership: PKCS #10, PEM."""
+        return request_membership(self.key, self.role, self.label, self.digest)
+
+    def join(self, authority: DomainAuthority, validity: Validity) -> Identity:
+        """Return the node as a member of the authority's domain."""
+        return self.admitted(authority.admit(self.request(), validity), authority.root)
+
+    def admitted(self, membership: Membership, root: Root) -> Identity:
+        """Return the node with a membership that was issued elsewhere.
+
+        Raises:
+            LocalError: it is another node's, or of another domain.
+        """
+        return Identity(membership, root, self.key, self.kem)
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """A node that can prove who it is.
+
+    Raises:
+        LocalError: the parts do not belong together.
+    """
+
+    member: Membership
+    root: Root
+    key: SigningKey
+    kem: KemPrivateKey
+
+    def __post_init__(self) -> None:
+        if self.member.key != self.key.public:
+            raise LocalError("the membership certificate is for another key")
+        if self.member.domain != self.root.domain:
+            raise LocalError("the membership certificate is of another domain")
+
+    @property
+    def membership(self) -> bytes:
+        """Return the membership certificate, DER, as statements carry it."""
+        return self.member.wire
+
+    @property
+    def name(self) -> Name:
+        """Return the node's name."""
+        return self.member.name
+
+    @property
+    def subject(self) -> Subject:
+        """Return the node's name and what proves it."""
+        return self.member.subject
+
+    @property
+    def role(self) -> Role:
+        """Return what the node is in its domain."""
+        return self.member.role
+
+    @property
+    def label(self) -> str:
+        """Return the node's name for people."""
+        return self.member.label
+
+    def sign(self, type_: StatementType, body: Mapping[str, object]) -> bytes:
+        """Return a statement of this node.
+
+        Raises:
+            LocalError: the body cannot be written, or is too long.
+        """
+        return sign(type_, body, self.name, self.key)
+
+
+def node_metadata(role: Role, label: str, more: Mapping[str, str | int] | None = None) -> Metadata:
+    """Return the metadata that name a node.
+
+    Raises:
+        LocalError: ``more`` is of the wrong form, or names kind or name again.
+    """
+    extra = dict(more or {})
+    if extra.keys() & {"kind", "name"}:
+        raise LocalError("a node's kind and name are its role and label")
+    return Metadata({"kind": role.value, "name": label, **extra})

@@ -1,0 +1,57 @@
+"""From when until when: the one test of time for certificates and delegations.
+
+Place: pure. Clocks of honest machines differ; ``CLOCK_SKEW_S`` is forgiven at both ends.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gdp.crypto.fields import Fields
+from gdp.errors import DropReason, LocalError, StatementError
+from gdp.limits import CLOCK_SKEW_S
+
+__all__ = ["Validity"]
+
+
+@dataclass(frozen=True, slots=True)
+class Validity:
+    """A span of wall-clock time in whole seconds, both ends included."""
+
+    not_before_unix_s: int
+    not_after_unix_s: int
+
+    @classmethod
+    def lasting(cls, unix_s: float, duration_s: float) -> Validity:
+        """Return the span that begins at ``unix_s``.
+
+        Raises:
+            LocalError: it would last no second, or begin before 1970.
+        """
+        if unix_s < 0 or duration_s < 1:
+            raise LocalError("a validity begins after 1970 and lasts a second or longer")
+        return cls(int(unix_s), int(unix_s + duration_s))
+
+    @classmethod
+    def from_fields(cls, fields: Fields) -> Validity:
+        """Read ``from`` and ``until`` of a statement's body.
+
+        Raises:
+            StatementError: MALFORMED.
+        """
+        return cls(fields.uint("from"), fields.uint("until"))
+
+    def to_fields(self) -> dict[str, object]:
+        """Return what ``from_fields`` reads."""
+        return {"from": self.not_before_unix_s, "until": self.not_after_unix_s}
+
+    def check(self, unix_s: float, what: str) -> None:
+        """Return if ``unix_s`` lies within, give or take the skew of clocks.
+
+        Raises:
+            StatementError: EXPIRED, or not valid yet; ``what`` names it for people.
+        """
+        if unix_s > self.not_after_unix_s + CLOCK_SKEW_S:
+            raise StatementError(DropReason.EXPIRED, what)
+        if unix_s < self.not_before_unix_s - CLOCK_SKEW_S:
+            raise StatementError(DropReason.EXPIRED, f"{what}: not valid yet")

@@ -1,0 +1,121 @@
+"""Files that hold keys: whole or not there, and for their owner's eyes.
+
+Place: I/O, the file system.
+A file appears under its name complete and synced, or not at all, so that a kill in the middle leaves nothing half
+written. A private file has mode 0600 from its first byte on, and is not read where group or others could have read it.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import stat
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from gdp.errors import LocalError
+
+__all__ = ["FILE_MAX_BYTES", "NewFile", "private", "public", "read_private", "read_public", "write_all"]
+
+FILE_MAX_BYTES: Final = 1 << 20
+_PRIVATE_MODE: Final = 0o600
+_PUBLIC_MODE: Final = 0o644  # less what the umask takes
+_DIRECTORY_MODE: Final = 0o700
+_OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
+
+
+@dataclass(frozen=True, slots=True)
+class NewFile:
+    """What a file is to hold, and who may read it."""
+
+    data: bytes
+    mode: int
+
+
+def private(data: bytes) -> NewFile:
+    """Return a file that only its owner may read."""
+    return NewFile(data, _PRIVATE_MODE)
+
+
+def public(data: bytes) -> NewFile:
+    """Return a file that anyone may read."""
+    return NewFile(data, _PUBLIC_MODE)
+
+
+def write_all(directory: Path, files: Mapping[str, NewFile], *, force: bool = False) -> None:
+    """Write files into a directory, which is made (mode 0700) if it is not there.
+
+    Args:
+        directory: where.
+        files: file name to content.
+        force: replace what is there; otherwise nothing is written if one of them is.
+
+    Raises:
+        LocalError: a file is there already, or the system refuses.
+    """
+    try:
+        directory.mkdir(mode=_DIRECTORY_MODE, parents=True, exist_ok=True)
+        for name in files:
+            if not force and os.path.lexists(directory / name):
+                raise LocalError(f"{directory / name}: is there already; --force replaces it")
+        for name, new in files.items():
+            _write(directory / name, new, force=force)
+    except OSError as error:
+        raise _translated(error, directory) from error
+
+
+def read_public(path: Path) -> bytes:
+    """Return what a file holds.
+
+    Raises:
+        LocalError: it is not there, too long, or the system refuses.
+    """
+    return _read(path, forbidden=0)
+
+
+def read_private(path: Path) -> bytes:
+    """Return what a private file holds.
+
+    Raises:
+        LocalError: group or others may read it, or as for ``read_public``.
+    """
+    return _read(path, forbidden=_OTHERS)
+
+
+def _write(path: Path, new: NewFile, *, force: bool) -> None:
+    draft = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
+    handle = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, new.mode)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(new.data)
+            file.flush()
+            os.fsync(file.fileno())
+        if force:
+            os.replace(draft, path)
+        else:
+            os.link(draft, path)  # unlike a rename, refuses to replace
+    except FileExistsError as error:
+        raise LocalError(f"{path}: is there already; --force replaces it") from error
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def _read(path: Path, *, forbidden: int) -> bytes:
+    try:
+        with path.open("rb") as file:
+            status = os.fstat(file.fileno())
+            if status.st_mode & forbidden:
+                mode = stat.S_IMODE(status.st_mode)
+                raise LocalError(f"{path}: mode {mode:04o} lets others read a private file; run: chmod 600 {path}")
+            data = file.read(FILE_MAX_BYTES + 1)
+    except OSError as error:
+        raise _translated(error, path) from error
+    if len(data) > FILE_MAX_BYTES:
+        raise LocalError(f"{path}: longer than {FILE_MAX_BYTES} bytes")
+    return data
+
+
+def _translated(error: OSError, path: Path) -> LocalError:
+    return LocalError(f"{error.filename or path}: {error.strerror or error}")

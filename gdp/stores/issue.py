@@ -1,0 +1,212 @@
+"""Making domains, nodes, owners and delegations in one call each: what the ``gdp`` command and the testbed both do.
+
+Place: I/O, through ``keyring``; reads the wall clock where no time is given.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Collection, Iterable, Mapping
+from pathlib import Path
+from typing import Final
+
+from gdp.crypto.certificates import Membership, Role, Root
+from gdp.crypto.identity import Identity, NodeKeys, node_metadata
+from gdp.crypto.issuing import DomainAuthority
+from gdp.crypto.keys import SigningKey
+from gdp.crypto.validity import Validity
+from gdp.errors import LocalError
+from gdp.metadata import Metadata
+from gdp.names import Name
+from gdp.stores.keyring import (
+    DELEGATIONS,
+    load_card,
+    load_domain,
+    load_identity,
+    load_node_keys,
+    load_owner,
+    save_delegation,
+    save_domain,
+    save_identity,
+    save_node_keys,
+    save_owner,
+)
+from gdp.trust.card import Card
+from gdp.trust.delegation import Delegation
+from gdp.trust.grants import SECRET_BYTES
+from gdp.trust.owner import Owner
+from gdp.trust.right import Right
+from gdp.trust.rtcert import RtCert
+
+__all__ = [
+    "admit",
+    "admit_node",
+    "delegate",
+    "delegate_route",
+    "install_delegation",
+    "install_membership",
+    "make_domain",
+    "make_node",
+    "make_node_keys",
+    "make_owner",
+]
+
+DAY_S: Final = 86_400
+ROOT_DAYS: Final = 3_650.0
+MEMBER_DAYS: Final = 365.0
+DELEGATION_DAYS: Final = 365.0
+
+
+def make_domain(
+    directory: Path, label: str, *, days: float = ROOT_DAYS, force: bool = False, unix_s: float | None = None
+) -> DomainAuthority:
+    """Found a trust domain and keep its root in ``directory``.
+
+    Raises:
+        LocalError: a wrong label, or there is one already.
+    """
+    authority = DomainAuthority.found(label, SigningKey.generate(), Validity.lasting(_now(unix_s), days * DAY_S))
+    save_domain(directory, authority, force=force)
+    return authority
+
+
+def make_owner(directory: Path, *, force: bool = False) -> Owner:
+    """Make an owner's keys and keep them in ``directory``.
+
+    Raises:
+        LocalError: there are some already.
+    """
+    owner = Owner(SigningKey.generate(), secrets.token_bytes(SECRET_BYTES))
+    save_owner(directory, owner, force=force)
+    return owner
+
+
+def make_node_keys(
+    directory: Path, role: Role, label: str, *, more: Mapping[str, str | int] | None = None, force: bool = False
+) -> NodeKeys:
+    """Make a node's keys and its request for a membership, and keep them in ``directory``.
+
+    Raises:
+        LocalError: wrong metadata, a library without the KEM, or there are some already.
+    """
+    keys = NodeKeys.generate(role, label, more)
+    save_node_keys(directory, keys, node_metadata(role, label, more), force=force)
+    return keys
+
+
+def make_node(
+    directory: Path,
+    role: Role,
+    label: str,
+    domain: Path,
+    *,
+    more: Mapping[str, str | int] | None = None,
+    days: float = MEMBER_DAYS,
+    force: bool = False,
+    unix_s: float | None = None,
+) -> Identity:
+    """Make a node and admit it to the domain whose directory is at hand too.
+
+    Raises:
+        LocalError: as ``make_node_keys`` and ``admit_node``.
+    """
+    make_node_keys(directory, role, label, more=more, force=force)
+    return admit_node(domain, directory, days=days, force=force, unix_s=unix_s)
+
+
+def admit(domain: Path, request: bytes, *, days: float = MEMBER_DAYS, unix_s: float | None = None) -> Membership:
+    """Return the membership that a request asks for; it ends with the root at the latest.
+
+    Raises:
+        StatementError: the request does not hold.
+        LocalError: no domain there.
+    """
+    authority = load_domain(domain)
+    return authority.admit(request, _within(authority.root, _now(unix_s), days))
+
+
+def admit_node(
+    domain: Path, node: Path, *, days: float = MEMBER_DAYS, force: bool = False, unix_s: float | None = None
+) -> Identity:
+    """Admit the node whose directory is at hand, and complete that directory.
+
+    Raises:
+        LocalError: no domain or no keys there, or it belongs to one already.
+    """
+    authority = load_domain(domain)
+    identity = load_node_keys(node).join(authority, _within(authority.root, _now(unix_s), days))
+    save_identity(node, identity, force=force)
+    return identity
+
+
+def install_membership(
+    node: Path, certificate: bytes, root: Root, *, force: bool = False, unix_s: float | None = None
+) -> Identity:
+    """Complete a node's directory with a membership that was issued elsewhere.
+
+    Raises:
+        StatementError: it does not hold under this root.
+        LocalError: it is another node's, or the node has one already.
+    """
+    member = Membership.from_wire(certificate, root, _now(unix_s))
+    identity = load_node_keys(node).admitted(member, root)
+    save_identity(node, identity, force=force)
+    return identity
+
+
+def delegate(
+    owner: Path,
+    card: Path | Card,
+    metadata: Metadata,
+    rights: Collection[Right],
+    epochs: Iterable[int] = (0,),
+    *,
+    days: float = DELEGATION_DAYS,
+    may_delegate: bool = False,
+    unix_s: float | None = None,
+) -> Delegation:
+    """Let a node act on a name, and grant it the secrets of ``epochs``.
+
+    Raises:
+        LocalError: no owner there, no card, rights or epochs out of bounds.
+    """
+    face = card if isinstance(card, Card) else load_card(card)
+    validity = Validity.lasting(_now(unix_s), days * DAY_S)
+    return load_owner(owner).delegate(face, metadata, rights, epochs, validity, may_delegate=may_delegate)
+
+
+def install_delegation(node: Path, delegation: Delegation, *, force: bool = False, unix_s: float | None = None) -> Path:
+    """Put a delegation where the node finds it, after seeing that it holds and opens; return the file.
+
+    Raises:
+        StatementError: it is for another node, or does not hold.
+        LocalError: there is one for the name already.
+    """
+    now = _now(unix_s)
+    identity = load_identity(node, now)
+    delegation.verify(identity, now)
+    delegation.open(identity)
+    return save_delegation(node / DELEGATIONS, delegation, force=force)
+
+
+def delegate_route(node: Path, switch: Name, *, days: float, unix_s: float | None = None) -> bytes:
+    """Return the RtCert by which a node lets a switch attract its traffic.
+
+    Raises:
+        LocalError: no node there.
+    """
+    now = _now(unix_s)
+    return RtCert.make(load_identity(node, now), switch, Validity.lasting(now, days * DAY_S))
+
+
+def _now(unix_s: float | None) -> float:
+    return time.time() if unix_s is None else unix_s
+
+
+def _within(root: Root, unix_s: float, days: float) -> Validity:
+    wanted = Validity.lasting(unix_s, days * DAY_S)
+    end = min(wanted.not_after_unix_s, root.validity.not_after_unix_s)
+    if end <= wanted.not_before_unix_s:
+        raise LocalError("the root of the domain has run out")
+    return Validity(wanted.not_before_unix_s, end)

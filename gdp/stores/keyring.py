@@ -1,0 +1,268 @@
+"""Where a domain, an owner and a node keep their keys and proofs: one directory each.
+
+Place: I/O, through ``files``. ``*`` marks what is private (mode 0600)::
+
+    domain/   root.key*  root.crt
+    owner/    owner.key*  owner.pub  master.key*
+    node/     node.key*  kem.key*  node.json  node.csr                      before it belongs to a domain
+              node.crt  root.crt  node.card                                 once it does
+              delegations/<name>.delegation*                                one for each name that it may act on
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, TypeVar
+
+from gdp.crypto.certificates import Membership, Role, Root
+from gdp.crypto.identity import Identity, NodeKeys, node_metadata
+from gdp.crypto.issuing import DomainAuthority
+from gdp.crypto.kem import KemPrivateKey
+from gdp.crypto.keys import PublicKey, SigningKey
+from gdp.crypto.x509_form import to_pem
+from gdp.errors import GdpError, LocalError
+from gdp.metadata import Metadata
+from gdp.stores.files import private, public, read_private, read_public, write_all
+from gdp.trust.card import Card
+from gdp.trust.delegation import Delegation
+from gdp.trust.owner import Owner
+
+__all__ = [
+    "CARD",
+    "DELEGATIONS",
+    "NODE_CERTIFICATE",
+    "OWNER_PUBLIC",
+    "REQUEST",
+    "ROOT_CERTIFICATE",
+    "load_card",
+    "load_delegation",
+    "load_delegations",
+    "load_domain",
+    "load_identity",
+    "load_node_keys",
+    "load_owner",
+    "load_public_key",
+    "load_root",
+    "parsed",
+    "save_delegation",
+    "save_domain",
+    "save_identity",
+    "save_node_keys",
+    "save_owner",
+]
+
+ROOT_KEY: Final = "root.key"
+ROOT_CERTIFICATE: Final = "root.crt"
+OWNER_KEY: Final = "owner.key"
+OWNER_PUBLIC: Final = "owner.pub"
+OWNER_MASTER: Final = "master.key"
+NODE_KEY: Final = "node.key"
+NODE_KEM: Final = "kem.key"
+NODE_METADATA: Final = "node.json"
+NODE_CERTIFICATE: Final = "node.crt"
+REQUEST: Final = "node.csr"
+CARD: Final = "node.card"
+DELEGATIONS: Final = "delegations"
+_DELEGATION_SUFFIX: Final = ".delegation"
+
+_T = TypeVar("_T")
+
+
+def parsed(path: Path, read: Callable[[bytes], _T], data: bytes) -> _T:
+    """Return what ``read`` makes of a file's bytes; an error names the file.
+
+    Raises:
+        LocalError: the file does not hold what it should.
+    """
+    try:
+        return read(data)
+    except GdpError as error:
+        raise LocalError(f"{path}: {error}") from error
+
+
+def load_root(path: Path) -> Root:
+    """Read a domain's root certificate, PEM or DER.
+
+    Raises:
+        LocalError: not there, or not a root; the text names the file.
+    """
+    return parsed(path, Root.from_wire, read_public(path))
+
+
+def load_public_key(path: Path) -> PublicKey:
+    """Read an owner's public key, PEM.
+
+    Raises:
+        LocalError: not there, or not a P-256 key; the text names the file.
+    """
+    return parsed(path, PublicKey.from_pem, read_public(path))
+
+
+def load_card(path: Path) -> Card:
+    """Read a node's card.
+
+    Raises:
+        LocalError: not there, or it does not hold; the text names the file.
+    """
+    return parsed(path, Card.from_wire, read_public(path))
+
+
+def save_domain(directory: Path, authority: DomainAuthority, *, force: bool = False) -> None:
+    """Write a domain's root key and certificate.
+
+    Raises:
+        LocalError: they are there already, or the system refuses.
+    """
+    files = {
+        ROOT_KEY: private(authority.key.to_pem()),
+        ROOT_CERTIFICATE: public(to_pem(authority.root.wire)),
+    }
+    write_all(directory, files, force=force)
+
+
+def load_domain(directory: Path) -> DomainAuthority:
+    """Read a domain with its private key.
+
+    Raises:
+        LocalError: something is missing, wrong, or readable for others.
+    """
+    key = parsed(directory / ROOT_KEY, SigningKey.from_pem, read_private(directory / ROOT_KEY))
+    root = load_root(directory / ROOT_CERTIFICATE)
+    return parsed(directory, lambda _: DomainAuthority(key, root), b"")
+
+
+def save_owner(directory: Path, owner: Owner, *, force: bool = False) -> None:
+    """Write an owner's keys.
+
+    Raises:
+        LocalError: they are there already, or the system refuses.
+    """
+    files = {
+        OWNER_KEY: private(owner.key.to_pem()),
+        OWNER_MASTER: private(owner.master),
+        OWNER_PUBLIC: public(owner.key.public.to_pem()),
+    }
+    write_all(directory, files, force=force)
+
+
+def load_owner(directory: Path) -> Owner:
+    """Read an owner.
+
+    Raises:
+        LocalError: something is missing, wrong, or readable for others.
+    """
+    key = parsed(directory / OWNER_KEY, SigningKey.from_pem, read_private(directory / OWNER_KEY))
+    path = directory / OWNER_MASTER
+    return parsed(path, lambda master: Owner(key, master), read_private(path))
+
+
+def save_node_keys(directory: Path, keys: NodeKeys, metadata: Metadata, *, force: bool = False) -> None:
+    """Write a node's keys, its metadata and its request for a membership.
+
+    Raises:
+        LocalError: they are there already, the metadata are of another node, or the system refuses.
+    """
+    if metadata.digest() != keys.digest:
+        raise LocalError("the metadata are not those of this node")
+    text = json.dumps(dict(metadata), ensure_ascii=False, indent=2, sort_keys=True) + "\n"
+    files = {
+        NODE_KEY: private(keys.key.to_pem()),
+        NODE_KEM: private(keys.kem.wire),
+        NODE_METADATA: public(text.encode()),
+        REQUEST: public(keys.request()),
+    }
+    write_all(directory, files, force=force)
+
+
+def load_node_keys(directory: Path) -> NodeKeys:
+    """Read a node's keys, whether it belongs to a domain or not.
+
+    Raises:
+        LocalError: something is missing, wrong, or readable for others.
+    """
+    path = directory / NODE_METADATA
+    role, label, digest = parsed(path, _node_metadata, read_public(path))
+    key = parsed(directory / NODE_KEY, SigningKey.from_pem, read_private(directory / NODE_KEY))
+    kem = parsed(directory / NODE_KEM, KemPrivateKey.from_wire, read_private(directory / NODE_KEM))
+    return NodeKeys(role, label, digest, key, kem)
+
+
+def save_identity(directory: Path, identity: Identity, *, force: bool = False) -> None:
+    """Add to a node's keys what makes it a member: certificate, root and card.
+
+    Raises:
+        LocalError: they are there already, or the system refuses.
+    """
+    files = {
+        NODE_CERTIFICATE: public(to_pem(identity.membership)),
+        ROOT_CERTIFICATE: public(to_pem(identity.root.wire)),
+        CARD: public(Card.make(identity)),
+    }
+    write_all(directory, files, force=force)
+
+
+def load_identity(directory: Path, unix_s: float) -> Identity:
+    """Read a node that belongs to a domain.
+
+    Args:
+        directory: the node's.
+        unix_s: wall clock; a membership that has run out is refused here rather than by every neighbour.
+
+    Raises:
+        LocalError: something is missing, wrong, run out, or readable for others.
+    """
+    keys = load_node_keys(directory)
+    root = load_root(directory / ROOT_CERTIFICATE)
+    path = directory / NODE_CERTIFICATE
+    member = parsed(path, lambda wire: Membership.from_wire(wire, root, unix_s), read_public(path))
+    return parsed(path, lambda _: keys.admitted(member, root), b"")
+
+
+def save_delegation(directory: Path, delegation: Delegation, *, force: bool = False) -> Path:
+    """Write a delegation under its name's hash; return the file.
+
+    Args:
+        directory: a node's ``delegations``, or wherever it waits to be carried there.
+        delegation: what an owner gave.
+        force: replace the one that is there.
+
+    Raises:
+        LocalError: it is there already, or the system refuses.
+    """
+    name = delegation.name.to_text() + _DELEGATION_SUFFIX
+    write_all(directory, {name: private(delegation.to_wire())}, force=force)
+    return directory / name
+
+
+def load_delegation(path: Path) -> Delegation:
+    """Read one delegation file.
+
+    Raises:
+        LocalError: it is missing, malformed, or readable for others; the text names the file.
+    """
+    return parsed(path, Delegation.from_wire, read_private(path))
+
+
+def load_delegations(directory: Path) -> list[Delegation]:
+    """Read all delegations of a directory, in the order of their names; none where there is no directory.
+
+    Raises:
+        LocalError: one is malformed or readable for others; the text names the file.
+    """
+    return [load_delegation(path) for path in sorted(directory.glob(f"[!.]*{_DELEGATION_SUFFIX}"))]
+
+
+def _node_metadata(data: bytes) -> tuple[Role, str, bytes]:
+    try:
+        items = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise LocalError("not JSON") from error
+    if not isinstance(items, dict):
+        raise LocalError("not a JSON object")
+    kind, label = items.pop("kind", None), items.pop("name", None)
+    if kind not in [role.value for role in Role] or not isinstance(label, str):
+        raise LocalError("'kind' is switch, rib or proxy, and 'name' is a text")
+    role = Role(kind)
+    return role, label, node_metadata(role, label, items).digest()

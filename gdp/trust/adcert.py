@@ -1,0 +1,190 @@
+"""AdCert: an owner, or who has it from the owner, lets a node do something with a name.
+
+Place: pure.
+Source: FogROS G, section on advertisements; DESIGN section 5. A chain leads from the owner's key to the node that acts:
+each link is signed by the key that the link before it names, may only narrow the rights, and needs its permission.
+
+::
+
+    owner's key ==AdCert==> node A (may delegate) ==AdCert==> node B
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+from gdp.crypto.keys import KEY_BYTES, PublicKey, SigningKey
+from gdp.crypto.statements import Statement, StatementType, parse, sign
+from gdp.crypto.subject import Subject
+from gdp.crypto.validity import Validity
+from gdp.errors import DropReason, StatementError
+from gdp.limits import CHAIN_MAX
+from gdp.names import Name
+from gdp.trust.lru import Lru
+from gdp.trust.revocation import Revocations
+from gdp.trust.right import Right, rights_from_fields, rights_to_wire
+
+__all__ = ["AdCert", "AdCertCache", "Chain"]
+
+
+@dataclass(frozen=True, slots=True)
+class AdCert:
+    """One link of a chain.
+
+    Args:
+        subject: the name that it is about.
+        issuer: who signed it: the name itself stands for its owner, else the node one link up.
+        delegate: the node that may.
+        delegate_key: that node's key, 33 bytes.
+        rights: what it may.
+        validity: when it may.
+        may_delegate: whether it may pass them on.
+        fingerprint: SHA-256 of the signed part, for revocation.
+    """
+
+    subject: Subject
+    issuer: Name
+    delegate: Name
+    delegate_key: bytes
+    rights: frozenset[Right]
+    validity: Validity
+    may_delegate: bool
+    fingerprint: bytes
+
+    @staticmethod
+    def make(
+        key: SigningKey,
+        issuer: Name,
+        subject: Subject,
+        delegate: Subject,
+        rights: Collection[Right],
+        validity: Validity,
+        *,
+        may_delegate: bool = False,
+    ) -> bytes:
+        """Return the signed statement.
+
+        Args:
+            key: the issuer's: the owner's key where ``issuer`` is the name itself.
+            issuer: the subject's own name, or the node that holds the link above.
+            subject: the name.
+            delegate: the node.
+            rights: of publish, serve and read.
+            validity: when.
+            may_delegate: whether the node may issue further links.
+
+        Raises:
+            LocalError: rights that cannot be delegated.
+        """
+        body = {
+            **subject.to_fields(),
+            "name": subject.name,
+            "to": delegate.name,
+            "key": delegate.owner_key,
+            "rights": rights_to_wire(rights),
+            "more": may_delegate,
+            **validity.to_fields(),
+        }
+        return sign(StatementType.ADCERT, body, issuer, key)
+
+    @classmethod
+    def from_statement(cls, statement: Statement) -> AdCert:
+        """Read a parsed statement; its signature is not looked at.
+
+        Raises:
+            StatementError: MALFORMED or WRONG_NAME.
+        """
+        fields = statement.expect(StatementType.ADCERT)
+        return cls(
+            subject=Subject.from_fields(fields, fields.name("name")),
+            issuer=statement.signer,
+            delegate=fields.name("to"),
+            delegate_key=fields.bytes_("key", KEY_BYTES),
+            rights=rights_from_fields(fields, "rights"),
+            validity=Validity.from_fields(fields),
+            may_delegate=fields.flag("more"),
+            fingerprint=statement.fingerprint,
+        )
+
+
+class AdCertCache:
+    """Remembers which AdCerts a key did sign, so that a refreshed claim costs no second look at them."""
+
+    def __init__(self, maximum: int) -> None:
+        self._good: Lru[AdCert] = Lru(maximum)
+
+    def verified(self, wire: bytes, issuer_key: bytes) -> AdCert:
+        """Return the AdCert if ``issuer_key`` (33 bytes) signed it. Time and rights are not looked at.
+
+        Raises:
+            StatementError: MALFORMED, WRONG_NAME or BAD_SIGNATURE.
+        """
+        entry = hashlib.sha256(issuer_key + wire).digest()
+        known = self._good.get(entry)
+        if known is None:
+            statement = parse(wire)
+            known = AdCert.from_statement(statement)
+            statement.verify(PublicKey.from_compressed(issuer_key))
+            self._good.put(entry, known)
+        return known
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """AdCerts from an owner to a node, each verified; empty where the node owns the name or nobody does."""
+
+    links: tuple[AdCert, ...]
+
+    @classmethod
+    def walk(
+        cls,
+        wires: Sequence[bytes],
+        subject: Subject,
+        node: Subject,
+        cache: AdCertCache,
+    ) -> Chain:
+        """Verify a chain from the owner of ``subject`` to ``node``.
+
+        Raises:
+            StatementError: NOT_DELEGATED, BAD_SIGNATURE, WRONG_NAME or MALFORMED.
+        """
+        if len(wires) > CHAIN_MAX:
+            raise StatementError(DropReason.NOT_DELEGATED, f"a chain of more than {CHAIN_MAX} links")
+        issuer, issuer_key, may_delegate = subject.name, subject.owner_key, True
+        links: list[AdCert] = []
+        for wire in wires:
+            if not may_delegate:
+                raise StatementError(DropReason.NOT_DELEGATED, "a link that its issuer may not give")
+            link = cache.verified(wire, issuer_key)
+            if link.subject.name != subject.name:
+                raise StatementError(DropReason.NOT_DELEGATED, "a link about another name")
+            if link.issuer != issuer:
+                raise StatementError(DropReason.NOT_DELEGATED, "a link that does not join the one before")
+            issuer, issuer_key, may_delegate = link.delegate, link.delegate_key, link.may_delegate
+            links.append(link)
+        if links and (issuer, issuer_key) != (node.name, node.owner_key):
+            raise StatementError(DropReason.NOT_DELEGATED, "the chain ends at another node")
+        return cls(tuple(links))
+
+    def check(self, right: Right, unix_s: float, revoked: Revocations | None = None) -> None:
+        """Return if every link gives ``right`` at ``unix_s`` and none was revoked.
+
+        Args:
+            right: what the node wants to do.
+            unix_s: wall clock.
+            revoked: what was taken back, by a link's issuer or by the owner; nothing if not given.
+
+        Raises:
+            StatementError: NOT_DELEGATED, EXPIRED or REVOKED.
+        """
+        issuer_key = self.links[0].subject.owner_key if self.links else b""
+        for link in self.links:
+            if right not in link.rights:
+                raise StatementError(DropReason.NOT_DELEGATED, f"no right to {right.value}")
+            link.validity.check(unix_s, "AdCert")
+            takers = {link.subject.owner_key, issuer_key}
+            if revoked is not None and any(revoked.has(link.fingerprint, key) for key in takers):
+                raise StatementError(DropReason.REVOKED, "AdCert")
+            issuer_key = link.delegate_key

@@ -1,0 +1,107 @@
+"""What this domain's policy says: which domains it trusts, and through which its traffic may pass.
+
+Place: pure.
+Source: DESIGN section 5. Tiers are for finding names; trust is not inherited along them: a domain trusts the roots that
+its own operator put there, and no others.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
+from typing import Final
+
+from gdp.crypto.certificates import Membership, Root, Unverified
+from gdp.errors import DropReason, LocalError, StatementError
+from gdp.names import Name
+from gdp.trust.lru import Lru
+from gdp.trust.revocation import Revocations
+
+__all__ = ["MEMBERS_REMEMBERED", "Policy"]
+
+MEMBERS_REMEMBERED: Final = 4_096
+
+
+class Policy:
+    """The trust decisions of one domain.
+
+    Args:
+        own: the root of the domain that this node belongs to.
+        trusted: roots of other domains whose members may claim, attach and carry here.
+        transit: domains through which this domain lets its traffic pass; all trusted ones if not given.
+        remembered: how many verified memberships to keep.
+
+    Raises:
+        LocalError: ``transit`` names a domain that is not trusted.
+    """
+
+    def __init__(
+        self,
+        own: Root,
+        trusted: Iterable[Root] = (),
+        transit: Iterable[Name] | None = None,
+        *,
+        remembered: int = MEMBERS_REMEMBERED,
+    ) -> None:
+        roots = {root.domain: root for root in (own, *trusted)}
+        self.own: Final = own.domain
+        self.roots: Final[Mapping[Name, Root]] = MappingProxyType(roots)
+        self.transit: Final = frozenset(roots if transit is None else {own.domain, *transit})
+        if not self.transit <= roots.keys():
+            raise LocalError("transit goes through trusted domains only")
+        self.revoked: Final = Revocations(frozenset(root.key.compressed for root in roots.values()))
+        self._by_issuer: dict[bytes, list[Root]] = {}
+        for root in roots.values():
+            self._by_issuer.setdefault(root.distinguished_name, []).append(root)
+        self._members: Lru[Membership] = Lru(remembered)
+
+    def trusts(self, domain: Name) -> bool:
+        """Return whether members of ``domain`` are believed here."""
+        return domain in self.roots
+
+    def verify_membership(self, wire: bytes, unix_s: float) -> Membership:
+        """Return the membership if a trusted domain issued it and it holds now; costs 0.2 ms once, then 2 us.
+
+        Args:
+            wire: X.509, DER.
+            unix_s: wall clock.
+
+        Raises:
+            StatementError: BAD_CERTIFICATE, WRONG_NAME, WRONG_DOMAIN, EXPIRED or REVOKED.
+        """
+        entry = hashlib.sha256(wire).digest()
+        member = self._members.get(entry)
+        if member is None:
+            member = self._verified(Unverified.from_wire(wire), unix_s)
+            self._members.put(entry, member)
+        self.check_member(member, unix_s)
+        return member
+
+    def check_member(self, member: Membership, unix_s: float) -> None:
+        """Return if a membership verified before holds still.
+
+        Raises:
+            StatementError: WRONG_DOMAIN, EXPIRED or REVOKED.
+        """
+        root = self.roots.get(member.domain)
+        if root is None:
+            raise StatementError(DropReason.WRONG_DOMAIN, "a domain that is not trusted here")
+        root.validity.check(unix_s, "domain root")
+        member.validity.check(unix_s, "membership")
+        if self.revoked.has(member.fingerprint, root.key.compressed):
+            raise StatementError(DropReason.REVOKED, "membership")
+
+    def _verified(self, stranger: Unverified, unix_s: float) -> Membership:
+        candidates = [
+            root
+            for root in self._by_issuer.get(stranger.certificate.issuer, ())
+            if stranger.certificate.issuer_key_id in (b"", root.key_id)
+        ]
+        refusal = StatementError(DropReason.WRONG_DOMAIN, "a domain that is not trusted here")
+        for root in candidates:  # more than one only where labels are equal and a tool left the key id out
+            try:
+                return stranger.verify(root, unix_s)
+            except StatementError as error:
+                refusal = error
+        raise refusal

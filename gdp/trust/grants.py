@@ -1,0 +1,117 @@
+"""Grants: how the secret of a topic's epoch reaches a node, and only that node.
+
+Place: pure, but for the randomness that sealing draws.
+Source: DESIGN section 4. HPKE (RFC 9180) to the node's key, signed by the owner. The owner keeps one master secret::
+
+    secret(name, epoch) = HKDF-SHA256(master, salt "", info "gdp-topic-secret-1" || name || epoch (2)), 32 bytes
+    HPKE info           = "gdp-grant-1" || name || epoch (2) || the node's name
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+
+from gdp.crypto.identity import Identity
+from gdp.crypto.kem import KemPublicKey
+from gdp.crypto.keys import PublicKey, SigningKey
+from gdp.crypto.statements import StatementType, parse, sign
+from gdp.crypto.subject import Subject
+from gdp.errors import DropReason, LocalError, StatementError
+from gdp.names import Name
+
+__all__ = ["EPOCH_MAX", "SECRET_BYTES", "Grant", "make_grant", "open_grant", "topic_secret"]
+
+EPOCH_MAX: Final = (1 << 16) - 1  # two bytes of the frame header
+SECRET_BYTES: Final = 32
+_SECRET_INFO: Final = b"gdp-topic-secret-1"
+_GRANT_INFO: Final = b"gdp-grant-1"
+
+
+@dataclass(frozen=True, slots=True)
+class Grant:
+    """The secret of one epoch of a topic."""
+
+    name: Name
+    epoch: int
+    secret: bytes = field(repr=False)
+
+
+def topic_secret(owner_master: bytes, name: Name, epoch: int) -> bytes:
+    """Return the 32-byte secret of a topic's epoch.
+
+    Args:
+        owner_master: 32 random bytes that never leave the owner.
+        name: the topic.
+        epoch: 0 to ``EPOCH_MAX``.
+
+    Raises:
+        LocalError: a length or the epoch is out of bounds.
+    """
+    if len(owner_master) != SECRET_BYTES:
+        raise LocalError(f"an owner's master secret has {SECRET_BYTES} bytes")
+    info = _SECRET_INFO + name + _epoch_bytes(epoch)
+    return HKDF(hashes.SHA256(), SECRET_BYTES, None, info).derive(owner_master)
+
+
+def make_grant(
+    key: SigningKey, owner_master: bytes, subject: Subject, epoch: int, node: Name, kem: KemPublicKey
+) -> bytes:
+    """Return the signed statement that hands an epoch's secret to a node.
+
+    Args:
+        key: the owner's.
+        owner_master: the owner's.
+        subject: the topic; ``key`` must own it.
+        epoch: 0 to ``EPOCH_MAX``.
+        node: whom it is for.
+        kem: that node's public key, from its card.
+
+    Raises:
+        LocalError: another owner's topic, an epoch out of bounds, or a library without the KEM.
+        StatementError: MALFORMED, the node's public key is none.
+    """
+    if subject.owner_key != key.public.compressed:
+        raise LocalError("only a topic's owner grants its secrets")
+    secret = topic_secret(owner_master, subject.name, epoch)
+    body = {
+        **subject.to_fields(),
+        "to": node,
+        "epoch": epoch,
+        "sealed": kem.seal(secret, _info(subject.name, epoch, node)),
+    }
+    return sign(StatementType.GRANT, body, subject.name, key)
+
+
+def open_grant(identity: Identity, wire: bytes) -> Grant:
+    """Return the secret that an owner granted to this node.
+
+    Raises:
+        StatementError: MALFORMED, WRONG_NAME, NOT_FOR_US, BAD_SIGNATURE or BAD_TAG.
+        LocalError: a library without the KEM.
+    """
+    statement = parse(wire)
+    fields = statement.expect(StatementType.GRANT)
+    subject = Subject.from_fields(fields, statement.signer)
+    epoch = fields.uint("epoch", EPOCH_MAX)
+    if fields.name("to") != identity.name:
+        raise StatementError(DropReason.NOT_FOR_US, "a grant to another node")
+    sealed = fields.bytes_("sealed")
+    statement.verify(PublicKey.from_compressed(subject.owner_key))
+    secret = identity.kem.open(sealed, _info(subject.name, epoch, identity.name))
+    if len(secret) != SECRET_BYTES:
+        raise StatementError(DropReason.MALFORMED, f"a secret has {SECRET_BYTES} bytes")
+    return Grant(subject.name, epoch, secret)
+
+
+def _info(name: Name, epoch: int, node: Name) -> bytes:
+    return _GRANT_INFO + name + _epoch_bytes(epoch) + node
+
+
+def _epoch_bytes(epoch: int) -> bytes:
+    if not 0 <= epoch <= EPOCH_MAX:
+        raise LocalError(f"an epoch is a number from 0 to {EPOCH_MAX}")
+    return epoch.to_bytes(2, "big")

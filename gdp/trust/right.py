@@ -1,0 +1,62 @@
+"""What a node may do with a name.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from enum import Enum
+from typing import Final
+
+from gdp.crypto.fields import Fields
+from gdp.errors import DropReason, LocalError, StatementError
+
+__all__ = ["DELEGABLE", "Right", "rights_from_fields", "rights_to_wire"]
+
+
+class Right(str, Enum):
+    """One right. ``ATTACH`` is what a node has on its own name, and nobody can give it away."""
+
+    PUBLISH = "publish"
+    SERVE = "serve"
+    READ = "read"
+    ATTACH = "attach"
+
+    @classmethod
+    def from_wire(cls, text: str) -> Right:
+        """Read a right.
+
+        Raises:
+            StatementError: MALFORMED, an unknown one.
+        """
+        try:
+            return cls(text)
+        except ValueError as error:
+            raise StatementError(DropReason.MALFORMED, "an unknown right") from error
+
+
+DELEGABLE: Final = frozenset({Right.PUBLISH, Right.SERVE, Right.READ})
+
+
+def rights_to_wire(rights: Collection[Right]) -> list[str]:
+    """Return the sorted texts of a set of rights.
+
+    Raises:
+        LocalError: none, or one that cannot be delegated.
+    """
+    if not rights or not DELEGABLE.issuperset(rights):
+        raise LocalError("the rights to delegate are one or more of publish, serve and read")
+    return sorted({right.value for right in rights})
+
+
+def rights_from_fields(fields: Fields, key: str) -> frozenset[Right]:
+    """Read a set of delegable rights.
+
+    Raises:
+        StatementError: MALFORMED.
+    """
+    rights = frozenset(Right.from_wire(text) for text in fields.texts(key, len(DELEGABLE)))
+    if not rights or not rights <= DELEGABLE:
+        raise StatementError(DropReason.MALFORMED, "rights that cannot be delegated")
+    return rights

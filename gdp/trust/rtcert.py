@@ -1,0 +1,62 @@
+"""RtCert: a node lets one switch attract traffic for it.
+
+Place: pure.
+Source: FogROS G, section on advertisements; DESIGN section 5.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+from gdp.crypto.identity import Identity
+from gdp.crypto.keys import PublicKey
+from gdp.crypto.statements import StatementType, parse
+from gdp.crypto.validity import Validity
+from gdp.errors import DropReason, StatementError
+from gdp.names import Name
+from gdp.trust.lru import Lru
+
+__all__ = ["RtCert", "RtCertCache"]
+
+
+@dataclass(frozen=True, slots=True)
+class RtCert:
+    """The right of ``switch`` to attract the traffic of ``node``."""
+
+    node: Name
+    switch: Name
+    validity: Validity
+    fingerprint: bytes
+
+    @staticmethod
+    def make(identity: Identity, switch: Name, validity: Validity) -> bytes:
+        """Return the node's signed statement."""
+        return identity.sign(StatementType.RTCERT, {"switch": switch, **validity.to_fields()})
+
+
+class RtCertCache:
+    """Remembers which RtCerts a node did sign: one serves all the claims that it makes through a switch."""
+
+    def __init__(self, maximum: int) -> None:
+        self._good: Lru[RtCert] = Lru(maximum)
+
+    def verified(self, wire: bytes, node: Name, node_key: PublicKey) -> RtCert:
+        """Return the RtCert if ``node``, whose key this is, signed it. Time is not looked at.
+
+        Raises:
+            StatementError: MALFORMED, NOT_DELEGATED (another node's) or BAD_SIGNATURE.
+        """
+        entry = hashlib.sha256(node_key.compressed + wire).digest()
+        known = self._good.get(entry)
+        if known is None:
+            statement = parse(wire)
+            fields = statement.expect(StatementType.RTCERT)
+            known = RtCert(statement.signer, fields.name("switch"), Validity.from_fields(fields), statement.fingerprint)
+            if known.node != node:
+                raise StatementError(DropReason.NOT_DELEGATED, "an RtCert of another node")
+            statement.verify(node_key)
+            self._good.put(entry, known)
+        elif known.node != node:
+            raise StatementError(DropReason.NOT_DELEGATED, "an RtCert of another node")
+        return known

@@ -1,0 +1,140 @@
+"""Believing a claim: every proof that it carries, in the order that costs a stranger most and us least.
+
+Place: pure; remembers what it verified, within bounds.
+Source: DESIGN section 5. First what is free (form, hash, lease), then who speaks (membership, signature), and only for
+a proved member the rest. A new claim costs two signature checks; a refreshed one costs one, since certificates seen
+before are remembered by digest. Time and revocation are asked every time.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from gdp.crypto.certificates import Membership
+from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.errors import DropReason, StatementError
+from gdp.limits import LEASE_MAX_S, LEASE_MIN_S
+from gdp.trust.adcert import AdCertCache, Chain
+from gdp.trust.claim import Claim, ClaimBody
+from gdp.trust.domain import Policy
+from gdp.trust.revocation import Revocation, Revocations
+from gdp.trust.right import Right
+from gdp.trust.rtcert import RtCertCache
+
+__all__ = ["ADCERTS_REMEMBERED", "RTCERTS_REMEMBERED", "ClaimVerifier"]
+
+ADCERTS_REMEMBERED: Final = 65_536
+RTCERTS_REMEMBERED: Final = 16_384
+_MS = 1_000
+
+
+class ClaimVerifier:
+    """Verifies claims under a policy.
+
+    Args:
+        policy: whom to trust; shared with whoever verifies memberships, so that a revocation reaches all.
+        allow_unowned: whether any member may claim a name without an owner.
+        adcerts_remembered: how many verified AdCerts to keep, about 1 kB each.
+        rtcerts_remembered: how many verified RtCerts to keep.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        *,
+        allow_unowned: bool = False,
+        adcerts_remembered: int = ADCERTS_REMEMBERED,
+        rtcerts_remembered: int = RTCERTS_REMEMBERED,
+    ) -> None:
+        self.policy: Final = policy
+        self._allow_unowned = allow_unowned
+        self._adcerts = AdCertCache(adcerts_remembered)
+        self._rtcerts = RtCertCache(rtcerts_remembered)
+
+    @property
+    def revoked(self) -> Revocations:
+        """Return what has been taken back, as far as this node was told."""
+        return self.policy.revoked
+
+    def verify(self, wire: bytes, unix_s: float) -> Claim:
+        """Return the claim if all of it holds now. Whether its sequence is news is for the RIB to say.
+
+        Args:
+            wire: the signed statement.
+            unix_s: wall clock.
+
+        Raises:
+            StatementError: with the reason; never another exception, whatever the bytes.
+        """
+        return self.verify_statement(parse(wire), unix_s)
+
+    def verify_statement(self, statement: Statement, unix_s: float) -> Claim:
+        """The same for a statement that was parsed already.
+
+        Raises:
+            StatementError: with the reason.
+        """
+        body = ClaimBody.from_statement(statement)
+        if not LEASE_MIN_S * _MS <= body.lease_ms <= LEASE_MAX_S * _MS:
+            raise StatementError(DropReason.LEASE_BOUNDS, f"{body.lease_ms} ms")
+        member = self.policy.verify_membership(body.membership, unix_s)
+        if member.name != statement.signer:
+            raise StatementError(DropReason.BAD_CERTIFICATE, "the membership is of another node")
+        statement.verify(member.key)
+        rtcert = self._rtcerts.verified(body.rtcert, member.name, member.key)
+        chain = self._chain(body, member)
+        claim = Claim(
+            subject=body.subject,
+            right=body.right,
+            member=member,
+            chain=chain,
+            rtcert=rtcert,
+            sequence=body.sequence,
+            incarnation=body.incarnation,
+            lease_s=body.lease_ms / _MS,
+            is_global=body.is_global,
+            wire=statement.wire,
+        )
+        self._check_evidence(claim, unix_s)
+        return claim
+
+    def recheck(self, claim: Claim, unix_s: float) -> None:
+        """Return if a claim verified before holds still; costs a few microseconds.
+
+        Raises:
+            StatementError: EXPIRED, REVOKED or WRONG_DOMAIN.
+        """
+        self.policy.check_member(claim.member, unix_s)
+        self._check_evidence(claim, unix_s)
+
+    def revoke(self, wire: bytes, unix_s: float) -> Revocation | None:
+        """Take in a revocation; return it if it is news, so that claims on its fingerprint can be rechecked.
+
+        Who may hand revocations in, and how many, is for the caller to bound.
+
+        Raises:
+            StatementError: MALFORMED, WRONG_NAME, BAD_SIGNATURE, EXPIRED or QUOTA.
+        """
+        statement = parse(wire)
+        statement.expect(StatementType.REVOKE)
+        revocation = Revocation.from_statement(statement)
+        return revocation if self.revoked.add(revocation, unix_s) else None
+
+    def _chain(self, body: ClaimBody, member: Membership) -> Chain:
+        """Return the proof that the member may act on the name, its links verified."""
+        subject = body.subject
+        if body.right is Right.ATTACH and subject.name != member.name:
+            raise StatementError(DropReason.NOT_DELEGATED, "a node attaches under its own name only")
+        if body.chain:
+            return Chain.walk(body.chain, subject, member.subject, self._adcerts)
+        owns = subject.owner_key == member.key.compressed or (not subject.owner_key and self._allow_unowned)
+        if not owns:
+            raise StatementError(DropReason.NOT_DELEGATED, "no delegation from the owner")
+        return Chain(())
+
+    def _check_evidence(self, claim: Claim, unix_s: float) -> None:
+        """Refuse what time or a revocation has taken away, the membership apart."""
+        claim.rtcert.validity.check(unix_s, "RtCert")
+        if self.revoked.has(claim.rtcert.fingerprint, claim.member.key.compressed):
+            raise StatementError(DropReason.REVOKED, "RtCert")
+        claim.chain.check(claim.right, unix_s, self.revoked)
