@@ -1,0 +1,253 @@
+"""How a node that is no switch holds on to the overlay: greet a switch, claim names there, renew, move on.
+
+Place: pure. Whoever publishes, reads or serves builds on this; so does a RIB.
+
+::
+
+    ALONE --a switch is up--> CLAIMING --all claims judged--> ATTACHED
+      ^------------- the switch is gone, or another is nearer -----------'
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from gdp.control.frames import ControlJoiner, ControlSplitter
+from gdp.control.greeter import Greeter
+from gdp.control.neighbour import Neighbour
+from gdp.control.verdict import Verdict
+from gdp.crypto.certificates import Role
+from gdp.crypto.identity import Identity
+from gdp.crypto.statements import Statement, StatementType, parse, sign
+from gdp.crypto.subject import Subject
+from gdp.crypto.validity import Validity
+from gdp.effects import Arrival, Instant, Transmit
+from gdp.errors import DropReason, FrameError, StatementError
+from gdp.frame.codec import Header
+from gdp.frame.kinds import Kind
+from gdp.limits import DEAD_S, HELLO_S
+from gdp.names import Name
+from gdp.trust.claim import make_claim
+from gdp.trust.domain import Policy
+from gdp.trust.right import Right
+from gdp.trust.rtcert import RtCert
+
+__all__ = ["Attachment", "AttachmentSettings", "Claimed"]
+
+CLAIM_LEASE_S: Final = 24.0
+_CLAIM_AGAIN_S: Final = 0.5  # until it is judged
+_RTCERT_S: Final = 600
+
+
+@dataclass(frozen=True, slots=True)
+class AttachmentSettings:
+    """``incarnation`` is random at each start; ``first_sequence`` is wall-clock milliseconds."""
+
+    incarnation: int
+    first_sequence: int
+    random_bytes: Callable[[int], bytes]
+    hello_s: float = HELLO_S
+    dead_s: float = DEAD_S
+
+
+@dataclass(slots=True)
+class Claimed:
+    """A name that this node claims, and what became of it."""
+
+    subject: Subject
+    right: Right
+    chain: tuple[bytes, ...]
+    is_global: bool
+    claim_at_s: float = 0.0
+    is_taken: bool = False
+    refused: DropReason | None = None
+
+
+class Attachment:
+    """One node's hold on the overlay."""
+
+    def __init__(self, identity: Identity, policy: Policy, settings: AttachmentSettings) -> None:
+        self._identity = identity
+        self._policy = policy
+        self._incarnation = settings.incarnation
+        self._sequence = settings.first_sequence
+        self.splitter = ControlSplitter(identity.name, settings.incarnation)
+        self.joiner = ControlJoiner()
+        self.greeter = Greeter(
+            identity, policy, self.splitter, settings.random_bytes, hello_s=settings.hello_s, dead_s=settings.dead_s
+        )
+        self._claims: dict[tuple[Name, Right], Claimed] = {}
+        self._switch: Neighbour | None = None
+        self._switch_nonce = b""  # of the session with it
+        self._rtcert = b""
+        self._rtcert_until_s = 0.0
+        self._out: list[Transmit] = []
+        self.refusals: Counter[DropReason] = Counter()
+
+    @property
+    def switch(self) -> Neighbour | None:
+        """Return the switch that this node is attached to, or None."""
+        return self._switch
+
+    @property
+    def is_attached(self) -> bool:
+        """Return whether a switch is there and has judged every claim."""
+        return self._switch is not None and all(each.is_taken or each.refused for each in self._claims.values())
+
+    @property
+    def claims(self) -> list[Claimed]:
+        """Return what is claimed."""
+        return list(self._claims.values())
+
+    @property
+    def mtu(self) -> int:
+        """Return the MTU of the port to the switch, in bytes after the Ethernet header."""
+        assert self._switch is not None
+        return self.greeter.ports[self._switch.port].mtu
+
+    def claim(self, subject: Subject, right: Right, chain: tuple[bytes, ...], *, is_global: bool) -> None:
+        """Claim a name from now on."""
+        self._claims[subject.name, right] = Claimed(subject, right, chain, is_global)
+
+    def withdraw(self, name: Name, right: Right) -> None:
+        """Claim a name no more, and say so."""
+        if self._claims.pop((name, right), None) is not None and self._switch is not None:
+            body = {"n": name, "s": self._next_sequence()}
+            wire = sign(StatementType.WITHDRAW, body, self._identity.name, self._identity.key)
+            self._say(Kind.WITHDRAW, wire)
+
+    def withdraw_all(self) -> None:
+        """Leave: claim nothing any more."""
+        for name, right in list(self._claims):
+            self.withdraw(name, right)
+
+    def send(self, frames: list[bytes]) -> None:
+        """Send frames to the switch; without one they are counted as lost."""
+        if self._switch is not None:
+            self._out.append(Transmit(self._switch.port, self._switch.mac, frames))
+        else:
+            self.refusals[DropReason.PORT_DOWN] += len(frames)
+
+    def receive_control(self, arrival: Arrival, header: Header, now: Instant) -> Statement | None:
+        """Take a frame of a kind that is for neighbours; return a statement that is for the node above.
+
+        Raises:
+            RemoteError: it does not hold.
+        """
+        wire = self.joiner.add(header, arrival.frame, now.mono_s)
+        if wire is None:
+            return None
+        statement = parse(wire)
+        if header.kind == Kind.HELLO:
+            if self.greeter.receive(arrival, statement, now) is not None:
+                self._choose_switch(now.mono_s)
+            return None
+        switch = self._switch
+        if switch is None or (arrival.port, arrival.mac) != (switch.port, switch.mac):
+            raise FrameError(DropReason.UNKNOWN_SENDER, "not our switch")
+        if header.kind == Kind.VERDICT:
+            return self._take_verdict(statement, switch, now)
+        if header.kind in (Kind.JOIN, Kind.LEAVE):
+            statement.verify(switch.key)
+            return statement
+        raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
+
+    def port_changed(self, port: int, up: bool, now: Instant) -> None:
+        """Learn that a port's link came or went."""
+        self.greeter.port_changed(port, up, now.mono_s)
+        self._choose_switch(now.mono_s)
+
+    def timeout(self, now: Instant) -> None:
+        """Renew what is due."""
+        if self.greeter.expire(now.mono_s):
+            self._choose_switch(now.mono_s)
+        self.joiner.expire(now.mono_s)
+        self._out += self.greeter.take(now.mono_s)
+        if self._switch is None:
+            return
+        for each in self._claims.values():
+            if each.claim_at_s <= now.mono_s:
+                each.claim_at_s = now.mono_s + (CLAIM_LEASE_S / 3 if each.is_taken else _CLAIM_AGAIN_S)
+                self._say(Kind.ADVERTISE, self._claim_wire(each, now))
+
+    def next_timeout(self) -> float | None:
+        """Return the monotonic second of the next timer, or None."""
+        times = [self.greeter.next_timeout()]
+        if self._switch is not None:
+            times += [each.claim_at_s for each in self._claims.values()]
+        return min((time for time in times if time is not None), default=None)
+
+    def take(self) -> list[Transmit]:
+        """Return, once, what is to be sent."""
+        out, self._out = self._out, []
+        return out
+
+    def _choose_switch(self, now_s: float) -> None:
+        """Attach to the switch over the cheapest port; a new or restarted one hears every claim."""
+        switches = [each for each in self.greeter.all_up() if each.role is Role.SWITCH]
+        best = min(switches, key=lambda each: (self.greeter.ports[each.port].cost, each.port), default=None)
+        is_same = best is not None and best is self._switch and best.nonce == self._switch_nonce
+        self._switch = best
+        self._switch_nonce = b"" if best is None else best.nonce
+        if best is not None and not is_same:
+            self._rtcert = b""
+            for each in self._claims.values():
+                each.claim_at_s, each.is_taken, each.refused = now_s, False, None
+
+    def _claim_wire(self, each: Claimed, now: Instant) -> bytes:
+        assert self._switch is not None
+        if not self._rtcert or now.mono_s >= self._rtcert_until_s:
+            validity = Validity(int(now.unix_s), int(now.unix_s) + _RTCERT_S)
+            self._rtcert = RtCert.make(self._identity, self._switch.name, validity)
+            self._rtcert_until_s = now.mono_s + _RTCERT_S / 2
+        return make_claim(
+            self._identity,
+            each.right,
+            each.subject,
+            rtcert=self._rtcert,
+            sequence=self._next_sequence(),
+            incarnation=self._incarnation,
+            lease_s=CLAIM_LEASE_S,
+            is_global=each.is_global,
+            chain=each.chain,
+        )
+
+    def _take_verdict(self, statement: Statement, switch: Neighbour, now: Instant) -> Statement | None:
+        """Take what became of a claim, or pass a publisher's place on."""
+        fields = statement.fields
+        member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
+        if member.name != statement.signer or (member.name != switch.name and member.role is not Role.RIB):
+            raise StatementError(DropReason.BAD_CERTIFICATE, "a verdict from nobody who may judge")
+        statement.verify(member.key)
+        if statement.type is StatementType.ANSWER:
+            return statement
+        verdict = Verdict.from_fields(statement.expect(StatementType.VERDICT))
+        for (name, _), each in self._claims.items():
+            if name == verdict.name and verdict.advertiser == self._identity.name:
+                self._judge(each, verdict, now.mono_s)
+        return None
+
+    def _judge(self, each: Claimed, verdict: Verdict, now_s: float) -> None:
+        if verdict.refused is None:
+            if not each.is_taken:
+                each.claim_at_s = now_s + CLAIM_LEASE_S / 3
+            each.is_taken, each.refused = True, None
+            return
+        self.refusals[verdict.refused] += 1
+        each.is_taken = False
+        if verdict.refused is DropReason.STALE:
+            self._sequence = max(self._sequence, verdict.sequence)
+            each.claim_at_s = now_s  # an earlier life of ours was ahead: try again above it
+        else:
+            each.refused = verdict.refused
+
+    def _say(self, kind: Kind, wire: bytes) -> None:
+        assert self._switch is not None
+        self.send(self.splitter.split(kind, wire, self.mtu))
+
+    def _next_sequence(self) -> int:
+        self._sequence += 1
+        return self._sequence

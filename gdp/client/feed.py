@@ -1,0 +1,272 @@
+"""One publisher of one topic as a reader sees it: open, join, put in order, report what is missing.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds).
+
+A feed begins ``NEW``: it announces itself until a status tells it where to begin and what the messages are. ``LIVE`` it
+delivers: a reliable topic in order and complete, a best-effort one in order and never waiting.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final
+
+from gdp.client.publisher import Secrets
+from gdp.crypto.envelope import Opener
+from gdp.crypto.note import NoteSealer
+from gdp.errors import DropReason, EnvelopeError, RemoteError
+from gdp.frame.codec import Header
+from gdp.frame.kinds import Flag, Kind
+from gdp.limits import (
+    JOIN_SOURCE_BYTES,
+    NACKS_PER_REPORT,
+    REPLAY_WINDOW_MESSAGES,
+    REPORT_DELAY_S,
+    REPORT_EVERY_BYTES,
+    REPORT_GAP_S,
+    REPORT_IDLE_S,
+)
+from gdp.message.join import Joined, Joiner, VerifiesDigest
+from gdp.message.memory import Budget
+from gdp.message.report import Missing, Report, ReportFlag
+from gdp.message.status import Status
+from gdp.names import Name
+
+__all__ = ["Delivered", "Feed", "FeedState", "Reader"]
+
+ANNOUNCE_S: Final = 0.1
+_WAITING: Final = Flag.RELIABLE | Flag.LATCHED  # topics whose readers wait for what is missing
+
+
+class FeedState(Enum):
+    """How far a feed is."""
+
+    NEW = "new"
+    LIVE = "live"
+
+
+@dataclass(frozen=True, slots=True)
+class Reader:
+    """Who reads, in this life of its process."""
+
+    name: Name
+    incarnation: int
+
+
+@dataclass(frozen=True, slots=True)
+class Delivered:
+    """One message, opened, verified and in its place."""
+
+    publisher: bytes
+    number: int
+    message: bytes
+    parts: int
+    hops: int
+
+
+class Feed:
+    """Reads one incarnation of one publisher of a topic."""
+
+    def __init__(
+        self,
+        topic: Name,
+        reader: Reader,
+        publisher: Name,
+        incarnation: int,
+        writer: VerifiesDigest,
+        secrets: Secrets,
+        budget: Budget,
+        now_s: float,
+    ) -> None:
+        self.publisher = publisher
+        self.incarnation = incarnation
+        self._topic = topic
+        self._reader = reader
+        self._secrets = secrets
+        self._openers: dict[tuple[int, int], Opener] = {}
+        self._note = NoteSealer(
+            secrets[max(secrets)], max(secrets), Kind.REPORT, reader.name, reader.incarnation, publisher, topic
+        )
+        self._data = Joiner(publisher, lambda epoch: self._opener(Kind.DATA, epoch), writer, budget)
+        self._status = Joiner(publisher, lambda epoch: self._opener(Kind.STATUS, epoch), writer, budget)
+        self.state = FeedState.NEW
+        self.description = b""
+        self._is_reliable: bool | None = None
+        self._expected = 0  # next number to deliver, once LIVE
+        self._known_next = 0  # the publisher has numbered everything below this
+        self._ready: dict[int, Joined] = {}
+        self._ready_bytes = 0
+        self._out = deque[Delivered]()
+        self._report_at_s = now_s
+        self._unreported_bytes = 0
+        self.claim_sequence = 0  # of the claim that brought this incarnation
+        self.lost = 0
+        self.delivered = 0
+
+    @property
+    def drops(self) -> Counter[DropReason]:
+        """Return what was dropped, by reason."""
+        return self._data.drops + self._status.drops
+
+    @property
+    def duplicates(self) -> int:
+        """Return how many parts came a second time and were dropped."""
+        return self._data.drops[DropReason.DUPLICATE] + self._data.drops[DropReason.LATE]
+
+    def receive(self, header: Header, frame: bytes, now_s: float) -> None:
+        """Take one DATA or STATUS frame of this publisher."""
+        if header.incarnation != self.incarnation:
+            self._data.drops[DropReason.WRONG_INCARNATION] += 1
+        elif header.kind == Kind.STATUS:
+            joined = self._status.add(header, frame, now_s)
+            if joined is not None:
+                self._take_status(joined, now_s)
+        else:
+            self._take_data(header, frame, now_s)
+
+    def timeout(self, now_s: float) -> None:
+        """Give back what waited too long for its parts (best effort), and let a due report go."""
+        if not self._is_reliable:
+            self._data.expire(now_s)
+        self._status.expire(now_s)
+
+    def next_timeout(self) -> float:
+        """Return the monotonic second of the next timer."""
+        expiries = [self._status.next_expiry(), None if self._is_reliable else self._data.next_expiry()]
+        return min([self._report_at_s, *(expiry for expiry in expiries if expiry is not None)])
+
+    def take_report(self, now_s: float) -> bytes | None:
+        """Return the frame of the report that is due, or None."""
+        if now_s < self._report_at_s:
+            return None
+        self._unreported_bytes = 0
+        if self.state is FeedState.NEW:
+            self._report_at_s = now_s + ANNOUNCE_S
+            return self._note.seal(Report(ReportFlag.NEW, 0, 0, ()).to_wire())
+        missing = self._missing() if self._is_reliable else ()
+        self._report_at_s = now_s + (REPORT_DELAY_S if missing else REPORT_IDLE_S)
+        part = self._data.progress(self._expected)
+        return self._note.seal(Report(ReportFlag.NONE, self._expected, part, missing).to_wire())
+
+    def take_delivered(self) -> list[Delivered]:
+        """Return, once, the messages that are ready, in order."""
+        delivered = list(self._out)
+        self._out.clear()
+        return delivered
+
+    def close(self) -> bytes:
+        """Give back all memory; return the frame that says goodbye."""
+        self._data.close()
+        self._status.close()
+        return self._note.seal(Report(ReportFlag.BYE, self._expected, 0, ()).to_wire())
+
+    def _opener(self, kind: Kind, epoch: int) -> Opener:
+        opener = self._openers.get((kind, epoch))
+        if opener is None:
+            secret = self._secrets.get(epoch)
+            if secret is None:
+                raise EnvelopeError(DropReason.UNKNOWN_EPOCH, str(epoch))
+            opener = Opener(secret, kind, self.publisher, self.incarnation, self._topic)
+            self._openers[kind, epoch] = opener
+        return opener
+
+    def _take_data(self, header: Header, frame: bytes, now_s: float) -> None:
+        joiner = self._data
+        if self.state is FeedState.LIVE and not 0 <= header.number - self._expected < REPLAY_WINDOW_MESSAGES:
+            joiner.drops[DropReason.LATE if header.number < self._expected else DropReason.MEMORY_FULL] += 1
+            return
+        seen, highest = joiner.new_parts, joiner.highest
+        joined = joiner.add(header, frame, now_s)
+        if joiner.new_parts > seen:
+            if self._is_reliable is None:
+                self._is_reliable = bool(header.flags & _WAITING)
+            self._unreported_bytes += header.length
+            self._plan_report(header, highest, now_s)
+        if joined is not None:
+            self._ready[joined.number] = joined
+            self._ready_bytes += len(joined.message)
+            self._deliver()
+            if self._ready_bytes > JOIN_SOURCE_BYTES:  # too much waits behind a gap: go on without what is missing
+                self._skip_to(min(self._ready))
+                self._deliver()
+
+    def _plan_report(self, header: Header, highest: int, now_s: float) -> None:
+        if self.state is FeedState.NEW or not self._is_reliable:
+            return
+        is_next = header.number == highest or (header.number == highest + 1 and self._is_whole(highest))
+        is_in_order = is_next and (
+            self._data.is_finished(header.number) or header.part == self._data.progress(header.number) - 1
+        )
+        if self._unreported_bytes >= REPORT_EVERY_BYTES:
+            due_s = now_s
+        else:
+            due_s = now_s + (REPORT_DELAY_S if is_in_order else REPORT_GAP_S)
+        self._report_at_s = min(self._report_at_s, due_s)
+
+    def _is_whole(self, number: int) -> bool:
+        return number < self._expected or self._data.is_finished(number)
+
+    def _missing(self) -> tuple[Missing, ...]:
+        """Return what is known to be lacking: gaps below the newest part, and all that a status announced."""
+        missing: list[Missing] = []
+        for number in range(self._expected, max(self._data.highest + 1, self._known_next)):
+            room = NACKS_PER_REPORT - len(missing)
+            if room <= 0:
+                break
+            is_announced = number < self._known_next
+            missing += [Missing(number, *each) for each in self._data.missing(number, room, to_end=is_announced)]
+        return tuple(missing)
+
+    def _take_status(self, joined: Joined, now_s: float) -> None:
+        try:
+            status = Status.from_wire(joined.message)
+        except RemoteError as error:
+            self._status.drops[error.reason] += 1
+            return
+        self._is_reliable = bool(joined.flags & _WAITING)
+        if self.state is FeedState.NEW:
+            if self._reader.name not in status.starts:
+                return
+            self.state = FeedState.LIVE
+            self._expected = status.starts[self._reader.name]
+            self.description = status.description
+            self._data.forget(self._expected)
+            for number in [number for number in self._ready if number < self._expected]:
+                self._ready_bytes -= len(self._ready.pop(number).message)
+        self._known_next = max(self._known_next, status.next_number)
+        if status.oldest > self._expected:
+            self._skip_to(status.oldest)
+        self._report_at_s = now_s
+        self._deliver()
+
+    def _skip_to(self, number: int) -> None:
+        """Accept that what lies before ``number`` and is not here will not come."""
+        here = sorted(each for each in self._ready if each < number)
+        self.lost += number - self._expected - len(here)
+        for each in here:
+            self._hand_out(self._ready.pop(each))
+        self._expected = number
+        self._data.forget(number)
+
+    def _deliver(self) -> None:
+        if self.state is FeedState.NEW:
+            return
+        if self._is_reliable:
+            while (joined := self._ready.pop(self._expected, None)) is not None:
+                self._hand_out(joined)
+                self._expected += 1
+        elif self._ready:
+            for number in sorted(self._ready):
+                if number >= self._expected:
+                    self.lost += number - self._expected
+                    self._hand_out(self._ready.pop(number))
+                    self._expected = number + 1
+            self._ready.clear()
+            self._ready_bytes = 0
+
+    def _hand_out(self, joined: Joined) -> None:
+        self.delivered += 1
+        self._ready_bytes -= len(joined.message)
+        self._out.append(Delivered(self.publisher, joined.number, joined.message, joined.parts, joined.hops))

@@ -1,0 +1,97 @@
+"""A RIB on the overlay: the RIB's machine with a hold on a switch.
+
+Place: pure; a shell or a simulated network feeds it frames and time. A RIB claims no name: its hello says what it is, and
+its switch says so to all (``control/link_state.py``).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+from gdp.client.attachment import Attachment, AttachmentSettings
+from gdp.control.frames import ControlJoiner
+from gdp.crypto.identity import Identity
+from gdp.effects import Arrival, Instant, Transmit
+from gdp.errors import DropReason, FrameError, RemoteError
+from gdp.frame.codec import decode
+from gdp.frame.kinds import CONTROL_FROM, Kind
+from gdp.names import Name
+from gdp.rib.machine import Rib
+from gdp.trust.domain import Policy
+
+__all__ = ["RibHost"]
+
+
+class RibHost:
+    """The machine of a RIB node."""
+
+    def __init__(self, identity: Identity, policy: Policy, rib: Rib, settings: AttachmentSettings) -> None:
+        self._identity = identity
+        self._joiner = ControlJoiner()
+        self._drops: Counter[DropReason] = Counter()
+        self.attachment = Attachment(identity, policy, settings)
+        self.rib = rib
+
+    @property
+    def name(self) -> Name:
+        """Return the RIB's name."""
+        return self._identity.name
+
+    def drops(self) -> Mapping[DropReason, int]:
+        """Return what was dropped or refused, by reason."""
+        return self._drops + self._joiner.drops + self.attachment.joiner.drops + self.rib.refusals
+
+    def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Instant) -> None:
+        """Begin to look for a switch on a port."""
+        self.attachment.greeter.add_port(index, mac, mtu, cost, now.mono_s)
+
+    def receive(self, arrivals: Sequence[Arrival], now: Instant) -> None:
+        """Take frames in."""
+        for arrival in arrivals:
+            try:
+                self._take(arrival, now)
+            except RemoteError as error:
+                self._drops[error.reason] += 1
+        self._post()
+
+    def port_changed(self, port: int, up: bool, now: Instant) -> None:
+        """Learn that a port's link came or went."""
+        self.attachment.port_changed(port, up, now)
+
+    def timeout(self, now: Instant) -> None:
+        """Do what is due."""
+        self.attachment.timeout(now)
+        self._joiner.expire(now.mono_s)
+        self.rib.timeout(now)
+        self._post()
+
+    def next_timeout(self) -> float | None:
+        """Return the monotonic second of the next timer, or None."""
+        times = [self.attachment.next_timeout(), self.rib.next_timeout()]
+        return min((time for time in times if time is not None), default=None)
+
+    def take(self) -> list[Transmit]:
+        """Return, once, what is to be sent."""
+        return self.attachment.take()
+
+    def _take(self, arrival: Arrival, now: Instant) -> None:
+        header = decode(arrival.frame)
+        if header.kind >= CONTROL_FROM:
+            self.attachment.receive_control(arrival, header, now)
+            return
+        if header.destination != self.name:
+            raise FrameError(DropReason.NOT_FOR_US)
+        if header.kind not in (Kind.RIB_REQUEST, Kind.RIB_ANSWER):
+            raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
+        wire = self._joiner.add(header, arrival.frame, now.mono_s)
+        if wire is not None:
+            self.rib.receive(wire, Name(header.source), now)
+
+    def _post(self) -> None:
+        letters = self.rib.take()
+        if self.attachment.switch is None:
+            return  # nobody to carry them: whoever asked will ask again
+        for letter in letters:
+            frames = self.attachment.splitter.split(letter.kind, letter.statement, self.attachment.mtu, letter.to)
+            self.attachment.send(frames)

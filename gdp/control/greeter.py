@@ -1,0 +1,183 @@
+"""Finding neighbours, proving who they are, and noticing when they are gone.
+
+Place: pure; every node that has a port greets: switches, RIBs, proxies.
+
+A hello is signed by a member of a trusted domain and carries its certificate. It counts as two-way when it echoes the
+nonce of our port's present session, so a recorded hello brings nobody up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+from gdp.control.frames import ControlSplitter
+from gdp.control.hello import DIGEST_BYTES, NONCE_BYTES, Hello
+from gdp.control.neighbour import TRANSITIONS, Neighbour, NeighbourEvent, NeighbourState
+from gdp.crypto.identity import Identity
+from gdp.crypto.statements import Statement, StatementType
+from gdp.effects import BROADCAST, Arrival, Instant, Transmit
+from gdp.errors import DropReason, StatementError
+from gdp.frame.kinds import Kind
+from gdp.limits import DEAD_S, HELLO_S, MTU_MIN_BYTES
+from gdp.names import Name
+from gdp.trust.domain import Policy
+
+__all__ = ["Change", "Greeter", "LinkPort"]
+
+NEIGHBOURS_PER_PORT: Final = 32
+_ANSWER_S: Final = 0.02  # a stranger's hello is answered at once, but not more often than this
+
+Change = tuple[Neighbour, NeighbourState]  # a neighbour after the change, and its state before
+
+
+@dataclass(slots=True)
+class LinkPort:
+    """A port as the control plane sees it."""
+
+    index: int
+    mac: bytes
+    mtu: int  # bytes after the Ethernet header
+    cost: int
+    nonce: bytes
+    is_up: bool = True
+    sequence: int = 0
+    hello_at_s: float = 0.0
+    said_s: float = float("-inf")
+    neighbours: dict[Name, Neighbour] = field(default_factory=dict)
+
+
+class Greeter:
+    """Greets on every port.
+
+    Args:
+        random_bytes: source of nonces.
+        digest_for: what to say of our link state to the far end of a port.
+    """
+
+    def __init__(
+        self,
+        identity: Identity,
+        policy: Policy,
+        splitter: ControlSplitter,
+        random_bytes: Callable[[int], bytes],
+        *,
+        hello_s: float = HELLO_S,
+        dead_s: float = DEAD_S,
+        digest_for: Callable[[LinkPort], bytes] = lambda port: bytes(DIGEST_BYTES),
+    ) -> None:
+        self._identity = identity
+        self._policy = policy
+        self._splitter = splitter
+        self._random_bytes = random_bytes
+        self._hello_s = hello_s
+        self._dead_s = dead_s
+        self._digest_for = digest_for
+        self.ports: dict[int, LinkPort] = {}
+
+    def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now_s: float) -> None:
+        """Begin to greet on a port."""
+        nonce = self._random_bytes(NONCE_BYTES)
+        self.ports[index] = LinkPort(index, mac, max(mtu, MTU_MIN_BYTES), cost, nonce, hello_at_s=now_s)
+
+    def neighbour(self, port: int, name: Name) -> Neighbour | None:
+        """Return the neighbour of that name that is up on a port, or None."""
+        on = self.ports.get(port)
+        found = on.neighbours.get(name) if on is not None else None
+        return found if found is not None and found.state is NeighbourState.UP else None
+
+    def all_up(self) -> list[Neighbour]:
+        """Return every neighbour that is up."""
+        return [n for port in self.ports.values() for n in port.neighbours.values() if n.state is NeighbourState.UP]
+
+    def receive(self, arrival: Arrival, statement: Statement, now: Instant) -> Change | None:
+        """Take a hello; return what it changed.
+
+        Raises:
+            StatementError: it does not hold; nothing has changed.
+        """
+        hello = Hello.from_fields(statement.expect(StatementType.HELLO))
+        port = self.ports.get(arrival.port)
+        if port is None or not port.is_up:
+            return None
+        if statement.signer == self._identity.name:
+            raise StatementError(DropReason.NOT_FOR_US, "our own hello came back")
+        member = self._policy.verify_membership(hello.membership, now.unix_s)
+        if member.name != statement.signer:
+            raise StatementError(DropReason.BAD_CERTIFICATE, "a hello under another's certificate")
+        known = port.neighbours.get(member.name)
+        if known is not None and known.nonce == hello.nonce and hello.sequence <= known.sequence:
+            raise StatementError(DropReason.REPLAYED, "hello")
+        statement.verify(member.key)
+        if known is None:
+            if len(port.neighbours) >= NEIGHBOURS_PER_PORT:
+                raise StatementError(DropReason.QUOTA, "neighbours on one port")
+            known = port.neighbours[member.name] = Neighbour(
+                member.name, member.role, member.domain, member.key, port.index, arrival.mac, 0, b"", 0, b"", 0.0
+            )
+        is_two_way = port.nonce in hello.heard
+        is_new_session = known.nonce != hello.nonce
+        if not is_two_way or is_new_session:
+            port.hello_at_s = min(port.hello_at_s, max(now.mono_s, port.said_s + _ANSWER_S))
+        if is_new_session and not is_two_way and known.state is NeighbourState.UP:
+            known.candidate = hello.nonce  # a restart, or an old hello played back: only an echo of our nonce will tell
+            return None
+        known.mac, known.mtu, known.nonce, known.candidate = arrival.mac, min(hello.mtu, port.mtu), hello.nonce, b""
+        known.sequence, known.digest, known.heard_s = hello.sequence, hello.digest, now.mono_s
+        change = self._step(known, NeighbourEvent.TWO_WAY if is_two_way else NeighbourEvent.ONE_WAY)
+        if change is None and is_new_session and is_two_way:
+            return known, NeighbourState.GONE  # it restarted, and has forgotten what we told it
+        return change
+
+    def port_changed(self, index: int, up: bool, now_s: float) -> list[Change]:
+        """Learn that a link came or went; return the neighbours that this took away."""
+        port = self.ports.get(index)
+        if port is None or port.is_up == up:
+            return []
+        port.is_up = up
+        if up:
+            port.nonce = self._random_bytes(NONCE_BYTES)
+            port.hello_at_s = now_s
+            return []
+        return self._lose(port, list(port.neighbours.values()), NeighbourEvent.LINK_LOST)
+
+    def expire(self, now_s: float) -> list[Change]:
+        """Let silent neighbours go; return them."""
+        changes: list[Change] = []
+        for port in self.ports.values():
+            silent = [n for n in port.neighbours.values() if now_s - n.heard_s >= self._dead_s]
+            if silent:
+                changes += self._lose(port, silent, NeighbourEvent.SILENCE)
+        return changes
+
+    def take(self, now_s: float) -> list[Transmit]:
+        """Return the hellos that are due."""
+        due = [port for port in self.ports.values() if port.is_up and port.hello_at_s <= now_s]
+        return [Transmit(port.index, BROADCAST, self._hello(port, now_s)) for port in due]
+
+    def next_timeout(self) -> float | None:
+        """Return the monotonic second of the next hello or of the next neighbour's silence."""
+        times = [port.hello_at_s for port in self.ports.values() if port.is_up]
+        times += [n.heard_s + self._dead_s for port in self.ports.values() for n in port.neighbours.values()]
+        return min(times, default=None)
+
+    def _hello(self, port: LinkPort, now_s: float) -> list[bytes]:
+        port.sequence += 1
+        port.said_s = now_s
+        port.hello_at_s = now_s + self._hello_s
+        heard = tuple(n for each in port.neighbours.values() for n in (each.nonce, each.candidate) if n)
+        identity = self._identity
+        hello = Hello(port.nonce, port.sequence, heard, port.mtu, self._digest_for(port), identity.membership)
+        return self._splitter.split(Kind.HELLO, hello.to_wire(identity.name, identity.key), port.mtu)
+
+    def _lose(self, port: LinkPort, lost: list[Neighbour], event: NeighbourEvent) -> list[Change]:
+        for neighbour in lost:
+            del port.neighbours[neighbour.name]
+        return [change for neighbour in lost if (change := self._step(neighbour, event)) is not None]
+
+    @staticmethod
+    def _step(neighbour: Neighbour, event: NeighbourEvent) -> Change | None:
+        before = neighbour.state
+        neighbour.state = TRANSITIONS[before, event]
+        return None if neighbour.state is before else (neighbour, before)

@@ -1,0 +1,72 @@
+"""A request of one switch to the next towards a publisher: let this tree grow (or shrink) here.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gdp.control.query import TRANSIT_MAX
+from gdp.crypto.fields import Fields
+from gdp.crypto.keys import SigningKey
+from gdp.crypto.statements import StatementType, sign
+from gdp.limits import FRAME_MAX_BYTES, LEASE_MAX_S
+from gdp.names import Name
+
+__all__ = ["Join"]
+
+
+@dataclass(frozen=True, slots=True)
+class Join:
+    """One tree: a topic from one publisher.
+
+    Args:
+        switch: where the publisher is attached.
+        domain: of that switch.
+        allowed: domains that both ends let the traffic pass.
+        mtu: smallest on the way down from here, in bytes after the Ethernet header.
+        lease_s: how long the branch stands unless renewed; 0 takes it down (LEAVE).
+        evidence: the signed claim of a reader further down; whoever passes a join on checks it.
+    """
+
+    topic: Name
+    publisher: Name
+    switch: Name
+    domain: Name
+    allowed: frozenset[Name]
+    mtu: int
+    lease_s: float
+    evidence: bytes
+
+    def to_wire(self, signer: Name, key: SigningKey) -> bytes:
+        """Return the signed statement."""
+        body = {
+            "n": self.topic,
+            "p": self.publisher,
+            "w": self.switch,
+            "d": self.domain,
+            "x": sorted(self.allowed)[:TRANSIT_MAX],
+            "m": self.mtu,
+            "l": float(self.lease_s),
+            "e": self.evidence,
+        }
+        return sign(StatementType.JOIN, body, signer, key)
+
+    @classmethod
+    def from_fields(cls, fields: Fields) -> Join:
+        """Read a parsed statement's body.
+
+        Raises:
+            StatementError: MALFORMED.
+        """
+        return cls(
+            fields.name("n"),
+            fields.name("p"),
+            fields.name("w"),
+            fields.name("d"),
+            frozenset(fields.names("x", TRANSIT_MAX)),
+            fields.uint("m", FRAME_MAX_BYTES),
+            fields.number("l", 0, LEASE_MAX_S),
+            fields.bytes_("e"),
+        )

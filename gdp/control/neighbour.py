@@ -1,0 +1,74 @@
+"""A neighbour, and the states it can be in.
+
+Place: pure.
+
+::
+
+    (unknown) --heard--> HEARD --echoed--> UP
+                 HEARD <--not echoed-- UP        silence or a lost link: gone
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final
+
+from gdp.crypto.certificates import Role
+from gdp.crypto.keys import PublicKey
+from gdp.names import Name
+
+__all__ = ["TRANSITIONS", "Neighbour", "NeighbourEvent", "NeighbourState"]
+
+
+class NeighbourState(Enum):
+    """How far two neighbours know each other."""
+
+    HEARD = "heard"  # we hear it; it has not shown that it hears us
+    UP = "up"
+    GONE = "gone"
+
+
+class NeighbourEvent(Enum):
+    """What can happen between neighbours."""
+
+    ONE_WAY = "one-way"  # a hello that does not echo our nonce
+    TWO_WAY = "two-way"  # one that does
+    SILENCE = "silence"
+    LINK_LOST = "link-lost"
+
+
+_S, _E = NeighbourState, NeighbourEvent
+TRANSITIONS: Final[dict[tuple[NeighbourState, NeighbourEvent], NeighbourState]] = {
+    (_S.HEARD, _E.ONE_WAY): _S.HEARD,
+    (_S.HEARD, _E.TWO_WAY): _S.UP,
+    (_S.HEARD, _E.SILENCE): _S.GONE,
+    (_S.HEARD, _E.LINK_LOST): _S.GONE,
+    (_S.UP, _E.ONE_WAY): _S.HEARD,
+    (_S.UP, _E.TWO_WAY): _S.UP,
+    (_S.UP, _E.SILENCE): _S.GONE,
+    (_S.UP, _E.LINK_LOST): _S.GONE,
+    (_S.GONE, _E.ONE_WAY): _S.HEARD,
+    (_S.GONE, _E.TWO_WAY): _S.UP,
+    (_S.GONE, _E.SILENCE): _S.GONE,
+    (_S.GONE, _E.LINK_LOST): _S.GONE,
+}
+
+
+@dataclass(slots=True)
+class Neighbour:
+    """Who is at the other end of a port, as its verified hellos say."""
+
+    name: Name
+    role: Role
+    domain: Name
+    key: PublicKey
+    port: int
+    mac: bytes
+    mtu: int
+    nonce: bytes
+    sequence: int
+    digest: bytes
+    heard_s: float
+    state: NeighbourState = NeighbourState.GONE
+    candidate: bytes = b""  # nonce of a session that has not proved itself yet

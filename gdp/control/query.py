@@ -1,0 +1,96 @@
+"""A question to a RIB, and its answers: one for each advertiser of the name, or one that there is none.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from gdp.crypto.fields import Fields
+from gdp.crypto.keys import SigningKey
+from gdp.crypto.statements import StatementType, sign
+from gdp.limits import LEASE_MAX_S
+from gdp.names import Name
+
+__all__ = ["Answer", "Query"]
+
+TRANSIT_MAX: Final = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Query:
+    """Who advertises ``name``? With ``watch_s`` above zero: and tell me of changes for so long."""
+
+    name: Name
+    watch_s: float
+
+    def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:
+        """Return the signed statement."""
+        body = {"n": self.name, "w": float(self.watch_s), "c": membership}
+        return sign(StatementType.QUERY, body, signer, key)
+
+    @classmethod
+    def from_fields(cls, fields: Fields) -> Query:
+        """Read a parsed statement's body.
+
+        Raises:
+            StatementError: MALFORMED.
+        """
+        return cls(fields.name("n"), fields.number("w", 0, LEASE_MAX_S))
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """One advertiser of a name, or none.
+
+    Args:
+        name: what was asked for.
+        advertiser: who advertises it; equal to ``name`` with an empty ``claim`` when nobody does.
+        claim: the advertiser's own signed claim, for the asker to verify; empty: it is gone, or nobody is there.
+        domain: where it is attached.
+        transit: domains through which that domain lets its traffic pass.
+        lease_s: how long this may be believed.
+    """
+
+    name: Name
+    advertiser: Name
+    claim: bytes
+    domain: Name
+    transit: tuple[Name, ...]
+    lease_s: float
+
+    @property
+    def is_nobody(self) -> bool:
+        """Return whether this says that no one advertises the name."""
+        return not self.claim and self.advertiser == self.name
+
+    def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:
+        """Return the signed statement."""
+        body = {
+            "n": self.name,
+            "a": self.advertiser,
+            "q": self.claim,
+            "d": self.domain,
+            "x": list(self.transit[:TRANSIT_MAX]),
+            "l": float(self.lease_s),
+            "c": membership,
+        }
+        return sign(StatementType.ANSWER, body, signer, key)
+
+    @classmethod
+    def from_fields(cls, fields: Fields) -> Answer:
+        """Read a parsed statement's body.
+
+        Raises:
+            StatementError: MALFORMED.
+        """
+        return cls(
+            fields.name("n"),
+            fields.name("a"),
+            fields.bytes_("q"),
+            fields.name("d"),
+            tuple(fields.names("x", TRANSIT_MAX)),
+            fields.number("l", 0, LEASE_MAX_S),
+        )

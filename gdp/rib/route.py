@@ -1,0 +1,47 @@
+"""What a RIB keeps of one advertisement.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gdp.names import Name
+
+__all__ = ["Route", "Withdrawn"]
+
+
+@dataclass(frozen=True, slots=True)
+class Route:
+    """One advertiser of a name, verified.
+
+    Args:
+        sender: the switch or RIB that relayed the claim, whose quota it counts against.
+        domain: where the claim's switch stands.
+        transit: domains through which that domain lets its traffic pass.
+        claim: the signed bytes.
+        is_from_above: learnt from the tier above, to be passed down only.
+        expires_s: end of the lease, monotonic seconds.
+        valid_until_unix_s: when the claim's evidence runs out; it cannot be played back after that.
+    """
+
+    name: Name
+    advertiser: Name
+    sender: Name
+    domain: Name
+    transit: tuple[Name, ...]
+    sequence: int
+    is_global: bool
+    claim: bytes
+    is_from_above: bool
+    expires_s: float
+    valid_until_unix_s: int
+
+
+@dataclass(frozen=True, slots=True)
+class Withdrawn:
+    """What stays of a withdrawn or expired advertisement: the sequence number that a new one must pass."""
+
+    sequence: int
+    valid_until_unix_s: int

@@ -1,0 +1,125 @@
+"""Where a RIB keeps its routes.
+
+Place: pure; the interface, and the embedded store, which is memory: leases refill it after a restart.
+"""
+
+from __future__ import annotations
+
+import heapq
+from typing import Protocol
+
+from gdp.names import Name
+from gdp.rib.route import Route, Withdrawn
+
+__all__ = ["MemoryStore", "Store"]
+
+
+class Store(Protocol):
+    """Routes by name and advertiser.
+
+    Every method may raise ``StoreError``: try again.
+    """
+
+    def __len__(self) -> int:
+        """Return how many routes are kept."""
+
+    def routes(self, name: Name) -> list[Route]:
+        """Return a name's routes."""
+
+    def get(self, name: Name, advertiser: Name) -> Route | Withdrawn | None:
+        """Return what is known of one advertiser of a name."""
+
+    def put(self, route: Route) -> None:
+        """Add or replace a route."""
+
+    def withdraw(self, name: Name, advertiser: Name) -> Route | None:
+        """Take a route away, keep its sequence number; return it."""
+
+    def expire(self, now_s: float, unix_s: float) -> list[Route]:
+        """Take away, keeping sequence numbers, and return the routes whose lease ended."""
+
+    def next_expiry(self) -> float | None:
+        """Return the monotonic second of the next lease end, or None."""
+
+    def count_of(self, sender: Name) -> int:
+        """Return how many routes a sender has relayed."""
+
+
+class MemoryStore:
+    """Routes in dictionaries; lease ends in a heap whose stale items are skipped."""
+
+    def __init__(self) -> None:
+        self._routes: dict[Name, dict[Name, Route]] = {}
+        self._withdrawn: dict[tuple[Name, Name], Withdrawn] = {}
+        self._counts: dict[Name, int] = {}
+        self._ends: list[tuple[float, Name, Name]] = []
+        self._forget: list[tuple[int, Name, Name]] = []
+        self._size = 0
+
+    def __len__(self) -> int:
+        return self._size
+
+    def routes(self, name: Name) -> list[Route]:
+        """Return a name's routes."""
+        return list(self._routes.get(name, {}).values())
+
+    def get(self, name: Name, advertiser: Name) -> Route | Withdrawn | None:
+        """Return what is known of one advertiser of a name."""
+        route = self._routes.get(name, {}).get(advertiser)
+        return route if route is not None else self._withdrawn.get((name, advertiser))
+
+    def put(self, route: Route) -> None:
+        """Add or replace a route."""
+        self._take(route.name, route.advertiser)
+        self._withdrawn.pop((route.name, route.advertiser), None)
+        self._routes.setdefault(route.name, {})[route.advertiser] = route
+        self._counts[route.sender] = self._counts.get(route.sender, 0) + 1
+        self._size += 1
+        heapq.heappush(self._ends, (route.expires_s, route.name, route.advertiser))
+
+    def withdraw(self, name: Name, advertiser: Name) -> Route | None:
+        """Take a route away, keep its sequence number; return it."""
+        route = self._take(name, advertiser)
+        if route is not None:
+            self._withdrawn[name, advertiser] = Withdrawn(route.sequence, route.valid_until_unix_s)
+            heapq.heappush(self._forget, (route.valid_until_unix_s, name, advertiser))
+        return route
+
+    def expire(self, now_s: float, unix_s: float) -> list[Route]:
+        """Take away, keeping sequence numbers, and return the routes whose lease ended."""
+        gone = []
+        while self._ends and self._ends[0][0] <= now_s:
+            _, name, advertiser = heapq.heappop(self._ends)
+            route = self._routes.get(name, {}).get(advertiser)
+            if route is not None and route.expires_s <= now_s:
+                self.withdraw(name, advertiser)
+                gone.append(route)
+        while self._forget and self._forget[0][0] <= unix_s:
+            _, name, advertiser = heapq.heappop(self._forget)
+            withdrawn = self._withdrawn.get((name, advertiser))
+            if withdrawn is not None and withdrawn.valid_until_unix_s <= unix_s:
+                del self._withdrawn[name, advertiser]
+        return gone
+
+    def next_expiry(self) -> float | None:
+        """Return a monotonic second that is no later than the next lease end, or None."""
+        return self._ends[0][0] if self._ends else None
+
+    def count_of(self, sender: Name) -> int:
+        """Return how many routes a sender has relayed."""
+        return self._counts.get(sender, 0)
+
+    def _take(self, name: Name, advertiser: Name) -> Route | None:
+        of_name = self._routes.get(name, {})
+        route = of_name.pop(advertiser, None)
+        if route is None:
+            return None
+        if not of_name:
+            del self._routes[name]
+        self._size -= 1
+        left = self._counts[route.sender] - 1
+        if left:
+            self._counts[route.sender] = left
+        else:
+            del self._counts[route.sender]
+        return route

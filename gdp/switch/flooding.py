@@ -1,0 +1,168 @@
+"""One switch's part in keeping everybody's view of the links the same.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Source: after RFC 2328, section 13. What differs: neighbours compare digests in every hello and send each other all they
+have where these differ, so that a lost flood heals without acknowledgements.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from gdp.control.greeter import Greeter, LinkPort
+from gdp.control.hello import DIGEST_BYTES
+from gdp.control.link_state import Adjacency, LinkState, Scope
+from gdp.control.neighbour import Neighbour
+from gdp.crypto.certificates import Role
+from gdp.crypto.identity import Identity
+from gdp.crypto.statements import Statement
+from gdp.effects import Instant
+from gdp.errors import DropReason, StatementError
+from gdp.limits import LINK_STATE_REFRESH_S
+from gdp.names import Name
+from gdp.switch.link_states import LinkStates
+from gdp.switch.paths import Paths
+from gdp.trust.domain import Policy
+
+__all__ = ["Flooding"]
+
+_SYNC_S: Final = 0.5  # a neighbour is not sent everything more often than this
+
+SendStatement = Callable[[Neighbour, bytes], None]
+
+
+class Flooding:
+    """Originates our link states, takes and passes on those of others.
+
+    Args:
+        send: sends a link state to a neighbour.
+        first_sequence: above every sequence number of an earlier life; wall-clock milliseconds do.
+    """
+
+    def __init__(
+        self, identity: Identity, policy: Policy, greeter: Greeter, send: SendStatement, first_sequence: int
+    ) -> None:
+        self._identity = identity
+        self._policy = policy
+        self._greeter = greeter
+        self._send = send
+        self._sequence = first_sequence
+        self._domain = identity.member.domain
+        self.link_states = LinkStates(self._domain)
+        self.paths = Paths(identity.name, self._domain, self.link_states)
+        self._said: dict[Scope, tuple[object, ...]] = {}
+        self._inside_version = -1
+        self._refresh_at_s = 0.0
+        self._synced_s: dict[tuple[int, Name], float] = {}
+
+    def digest_for(self, port: LinkPort) -> bytes:
+        """Return what to say in a hello on a port."""
+        switches = [each for each in port.neighbours.values() if each.role == Role.SWITCH]
+        domain = switches[0].domain if len(switches) == 1 else None
+        return bytes(DIGEST_BYTES) if domain is None else self.link_states.digest(domain)
+
+    def receive(self, neighbour: Neighbour, statement: Statement, now: Instant) -> bool:
+        """Take a link state that a neighbour passed on; return whether it was news.
+
+        Raises:
+            StatementError: it does not hold, or does not belong here.
+        """
+        fields = statement.fields
+        if statement.signer != self._identity.name:
+            scope = Scope.BORDER if fields.text("o", 8) == Scope.BORDER.value else Scope.DOMAIN
+            if not self.link_states.is_news(statement.signer, scope, fields.uint("s")):
+                return False
+        member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
+        if member.name != statement.signer or member.role is not Role.SWITCH:
+            raise StatementError(DropReason.BAD_CERTIFICATE, "a link state is signed by a switch")
+        state = LinkState.from_fields(fields, member.name, member.domain)
+        if state.scope is Scope.DOMAIN and not self._domain == member.domain == neighbour.domain:
+            raise StatementError(DropReason.WRONG_DOMAIN, "a link state that should not have left its domain")
+        statement.verify(member.key)
+        if state.origin == self._identity.name:
+            self._outdo(state, now.mono_s)
+            return False
+        if not self.link_states.put(state, statement.wire, now.mono_s):
+            return False
+        self._flood(state.scope, statement.wire, but=neighbour)
+        return True
+
+    def neighbour_changed(self, now_s: float) -> None:
+        """Say anew what our links are, if that changed."""
+        self._originate(now_s)
+
+    def sync(self, neighbour: Neighbour, now_s: float) -> None:
+        """Send a neighbour everything it should have, but not too often."""
+        key = (neighbour.port, neighbour.name)
+        if now_s - self._synced_s.get(key, float("-inf")) < _SYNC_S:
+            return
+        self._synced_s[key] = now_s
+        for wire in self.link_states.shared_with(neighbour.domain):
+            self._send(neighbour, wire)
+
+    def is_in_step(self, neighbour: Neighbour) -> bool:
+        """Return whether a neighbour's last hello showed the same link states as ours."""
+        return neighbour.digest in (self.link_states.digest(neighbour.domain), bytes(DIGEST_BYTES))
+
+    def timeout(self, now_s: float) -> None:
+        """Renew our link states, forget what others did not renew, and follow what moved inside our domain."""
+        self.link_states.expire(now_s)
+        if now_s >= self._refresh_at_s:
+            self._said.clear()
+        self._originate(now_s)
+
+    def next_timeout(self) -> float:
+        """Return the monotonic second of the next timer."""
+        expiry = self.link_states.next_expiry()
+        return self._refresh_at_s if expiry is None else min(expiry, self._refresh_at_s)
+
+    def _originate(self, now_s: float) -> None:
+        up = [each for each in self._greeter.all_up() if each.role == Role.SWITCH]
+        links = tuple(sorted(Adjacency(n.name, n.domain, self._cost(n), n.mtu) for n in up))
+        ribs = tuple(sorted(n.name for n in self._greeter.all_up() if n.role == Role.RIB and n.domain == self._domain))
+        self._say(Scope.DOMAIN, links, (), ribs, now_s)
+        leaving = tuple(link for link in links if link.domain != self._domain)
+        if leaving or Scope.BORDER in self._said or self.link_states.sequence_of(self._identity.name, Scope.BORDER):
+            inside = tuple(
+                Adjacency(border, self._domain, max(distance, 1), 1)
+                for border, distance in self.paths.borders().items()
+                if border != self._identity.name
+            )
+            self._say(Scope.BORDER, leaving, inside, tuple(sorted(self.paths.ribs())), now_s)
+
+    def _say(
+        self,
+        scope: Scope,
+        links: tuple[Adjacency, ...],
+        inside: tuple[Adjacency, ...],
+        ribs: tuple[Name, ...],
+        now_s: float,
+    ) -> None:
+        said = (links, inside, ribs)
+        if self._said.get(scope) == said:
+            return
+        self._said[scope] = said
+        self._sequence += 1
+        state = LinkState(self._identity.name, self._domain, scope, self._sequence, links, inside, ribs)
+        wire = state.to_wire(self._identity.key, self._identity.membership)
+        self.link_states.put(state, wire, now_s)
+        self._refresh_at_s = now_s + LINK_STATE_REFRESH_S
+        self._flood(scope, wire)
+
+    def _outdo(self, state: LinkState, now_s: float) -> None:
+        """Answer a link state of an earlier life of ours that others still hold."""
+        if state.sequence > self._sequence:
+            self._sequence = state.sequence
+            self._said.clear()
+            self._originate(now_s)
+
+    def _flood(self, scope: Scope, wire: bytes, but: Neighbour | None = None) -> None:
+        for neighbour in self._greeter.all_up():
+            is_sender = but is not None and neighbour.port == but.port and neighbour.name == but.name
+            is_in_scope = scope is Scope.BORDER or neighbour.domain == self._domain
+            if neighbour.role == Role.SWITCH and is_in_scope and not is_sender:
+                self._send(neighbour, wire)
+
+    def _cost(self, neighbour: Neighbour) -> int:
+        return self._greeter.ports[neighbour.port].cost

@@ -1,0 +1,108 @@
+"""The forwarding decision, in the plainest words: every data plane must decide as this does.
+
+Place: pure; the reference that the planes are tested against, and what they call for any frame out of the ordinary.
+Source: DESIGN sections 3 and 7. In this order:
+
+1. shorter than an Ethernet and a GDP header: drop, truncated; another EtherType or version: drop;
+2. a kind from 0x80 on is for the neighbour itself: hand up;
+3. hops left 0 or 1: drop, for it may not leave again; a payload longer than what came: drop, truncated;
+4. look up destination and source, then destination alone; a miss: hand up; an entry without hops: drop, no route;
+5. one copy to every hop, except to a port that is down or whose link is too narrow: that copy alone is dropped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+from gdp.errors import DropReason
+from gdp.frame.codec import DESTINATION_AT, ETHER_BYTES, HEADER_BYTES, HOPS_AT, KIND_AT, OVERHEAD_BYTES, SOURCE_AT
+from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION
+from gdp.switch.table import MACS_BYTES, Hop, Hops
+
+__all__ = ["HAND_UP", "Drop", "Forward", "HandUp", "Verdict", "decide", "rewrite"]
+
+_ETHERTYPE: Final = ETHERTYPE.to_bytes(2, "big")
+_HOPS: Final = ETHER_BYTES + HOPS_AT
+_LENGTH: Final = ETHER_BYTES + 6
+_DESTINATION: Final = ETHER_BYTES + DESTINATION_AT
+_SOURCE: Final = ETHER_BYTES + SOURCE_AT
+
+
+class Drop(NamedTuple):
+    """The frame ends here."""
+
+    reason: DropReason
+
+
+class HandUp(NamedTuple):
+    """The frame is for the switch's own machine: a neighbour's word, or a destination that it must look for."""
+
+
+class Forward(NamedTuple):
+    """Copies to send, and why some could not be."""
+
+    hops: Hops
+    lost: tuple[DropReason, ...] = ()
+
+
+Verdict = Drop | HandUp | Forward
+HAND_UP: Final = HandUp()
+
+
+def decide(frame: bytes | bytearray | memoryview, entries: Mapping[bytes, Hops], mtus: Mapping[int, int]) -> Verdict:
+    """Say what becomes of a frame. Any bytes get a verdict; nothing is raised.
+
+    Args:
+        frame: from the Ethernet header on, padding included.
+        entries: the forwarding table.
+        mtus: port index to MTU (bytes after the Ethernet header) of the ports that are up.
+    """
+    if len(frame) < OVERHEAD_BYTES:
+        return Drop(DropReason.TRUNCATED)
+    if frame[MACS_BYTES:ETHER_BYTES] != _ETHERTYPE:
+        return Drop(DropReason.BAD_ETHERTYPE)
+    if frame[ETHER_BYTES] != VERSION:
+        return Drop(DropReason.BAD_VERSION)
+    if frame[ETHER_BYTES + KIND_AT] >= CONTROL_FROM:
+        return HAND_UP
+    if frame[_HOPS] <= 1:
+        return Drop(DropReason.HOPS_EXPIRED)
+    if len(frame) < OVERHEAD_BYTES + int.from_bytes(frame[_LENGTH : _LENGTH + 2], "big"):
+        return Drop(DropReason.TRUNCATED)
+    hops = entries.get(bytes(frame[_DESTINATION : ETHER_BYTES + HEADER_BYTES]))
+    if hops is None:
+        hops = entries.get(bytes(frame[_DESTINATION:_SOURCE]))
+    if hops is None:
+        return HAND_UP
+    if not hops:
+        return Drop(DropReason.NO_ROUTE)
+    return _fit(hops, len(frame) - ETHER_BYTES, mtus)
+
+
+def _fit(hops: Hops, size: int, mtus: Mapping[int, int]) -> Forward:
+    """Part the hops whose link takes ``size`` bytes after the Ethernet header from the reasons of the others."""
+    good: list[Hop] = []
+    lost: list[DropReason] = []
+    for hop in hops:
+        mtu = mtus.get(hop[0])
+        if mtu is None:
+            lost.append(DropReason.PORT_DOWN)
+        elif size > mtu:
+            lost.append(DropReason.TOO_BIG)
+        else:
+            good.append(hop)
+    return Forward(tuple(good), tuple(lost))
+
+
+def rewrite(frame: bytes | bytearray | memoryview, macs: bytes) -> bytes:
+    """Return the copy that leaves: new addresses, one hop fewer, every other byte (padding too) as it came.
+
+    Args:
+        frame: from the Ethernet header on, for which ``decide`` said ``Forward``.
+        macs: destination and source MAC, 12 bytes.
+    """
+    copy = bytearray(frame)
+    copy[:MACS_BYTES] = macs
+    copy[_HOPS] -= 1
+    return bytes(copy)

@@ -1,0 +1,337 @@
+"""A switch's control plane: what it hears from neighbours, asks of its RIB, and writes into the forwarding table.
+
+Place: pure; a shell or a simulated network feeds it the frames that its data plane hands up, and the time.
+
+The walk of a frame that was handed up::
+
+    kind >= 0x80  -> joined to a statement -> hello | link state | claim, withdrawal | join, leave
+    addressed to us -> a RIB's answer, or an echo
+    anything else -> no entry yet: Unicast finds the way, or parks the frame and asks
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from gdp.control.frames import ControlJoiner, ControlSplitter
+from gdp.control.greeter import Change, Greeter, LinkPort
+from gdp.control.join import Join
+from gdp.control.neighbour import Neighbour, NeighbourState
+from gdp.control.verdict import Verdict
+from gdp.crypto.certificates import Role
+from gdp.crypto.identity import Identity
+from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.effects import Arrival, Instant, Transmit
+from gdp.errors import DropReason, FrameError, RemoteError, StatementError
+from gdp.frame.codec import HEADER_BYTES, Header, decode, encode
+from gdp.frame.kinds import CONTROL_FROM, Kind
+from gdp.limits import DEAD_S, HELLO_S, HOPS_MAX
+from gdp.names import Name
+from gdp.switch.attached import Attached
+from gdp.switch.flooding import Flooding
+from gdp.switch.inquirer import Inquirer
+from gdp.switch.outbox import Outbox
+from gdp.switch.parked import Parked
+from gdp.switch.places import Places
+from gdp.switch.planter import Planter
+from gdp.switch.table import Table
+from gdp.switch.unicast import Unicast
+from gdp.trust.claim import ClaimBody
+from gdp.trust.domain import Policy
+from gdp.trust.right import Right
+from gdp.trust.verifier import ClaimVerifier
+
+__all__ = ["Switch", "SwitchSettings"]
+
+_CONTROL = frozenset(kind.value for kind in Kind if kind >= CONTROL_FROM)
+
+
+@dataclass(frozen=True, slots=True)
+class SwitchSettings:
+    """What an operator may choose. ``incarnation`` is random at each start; ``first_sequence`` is wall-clock ms."""
+
+    incarnation: int
+    first_sequence: int
+    random_bytes: Callable[[int], bytes]
+    hello_s: float = HELLO_S
+    dead_s: float = DEAD_S
+
+
+class Switch:
+    """The machine of one switch.
+
+    Args:
+        table: the forwarding table that the data plane reads.
+    """
+
+    def __init__(self, identity: Identity, policy: Policy, table: Table, settings: SwitchSettings) -> None:
+        self._identity = identity
+        self._policy = policy
+        self.table = table
+        self._splitter = ControlSplitter(identity.name, settings.incarnation)
+        self._joiner = ControlJoiner()
+        self.greeter = Greeter(
+            identity,
+            policy,
+            self._splitter,
+            settings.random_bytes,
+            hello_s=settings.hello_s,
+            dead_s=settings.dead_s,
+            digest_for=self._digest_for,
+        )
+        self._outbox = Outbox(self.greeter, self._splitter)
+        self._flooding = Flooding(identity, policy, self.greeter, self._send_link_state, settings.first_sequence)
+        self._paths = self._flooding.paths
+        self._verifier = ClaimVerifier(policy)
+        self._incarnation = settings.incarnation
+        self.attached = Attached()
+        self.places = Places()
+        self.parked = Parked()
+        self.planter = Planter(identity, policy, table, self._paths, self.attached, self._outbox)
+        self.unicast = Unicast(
+            policy.own, policy.transit, table, self._paths, self.places, self.attached, self.parked, self._outbox
+        )
+        self._seen_version = -1
+        self.inquirer = Inquirer(
+            identity, policy, self._paths, self.attached, self.places, self.parked, self.planter, self.unicast,
+            self._outbox,
+        )  # fmt: skip
+        self._drops: Counter[DropReason] = Counter()
+
+    @property
+    def name(self) -> Name:
+        """Return the switch's name."""
+        return self._identity.name
+
+    @property
+    def rib(self) -> Name | None:
+        """Return the RIB that is asked, or None while none is known."""
+        return self.inquirer.rib
+
+    @property
+    def link_states(self) -> int:
+        """Return how many link states are known."""
+        return len(self._flooding.link_states)
+
+    def drops(self) -> Mapping[DropReason, int]:
+        """Return what the control plane dropped, by reason."""
+        return self._drops + self._joiner.drops + self.parked.drops + self.planter.drops + self.unicast.drops
+
+    def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Instant) -> None:
+        """Begin to use a port."""
+        self.greeter.add_port(index, mac, mtu, cost, now.mono_s)
+
+    def port_changed(self, port: int, up: bool, now: Instant) -> None:
+        """Learn that a port's link came or went."""
+        for change in self.greeter.port_changed(port, up, now.mono_s):
+            self._neighbour_changed(change, now.mono_s)
+        self._follow_links(now.mono_s)
+
+    def receive(self, arrivals: Sequence[Arrival], now: Instant) -> None:
+        """Take frames that the data plane handed up."""
+        for arrival in arrivals:
+            try:
+                self._take(arrival, decode(arrival.frame), now)
+            except RemoteError as error:
+                self._drops[error.reason] += 1
+        self._follow_links(now.mono_s)
+
+    def timeout(self, now: Instant) -> None:
+        """Do what is due."""
+        now_s = now.mono_s
+        for change in self.greeter.expire(now_s):
+            self._neighbour_changed(change, now_s)
+        for hello in self.greeter.take(now_s):
+            self._outbox.put(hello)
+        self._flooding.timeout(now_s)
+        self._follow_links(now_s)
+        self._joiner.expire(now_s)
+        self.parked.expire(now_s)
+        self.places.expire(now_s)
+        for key in self.table.expire(now_s):
+            self.unicast.expired(key)
+        for attachment in self.attached.expire(now_s):
+            self.unicast.forget(attachment.claim.name)
+        for topic in self.planter.timeout(now_s):
+            self.places.unwatch(topic)
+        self.inquirer.ask(now_s)
+
+    def next_timeout(self) -> float | None:
+        """Return the monotonic second of the next timer, or None."""
+        times = [
+            self.greeter.next_timeout(),
+            self._flooding.next_timeout(),
+            self.parked.next_expiry(),
+            self.table.next_expiry(),
+            self.planter.next_timeout(),
+        ]
+        if self.inquirer.rib is not None:
+            times += [self.attached.next_event(), self.places.next_due()]
+        return min((time for time in times if time is not None), default=None)
+
+    def take(self) -> list[Transmit]:
+        """Return, once, what is to be sent."""
+        return self._outbox.take()
+
+    def _digest_for(self, port: LinkPort) -> bytes:
+        return self._flooding.digest_for(port)
+
+    # -- frames
+
+    def _take(self, arrival: Arrival, header: Header, now: Instant) -> None:
+        if header.kind >= CONTROL_FROM:
+            if header.kind not in _CONTROL:
+                raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
+            wire = self._joiner.add(header, arrival.frame, now.mono_s)
+            if wire is not None:
+                self._take_control(arrival, header.kind, parse(wire), now)
+        elif header.destination == self.name:
+            self._take_own(header, arrival.frame, now)
+        else:
+            self.unicast.miss(header, arrival.frame[: HEADER_BYTES + header.length], now.mono_s)
+
+    def _take_control(self, arrival: Arrival, kind: int, statement: Statement, now: Instant) -> None:
+        if kind == Kind.HELLO:
+            change = self.greeter.receive(arrival, statement, now)
+            if change is not None:
+                self._neighbour_changed(change, now.mono_s)
+            known = self.greeter.neighbour(arrival.port, statement.signer)
+            if known is not None and known.role is Role.SWITCH and not self._flooding.is_in_step(known):
+                self._flooding.sync(known, now.mono_s)
+            return
+        neighbour = self._sender(arrival)
+        if kind == Kind.LINK_STATE:
+            if neighbour.role is not Role.SWITCH:
+                raise StatementError(DropReason.NOT_DELEGATED, "only switches speak of links")
+            self._flooding.receive(neighbour, statement, now)
+        elif kind == Kind.ADVERTISE:
+            self._take_claim(neighbour, statement, now)
+        elif kind == Kind.WITHDRAW:
+            self._take_withdrawal(neighbour, statement, now)
+        elif kind in (Kind.JOIN, Kind.LEAVE):
+            self._take_join(neighbour, statement, now)
+        else:
+            raise FrameError(DropReason.UNKNOWN_KIND, str(kind))
+
+    def _sender(self, arrival: Arrival) -> Neighbour:
+        """Return the neighbour with the sender's address.
+
+        Raises:
+            FrameError: UNKNOWN_SENDER, it is not up.
+        """
+        port = self.greeter.ports.get(arrival.port)
+        for neighbour in port.neighbours.values() if port is not None else ():
+            if neighbour.mac == arrival.mac and neighbour.state is NeighbourState.UP:
+                return neighbour
+        raise FrameError(DropReason.UNKNOWN_SENDER)
+
+    def _take_own(self, header: Header, frame: bytes, now: Instant) -> None:
+        if header.kind == Kind.RIB_ANSWER:
+            wire = self._joiner.add(header, frame, now.mono_s)
+            if wire is not None:
+                self.inquirer.receive(parse(wire), now)
+        elif header.kind == Kind.ECHO_REQUEST:
+            back = header._replace(
+                kind=Kind.ECHO_REPLY, hops_left=HOPS_MAX, destination=header.source, source=self.name,
+                incarnation=self._incarnation,
+            )  # fmt: skip
+            reply = encode(back) + frame[HEADER_BYTES : HEADER_BYTES + header.length]
+            self.unicast.send([reply], Name(header.source), self.name, now.mono_s)
+        else:
+            raise FrameError(DropReason.NOT_FOR_US, str(header.kind))
+
+    # -- neighbours and links
+
+    def _neighbour_changed(self, change: Change, now_s: float) -> None:
+        neighbour, before = change
+        if NeighbourState.UP in (neighbour.state, before):
+            self._flooding.neighbour_changed(now_s)
+        if neighbour.state is NeighbourState.UP:
+            if neighbour.role is Role.SWITCH:
+                self._flooding.sync(neighbour, now_s)
+        elif before is NeighbourState.UP:
+            self.planter.neighbour_lost((neighbour.port, neighbour.mac))
+            for attachment in self.attached.of(neighbour.name):
+                if attachment.port == neighbour.port:
+                    self.attached.remove(attachment.claim.name, neighbour.name)
+                    self.unicast.forget(attachment.claim.name)
+
+    def _follow_links(self, now_s: float) -> None:
+        """Let everything that depends on paths follow a change of the links."""
+        version = self._flooding.link_states.version
+        if version == self._seen_version:
+            return
+        self._flooding.neighbour_changed(now_s)  # what lies inside our domain may have moved
+        self._seen_version = self._flooding.link_states.version
+        self.unicast.refresh(now_s)
+        self.planter.reroute(now_s)
+        self.inquirer.links_changed(now_s)
+
+    def _send_link_state(self, neighbour: Neighbour, wire: bytes) -> None:
+        self._outbox.say(neighbour, Kind.LINK_STATE, wire)
+
+    # -- claims of attached nodes
+
+    def _take_claim(self, neighbour: Neighbour, statement: Statement, now: Instant) -> None:
+        if statement.signer != neighbour.name:
+            raise StatementError(DropReason.UNKNOWN_SENDER, "a claim that its maker did not bring")
+        try:
+            claim = self._verifier.verify_statement(statement, now.unix_s)
+            if claim.switch != self.name:
+                raise StatementError(DropReason.NOT_FOR_US, "the RtCert names another switch")
+        except StatementError as error:
+            self._refuse(neighbour, statement, error)
+            raise
+        at = (neighbour.port, neighbour.mac)
+        if claim.right is Right.READ:
+            if self.planter.add_reader(claim, at, self.places.of(claim.name, now.mono_s), now.mono_s):
+                self.places.want(claim.name, now.mono_s, watch=True)
+            self._judge(neighbour, claim.name, None, claim.sequence)
+            for place in self.places.of(claim.name, now.mono_s):
+                self.inquirer.tell_reader(at, place, now.mono_s)
+        else:
+            self.attached.put(claim, *at, now.mono_s)
+            self.unicast.forget(claim.name)
+            self.unicast.release(claim.name, now.mono_s)
+            for tree in self.planter.trees.of_topic(claim.name):
+                if tree.publisher == claim.node:
+                    tree.renew_at_s = now.mono_s
+        self.inquirer.ask(now.mono_s)
+
+    def _refuse(self, neighbour: Neighbour, statement: Statement, error: StatementError) -> None:
+        """Tell an attached node why its claim was not taken."""
+        try:
+            body = ClaimBody.from_statement(statement)
+        except StatementError:
+            return  # not even a claim: the caller counts it
+        self._judge(neighbour, body.subject.name, error.reason, body.sequence)
+
+    def _judge(self, neighbour: Neighbour, name: Name, refused: DropReason | None, sequence: int) -> None:
+        verdict = Verdict(name, neighbour.name, refused, sequence)
+        wire = verdict.to_wire(self.name, self._identity.key, self._identity.membership)
+        self._outbox.say(neighbour, Kind.VERDICT, wire)
+
+    def _take_withdrawal(self, neighbour: Neighbour, statement: Statement, now: Instant) -> None:
+        fields = statement.expect(StatementType.WITHDRAW)
+        if statement.signer != neighbour.name:
+            raise StatementError(DropReason.UNKNOWN_SENDER, "a withdrawal that its maker did not bring")
+        statement.verify(neighbour.key)
+        name = fields.name("n")
+        if self.planter.remove_reader(name, (neighbour.port, neighbour.mac)):
+            self.places.unwatch(name)
+        if self.attached.remove(name, neighbour.name) is not None:
+            self.unicast.forget(name)
+            self.inquirer.relay(statement.wire, now.mono_s)
+
+    def _take_join(self, neighbour: Neighbour, statement: Statement, now: Instant) -> None:
+        join = Join.from_fields(statement.expect(StatementType.JOIN))
+        if neighbour.role is not Role.SWITCH or statement.signer != neighbour.name:
+            raise StatementError(DropReason.UNKNOWN_SENDER, "a join is from a neighbouring switch")
+        statement.verify(neighbour.key)
+        if join.lease_s > 0:
+            claim = self._verifier.verify(join.evidence, now.unix_s)
+            if claim.right is not Right.READ or claim.name != join.topic:
+                raise StatementError(DropReason.NOT_DELEGATED, "a join without a reader's claim")
+        self.planter.join(join, neighbour, now.mono_s)

@@ -1,0 +1,144 @@
+"""Where names are, as the RIB answered, and what is still to be asked.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds).
+
+A question is asked again until it is answered; a watched name is asked anew before its watch ends, so that a RIB which
+restarted learns of the watch again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from gdp.limits import NEGATIVE_LEASE_S
+from gdp.names import Name
+from gdp.trust.right import Right
+
+__all__ = ["WATCH_S", "Place", "Places"]
+
+RETRY_S: Final = 0.25
+TRIES_MAX: Final = 8
+WATCH_S: Final = 20.0
+WATCH_AGAIN_S: Final = 6.0
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """One advertiser of a name, and where it is attached."""
+
+    name: Name
+    advertiser: Name
+    right: Right
+    switch: Name
+    domain: Name
+    transit: frozenset[Name]  # domains through which that domain lets its traffic pass
+    claim: bytes
+    expires_s: float
+
+
+@dataclass(slots=True)
+class _Question:
+    ask_at_s: float
+    tries: int = 0
+    is_watch: bool = False
+    is_answered: bool = False
+
+
+class Places:
+    """What one switch knows of where names are."""
+
+    def __init__(self) -> None:
+        self._places: dict[Name, dict[Name, Place]] = {}
+        self._nobody: dict[Name, float] = {}
+        self._questions: dict[Name, _Question] = {}
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def of(self, name: Name, now_s: float) -> list[Place]:
+        """Return the known places of a name."""
+        known = self._places.get(name)
+        return [] if known is None else [place for place in known.values() if place.expires_s > now_s]
+
+    def is_nowhere(self, name: Name, now_s: float) -> bool:
+        """Return whether the RIB said a moment ago that nobody advertises the name."""
+        return self._nobody.get(name, 0.0) > now_s
+
+    def want(self, name: Name, now_s: float, *, watch: bool) -> None:
+        """Have the RIB asked for a name, unless it is being asked already."""
+        question = self._questions.setdefault(name, _Question(now_s))
+        question.is_watch |= watch
+        if question.is_answered and not question.is_watch:
+            self._questions[name] = _Question(now_s)
+
+    def unwatch(self, name: Name) -> None:
+        """Ask for a name no more."""
+        self._questions.pop(name, None)
+
+    def ask_again(self, now_s: float) -> None:
+        """Have every open question and every watch asked at once: there is a new RIB."""
+        for question in self._questions.values():
+            question.ask_at_s, question.tries = now_s, 0
+
+    def due(self, now_s: float) -> tuple[list[tuple[Name, bool]], list[Name]]:
+        """Return the questions to send now, as (name, watch), and the names whose question was given up."""
+        ask: list[tuple[Name, bool]] = []
+        given_up: list[Name] = []
+        for name, question in list(self._questions.items()):
+            if question.ask_at_s > now_s:
+                continue
+            if not question.is_watch and (question.is_answered or question.tries >= TRIES_MAX):
+                del self._questions[name]
+                if not question.is_answered:
+                    given_up.append(name)
+                continue
+            question.tries += 1
+            question.ask_at_s = now_s + (WATCH_AGAIN_S if question.is_answered else RETRY_S)
+            ask.append((name, question.is_watch))
+        return ask, given_up
+
+    def next_due(self) -> float | None:
+        """Return the monotonic second of the next question, or None."""
+        return min((question.ask_at_s for question in self._questions.values()), default=None)
+
+    def put(self, place: Place, now_s: float) -> Place | None:
+        """Note a place; return what was known of this advertiser before."""
+        self._answered(place.name, now_s)
+        self._nobody.pop(place.name, None)
+        known = self._places.setdefault(place.name, {})
+        before = known.get(place.advertiser)
+        known[place.advertiser] = place
+        return before
+
+    def remove(self, name: Name, advertiser: Name, now_s: float) -> None:
+        """Note that an advertiser is gone."""
+        self._answered(name, now_s)
+        known = self._places.get(name, {})
+        known.pop(advertiser, None)
+        if not known:
+            self._places.pop(name, None)
+
+    def nobody(self, name: Name, now_s: float) -> None:
+        """Note that nobody advertises a name."""
+        self._answered(name, now_s)
+        self._places.pop(name, None)
+        self._nobody[name] = now_s + NEGATIVE_LEASE_S
+
+    def expire(self, now_s: float) -> None:
+        """Forget what was believed long enough."""
+        for name in list(self._places):
+            known = self._places[name]
+            for advertiser in [a for a, place in known.items() if place.expires_s <= now_s]:
+                del known[advertiser]
+            if not known:
+                del self._places[name]
+        for name in [name for name, until_s in self._nobody.items() if until_s <= now_s]:
+            del self._nobody[name]
+
+    def _answered(self, name: Name, now_s: float) -> None:
+        question = self._questions.get(name)
+        if question is not None:
+            question.is_answered = True
+            question.tries = 0
+            question.ask_at_s = now_s + WATCH_AGAIN_S

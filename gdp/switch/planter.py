@@ -1,0 +1,219 @@
+"""Growing and pruning trees: joins from below, joins upwards, and the table entries in between.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds).
+
+A reader's claim and each known publisher of its topic make a tree. A switch asks the next switch towards the publisher,
+again and again while a branch stands, and asks another one at once when the way changes.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+
+from gdp.control.join import Join
+from gdp.control.neighbour import Neighbour
+from gdp.crypto.identity import Identity
+from gdp.errors import DropReason, StatementError
+from gdp.frame.kinds import Kind
+from gdp.limits import JOIN_LEASE_S, JOIN_REFRESH_S
+from gdp.names import Name
+from gdp.switch.attached import Attached
+from gdp.switch.outbox import Outbox
+from gdp.switch.paths import Paths
+from gdp.switch.places import Place
+from gdp.switch.table import Table
+from gdp.switch.trees import At, Branch, Tree, Trees
+from gdp.trust.claim import Claim
+from gdp.trust.domain import Policy
+from gdp.trust.right import Right
+
+__all__ = ["Planter"]
+
+
+@dataclass(slots=True)
+class _Reader:
+    """A node attached here that reads a topic."""
+
+    claim: Claim
+    expires_s: float
+
+
+class Planter:
+    """All trees of one switch."""
+
+    def __init__(
+        self, identity: Identity, policy: Policy, table: Table, paths: Paths, attached: Attached, outbox: Outbox
+    ) -> None:
+        self._identity = identity
+        self._policy = policy
+        self._table = table
+        self._paths = paths
+        self._attached = attached
+        self._outbox = outbox
+        self._readers: dict[Name, dict[At, _Reader]] = {}
+        self.trees = Trees()
+        self.drops: Counter[DropReason] = Counter()
+
+    def readers(self, topic: Name) -> list[At]:
+        """Return where the readers of a topic are attached."""
+        return list(self._readers.get(topic, {}))
+
+    def add_reader(self, claim: Claim, at: At, places: list[Place], now_s: float) -> bool:
+        """Take a verified READ claim of an attached node; return whether it is the topic's first reader here."""
+        readers = self._readers.setdefault(claim.name, {})
+        is_first = not readers
+        readers[at] = _Reader(claim, now_s + claim.lease_s)
+        for place in places:
+            self.publisher_found(place, now_s)
+        return is_first
+
+    def remove_reader(self, topic: Name, at: At) -> bool:
+        """Let a reader go; return whether the topic has none left here."""
+        readers = self._readers.get(topic, {})
+        readers.pop(at, None)
+        for tree in self.trees.of_topic(topic):
+            self._cut(tree, at)
+        if readers:
+            return False
+        self._readers.pop(topic, None)
+        return True
+
+    def publisher_found(self, place: Place, now_s: float) -> None:
+        """Join, or follow, a publisher of a topic that has readers here."""
+        if place.right is not Right.PUBLISH:
+            return
+        for at, reader in self._readers.get(place.name, {}).items():
+            if reader.claim.node == place.advertiser:
+                continue  # one's own messages do not come back
+            allowed = (self._policy.transit & place.transit) | {self._policy.own, place.domain}
+            tree = self._tree(place.name, place.advertiser, reader.claim.wire, allowed)
+            tree.switch, tree.domain, tree.allowed = place.switch, place.domain, allowed
+            tree.evidence = reader.claim.wire
+            lease_s = min(reader.expires_s, place.expires_s)
+            tree.branches[at] = Branch(lease_s, self._outbox.mtu_of(at[0]))
+            self._plant(tree)
+            self._ask_above(tree, now_s)
+
+    def publisher_gone(self, topic: Name, publisher: Name) -> None:
+        """Take the readers attached here off a tree whose publisher is gone."""
+        tree = self.trees.get(topic, publisher)
+        if tree is not None:
+            for at in self._readers.get(topic, {}):
+                self._cut(tree, at)
+
+    def join(self, join: Join, neighbour: Neighbour, now_s: float) -> None:
+        """Take a verified join (or, with no lease, a leave) from the switch below.
+
+        Raises:
+            StatementError: the way is not allowed to lead through here.
+        """
+        at = (neighbour.port, neighbour.mac)
+        if join.lease_s == 0:
+            tree = self.trees.get(join.topic, join.publisher)
+            if tree is not None:
+                self._cut(tree, at)
+            return
+        if self._policy.own not in join.allowed or neighbour.domain not in join.allowed:
+            raise StatementError(DropReason.WRONG_DOMAIN, "a tree that must not pass here")
+        tree = self._tree(join.topic, join.publisher, join.evidence, join.allowed)
+        is_known = at in tree.branches
+        tree.switch, tree.domain, tree.allowed, tree.evidence = join.switch, join.domain, join.allowed, join.evidence
+        mtu = min(join.mtu, neighbour.mtu)
+        is_known = is_known and tree.branches[at].mtu == mtu
+        tree.branches[at] = Branch(now_s + min(join.lease_s, JOIN_LEASE_S), mtu)
+        self._plant(tree)
+        if not is_known:
+            self._ask_above(tree, now_s)
+
+    def neighbour_lost(self, at: At) -> None:
+        """Cut every branch to a neighbour that is gone."""
+        for topic in [topic for topic, readers in self._readers.items() if at in readers]:
+            self.remove_reader(topic, at)
+        for tree in self.trees.all():
+            self._cut(tree, at)
+
+    def reroute(self, now_s: float) -> None:
+        """Ask anew where the way to a publisher has changed."""
+        for tree in self.trees.all():
+            above = self._above(tree)
+            if (None if above is None else above[:2]) != tree.above:
+                self._leave(tree)
+                self._ask_above(tree, now_s)
+
+    def timeout(self, now_s: float) -> list[Name]:
+        """Prune, renew upwards; return the topics that lost their last reader here."""
+        orphaned = []
+        for topic in list(self._readers):
+            for at in [at for at, reader in self._readers[topic].items() if reader.expires_s <= now_s]:
+                if self.remove_reader(topic, at):
+                    orphaned.append(topic)
+        for tree in self.trees.prune(now_s):
+            self._after_cut(tree)
+        for tree in self.trees.all():
+            if tree.renew_at_s <= now_s:
+                self._ask_above(tree, now_s)
+        return orphaned
+
+    def next_timeout(self) -> float | None:
+        """Return the monotonic second of the next timer, or None."""
+        readers = [reader.expires_s for readers in self._readers.values() for reader in readers.values()]
+        times = [time for time in (self.trees.next_event(), min(readers, default=None)) if time is not None]
+        return min(times, default=None)
+
+    def _tree(self, topic: Name, publisher: Name, evidence: bytes, allowed: frozenset[Name]) -> Tree:
+        tree = self.trees.get(topic, publisher)
+        if tree is None:
+            tree = Tree(topic, publisher, self._identity.name, self._policy.own, allowed, evidence)
+            self.trees.put(tree)
+        return tree
+
+    def _plant(self, tree: Tree) -> None:
+        if not self._table.install(tree.key, tree.hops(self._outbox.mac_of()), tree.expires_s()):
+            self.drops[DropReason.QUOTA] += 1
+
+    def _cut(self, tree: Tree, at: At) -> None:
+        if tree.branches.pop(at, None) is not None:
+            self._after_cut(tree)
+
+    def _after_cut(self, tree: Tree) -> None:
+        if tree.branches:
+            self._plant(tree)
+            return
+        self._table.remove(tree.key)
+        self._leave(tree)
+        self.trees.remove(tree)
+
+    def _above(self, tree: Tree) -> tuple[int, bytes, Name] | None:
+        """Return port, address and name of the next one towards the publisher; None when there is no way now."""
+        if tree.switch == self._identity.name:
+            attachment = self._attached.get(tree.topic, tree.publisher)
+            return None if attachment is None else (attachment.port, attachment.mac, tree.publisher)
+        way = self._paths.to_switch(tree.switch, tree.domain, tree.allowed)
+        neighbour = None if way is None else self._outbox.neighbour(way.first)
+        if neighbour is None or (neighbour.port, neighbour.mac) in tree.branches:
+            return None  # no way, or it leads back to where the join came from: links are still settling
+        return neighbour.port, neighbour.mac, neighbour.name
+
+    def _ask_above(self, tree: Tree, now_s: float) -> None:
+        above = self._above(tree)
+        tree.renew_at_s = now_s + JOIN_REFRESH_S
+        if above is None:
+            tree.above = tree.above_name = None
+            return
+        tree.above, tree.above_name = above[:2], above[2]
+        mtu = min(tree.mtu, self._outbox.mtu_of(above[0]))
+        self._say(above[:2], Kind.JOIN, self._join(tree, mtu))
+
+    def _leave(self, tree: Tree) -> None:
+        if tree.above is not None:
+            self._say(tree.above, Kind.LEAVE, replace(self._join(tree, 1), lease_s=0.0, evidence=b""))
+        tree.above = tree.above_name = None
+
+    def _join(self, tree: Tree, mtu: int) -> Join:
+        return Join(
+            tree.topic, tree.publisher, tree.switch, tree.domain, tree.allowed, mtu, JOIN_LEASE_S, tree.evidence
+        )
+
+    def _say(self, at: At, kind: Kind, join: Join) -> None:
+        self._outbox.say_at(at[0], at[1], kind, join.to_wire(self._identity.name, self._identity.key))

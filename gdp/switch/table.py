@@ -1,0 +1,130 @@
+"""The forwarding table: where a frame goes, and until when that is known.
+
+Place: pure; a data plane reads ``entries`` directly for every frame, the switch's machine alone writes.
+Source: DESIGN sections 6 and 7. A key is a destination (32 bytes) or destination and source (64 bytes, the order in
+which they stand in a frame), the longer one looked up first. A value is the tuple of hops that each get a copy; the
+empty tuple is a negative entry: known to lead nowhere.
+
+Leases stand beside the entries, so that the hot dictionary holds nothing that forwarding does not need. A heap holds
+for every entry at least one item that is no later than the end of its lease; renewing a lease leaves the item alone,
+and it is put right when it comes to the top. So no operation looks at all entries, except a rebuild that as many
+changes have paid for.
+"""
+
+from __future__ import annotations
+
+import heapq
+from typing import Final
+
+from gdp.errors import LocalError
+from gdp.limits import TABLE_MAX
+from gdp.names import NAME_BYTES
+
+__all__ = ["MACS_BYTES", "NOWHERE", "Hop", "Hops", "Table"]
+
+MACS_BYTES: Final = 12  # destination MAC, source MAC: the first bytes of the frame that goes out
+
+Hop = tuple[int, bytes]  # port index, the 12 bytes of addresses
+Hops = tuple[Hop, ...]
+
+NOWHERE: Final[Hops] = ()
+
+_SHARED_MAX: Final = 4_096  # hop tuples remembered for sharing; a switch has far fewer different ones
+_SLACK: Final = 1_024  # stale heap items that are not yet worth a rebuild
+
+
+class Table:
+    """Entries under leases.
+
+    Args:
+        max_entries: most entries that may stand at once.
+
+    Attributes:
+        entries: key to hops. Data planes hold this very dictionary; it is never replaced.
+    """
+
+    __slots__ = ("_ends", "_heap", "_max", "_shared", "entries")
+
+    def __init__(self, max_entries: int = TABLE_MAX) -> None:
+        self.entries: dict[bytes, Hops] = {}
+        self._ends: dict[bytes, float] = {}
+        self._heap: list[tuple[float, bytes]] = []
+        self._shared: dict[Hops, Hops] = {}
+        self._max = max_entries
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def install(self, key: bytes, hops: Hops, expires_s: float) -> bool:
+        """Put or replace an entry and its lease; False when the table is full and the key is new.
+
+        Args:
+            key: 32 bytes (destination) or 64 (destination, source).
+            hops: where copies go; equal tuples are shared in memory. ``NOWHERE`` makes a negative entry.
+            expires_s: end of the lease, on the monotonic clock of the caller.
+
+        Raises:
+            LocalError: a key or an address of another length.
+        """
+        if len(key) not in (NAME_BYTES, 2 * NAME_BYTES):
+            raise LocalError(f"a table key has {NAME_BYTES} or {2 * NAME_BYTES} bytes, not {len(key)}")
+        if any(len(macs) != MACS_BYTES for _, macs in hops):
+            raise LocalError(f"a hop has {MACS_BYTES} bytes of addresses: destination MAC, source MAC")
+        known = self._ends.get(key)
+        if known is None:
+            if len(self.entries) >= self._max:
+                return False
+            key = bytes(key)  # a plain one: looked up faster than a subclass
+        self.entries[key] = self._share(hops)
+        self._ends[key] = expires_s
+        if known is None or expires_s < known:
+            heapq.heappush(self._heap, (expires_s, key))
+            self._rebuild_if_stale()
+        return True
+
+    def remove(self, key: bytes) -> bool:
+        """Take an entry out; False when there was none."""
+        if self.entries.pop(key, None) is None:
+            return False
+        del self._ends[key]
+        self._rebuild_if_stale()
+        return True
+
+    def expire(self, now_s: float) -> list[bytes]:
+        """Take out every entry whose lease ended at or before ``now_s``; return their keys, earliest first."""
+        gone: list[bytes] = []
+        while self._settle() and self._heap[0][0] <= now_s:
+            key = heapq.heappop(self._heap)[1]
+            del self._ends[key]
+            del self.entries[key]
+            gone.append(key)
+        return gone
+
+    def next_expiry(self) -> float | None:
+        """Return when the first lease ends, or None for an empty table."""
+        return self._heap[0][0] if self._settle() else None
+
+    def _settle(self) -> bool:
+        """Bring a true lease end to the top of the heap; False when there is none."""
+        heap, ends = self._heap, self._ends
+        while heap:
+            end, key = heap[0]
+            true_end = ends.get(key)
+            if true_end is None:
+                heapq.heappop(heap)
+            elif true_end > end:
+                heapq.heapreplace(heap, (true_end, key))
+            else:
+                return True
+        return False
+
+    def _share(self, hops: Hops) -> Hops:
+        """Return the one remembered tuple that equals ``hops``."""
+        if len(self._shared) >= _SHARED_MAX:
+            self._shared.clear()  # only sharing is lost
+        return self._shared.setdefault(hops, hops)
+
+    def _rebuild_if_stale(self) -> None:
+        if len(self._heap) > 2 * len(self.entries) + _SLACK:
+            self._heap = [(end, key) for key, end in self._ends.items()]
+            heapq.heapify(self._heap)

@@ -1,0 +1,105 @@
+"""Reverse-path trees: for each topic and publisher, who wants a copy below, and whom it is asked of above.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds). A branch is soft state: it stands for a lease and is
+renewed from below; a switch renews upwards for as long as a branch of its own stands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from gdp.names import Name
+from gdp.switch.table import Hops
+
+__all__ = ["Branch", "Tree", "Trees"]
+
+At = tuple[int, bytes]  # port, MAC of the one below
+
+
+@dataclass(slots=True)
+class Branch:
+    """One neighbour below that wants a copy."""
+
+    expires_s: float
+    mtu: int  # smallest on the way down
+
+
+@dataclass(slots=True)
+class Tree:
+    """One topic from one publisher, as it passes this switch."""
+
+    topic: Name
+    publisher: Name
+    switch: Name  # where the publisher is attached
+    domain: Name  # of that switch
+    allowed: frozenset[Name]
+    evidence: bytes  # a reader's claim
+    branches: dict[At, Branch] = field(default_factory=dict)
+    above: At | None = None  # whom the last join went to
+    above_name: Name | None = None
+    renew_at_s: float = 0.0
+
+    @property
+    def key(self) -> bytes:
+        """Return its key in the forwarding table."""
+        return bytes(self.topic) + bytes(self.publisher)
+
+    @property
+    def mtu(self) -> int:
+        """Return the smallest MTU below here."""
+        return min(branch.mtu for branch in self.branches.values())
+
+    def expires_s(self) -> float:
+        """Return when the last branch ends."""
+        return max(branch.expires_s for branch in self.branches.values())
+
+    def hops(self, mac_of: dict[int, bytes]) -> Hops:
+        """Return where copies go: one per branch, in a stable order."""
+        return tuple((port, mac + mac_of[port]) for port, mac in sorted(self.branches) if port in mac_of)
+
+
+class Trees:
+    """All trees that pass one switch."""
+
+    def __init__(self) -> None:
+        self._trees: dict[tuple[Name, Name], Tree] = {}
+
+    def __len__(self) -> int:
+        return len(self._trees)
+
+    def get(self, topic: Name, publisher: Name) -> Tree | None:
+        """Return a tree, or None."""
+        return self._trees.get((topic, publisher))
+
+    def all(self) -> list[Tree]:
+        """Return every tree."""
+        return list(self._trees.values())
+
+    def of_topic(self, topic: Name) -> list[Tree]:
+        """Return a topic's trees."""
+        return [tree for (its, _), tree in self._trees.items() if its == topic]
+
+    def put(self, tree: Tree) -> None:
+        """Add a tree."""
+        self._trees[tree.topic, tree.publisher] = tree
+
+    def remove(self, tree: Tree) -> None:
+        """Take a tree away."""
+        self._trees.pop((tree.topic, tree.publisher), None)
+
+    def prune(self, now_s: float) -> list[Tree]:
+        """Cut branches whose lease ended; return the trees that changed, bare ones too."""
+        changed = []
+        for tree in self._trees.values():
+            late = [at for at, branch in tree.branches.items() if branch.expires_s <= now_s]
+            for at in late:
+                del tree.branches[at]
+            if late:
+                changed.append(tree)
+        return changed
+
+    def next_event(self) -> float | None:
+        """Return the monotonic second of the next renewal or lease end, or None."""
+        times = [tree.renew_at_s for tree in self._trees.values()]
+        times += [branch.expires_s for tree in self._trees.values() for branch in tree.branches.values()]
+        return min(times, default=None)

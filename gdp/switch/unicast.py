@@ -1,0 +1,220 @@
+"""Frames to one name: find its place, install the way, send on what was waiting.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds).
+
+An entry is keyed by the destination alone where one domain is concerned, and by destination and source where the way
+leaves it: then only domains that the policies of both ends trust may carry the frame.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Final
+
+from gdp.errors import DropReason
+from gdp.frame.codec import HOPS_AT, Header
+from gdp.names import Name
+from gdp.switch.attached import Attached
+from gdp.switch.outbox import Outbox
+from gdp.switch.parked import Parked
+from gdp.switch.paths import Paths, Way
+from gdp.switch.places import Place, Places
+from gdp.switch.table import NOWHERE, Hop, Table
+from gdp.trust.right import Right
+
+__all__ = ["Unicast"]
+
+NODE_LEASE_S: Final = 30.0  # an entry for a switch or a RIB, which the link states renew
+NEGATIVE_S: Final = 1.0
+_TAKES_FRAMES: Final = (Right.ATTACH, Right.SERVE)
+
+
+@dataclass(frozen=True, slots=True)
+class _Installed:
+    """Why an entry stands, to be looked at again when links change."""
+
+    destination: Name
+    source: Name
+
+
+class Unicast:
+    """Resolves and installs the ways of frames to one name."""
+
+    def __init__(
+        self,
+        own_domain: Name,
+        transit: frozenset[Name],
+        table: Table,
+        paths: Paths,
+        places: Places,
+        attached: Attached,
+        parked: Parked,
+        outbox: Outbox,
+    ) -> None:
+        self._own_domain = own_domain
+        self._transit = transit
+        self._table = table
+        self._paths = paths
+        self._places = places
+        self._attached = attached
+        self._parked = parked
+        self._outbox = outbox
+        self._installed: dict[bytes, _Installed] = {}
+        self.drops: Counter[DropReason] = Counter()
+
+    def miss(self, header: Header, frame: bytes, now_s: float) -> None:
+        """Take a frame for which the table had no entry."""
+        destination, source = Name(header.destination), Name(header.source)
+        waits_for = self._resolve(destination, source, now_s)
+        if waits_for is not None:
+            self._parked.park(waits_for, frame, now_s)
+        else:
+            self._forward(destination, source, frame)
+
+    def send(self, frames: list[bytes], destination: Name, source: Name, now_s: float) -> None:
+        """Send frames of our own to a name, by the way that others' frames go."""
+        if self._resolve(destination, source, now_s) is None:
+            hop = self._hop(destination, source)
+            if hop is None:
+                self.drops[DropReason.NO_ROUTE] += len(frames)
+            else:
+                self._outbox.frames(hop[0], hop[1][:6], frames)
+
+    def release(self, name: Name, now_s: float) -> None:
+        """Look again at what waited for a name."""
+        for frame in self._parked.release(name):
+            destination, source = Name(frame[32:64]), Name(frame[64:96])
+            waits_for = self._resolve(destination, source, now_s)
+            if waits_for is None:
+                self._forward(destination, source, frame)
+            else:
+                self._parked.park(waits_for, frame, now_s)
+
+    def refresh(self, now_s: float) -> None:
+        """Compute every installed way anew: links have changed."""
+        for key, why in list(self._installed.items()):
+            if key not in self._table.entries:
+                del self._installed[key]
+                continue
+            self._table.remove(key)
+            del self._installed[key]
+            if self._resolve(why.destination, why.source, now_s) is not None:
+                self._places.want(why.destination, now_s, watch=False)
+
+    def forget(self, name: Name) -> None:
+        """Take out the entries to a name whose place has changed."""
+        for key in [key for key, why in self._installed.items() if why.destination == name]:
+            self._table.remove(key)
+            del self._installed[key]
+
+    def expired(self, key: bytes) -> None:
+        """Learn that the table let an entry go."""
+        self._installed.pop(key, None)
+
+    def _forward(self, destination: Name, source: Name, frame: bytes) -> None:
+        hop = self._hop(destination, source)
+        if hop is None:
+            self.drops[DropReason.NO_ROUTE] += 1
+        elif frame[HOPS_AT] <= 1:
+            self.drops[DropReason.HOPS_EXPIRED] += 1
+        else:
+            on = frame[:HOPS_AT] + bytes([frame[HOPS_AT] - 1]) + frame[HOPS_AT + 1 :]
+            self._outbox.frames(hop[0], hop[1][:6], [on])
+
+    def _hop(self, destination: Name, source: Name) -> Hop | None:
+        hops = self._table.entries.get(destination + source) or self._table.entries.get(destination)
+        return hops[0] if hops else None
+
+    def _resolve(self, destination: Name, source: Name, now_s: float) -> Name | None:
+        """Install an entry, perhaps a negative one; or return the name whose place must be asked for first."""
+        at = self._attached.at(destination)
+        if at is not None:
+            self._install(destination, b"", self._outbox.hop_at(at.port, at.mac), source, at.expires_s)
+            return None
+        neighbour = self._outbox.neighbour(destination)
+        if neighbour is not None:
+            self._install(destination, b"", self._outbox.hop(neighbour), source, now_s + NODE_LEASE_S)
+            return None
+        if self._paths.is_switch(destination):
+            domain = self._paths.domain_of(destination)
+            way = self._paths.to_switch(destination, domain or self._own_domain, self._transit)
+            self._install_way(destination, b"", way, source, now_s + NODE_LEASE_S, now_s)
+            return None
+        if self._paths.is_rib(destination):
+            way, _ = self._paths.to_rib(destination, self._transit)
+            self._install_way(destination, b"", way, source, now_s + NODE_LEASE_S, now_s)
+            return None
+        return self._resolve_by_rib(destination, source, now_s)
+
+    def _resolve_by_rib(self, destination: Name, source: Name, now_s: float) -> Name | None:
+        places = self._places.of(destination, now_s)
+        takers = [place for place in places if place.right in _TAKES_FRAMES]
+        if not takers:
+            if not places and not self._places.is_nowhere(destination, now_s):
+                self._places.want(destination, now_s, watch=False)
+                return destination
+            self.drops[DropReason.NO_READER if places else DropReason.NO_ROUTE] += 1
+            self._table.install(destination + source, NOWHERE, now_s + NEGATIVE_S)
+            return None
+        if all(place.domain == self._own_domain for place in takers) and self._is_of_own_domain(source, now_s):
+            best = self._nearest(takers, frozenset({self._own_domain}))
+            self._install_place(destination, b"", best, source, now_s)
+            return None
+        transit = self._source_transit(source, now_s)
+        if transit is None:
+            if self._places.is_nowhere(source, now_s):
+                self.drops[DropReason.NO_ROUTE] += 1
+                self._table.install(destination + source, NOWHERE, now_s + NEGATIVE_S)
+                return None
+            self._places.want(source, now_s, watch=False)
+            return source
+        best = self._nearest(takers, transit & self._transit)
+        self._install_place(destination, source, best, source, now_s)
+        return None
+
+    def _is_of_own_domain(self, source: Name, now_s: float) -> bool:
+        if self._attached.at(source) is not None or self._paths.domain_of(source) == self._own_domain:
+            return True
+        places = self._places.of(source, now_s)
+        return bool(places) and all(place.domain == self._own_domain for place in places)
+
+    def _source_transit(self, source: Name, now_s: float) -> frozenset[Name] | None:
+        """Return the domains that the source's domain lets its traffic pass; None: to be asked for."""
+        if self._attached.at(source) is not None or self._paths.is_switch(source) or self._paths.is_rib(source):
+            return self._transit
+        places = self._places.of(source, now_s)
+        return places[0].transit | {places[0].domain} if places else None
+
+    def _nearest(self, takers: list[Place], allowed: frozenset[Name]) -> tuple[Place, Way] | None:
+        ways = [
+            (place, way)
+            for place in takers
+            if (way := self._paths.to_switch(place.switch, place.domain, allowed & place.transit | {place.domain}))
+        ]
+        return min(ways, key=lambda each: (each[1].distance, each[0].advertiser), default=None)
+
+    def _install_place(
+        self, destination: Name, source_key: bytes, best: tuple[Place, Way] | None, source: Name, now_s: float
+    ) -> None:
+        if best is None:
+            self._install_way(destination, source_key, None, source, now_s, now_s)
+        else:
+            self._install_way(destination, source_key, best[1], source, best[0].expires_s, now_s)
+
+    def _install_way(
+        self, destination: Name, source_key: bytes, way: Way | None, source: Name, expires_s: float, now_s: float
+    ) -> None:
+        neighbour = None if way is None else self._outbox.neighbour(way.first)
+        if neighbour is None:
+            self.drops[DropReason.NO_ROUTE] += 1
+            self._table.install(destination + source, NOWHERE, now_s + NEGATIVE_S)
+            self._installed[destination + source] = _Installed(destination, source)
+        else:
+            self._install(destination, source_key, self._outbox.hop(neighbour), source, expires_s)
+
+    def _install(self, destination: Name, source_key: bytes, hop: Hop, source: Name, expires_s: float) -> None:
+        key = destination + source_key
+        self._table.remove(destination + source)  # a negative entry would be found first
+        if self._table.install(key, (hop,), expires_s):
+            self._installed[key] = _Installed(destination, source)
