@@ -1,0 +1,191 @@
+"""A network as data: who stands where and who is joined to whom. Realising it is another file's work.
+
+Place: pure. ``gdp/testbed/namespaces.py`` makes kernel namespaces of it, the in-memory network machines in one process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final, Literal
+
+from gdp.errors import LocalError
+from gdp.limits import FRAME_MAX_BYTES, MTU_MIN_BYTES
+
+__all__ = ["Attachment", "DomainPlan", "Link", "Topology", "chain", "ring5"]
+
+Role = Literal["rib", "proxy"]
+
+COST: Final = 10
+DETOUR_COST: Final = 100
+MTU_BYTES: Final = 1_500
+MTU_MAX_BYTES: Final = FRAME_MAX_BYTES - 14  # an MTU does not count the Ethernet header
+_IFNAME_MAX: Final = 13
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """Two switches joined. On each end the device is called like the neighbour it leads to."""
+
+    a: str
+    b: str
+    cost: int = COST
+    mtu: int = MTU_BYTES
+
+    def ends(self) -> frozenset[str]:
+        """Return both switches, so that ``a-b`` and ``b-a`` are one link."""
+        return frozenset((self.a, self.b))
+
+    def other(self, node: str) -> str:
+        """Return the switch at the far end from ``node``."""
+        return self.b if node == self.a else self.a
+
+    def __str__(self) -> str:
+        return f"{self.a}-{self.b}"
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """A RIB or a proxy beside a switch; ``ifname`` is its device, the first half of the pair that the switch makes."""
+
+    switch: str
+    role: Role
+    ifname: str
+
+
+@dataclass(frozen=True, slots=True)
+class DomainPlan:
+    """A trust domain: its switches, and the domain whose RIB is the tier above (None at the top)."""
+
+    label: str
+    switches: tuple[str, ...]
+    upper: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Topology:
+    """Switches, links, domains and what is attached; consistent once made.
+
+    Raises:
+        LocalError: an unknown or repeated switch, a link twice or to itself, a domain that overlaps, a cost, MTU or
+            device name out of bounds.
+    """
+
+    links: tuple[Link, ...]
+    domains: tuple[DomainPlan, ...]
+    attachments: tuple[Attachment, ...]
+
+    def __post_init__(self) -> None:
+        nodes = [node for domain in self.domains for node in domain.switches]
+        labels = {domain.label for domain in self.domains}
+        _require(len(set(nodes)) == len(nodes), "a switch belongs to one domain")
+        _require(len(labels) == len(self.domains), "a domain's label stands twice")
+        _require(all(d.upper is None or d.upper in labels - {d.label} for d in self.domains), "an unknown tier above")
+        _require(all(0 < len(node) <= _IFNAME_MAX for node in nodes), f"a switch has 1 to {_IFNAME_MAX} characters")
+        _require(len({link.ends() for link in self.links}) == len(self.links), "a link stands twice")
+        for link in self.links:
+            _require(link.a != link.b and link.ends() <= set(nodes), f"{link} does not join two switches")
+            _require(link.cost >= 1, f"{link} costs less than 1")
+            _require(MTU_MIN_BYTES <= link.mtu <= MTU_MAX_BYTES, f"an MTU is {MTU_MIN_BYTES} to {MTU_MAX_BYTES} bytes")
+        ends = [(at.switch, at.ifname) for at in self.attachments]
+        _require(len(set(ends)) == len(ends), "two attachments share a device")
+        for at in self.attachments:
+            _require(at.switch in nodes, f"{at.role} stands at no switch: {at.switch}")
+            _require(0 < len(at.ifname) <= _IFNAME_MAX and at.ifname not in nodes, f"{at.ifname} cannot name a device")
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """Return all switches, domain by domain."""
+        return tuple(node for domain in self.domains for node in domain.switches)
+
+    def links_of(self, node: str) -> Iterator[Link]:
+        """Yield the links that end at this switch, in the topology's order."""
+        return (link for link in self.links if node in link.ends())
+
+    def link(self, a: str, b: str) -> Link:
+        """Return the link between two switches, named in either order.
+
+        Raises:
+            LocalError: they are not joined.
+        """
+        for link in self.links:
+            if link.ends() == {a, b}:
+                return link
+        raise LocalError(f"no link {a}-{b}; there are {', '.join(map(str, self.links))}")
+
+    def domain_of(self, node: str) -> DomainPlan:
+        """Return the trust domain of a switch.
+
+        Raises:
+            LocalError: no such switch.
+        """
+        for domain in self.domains:
+            if node in domain.switches:
+                return domain
+        raise LocalError(f"no switch {node}; there are {', '.join(self.nodes)}")
+
+    def attached(self, role: Role) -> tuple[Attachment, ...]:
+        """Return the attachments of one role, in the topology's order."""
+        return tuple(at for at in self.attachments if at.role == role)
+
+    def rib_of(self, label: str) -> Attachment | None:
+        """Return the RIB that stands in this domain, if one does."""
+        return next((at for at in self.attached("rib") if self.domain_of(at.switch).label == label), None)
+
+
+def _require(holds: bool, otherwise: str) -> None:
+    if not holds:
+        raise LocalError(otherwise)
+
+
+def ring5(mtu: int = MTU_BYTES) -> Topology:
+    """Return five switches in a ring over three domains; usual way nuc1-nuc2-nuc3-nuc4-nuc5, the short cut costs more.
+
+    ::
+
+        school: nuc1 (robot) -- nuc2 (border)            cloud: nuc4 (border) -- nuc5 (server)
+                  |                   \\                         /                   |
+                  |                     backbone: nuc3 (upper RIB)                  |
+                  +------------------------- cost 100 -----------------------------+
+    """
+    return Topology(
+        links=(
+            Link("nuc1", "nuc2", mtu=mtu),
+            Link("nuc2", "nuc3", mtu=mtu),
+            Link("nuc3", "nuc4", mtu=mtu),
+            Link("nuc4", "nuc5", mtu=mtu),
+            Link("nuc5", "nuc1", cost=DETOUR_COST, mtu=mtu),
+        ),
+        domains=(
+            DomainPlan("school", ("nuc1", "nuc2"), upper="backbone"),
+            DomainPlan("backbone", ("nuc3",)),
+            DomainPlan("cloud", ("nuc4", "nuc5"), upper="backbone"),
+        ),
+        attachments=(
+            Attachment("nuc2", "rib", "rib"),
+            Attachment("nuc3", "rib", "rib"),
+            Attachment("nuc4", "rib", "rib"),
+            Attachment("nuc1", "proxy", "robot"),
+            Attachment("nuc5", "proxy", "server"),
+        ),
+    )
+
+
+def chain(length: int, mtu: int = MTU_BYTES) -> Topology:
+    """Return ``length`` switches ``s1 .. sN`` in a row in one domain: its RIB in the middle, a proxy at either end.
+
+    Raises:
+        LocalError: no switch at all.
+    """
+    _require(length >= 1, "a chain has at least one switch")
+    nodes = tuple(f"s{number}" for number in range(1, length + 1))
+    return Topology(
+        links=tuple(Link(a, b, mtu=mtu) for a, b in pairwise(nodes)),
+        domains=(DomainPlan("chain", nodes),),
+        attachments=(
+            Attachment(nodes[length // 2], "rib", "rib"),
+            Attachment(nodes[0], "proxy", "left"),
+            Attachment(nodes[-1], "proxy", "right"),
+        ),
+    )

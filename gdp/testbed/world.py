@@ -1,0 +1,161 @@
+"""A topology realised in memory: domains with keys, switches, RIBs and members, ready to run.
+
+Place: shell, without I/O. ``namespaces`` realises the same topology with kernel namespaces and real processes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+
+from gdp.client.attachment import AttachmentSettings
+from gdp.client.member import Member, Topic
+from gdp.client.rib_host import RibHost
+from gdp.crypto.certificates import Role
+from gdp.crypto.identity import Identity, NodeKeys
+from gdp.crypto.issuing import DomainAuthority
+from gdp.crypto.keys import SigningKey
+from gdp.crypto.validity import Validity
+from gdp.limits import DEAD_S, HELLO_S
+from gdp.metadata import Metadata
+from gdp.names import Name
+from gdp.rib.machine import Rib, RibSettings
+from gdp.rib.store import MemoryStore
+from gdp.switch.machine import Switch, SwitchSettings
+from gdp.switch.table import Table
+from gdp.testbed.memory import EPOCH_UNIX_S, Cable, MemoryNetwork
+from gdp.testbed.topology import Topology
+from gdp.trust.card import Card
+from gdp.trust.domain import Policy
+from gdp.trust.owner import Owner
+from gdp.trust.right import Right
+
+__all__ = ["World"]
+
+_YEAR_S = 365 * 86_400
+
+
+@dataclass(slots=True)
+class World:
+    """A running network in memory.
+
+    Args:
+        topology: what to build. Nodes are called by their switch's name, or ``switch/device`` for what is attached.
+        trusts: for each domain label, the labels it trusts; None: everyone trusts everyone.
+        delay_s: of every link between switches.
+    """
+
+    topology: Topology
+    seed: int = 1
+    delay_s: float = 0.0005
+    hello_s: float = HELLO_S
+    dead_s: float = DEAD_S
+    trusts: dict[str, tuple[str, ...]] | None = None
+    network: MemoryNetwork = field(init=False)
+    authorities: dict[str, DomainAuthority] = field(default_factory=dict)
+    identities: dict[str, Identity] = field(default_factory=dict)
+    switches: dict[str, Switch] = field(default_factory=dict)
+    ribs: dict[str, RibHost] = field(default_factory=dict)
+    members: dict[str, Member] = field(default_factory=dict)
+    cables: dict[frozenset[str], Cable] = field(default_factory=dict)
+    owner: Owner = field(init=False)
+    _incarnation: int = 0
+
+    def __post_init__(self) -> None:
+        self.network = MemoryNetwork(self.seed)
+        self.owner = Owner(SigningKey.generate(), bytes(range(32)))
+        self._validity = Validity(int(EPOCH_UNIX_S) - _YEAR_S, int(EPOCH_UNIX_S) + _YEAR_S)
+        for domain in self.topology.domains:
+            self.authorities[domain.label] = DomainAuthority.found(domain.label, SigningKey.generate(), self._validity)
+        for node in self.topology.nodes:
+            self._add_switch(node, self.topology.domain_of(node).label)
+        for link in self.topology.links:
+            cable = Cable(self.delay_s, mtu=link.mtu)
+            self.cables[link.ends()] = self.network.connect(link.a, link.b, cable, link.cost)
+        for at in self.topology.attached("rib"):
+            identity = self.identity(Role.RIB, f"{at.switch}/{at.ifname}", self.topology.domain_of(at.switch).label)
+            self.identities[f"rib:{self.topology.domain_of(at.switch).label}"] = identity
+        for at in self.topology.attached("rib"):
+            self._add_rib(f"{at.switch}/{at.ifname}", at.switch)
+        for at in self.topology.attached("proxy"):
+            self.add_member(f"{at.switch}/{at.ifname}", at.switch)
+
+    _validity: Validity = field(init=False)
+
+    def identity(self, role: Role, label: str, domain: str) -> Identity:
+        """Return (making it the first time) the identity of a node."""
+        known = self.identities.get(label)
+        if known is None:
+            keys = NodeKeys.generate(role, label.replace("/", "-"))
+            known = self.identities[label] = keys.join(self.authorities[domain], self._validity)
+        return known
+
+    def policy(self, domain: str) -> Policy:
+        """Return the policy of a domain's nodes."""
+        trusted = self.authorities if self.trusts is None else self.trusts.get(domain, ())
+        return Policy(self.authorities[domain].root, [self.authorities[label].root for label in trusted])
+
+    def add_member(self, label: str, switch: str, domain: str | None = None) -> Member:
+        """Attach a member to a switch; its domain is the switch's unless given."""
+        domain = domain or self.topology.domain_of(switch).label
+        member = Member(self.identity(Role.PROXY, label, domain), self.policy(domain), self._attachment_settings())
+        self.members[label] = member
+        self.network.add(label, member)
+        self.network.connect(switch, label, Cable(0.0001))
+        return member
+
+    def topic(self, name: str, member: Member, rights: Collection[Right], **metadata: str) -> Topic:
+        """Return a topic of the owner's, delegated to a member."""
+        identity = next(each for each in self.identities.values() if each.name == member.name)
+        described = Metadata({"kind": "topic", "name": name, **metadata})
+        card = Card.from_wire(Card.make(identity))
+        delegation = self.owner.delegate(card, described, rights, [1], self._validity)
+        grants = delegation.open(identity)
+        return Topic(delegation, {epoch: grant.secret for epoch, grant in grants.items()})
+
+    def restart_switch(self, name: str) -> Switch:
+        """Start a switch anew with nothing remembered."""
+        switch, table = self._switch(name, self.topology.domain_of(name).label)
+        self.network.replace(name, switch, table)
+        return switch
+
+    def settle(self, duration_s: float = 10.0) -> bool:
+        """Let time go on until every member is attached; return whether that came true."""
+        return self.network.run(duration_s, lambda: all(m.attachment.is_attached for m in self.members.values()))
+
+    def _add_switch(self, name: str, domain: str) -> None:
+        self.identity(Role.SWITCH, name, domain)
+        self.network.add(name, *self._switch(name, domain))
+
+    def _switch(self, name: str, domain: str) -> tuple[Switch, Table]:
+        table = Table()
+        self._incarnation += 1
+        settings = SwitchSettings(
+            self._incarnation,
+            int(self.network.now.unix_s * 1000),
+            self.network.random_bytes,
+            self.hello_s,
+            self.dead_s,
+        )
+        switch = self.switches[name] = Switch(self.identities[name], self.policy(domain), table, settings)
+        return switch, table
+
+    def _add_rib(self, label: str, switch: str) -> None:
+        domain = self.topology.domain_of(switch)
+        upper = None if domain.upper is None else self.identities[f"rib:{domain.upper}"].name
+        identity = self.identities[f"rib:{domain.label}"]
+        policy = self.policy(domain.label)
+        rib = Rib(identity, policy, MemoryStore(), RibSettings(upper))
+        host = self.ribs[domain.label] = RibHost(identity, policy, rib, self._attachment_settings())
+        self.network.add(label, host)
+        self.network.connect(switch, label, Cable(0.0001))
+
+    def _attachment_settings(self) -> AttachmentSettings:
+        self._incarnation += 1
+        return AttachmentSettings(
+            self._incarnation,
+            int(self.network.now.unix_s * 1000),
+            self.network.random_bytes,
+            self.hello_s,
+            self.dead_s,
+        )
