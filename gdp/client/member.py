@@ -131,6 +131,10 @@ class Member:
         delegation = topic.delegation
         self.attachment.claim(delegation.subject, Right.READ, delegation.chain, is_global=False)
 
+    def publishers(self) -> list[Publisher]:
+        """Return what is being published, one publisher for each topic."""
+        return list(self._publishers.values())
+
     def feeds(self) -> Iterator[Feed]:
         """Yield what is being read, one feed for each publisher of each topic."""
         for subscription in self._subscriptions.values():

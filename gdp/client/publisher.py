@@ -103,6 +103,11 @@ class Publisher:
         """Return whether every reader has confirmed everything."""
         return not self._early and not self._waiting and self._window.is_acknowledged()
 
+    @property
+    def acknowledged(self) -> int:
+        """Return how many messages every reader has confirmed; of a best-effort topic, how many were sent."""
+        return self._window.acknowledged if self._repairs_wanted else self.messages
+
     def tree_stands(self, mtu: int) -> None:
         """Learn that a tree reaches this publisher, and the smallest MTU on it (bytes after the Ethernet header)."""
         self._mtu = max(mtu, MTU_MIN_BYTES)

@@ -67,9 +67,12 @@ class NodeKeys:
         """Return the node with a membership that was issued elsewhere.
 
         Raises:
-            LocalError: it is another node's, or of another domain.
+            LocalError: it is another node's, of another domain, or not what the node asked for.
         """
-        return Identity(membership, root, self.key, self.kem)
+        identity = Identity(membership, root, self.key, self.kem)
+        if (membership.subject, membership.role, membership.label) != (self.subject, self.role, self.label):
+            raise LocalError("the membership certificate names role, label or metadata otherwise")
+        return identity
 
 
 @dataclass(frozen=True, slots=True)

@@ -179,6 +179,9 @@ def _certificate(wire: bytes) -> Certificate:
     extensions = certificate.extensions
     if any(extension.critical and extension.oid not in _UNDERSTOOD for extension in extensions):
         raise bad("a critical extension that is not understood")
+    der, signature = certificate.public_bytes(Encoding.DER), certificate.signature
+    if not der.endswith(bytes((0x03, len(signature) + 1, 0)) + signature):  # the library lets unused bits pass
+        raise bad("a signature that is not in DER")
     return Certificate(
         holder=_holder(certificate.subject, extensions, PublicKey.from_point(certificate.public_key())),
         validity=Validity(
@@ -189,9 +192,9 @@ def _certificate(wire: bytes) -> Certificate:
         distinguished_name=certificate.subject.public_bytes(),
         key_id=_key_id(extensions),
         issuer_key_id=_issuer_key_id(extensions),
-        signature=certificate.signature,
+        signature=signature,
         signed_bytes=certificate.tbs_certificate_bytes,
-        wire=certificate.public_bytes(Encoding.DER),
+        wire=der,
     )
 
 

@@ -65,6 +65,7 @@ class SendWindow:
         self._next = deque[tuple[int, int]]()  # (number, first part not sent), oldest first
         self._repairs: OrderedDict[tuple[int, int], None] = OrderedDict()
         self._repaired_s: dict[tuple[int, int], float] = {}
+        self._newest = 0
         self._end_at = 0
         self._sent_at = 0
         self._kept_bytes = 0
@@ -101,12 +102,18 @@ class SendWindow:
         """Return whether every reader has everything."""
         return self._acked_at() == self._end_at
 
+    @property
+    def acknowledged(self) -> int:
+        """Return the highest message number that every reader has confirmed, with all before it."""
+        return min(self._least_number(), self._newest + 1) - 1
+
     def add(self, number: int, frames: list[bytes]) -> None:
         """Queue a sealed message; numbers rise."""
         size = sum(map(len, frames))
         while self._kept and self._kept_bytes + size > 2 * self._budget_bytes:
             self._release(next(iter(self._kept)))
             self.let_go += 1
+        self._newest = number
         self._kept[number] = _Kept(frames, self._end_at, size)
         self._kept_bytes += size
         self._end_at += size

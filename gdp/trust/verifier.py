@@ -23,8 +23,8 @@ from gdp.trust.rtcert import RtCertCache
 
 __all__ = ["ADCERTS_REMEMBERED", "RTCERTS_REMEMBERED", "ClaimVerifier"]
 
-ADCERTS_REMEMBERED: Final = 65_536
-RTCERTS_REMEMBERED: Final = 16_384
+ADCERTS_REMEMBERED: Final = 16_384
+RTCERTS_REMEMBERED: Final = 4_096
 _MS = 1_000
 
 

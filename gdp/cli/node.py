@@ -1,0 +1,52 @@
+"""What the commands of long-running nodes share: how they log, say that they are ready, and fail.
+
+Place: command.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Final
+
+import orjson
+import typer
+
+from gdp.errors import ConfigError, GdpError
+
+__all__ = ["WRONG", "Check", "Config", "Json", "Verbose", "emit", "failing_clearly", "set_up_logging"]
+
+WRONG: Final = 2  # exit code of a wrong configuration
+
+Config = Annotated[Path, typer.Option("--config", help="The YAML file; see docs/configuration.md.")]
+Check = Annotated[bool, typer.Option("--check", help="Validate the configuration and end.")]
+Json = Annotated[bool, typer.Option("--json", help="Say what happens as lines of JSON on standard output.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Log decisions, too.")]
+
+
+def set_up_logging(*, verbose: bool) -> None:
+    """Log to standard error: life-cycle steps, or decisions as well."""
+    level = logging.DEBUG if verbose else logging.INFO
+    logging.basicConfig(level=level, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s %(message)s")
+
+
+def emit(event: str, **fields: object) -> None:
+    """Write one line of JSON and flush it: somebody waits for it."""
+    sys.stdout.buffer.write(orjson.dumps({"event": event, **fields}) + b"\n")
+    sys.stdout.buffer.flush()
+
+
+@contextlib.contextmanager
+def failing_clearly() -> Iterator[None]:
+    """Turn an error of ours into one line on standard error and exit code 2."""
+    try:
+        yield
+    except ConfigError as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(WRONG) from error
+    except GdpError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(WRONG) from error

@@ -1,0 +1,48 @@
+"""The ``gdp-rib`` command.
+
+Place: command.
+"""
+
+from __future__ import annotations
+
+import typer
+
+from gdp.cli.node import Check, Config, Json, Verbose, emit, failing_clearly, set_up_logging
+from gdp.crypto.certificates import Role
+from gdp.names import Name
+from gdp.nodes.config import RibConfig
+from gdp.nodes.membership import load_member
+from gdp.nodes.rib import run_rib
+
+__all__ = ["main"]
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+@app.command(epilog="Example: gdp-rib --config rib.yaml")
+def rib(config: Config, check: Check = False, json: Json = False, verbose: Verbose = False) -> None:
+    """Answer who advertises a name, and where, for one trust domain, until Ctrl-C."""
+    set_up_logging(verbose=verbose)
+    with failing_clearly():
+        settings = RibConfig.load(config)
+        if check:
+            identity, _ = load_member(settings.identity, settings.domain, Role.RIB)
+            _report("checked", f"configuration good: RIB {identity.name.short}", identity.name, json=json)
+            return
+        run_rib(settings, lambda name: _report("ready", f"RIB {name.short} is up; Ctrl-C ends it", name, json=json))
+
+
+def _report(event: str, text: str, name: Name, *, json: bool) -> None:
+    if json:
+        emit(event, name=name.to_text())
+    else:
+        typer.echo(text)
+
+
+def main() -> None:
+    """Run the command."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

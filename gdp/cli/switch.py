@@ -1,0 +1,76 @@
+"""The ``gdp-switch`` command.
+
+Place: command.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from gdp.cli.node import Check, Config, Json, Verbose, emit, failing_clearly, set_up_logging
+from gdp.crypto.certificates import Role
+from gdp.errors import LocalError
+from gdp.names import Name
+from gdp.nodes.config import DataPlane, SwitchConfig
+from gdp.nodes.membership import load_member
+from gdp.nodes.switch import run_switch
+
+__all__ = ["main"]
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+@app.command(
+    epilog="Example: gdp-switch --iface eth0 --iface eth1 --config switch.yaml",
+)
+def switch(
+    config: Config,
+    iface: Annotated[list[str] | None, typer.Option(help="A port; once for each. Adds to the file's.")] = None,
+    data_plane: Annotated[str | None, typer.Option(help="auto, raw or scapy; instead of the file's.")] = None,
+    check: Check = False,
+    json: Json = False,
+    verbose: Verbose = False,
+) -> None:
+    """Switch frames by 256-bit names between layer-2 ports, until Ctrl-C."""
+    set_up_logging(verbose=verbose)
+    with failing_clearly():
+        settings = SwitchConfig.load(config).with_ifaces(iface or [])
+        if data_plane is not None:
+            settings = settings.model_copy(update={"data_plane": _data_plane(data_plane)})
+        if check:
+            identity, _ = load_member(settings.identity, settings.domain, Role.SWITCH)
+            _report_check(identity.name, len(settings.ports), json=json)
+            return
+        run_switch(settings, lambda name, plane: _report_ready(name, plane, json=json))
+
+
+def _data_plane(text: str) -> DataPlane:
+    known: dict[str, DataPlane] = {"auto": "auto", "raw": "raw", "scapy": "scapy"}
+    if text not in known:
+        raise LocalError(f"--data-plane is {', '.join(known)}, not {text}")
+    return known[text]
+
+
+def _report_check(name: Name, ports: int, *, json: bool) -> None:
+    if json:
+        emit("checked", name=name.to_text(), ports=ports)
+    else:
+        typer.echo(f"configuration good: switch {name.short}, {ports} ports")
+
+
+def _report_ready(name: Name, plane: str, *, json: bool) -> None:
+    if json:
+        emit("ready", name=name.to_text(), data_plane=plane)
+    else:
+        typer.echo(f"switch {name.short} is up, data plane {plane}; Ctrl-C ends it")
+
+
+def main() -> None:
+    """Run the command."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

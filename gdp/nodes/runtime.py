@@ -1,0 +1,136 @@
+"""One node at work: a machine, a data plane, two clocks and the signals that end it.
+
+Place: shell. One thread, one loop: wait for frames or for the machine's next timer, let the machine think, send what it
+says.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator, Mapping
+from types import FrameType
+
+from gdp.effects import Instant, Machine
+from gdp.ports.plane import Plane
+
+__all__ = ["Runtime", "now"]
+
+log = logging.getLogger(__name__)
+
+COST_DEFAULT = 10
+
+
+def now() -> Instant:
+    """Return the present moment."""
+    return Instant(time.monotonic(), time.time())
+
+
+class Runtime:
+    """Drives a machine over a plane.
+
+    Args:
+        costs: of ports by device name; others cost ``COST_DEFAULT``.
+    """
+
+    def __init__(self, machine: Machine, plane: Plane, costs: Mapping[str, int] | None = None) -> None:
+        self._machine = machine
+        self._plane = plane
+        self._costs = dict(costs or {})
+        self._is_stopped = False
+        self._deadline_s: float | None = None
+        moment = now()
+        for port in list(plane.ports.values()):
+            self._add(port.index, moment)
+        plane.on_link(self._link_changed)
+
+    @property
+    def is_stopped(self) -> bool:
+        """Return whether the node was asked to end."""
+        return self._is_stopped
+
+    def stop(self) -> None:
+        """End ``run`` after the present step."""
+        self._is_stopped = True
+
+    def run(self, until: Callable[[], bool] | None = None, deadline_s: float | None = None) -> bool:
+        """Work until stopped, until ``until`` is true (asked after each step), or until a monotonic second.
+
+        Returns whether ``until`` came true (without one: whether the node was stopped).
+        """
+        while not self._is_stopped:
+            if until is not None and until():
+                return True
+            if deadline_s is not None and time.monotonic() >= deadline_s:
+                return False
+            self.step(deadline_s)
+        return until is None
+
+    def step(self, latest_s: float | None = None) -> None:
+        """Wait for something to do, no longer than a monotonic second, and do it."""
+        self.flush()
+        times = [each for each in (self._deadline_s, latest_s) if each is not None]
+        timeout_s = max(min(times) - time.monotonic(), 0.0) if times else None
+        arrivals = self._plane.poll(timeout_s)
+        moment = now()
+        if arrivals:
+            self._machine.receive(arrivals, moment)
+            self._deadline_s = self._machine.next_timeout()
+        if self._deadline_s is not None and moment.mono_s >= self._deadline_s:
+            self._machine.timeout(moment)
+            self._deadline_s = self._machine.next_timeout()
+
+    def flush(self) -> None:
+        """Send what the machine has to say, and ask when it wants to be called next."""
+        for port, mac, frames in self._machine.take():
+            self._plane.transmit(port, mac, frames)
+        self._deadline_s = self._machine.next_timeout()
+
+    @contextlib.contextmanager
+    def signals(self) -> Iterator[None]:
+        """End ``run`` on SIGINT and SIGTERM while within; a blocked ``poll`` wakes up for them."""
+        reading, writing = socket.socketpair()
+        reading.setblocking(False)
+        writing.setblocking(False)
+
+        def stop(number: int, frame: FrameType | None) -> None:
+            del frame
+            log.info("stopping signal=%d", number)
+            self.stop()
+
+        def drain() -> None:
+            with contextlib.suppress(BlockingIOError):
+                while reading.recv(64):
+                    continue
+
+        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        woken_before = signal.set_wakeup_fd(writing.fileno(), warn_on_full_buffer=False)
+        self._plane.watch(reading, drain)
+        try:
+            yield
+        finally:
+            self._plane.unwatch(reading)
+            signal.set_wakeup_fd(woken_before)
+            for number, handler in before.items():
+                signal.signal(number, handler)
+            reading.close()
+            writing.close()
+
+    def _add(self, index: int, moment: Instant) -> None:
+        port = self._plane.ports[index]
+        cost = self._costs.get(port.ifname, COST_DEFAULT)
+        self._machine.add_port(index, port.mac, port.mtu, cost, moment)
+        if not port.up:
+            self._machine.port_changed(index, False, moment)
+
+    def _link_changed(self, index: int, up: bool) -> None:
+        moment = now()
+        log.info("link port=%d up=%s", index, up)
+        if up and index in self._plane.ports:
+            self._add(index, moment)  # it may have come back with another address or MTU
+        else:
+            self._machine.port_changed(index, up, moment)
+        self._deadline_s = moment.mono_s

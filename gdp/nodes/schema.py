@@ -1,0 +1,192 @@
+"""What every configuration file shares: strict fields, paths relative to the file, errors that point into it.
+
+Place: shell; loading reads files and changes nothing. ``gdp/nodes/config.py`` and ``proxy/config.py`` state the keys.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Final, TypeVar, get_args
+
+import orjson
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, ValidationInfo
+from pydantic_core import ErrorDetails
+
+from gdp.errors import ConfigError, LocalError
+from gdp.names import Name
+from gdp.nodes.yaml_source import ConfigFileError, KeyPath, YamlSource, read_yaml
+
+__all__ = [
+    "Directory",
+    "Domain",
+    "ExistingFile",
+    "Ifname",
+    "Metrics",
+    "NameText",
+    "NewFile",
+    "Section",
+    "Unique",
+    "load",
+    "read_name",
+    "relative",
+]
+
+_SHOULD_BE: Final = "Input should be "  # how pydantic begins when a value is of the wrong kind or out of bounds
+_IFNAME_MAX: Final = 15  # IFNAMSIZ - 1; Linux, include/uapi/linux/if.h
+_WORDS: Final = {
+    "an object": "a mapping of keys to values",
+    "array": "a list",
+    "boolean": "true or false",
+    "integer": "a whole number",
+    "number": "a number",
+    "string": "a text",
+}
+
+M = TypeVar("M", bound="Section")
+T = TypeVar("T")
+
+
+class Section(BaseModel):
+    """One mapping of a configuration file: immutable, and without a key that is not stated here."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+
+
+def relative(path: Path, info: ValidationInfo) -> Path:
+    """Return ``path`` as seen from the file that names it; ``load`` puts that folder into the context."""
+    base = info.context["base"] if isinstance(info.context, dict) else Path()
+    return Path(base) / path.expanduser()
+
+
+def _file(path: Path) -> Path:
+    if not path.is_file():
+        raise ValueError(f"no such file: {path}")
+    return path
+
+
+def _directory(path: Path) -> Path:
+    if not path.is_dir():
+        raise ValueError(f"no such directory: {path}")
+    return path
+
+
+def _writable_place(path: Path) -> Path:
+    if not path.parent.is_dir():
+        raise ValueError(f"no such directory: {path.parent}")
+    return path
+
+
+def _unique(items: tuple[T, ...]) -> tuple[T, ...]:
+    for index, item in enumerate(items):
+        if item in items[:index]:
+            raise ValueError(f"{item} stands twice")
+    return items
+
+
+def read_name(value: object) -> Name | None:
+    """Read 64 hex digits, or ``null`` for no name."""
+    if value is None or isinstance(value, Name):
+        return value
+    try:
+        return Name.from_text(value if isinstance(value, str) else "")
+    except LocalError as error:
+        raise ValueError(str(error)) from error
+
+
+def _ifname(text: str) -> str:
+    if not text or len(text) > _IFNAME_MAX or text in (".", "..") or set(text) & set("/: \t\n") or not text.isascii():
+        raise ValueError(f"a device's name has 1 to {_IFNAME_MAX} characters without '/', ':' or blanks")
+    return text
+
+
+Relative = Annotated[Path, AfterValidator(relative)]
+ExistingFile = Annotated[Relative, AfterValidator(_file)]
+Directory = Annotated[Relative, AfterValidator(_directory)]
+NewFile = Annotated[Relative, AfterValidator(_writable_place)]
+Unique = AfterValidator(_unique)
+Ifname = Annotated[str, AfterValidator(_ifname)]
+NameText = Annotated[Name | None, BeforeValidator(read_name)]
+
+
+class Domain(Section):
+    """The trust domain of a node, and the others whose members it believes."""
+
+    root: ExistingFile
+    trusts: Annotated[tuple[ExistingFile, ...], Unique] = ()
+    transit: Annotated[tuple[str, ...] | None, Field(default=None)]  # labels; None: every trusted domain
+
+
+class Metrics(Section):
+    """Prometheus text on a loopback port."""
+
+    port: int = Field(ge=1, le=65_535)
+
+
+def load(model: type[M], path: Path) -> M:
+    """Read a YAML file as this model.
+
+    Raises:
+        ConfigError: the file cannot be read, or holds anything but what the model states (then every error is listed).
+    """
+    source = read_yaml(path)
+    try:
+        return model.model_validate_json(orjson.dumps(source.data), strict=True, context={"base": path.parent})
+    except ValidationError as invalid:
+        errors = _translated(model, source, invalid.errors(include_url=False))
+        raise ConfigFileError(sorted(errors, key=lambda error: _line_and_column(error.where))) from invalid
+    except TypeError as error:  # a number beyond 64 bits
+        raise ConfigError(str(path), "", str(error)) from error
+
+
+def _line_and_column(where: str) -> tuple[int, int]:
+    _, line, column = where.rsplit(":", 2)
+    return int(line), int(column)
+
+
+def _translated(model: type[Section], source: YamlSource, details: list[ErrorDetails]) -> Iterator[ConfigError]:
+    """Yield pydantic's findings in our words; what it says about each member of a union becomes one error."""
+    wrong_kind: dict[KeyPath, tuple[list[str], object]] = {}
+    for detail in details:
+        key = tuple(detail["loc"])
+        message = detail["msg"]
+        if detail["type"] == "missing":
+            yield source.error(key, "required, but not there")
+        elif detail["type"] == "extra_forbidden":
+            known = ", ".join(_keys_of(_section_at(model, key[:-1])))
+            yield source.error(_shown(source, key), f"unknown key; expected one of {known}", at_key=True)
+        elif message.startswith(_SHOULD_BE):
+            wanted = message.removeprefix(_SHOULD_BE).removeprefix("a valid ")
+            wrong_kind.setdefault(_shown(source, key), ([], detail["input"]))[0].append(_WORDS.get(wanted, wanted))
+        else:
+            yield source.error(_shown(source, key), message.removeprefix("Value error, "))
+    for key, (wanted_each, found) in wrong_kind.items():
+        instead = f", not {found!r}" if isinstance(found, str | int | float | None) else ""
+        yield source.error(key, f"expected {' or '.join(wanted_each)}{instead}")
+
+
+def _shown(source: YamlSource, key: KeyPath) -> KeyPath:
+    """Drop what pydantic appends to a path for its own purposes, such as the member of a union."""
+    while key and key not in source.values:
+        key = key[:-1]
+    return key
+
+
+def _section_at(model: type[Section], key: KeyPath) -> type[Section]:
+    """Return the model of the mapping at this path, which validation has already walked."""
+    for part in key:
+        for name, field in model.model_fields.items():
+            if part == (field.alias or name):
+                model = next(_sections_in(field.annotation), model)
+    return model
+
+
+def _sections_in(annotation: object) -> Iterator[type[Section]]:
+    if isinstance(annotation, type) and issubclass(annotation, Section):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from _sections_in(inner)
+
+
+def _keys_of(model: type[Section]) -> list[str]:
+    return [field.alias or name for name, field in model.model_fields.items()]

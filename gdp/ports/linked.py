@@ -1,0 +1,210 @@
+"""What the planes on real devices share: ports that come and go with their devices, one epoll, the counters.
+
+Place: I/O; how a frame is read, decided on and sent is left to the plane that builds on this.
+A port outlives its device. When the device is deleted, or moved away, the port is down; when one of that name appears,
+the port opens it anew. The kernel's own word (netlink) decides, so a cut link is known within milliseconds.
+
+A port's life::
+
+    add_port -> open, up or down <-> up or down (carrier) -> absent (device deleted) -> open (device of that name) ...
+"""
+
+from __future__ import annotations
+
+import select
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Final
+
+from gdp.errors import DropReason, LocalError
+from gdp.frame.codec import ETHER_BYTES
+from gdp.limits import FRAME_MAX_BYTES, MTU_MIN_BYTES
+from gdp.ports.link import Link, LinkWatch
+from gdp.ports.plane import MAC_BYTES, Arrival, Counters, HasFileno, LinkCallback, Port
+from gdp.switch.table import Hops, Table
+
+__all__ = ["LinkedPlane"]
+
+_MTU_MAX_BYTES: Final = FRAME_MAX_BYTES - ETHER_BYTES
+_AUDIT_POLLS: Final = 256  # a busy plane asks the kernel for its drops this often, an idle one each time
+
+
+class LinkedPlane(ABC):
+    """Base of the planes whose ports are Linux devices.
+
+    Args:
+        ifnames: devices to open at once.
+        table: what to forward by; None hands every frame up.
+
+    Raises:
+        LocalError: as ``add_port``.
+    """
+
+    def __init__(self, ifnames: Sequence[str] = (), table: Table | None = None) -> None:
+        self._entries: Mapping[bytes, Hops] | None = None if table is None else table.entries
+        self._ports: dict[int, Port] = {}
+        self._mtus: dict[int, int] = {}  # of the ports that are up
+        self._devices: dict[int, int] = {}  # ifindex of an open device -> port index
+        self._counters = Counters()
+        self._polls = 0
+        self._next_index = 0
+        self._epoll = select.epoll()
+        self._ready: dict[int, Callable[[], None]] = {}
+        self._arrivals: list[Arrival] = []
+        self._on_link: list[LinkCallback] = []
+        self._links = LinkWatch()
+        self.watch(self._links, self._hear)
+        try:
+            for ifname in ifnames:
+                self.add_port(ifname)
+        except LocalError:
+            self.close()
+            raise
+
+    # what a plane adds
+
+    @abstractmethod
+    def _open(self, port: Port) -> None:
+        """Open the port's device and watch it.
+
+        Raises:
+            LocalError: it cannot be opened.
+        """
+
+    @abstractmethod
+    def _shut(self, index: int) -> None:
+        """Close whatever ``_open`` opened; nothing may be open."""
+
+    @abstractmethod
+    def _is_open(self, index: int) -> bool: ...
+
+    @abstractmethod
+    def _kernel_drops(self) -> int:
+        """Return the frames that the kernel dropped at open ports since last asked."""
+
+    @abstractmethod
+    def transmit(self, port: int, destination_mac: bytes, frames: Sequence[bytes]) -> int: ...
+
+    # the Plane protocol
+
+    @property
+    def ports(self) -> Mapping[int, Port]:
+        return self._ports
+
+    @property
+    def counters(self) -> Counters:
+        return self._counters
+
+    def poll(self, timeout_s: float | None) -> list[Arrival]:
+        events = self._epoll.poll(timeout_s)
+        self._polls += 1
+        if not events or not self._polls % _AUDIT_POLLS:
+            self._audit()
+        for fd, _ in events:
+            ready = self._ready.get(fd)
+            if ready is not None:  # an earlier one of this round may have closed it
+                ready()
+        arrivals, self._arrivals = self._arrivals, []
+        self._counters.handed_up += len(arrivals)
+        return arrivals
+
+    def watch(self, source: HasFileno, ready: Callable[[], None]) -> None:
+        fd = source.fileno()
+        self._epoll.register(fd, select.EPOLLIN)
+        self._ready[fd] = ready
+
+    def unwatch(self, source: HasFileno) -> None:
+        fd = source.fileno()
+        if self._ready.pop(fd, None) is not None:
+            self._epoll.unregister(fd)
+
+    def add_port(self, ifname: str) -> int:
+        if any(port.ifname == ifname for port in self._ports.values()):
+            raise LocalError(f"port {ifname}: given twice")
+        link = next((link for link in self._links.all() if link.ifname == ifname), None)
+        if link is None:
+            raise LocalError(f"port {ifname}: no such device")
+        if link.mtu < MTU_MIN_BYTES:
+            raise LocalError(f"port {ifname}: MTU {link.mtu} is below {MTU_MIN_BYTES}")
+        if len(link.mac) != MAC_BYTES:
+            raise LocalError(f"port {ifname}: not an Ethernet device")
+        port = Port(self._next_index, ifname, link.mac, min(link.mtu, _MTU_MAX_BYTES), link.up)
+        self._open(port)
+        self._next_index += 1
+        self._devices[link.ifindex] = port.index
+        self._know(port)
+        return port.index
+
+    def remove_port(self, index: int) -> None:
+        if self._ports.pop(index, None) is not None:
+            self._close_device(index)
+            self._mtus.pop(index, None)
+            self._devices = {ifindex: port for ifindex, port in self._devices.items() if port != index}
+
+    def port_state(self, index: int) -> bool:
+        return index in self._mtus
+
+    def on_link(self, callback: LinkCallback) -> None:
+        self._on_link.append(callback)
+
+    def close(self) -> None:
+        for index in list(self._ports):
+            self.remove_port(index)
+        self._links.close()
+        self._epoll.close()
+
+    # links
+
+    def _close_device(self, index: int) -> None:
+        """Close, not losing what the kernel counted."""
+        self._audit()
+        self._shut(index)
+
+    def _audit(self) -> None:
+        """Bring the kernel's own drops into the counters."""
+        self._counters.drops[DropReason.PORT_FULL] += self._kernel_drops()
+
+    def _know(self, port: Port) -> None:
+        """Remember a port as it now is, and tell if it went up or down."""
+        before = self._ports.get(port.index)
+        self._ports[port.index] = port
+        if port.up:
+            self._mtus[port.index] = port.mtu
+        else:
+            self._mtus.pop(port.index, None)
+        if before is not None and before.up != port.up:
+            for callback in self._on_link:
+                callback(port.index, port.up)
+
+    def _hear(self) -> None:
+        for link in self._links.news():
+            index = self._devices.get(link.ifindex)
+            if index is None:
+                index = next((port.index for port in self._ports.values() if port.ifname == link.ifname), None)
+                if index is None or index in self._devices.values() or link.gone:
+                    continue
+            self._follow(self._ports[index], link)
+
+    def _follow(self, port: Port, link: Link) -> None:
+        """Bring a port in step with its device."""
+        if link.gone:
+            self._close_device(port.index)
+            del self._devices[link.ifindex]
+        after = replace(port, up=False)
+        if not link.gone and link.mtu >= MTU_MIN_BYTES and len(link.mac) == MAC_BYTES:
+            self._devices[link.ifindex] = port.index
+            after = replace(port, mac=link.mac, mtu=min(link.mtu, _MTU_MAX_BYTES), up=link.up)
+            after = self._reopen_if_needed(port, after)
+        self._know(after)
+
+    def _reopen_if_needed(self, before: Port, after: Port) -> Port:
+        """Open a device that is new, or whose frames no longer fit what was made for the old MTU."""
+        if self._is_open(before.index) and before.mtu == after.mtu:
+            return after
+        self._close_device(before.index)
+        try:
+            self._open(after)
+        except LocalError:  # gone again, or not ready: its next news tries once more
+            return replace(after, up=False)
+        return after

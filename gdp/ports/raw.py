@@ -1,0 +1,157 @@
+"""The data plane on AF_PACKET sockets: batches in, a decision each, batches out.
+
+Place: I/O; no Scapy, and the struct codec's offsets only.
+Source: DESIGN section 7. What is ordinary is decided here, in one pass over the batch; whatever is not goes to
+``gdp.switch.forwarder.decide``, and fixtures hold the two together. Neighbouring frames of a batch that go the same way
+leave in one call, a *run*::
+
+    take  | A A A A B B A |      decide      runs: A A A A | B B | A      put, put, put
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Final
+
+from gdp.errors import DropReason
+from gdp.frame.codec import ETHER_BYTES, HEADER_BYTES, HOPS_AT, OVERHEAD_BYTES
+from gdp.frame.kinds import CONTROL_FROM, VERSION
+from gdp.names import NAME_BYTES
+from gdp.ports.batch import SLOTS, Batch, make_batch
+from gdp.ports.linked import LinkedPlane
+from gdp.ports.plane import MAC_BYTES, Arrival, Port
+from gdp.ports.sockets import kernel_drops, open_port
+from gdp.switch.forwarder import Drop, Forward, decide
+from gdp.switch.table import NOWHERE, Hops, Table
+
+__all__ = ["RawPlane"]
+
+# From the header on: version and kind as one number, hops left, payload length, destination and source as one key.
+_GLANCE: Final = struct.Struct("!HxBxxH24x64s")
+_FIRST: Final = VERSION << 8
+_FIRST_CONTROL: Final = _FIRST | CONTROL_FROM
+
+
+class RawPlane(LinkedPlane):
+    """``Plane`` over AF_PACKET.
+
+    Args:
+        ifnames: devices to open at once.
+        table: what to forward by; None hands every frame up.
+        bypass_qdisc: send past traffic control.
+
+    Raises:
+        LocalError: as ``add_port``.
+    """
+
+    def __init__(
+        self, ifnames: Sequence[str] = (), table: Table | None = None, *, bypass_qdisc: bool = False
+    ) -> None:
+        self._bypass_qdisc = bypass_qdisc
+        self._sockets: dict[int, socket.socket] = {}
+        self._batch: Batch = make_batch(OVERHEAD_BYTES)
+        super().__init__(ifnames, table)
+
+    def _open(self, port: Port) -> None:
+        opened = open_port(port.ifname, bypass_qdisc=self._bypass_qdisc)
+        if port.mtu + ETHER_BYTES > self._batch.slot_bytes:
+            self._batch = make_batch(port.mtu + ETHER_BYTES)
+        self._sockets[port.index] = opened
+        take = self._hand_up_all if self._entries is None else partial(self._forward_all, self._entries)
+        self.watch(opened, partial(take, port.index, opened))
+
+    def _shut(self, index: int) -> None:
+        opened = self._sockets.pop(index, None)
+        if opened is not None:
+            self.unwatch(opened)
+            opened.close()
+
+    def _is_open(self, index: int) -> bool:
+        return index in self._sockets
+
+    def _kernel_drops(self) -> int:
+        return sum(map(kernel_drops, self._sockets.values()))
+
+    def transmit(self, port: int, destination_mac: bytes, frames: Sequence[bytes]) -> int:
+        counters, facts, batch = self._counters, self._ports.get(port), self._batch
+        if facts is None or not facts.up:
+            counters.drops[DropReason.PORT_DOWN] += len(frames)
+            return 0
+        fitting = [frame for frame in frames if len(frame) <= facts.mtu]
+        counters.drops[DropReason.TOO_BIG] += len(frames) - len(fitting)
+        macs, sink, left = destination_mac + facts.mac, self._sockets[port], 0
+        for at in range(0, len(fitting), SLOTS):
+            chunk = fitting[at : at + SLOTS]
+            batch.fill(chunk)
+            left += batch.put(sink, 0, len(chunk), macs, counters.drops)
+        counters.frames_out += left
+        return left
+
+    def _hand_up_all(self, port: int, source: socket.socket) -> None:
+        sizes = self._batch.take(source)
+        self._counters.frames_in += len(sizes)
+        slots = range(0, len(self._batch.pool), self._batch.slot_bytes)
+        self._arrivals += [self._arrival(port, slot, size) for slot, size in zip(slots, sizes, strict=False)]
+
+    def _arrival(self, port: int, slot: int, size: int) -> Arrival:
+        with memoryview(self._batch.pool) as pool:
+            mac = bytes(pool[slot + MAC_BYTES : slot + 2 * MAC_BYTES])
+            return Arrival(port, mac, bytes(pool[slot + ETHER_BYTES : slot + ETHER_BYTES + size]))
+
+    def _forward_all(self, entries: Mapping[bytes, Hops], port: int, source: socket.socket) -> None:
+        """Take one batch from a port and forward it, handing up what is for the node."""
+        batch, get = self._batch, entries.get
+        pool, step, glance = batch.pool, batch.slot_bytes, _GLANCE.unpack_from
+        sizes = batch.take(source)
+        self._counters.frames_in += len(sizes)
+        run_key, run_hops, run_start, fits = b"", NOWHERE, 0, 0
+        for at, size in zip(range(ETHER_BYTES, len(pool), step), sizes, strict=False):
+            first, hops_left, length, key = glance(pool, at)
+            if key != run_key:
+                slot = at // step
+                self._send(run_hops, run_start, slot - run_start)
+                hops = get(key)
+                if hops is None:
+                    hops = get(key[:NAME_BYTES])
+                run_key, run_hops, run_start = key, hops or NOWHERE, slot
+                fits = self._narrowest(run_hops)
+            if HEADER_BYTES + length <= size <= fits and hops_left > 1 and _FIRST <= first < _FIRST_CONTROL:
+                pool[at + HOPS_AT] = hops_left - 1
+            else:
+                slot = at // step
+                self._send(run_hops, run_start, slot - run_start)
+                run_start = slot + 1
+                self._consider(entries, port, slot, size)
+        self._send(run_hops, run_start, len(sizes) - run_start)
+
+    def _narrowest(self, hops: Hops) -> int:
+        """Return the size that every hop's link takes; 0 where one is down or there is none."""
+        return min((self._mtus.get(port, 0) for port, _ in hops), default=0)
+
+    def _consider(self, entries: Mapping[bytes, Hops], port: int, slot: int, size: int) -> None:
+        """Decide on the one frame in a slot by the reference, and do what it says."""
+        batch, drops = self._batch, self._counters.drops
+        at = slot * batch.slot_bytes
+        verdict = decide(batch.pool[at : at + ETHER_BYTES + size], entries, self._mtus)
+        if isinstance(verdict, Drop):
+            drops[verdict.reason] += 1
+        elif isinstance(verdict, Forward):
+            for reason in verdict.lost:
+                drops[reason] += 1
+            batch.pool[at + ETHER_BYTES + HOPS_AT] -= 1
+            self._send(verdict.hops, slot, 1)
+        else:
+            self._arrivals.append(self._arrival(port, at, size))
+
+    def _send(self, hops: Hops, first: int, count: int) -> None:
+        """Send a run of slots to every hop."""
+        if not count:
+            return
+        counters = self._counters
+        for port, macs in hops:
+            left = self._batch.put(self._sockets[port], first, count, macs, counters.drops)
+            counters.forwarded += left
+            counters.frames_out += left

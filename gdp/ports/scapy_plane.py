@@ -1,0 +1,143 @@
+"""The data plane by Scapy: sniff, dissect, decide, build, send. The reference, for learning and for tests.
+
+Place: I/O; the only plane that imports Scapy, and imported only when chosen.
+Source: DESIGN section 7. It decides by the very ``decide`` that the others are tested against, and leaves the bytes of
+a frame alone but for addresses and hops left, because Scapy builds anew only what was changed.
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+from collections.abc import Sequence
+from functools import partial
+from typing import Final
+
+from scapy.arch.linux import L2Socket
+from scapy.error import Scapy_Exception
+from scapy.layers.l2 import Ether
+from scapy.packet import Packet
+from scapy.sendrecv import sendp, sniff
+from scapy.utils import str2mac
+
+from gdp.errors import DropReason, LocalError
+from gdp.frame.codec import ETHER_BYTES
+from gdp.frame.kinds import ETHERTYPE
+from gdp.frame.layers import GDP
+from gdp.ports.batch import send_failure
+from gdp.ports.linked import LinkedPlane
+from gdp.ports.plane import MAC_BYTES, Arrival, Port
+from gdp.ports.sockets import NO_RAW_SOCKETS, kernel_drops, large_buffers, only_ours
+from gdp.switch.forwarder import Drop, Forward, decide
+from gdp.switch.table import Table
+
+__all__ = ["ScapyPlane"]
+
+_BURST: Final = 64  # frames of one port before the others have their turn
+
+
+class ScapyPlane(LinkedPlane):
+    """``Plane`` over one Scapy socket a port.
+
+    Args:
+        ifnames: devices to open at once.
+        table: what to forward by; None hands every frame up.
+
+    Raises:
+        LocalError: as ``add_port``.
+    """
+
+    def __init__(self, ifnames: Sequence[str] = (), table: Table | None = None) -> None:
+        self._sockets: dict[int, tuple[L2Socket, int]] = {}  # and its file descriptor, known even after it closed
+        super().__init__(ifnames, table)
+
+    def _open(self, port: Port) -> None:
+        try:
+            opened = L2Socket(iface=port.ifname, type=ETHERTYPE, promisc=False)
+        except PermissionError as error:
+            raise LocalError(NO_RAW_SOCKETS) from error
+        except (OSError, Scapy_Exception) as error:
+            raise LocalError(f"port {port.ifname}: {error}") from error
+        only_ours(opened.ins)
+        large_buffers(opened.ins)
+        self._sockets[port.index] = opened, opened.fileno()
+        self.watch(opened, partial(self._sniff, port.index))
+
+    def _shut(self, index: int) -> None:
+        opened, fd = self._sockets.pop(index, (None, -1))
+        if opened is None:
+            return
+        if opened.closed:  # by Scapy, after an error; the kernel has forgotten the descriptor
+            self._ready.pop(fd, None)
+        else:
+            self.unwatch(opened)
+            opened.close()
+
+    def _is_open(self, index: int) -> bool:
+        return index in self._sockets
+
+    def _kernel_drops(self) -> int:
+        return sum(kernel_drops(opened.ins) for opened, _ in self._sockets.values() if not opened.closed)
+
+    def transmit(self, port: int, destination_mac: bytes, frames: Sequence[bytes]) -> int:
+        drops, facts, left = self._counters.drops, self._ports.get(port), 0
+        if facts is None or not facts.up:
+            drops[DropReason.PORT_DOWN] += len(frames)
+            return 0
+        for frame in frames:
+            if len(frame) > facts.mtu:
+                drops[DropReason.TOO_BIG] += 1
+            else:
+                ether = Ether(dst=str2mac(destination_mac), src=str2mac(facts.mac), type=ETHERTYPE)
+                left += self._send(port, ether / GDP(frame))
+        return left
+
+    def _sniff(self, index: int) -> None:
+        """Read a burst from one port that is ready; return when it is empty."""
+        opened, _ = self._sockets[index]
+        if opened.ins.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
+            return  # the device went down: asking has cleared it, and the link watch tells
+        sniff(
+            opened_socket=opened,
+            prn=partial(self._consider, index),
+            store=False,
+            count=_BURST,
+            stop_filter=lambda _: not select.select([opened], [], [], 0)[0],
+            chainCC=True,
+        )
+        if opened.closed:  # an error all the same
+            self._shut(index)
+            self._know(self._reopen_if_needed(self._ports[index], self._ports[index]))
+
+    def _consider(self, index: int, packet: Packet) -> None:
+        """Decide on one frame, and do what the verdict says."""
+        counters, frame = self._counters, bytes(packet)
+        counters.frames_in += 1
+        if self._entries is None:
+            self._hand_up(index, frame)
+            return
+        verdict = decide(frame, self._entries, self._mtus)
+        if isinstance(verdict, Drop):
+            counters.drops[verdict.reason] += 1
+        elif isinstance(verdict, Forward):
+            for reason in verdict.lost:
+                counters.drops[reason] += 1
+            packet[GDP].hops_left -= 1
+            for port, macs in verdict.hops:
+                packet[Ether].dst, packet[Ether].src = str2mac(macs[:MAC_BYTES]), str2mac(macs[MAC_BYTES:])
+                counters.forwarded += self._send(port, packet)
+        else:
+            self._hand_up(index, frame)
+
+    def _hand_up(self, index: int, frame: bytes) -> None:
+        self._arrivals.append(Arrival(index, frame[MAC_BYTES : 2 * MAC_BYTES], frame[ETHER_BYTES:]))
+
+    def _send(self, port: int, packet: Packet) -> int:
+        """Send one packet; return 1, or 0 when it is lost and counted."""
+        try:
+            sendp(packet, socket=self._sockets[port][0], verbose=False)
+        except OSError as error:
+            self._counters.drops[send_failure(error.errno or 0)[0]] += 1
+            return 0
+        self._counters.frames_out += 1
+        return 1

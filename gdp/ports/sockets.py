@@ -1,0 +1,108 @@
+"""AF_PACKET sockets that see our frames and nothing else.
+
+Place: I/O; opens and asks sockets, keeps nothing.
+Source: packet(7), socket(7), ``linux/filter.h`` (classic BPF, which needs no privilege beyond the raw socket itself).
+
+What a port lets in is settled in the kernel, by four loads and compares, so that no frame that is someone else's costs
+Python anything: frames to the port's own address, and broadcast frames whose kind is for the neighbour itself. A frame
+to another station (``PACKET_OTHERHOST``, seen on a shared or promiscuous link), a multicast, an echo of our own
+sending, and a data frame that was broadcast (which every switch on a shared link would forward once more) are none of
+our business: neither forwarded nor counted.
+"""
+
+from __future__ import annotations
+
+import errno
+import socket
+import struct
+from array import array
+from typing import Final
+
+from gdp.errors import LocalError
+from gdp.frame.codec import ETHER_BYTES, KIND_AT
+from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE
+
+__all__ = ["NO_RAW_SOCKETS", "kernel_drops", "large_buffers", "only_ours", "open_port"]
+
+NO_RAW_SOCKETS: Final = "raw sockets need root or CAP_NET_RAW (or a user namespace with its own network)"
+
+_SOL_PACKET: Final = 263
+_PACKET_STATISTICS: Final = 6
+_PACKET_QDISC_BYPASS: Final = 20
+_PACKET_IGNORE_OUTGOING: Final = 23  # Linux 4.20; older kernels rely on the filter
+_SO_ATTACH_FILTER: Final = 26
+_SO_SNDBUFFORCE: Final = 32
+_SO_RCVBUFFORCE: Final = 33
+_BUFFER_BYTES: Final = 16 << 20  # a 921,600-byte message is 1.6 MB of socket memory at MTU 1500
+
+_LOAD_BYTE: Final = 0x30  # BPF_LD | BPF_B | BPF_ABS
+_JUMP_EQUAL: Final = 0x15  # BPF_JMP | BPF_JEQ | BPF_K
+_JUMP_GREATER_EQUAL: Final = 0x35  # BPF_JMP | BPF_JGE | BPF_K
+_RETURN: Final = 0x06  # BPF_RET | BPF_K
+_PACKET_TYPE: Final = 0xFFFFF004  # SKF_AD_OFF + SKF_AD_PKTTYPE
+_WHOLE: Final = 0xFFFFFFFF
+_OURS: Final = (
+    # code, jump if true, jump if false, value
+    (_LOAD_BYTE, 0, 0, _PACKET_TYPE),
+    (_JUMP_EQUAL, 3, 0, socket.PACKET_HOST),
+    (_JUMP_EQUAL, 0, 3, socket.PACKET_BROADCAST),
+    (_LOAD_BYTE, 0, 0, ETHER_BYTES + KIND_AT),
+    (_JUMP_GREATER_EQUAL, 0, 1, CONTROL_FROM),
+    (_RETURN, 0, 0, _WHOLE),
+    (_RETURN, 0, 0, 0),
+)
+
+
+def open_port(ifname: str, *, bypass_qdisc: bool = False) -> socket.socket:
+    """Open a non-blocking socket for our EtherType on one device.
+
+    Args:
+        bypass_qdisc: hand frames to the driver past traffic control; quicker, but shaping (tc) is skipped too.
+
+    Raises:
+        LocalError: raw sockets are not allowed here, or no such device.
+    """
+    try:
+        opened = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)  # protocol 0: hears nothing before it is bound
+    except PermissionError as error:
+        raise LocalError(NO_RAW_SOCKETS) from error
+    try:
+        only_ours(opened)
+        if bypass_qdisc:
+            opened.setsockopt(_SOL_PACKET, _PACKET_QDISC_BYPASS, 1)
+        large_buffers(opened)
+        opened.setblocking(False)
+        opened.bind((ifname, ETHERTYPE))
+    except OSError as error:
+        opened.close()
+        raise LocalError(f"port {ifname}: {error.strerror}") from error
+    return opened
+
+
+def only_ours(opened: socket.socket) -> None:
+    """Let in what the head of this module says.
+
+    Raises:
+        OSError: not a packet socket.
+    """
+    program = array("B", b"".join(struct.pack("=HBBI", *step) for step in _OURS))
+    opened.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", len(_OURS), program.buffer_info()[0]))
+    try:
+        opened.setsockopt(_SOL_PACKET, _PACKET_IGNORE_OUTGOING, 1)
+    except OSError as error:
+        if error.errno != errno.ENOPROTOOPT:
+            raise
+
+
+def kernel_drops(opened: socket.socket) -> int:
+    """Return how many frames the kernel dropped at this socket, its buffer being full, since last asked."""
+    return int(struct.unpack("=II", opened.getsockopt(_SOL_PACKET, _PACKET_STATISTICS, 8))[1])
+
+
+def large_buffers(opened: socket.socket) -> None:
+    """Ask for large buffers both ways: past the system's limit where that is allowed, else up to it."""
+    for forced, plain in (_SO_RCVBUFFORCE, socket.SO_RCVBUF), (_SO_SNDBUFFORCE, socket.SO_SNDBUF):
+        try:
+            opened.setsockopt(socket.SOL_SOCKET, forced, _BUFFER_BYTES)
+        except PermissionError:
+            opened.setsockopt(socket.SOL_SOCKET, plain, _BUFFER_BYTES)

@@ -1,0 +1,162 @@
+"""A node's numbers as Prometheus text, on the loopback address only.
+
+Place: I/O. Nodes count in plain attributes; this asks for them when somebody scrapes, so that a metric costs the hot
+path nothing. A node says which of its numbers there are; the names are the same for all.
+Source: Prometheus text exposition format, version 0.0.4.
+"""
+
+from __future__ import annotations
+
+import threading
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import Final
+from wsgiref.simple_server import WSGIServer
+
+from prometheus_client import CollectorRegistry, generate_latest, start_http_server
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from gdp.errors import DropReason, LocalError
+
+__all__ = ["LATENCY_BOUNDS_S", "Histogram", "Metrics", "Sources"]
+
+LATENCY_BOUNDS_S: Final = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+_LOOPBACK: Final = "127.0.0.1"
+
+
+class Histogram:
+    """How often which duration came.
+
+    Attributes:
+        bounds_s: upper ends of the buckets, ascending, each included.
+        counts: one a bucket, and one for what lies above them all.
+        total_s: sum of all durations.
+    """
+
+    __slots__ = ("bounds_s", "counts", "total_s")
+
+    def __init__(self, bounds_s: Sequence[float] = LATENCY_BOUNDS_S) -> None:
+        self.bounds_s = tuple(bounds_s)
+        self.counts = [0] * (len(self.bounds_s) + 1)
+        self.total_s = 0.0
+
+    def observe(self, duration_s: float) -> None:
+        self.counts[bisect_left(self.bounds_s, duration_s)] += 1
+        self.total_s += duration_s
+
+
+Counts = Callable[[], Mapping[str, int]]  # label value to count
+Gauge = Callable[[], float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sources:
+    """Whom to ask, on each scrape and from another thread, for what a node counts; None: it has no such number.
+
+    Attributes:
+        frames: by direction: in, out, forwarded, handed-up.
+        drops: lists of counts by ``DropReason``, added up.
+        table_entries: entries of the forwarding table.
+        parked_frames: frames that wait for an answer.
+        rib_answers: a RIB's answers by what they said.
+        rib_refusals: a RIB's refusals by reason.
+        messages: whole messages by direction.
+        message_bytes: their bytes by direction, before sealing.
+        repairs: lost parts by what happened to them: asked, sent, given-up.
+        latency: one-way, from the source's stamp to delivery.
+    """
+
+    frames: Counts | None = None
+    drops: Sequence[Callable[[], Sequence[int]]] = ()
+    table_entries: Gauge | None = None
+    parked_frames: Gauge | None = None
+    rib_answers: Counts | None = None
+    rib_refusals: Counts | None = None
+    messages: Counts | None = None
+    message_bytes: Counts | None = None
+    repairs: Counts | None = None
+    latency: Callable[[], Histogram] | None = None
+
+
+class Metrics(Collector):
+    """One node's metrics, in a registry of their own."""
+
+    def __init__(self, sources: Sources) -> None:
+        self._sources = sources
+        self._registry = CollectorRegistry(auto_describe=False)
+        self._registry.register(self)
+        self._server: tuple[WSGIServer, threading.Thread] | None = None
+
+    def describe(self) -> list[Metric]:
+        """Return nothing, so that registering asks no source."""
+        return []
+
+    def collect(self) -> Iterator[Metric]:
+        """Ask every source."""
+        of = self._sources
+        yield from _counter("gdp_frames", "Frames by direction", "direction", of.frames)
+        if of.drops:
+            yield from _counter("gdp_drops", "What went no further, by reason", "reason", self._drops)
+        yield from _gauge("gdp_table_entries", "Entries of the forwarding table", of.table_entries)
+        yield from _gauge("gdp_parked_frames", "Frames waiting for an answer", of.parked_frames)
+        yield from _counter("gdp_rib_answers", "Answers by what they said", "answer", of.rib_answers)
+        yield from _counter("gdp_rib_refusals", "Refusals by reason", "reason", of.rib_refusals)
+        yield from _counter("gdp_messages", "Whole messages by direction", "direction", of.messages)
+        yield from _counter("gdp_message_bytes", "Their bytes before sealing", "direction", of.message_bytes)
+        yield from _counter("gdp_repairs", "Lost parts by what happened to them", "step", of.repairs)
+        if of.latency is not None:
+            yield _histogram("gdp_latency_seconds", "One-way latency of messages", of.latency())
+
+    def _drops(self) -> Mapping[str, int]:
+        lists = [source() for source in self._sources.drops]
+        return {reason.label: sum(counts[reason] for counts in lists) for reason in DropReason}
+
+    def text(self) -> str:
+        """Return what a scrape would get."""
+        return generate_latest(self._registry).decode()
+
+    def serve(self, port: int) -> int:
+        """Answer scrapes on 127.0.0.1, in a thread; return the port (chosen by the system for 0).
+
+        Raises:
+            LocalError: it is served already, or the port is taken.
+        """
+        if self._server is not None:
+            raise LocalError("metrics are served already")
+        try:
+            self._server = start_http_server(port, _LOOPBACK, self._registry)
+        except OSError as error:
+            raise LocalError(f"metrics port {port}: {error.strerror}") from error
+        return int(self._server[0].server_port)
+
+    def close(self) -> None:
+        """Stop answering, and return when the port is free again."""
+        if self._server is None:
+            return
+        server, thread = self._server
+        self._server = None
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+def _counter(name: str, text: str, label: str, source: Counts | None) -> Iterator[Metric]:
+    if source is not None:
+        family = CounterMetricFamily(name, text, labels=[label])
+        for value, count in list(source().items()):  # at once: the node goes on counting
+            family.add_metric([value], count)
+        yield family
+
+
+def _gauge(name: str, text: str, source: Gauge | None) -> Iterator[Metric]:
+    if source is not None:
+        yield GaugeMetricFamily(name, text, value=source())
+
+
+def _histogram(name: str, text: str, seen: Histogram) -> Metric:
+    ends = [*map(repr, seen.bounds_s), "+Inf"]
+    buckets = list(zip(ends, accumulate(seen.counts), strict=True))
+    return HistogramMetricFamily(name, text, buckets=buckets, sum_value=seen.total_s)

@@ -1,0 +1,133 @@
+"""A topology made real: one network namespace a switch, one veth pair a link, processes started inside.
+
+Place: shell; needs root of the machine or of a user namespace.
+Devices carry no addresses and speak no IPv6: what travels on them is ours alone. On every end the device is called like
+the neighbour it leads to, and its MAC says both (``02:67:64:70:AA:BB``, the AA-th switch towards the BB-th).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from pyroute2 import IPRoute
+
+from gdp.errors import LocalError
+from gdp.testbed import netns_files
+from gdp.testbed.runs import Run, in_first_user_namespace
+from gdp.testbed.topology import Link, Topology
+
+__all__ = ["Namespaces"]
+
+_MAC_PREFIX: Final = "02:67:64:70"  # locally administered; "gdp" in ASCII
+_LOOPBACK: Final = 1  # the index of lo in every namespace
+_INDEX_FROM: Final = 100
+_NO_IPV6: Final = ("all", "default")
+_IPV6_SETTINGS: Final = Path("/proc/sys/net/ipv6/conf")
+
+
+class Namespaces:
+    """The namespaces of one run. ``run.end()`` removes exactly these, and with them every device inside.
+
+    Raises:
+        LocalError: the kernel refuses; what was made until then is in the run's record.
+    """
+
+    def __init__(self, topology: Topology, run: Run) -> None:
+        self.topology = topology
+        if in_first_user_namespace():
+            self._paths = {node: netns_files.IP_NETNS_DIRECTORY / f"gdp-{run.id}-{node}" for node in topology.nodes}
+        else:
+            self._paths = {node: run.directory / "netns" / f"gdp-{run.id}-{node}" for node in topology.nodes}
+        for path in self._paths.values():
+            run.plan_namespace(path)
+            netns_files.create(path)
+            netns_files.inside(path, _silence)
+        self._join()
+        for node in topology.nodes:
+            self._inside(node, partial(_raise, [link.other(node) for link in topology.links_of(node)]))
+
+    def path(self, node: str) -> Path:
+        """Return the file that holds the namespace of a switch."""
+        return self._paths[node]
+
+    def command(self, node: str, argv: Sequence[str], *, dies_with_us: bool = True) -> list[str]:
+        """Return the command line that runs ``argv`` in the namespace of a switch, under the same process id.
+
+        Args:
+            node: the switch.
+            argv: program and arguments.
+            dies_with_us: the kernel kills it when the thread that starts it ends, however that comes about.
+        """
+        leash = ["setpriv", "--pdeathsig", "KILL", "--"] if dies_with_us else []
+        return ["nsenter", f"--net={self._paths[node]}", "--", *leash, *argv]
+
+    def cut(self, a: str, b: str) -> None:
+        """Take the link between two switches down; both ends lose their carrier at once."""
+        self._set_link(a, b, "down")
+
+    def mend(self, a: str, b: str) -> None:
+        """Bring a cut link back."""
+        self._set_link(a, b, "up")
+
+    def _set_link(self, a: str, b: str, state: str) -> None:
+        link = self.topology.link(a, b)
+        self._inside(link.a, partial(_set_state, link.b, state))
+
+    def _join(self) -> None:
+        number = {node: index for index, node in enumerate(self.topology.nodes, 1)}
+        files = {node: os.open(path, os.O_RDONLY | os.O_CLOEXEC) for node, path in self._paths.items()}
+        try:
+            # Any namespace will do to ask from; in one of ours, no name of the machine's can clash.
+            self._inside(self.topology.nodes[0], partial(_add, self.topology.links, number, files))
+        finally:
+            for descriptor in files.values():
+                os.close(descriptor)
+
+    def _inside(self, node: str, work: Callable[[IPRoute], object]) -> None:
+        def ask() -> None:
+            with IPRoute() as ipr:
+                work(ipr)
+
+        try:
+            netns_files.inside(self._paths[node], ask)
+        except Exception as error:  # pyroute2 raises NetlinkError, which is no OSError
+            raise LocalError(f"namespace of {node}: {error}") from error
+
+
+def _silence() -> None:
+    """Switch IPv6 off before the first device comes, so that not even a neighbour solicitation leaves it."""
+    for scope in _NO_IPV6:
+        setting = _IPV6_SETTINGS / scope / "disable_ipv6"
+        if setting.exists() and os.access(setting, os.W_OK):  # containers may have it read-only
+            setting.write_text("1", encoding="ascii")
+
+
+def _add(links: Sequence[Link], number: dict[str, int], files: dict[str, int], ipr: IPRoute) -> None:
+    """Make the veth pairs. Two ends must not share an index, or Linux may tell of a lost carrier a whole second late.
+
+    Source of that: Linux, net/core/link_watch.c, ``linkwatch_urgent_event``. The far end's index is the kernel's
+    choice, and it counts from 2.
+    """
+    for index, link in enumerate(links, _INDEX_FROM):
+        a, b = number[link.a], number[link.b]
+        own = {"ifname": link.b, "mtu": link.mtu, "address": _mac(a, b), "net_ns_fd": files[link.a]}
+        peer = {"ifname": link.a, "mtu": link.mtu, "address": _mac(b, a), "net_ns_fd": files[link.b]}
+        ipr.link("add", kind="veth", index=index, peer=peer, **own)
+
+
+def _mac(own: int, other: int) -> str:
+    return f"{_MAC_PREFIX}:{own:02x}:{other:02x}"
+
+
+def _raise(devices: Sequence[str], ipr: IPRoute) -> None:
+    ipr.link("set", index=_LOOPBACK, state="up")
+    for device in devices:
+        _set_state(device, "up", ipr)
+
+
+def _set_state(device: str, state: str, ipr: IPRoute) -> None:
+    ipr.link("set", index=ipr.link_lookup(ifname=device)[0], state=state)

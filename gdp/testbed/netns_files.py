@@ -1,0 +1,89 @@
+"""Network namespaces held by files: made, entered and released.
+
+Place: shell; needs CAP_SYS_ADMIN in the user namespace it runs in.
+Source: network_namespaces(7), setns(2). A namespace is bound to a file, as ip-netns(8) does it; for root of the machine
+the file lies in ``/run/netns``, so that ``ip netns`` finds it; inside a user namespace that folder may be missing or
+closed, so it lies in the run's own directory and ``nsenter --net=FILE`` enters it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, TypeVar
+
+from pyroute2 import netns
+
+from gdp.errors import LocalError
+
+__all__ = ["IP_NETNS_DIRECTORY", "create", "inside", "release"]
+
+IP_NETNS_DIRECTORY: Final = Path("/run/netns")
+_MNT_DETACH: Final = 2
+
+T = TypeVar("T")
+
+
+def create(path: Path) -> None:
+    """Make a network namespace and bind it to the new file ``path``.
+
+    Raises:
+        LocalError: the kernel refuses.
+    """
+    try:
+        netns.create(str(path))
+    except OSError as error:
+        raise LocalError(f"network namespace {path.name} cannot be made: {error}") from error
+
+
+def inside(path: Path, work: Callable[[], T]) -> T:
+    """Do ``work`` in a thread that has entered the namespace, and return its result; the caller stays where it is.
+
+    Raises:
+        OSError: no such namespace, or what ``work`` raises.
+    """
+    results: list[T] = []
+    failures: list[BaseException] = []
+
+    def visit() -> None:
+        try:
+            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            try:
+                netns.setns(descriptor)
+            finally:
+                os.close(descriptor)
+            results.append(work())
+        except BaseException as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=visit, name=f"inside {path.name}")
+    thread.start()
+    thread.join()
+    if failures:
+        raise failures[0]
+    return results[0]
+
+
+def release(path: Path) -> None:
+    """Unbind the namespace and delete its file; the kernel frees it with its last process. Fine if it is gone already.
+
+    Raises:
+        LocalError: the kernel refuses.
+    """
+    _unmount(path)
+    if path.parent != IP_NETNS_DIRECTORY:
+        _unmount(path.parent)  # which ``create`` has bound onto itself, as ip-netns(8) does with its own folder
+    path.unlink(missing_ok=True)
+
+
+def _unmount(path: Path) -> None:
+    """Unmount what lies on ``path``; fine if nothing does, since mounts go with their mount namespace."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.umount2(os.fsencode(path), _MNT_DETACH) != 0:
+        reason = ctypes.get_errno()
+        if reason not in (errno.EINVAL, errno.ENOENT):
+            raise LocalError(f"{path} cannot be unmounted: {os.strerror(reason)}")

@@ -1,0 +1,90 @@
+"""Processes known by id and start time, so that an id which the kernel gave to somebody else is never signalled.
+
+Place: shell. Source: proc(5), field 22 of ``/proc/PID/stat``; pidfd_open(2).
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import time
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["Process", "boot_id", "end_all"]
+
+
+@dataclass(frozen=True, slots=True)
+class Process:
+    """One process, leader of a group of its own: id, and start in clock ticks since boot."""
+
+    pid: int
+    started: int
+
+    @classmethod
+    def of(cls, pid: int) -> Process:
+        """Return the running process ``pid``.
+
+        Raises:
+            ProcessLookupError: there is none.
+        """
+        started = _started(pid)
+        if started is None:
+            raise ProcessLookupError(pid)
+        return cls(pid, started)
+
+    @property
+    def alive(self) -> bool:
+        """Tell whether this very process still runs (a zombie does not)."""
+        return _started(self.pid) == self.started
+
+
+def boot_id() -> str:
+    """Return what changes with every boot of this machine, after which no process id means anything."""
+    return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+
+
+def _started(pid: int) -> int | None:
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except (FileNotFoundError, ProcessLookupError):
+        return None
+    fields = stat.rpartition(")")[2].split()  # the name before it may hold blanks and parentheses
+    return None if fields[0] in ("Z", "X") else int(fields[19])
+
+
+def end_all(processes: Iterable[Process], patience_s: float = 3.0) -> None:
+    """End the groups of these processes: SIGTERM, and after ``patience_s`` SIGKILL. Those gone already are fine."""
+    waiting: dict[int, Process] = {}
+    try:
+        for process in processes:
+            with suppress(ProcessLookupError):
+                descriptor = os.pidfd_open(process.pid)
+                waiting[descriptor] = process
+                if process.alive:
+                    os.killpg(process.pid, signal.SIGTERM)
+        for process in _still_running(waiting, patience_s):
+            with suppress(ProcessLookupError):
+                if process.alive:
+                    os.killpg(process.pid, signal.SIGKILL)
+        _still_running(waiting, patience_s)
+    finally:
+        for descriptor in waiting:
+            os.close(descriptor)
+
+
+def _still_running(waiting: dict[int, Process], patience_s: float) -> list[Process]:
+    """Wait for the process descriptors to become readable, which they do at the end of their process."""
+    poller = select.poll()
+    left = {descriptor: process for descriptor, process in waiting.items() if process.alive}
+    for descriptor in left:
+        poller.register(descriptor, select.POLLIN)
+    deadline_s = time.monotonic() + patience_s
+    while left and (rest_s := deadline_s - time.monotonic()) > 0:
+        for descriptor, _ in poller.poll(rest_s * 1_000):
+            poller.unregister(descriptor)
+            del left[descriptor]
+    return list(left.values())

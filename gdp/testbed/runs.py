@@ -1,0 +1,197 @@
+"""A run and the record of what it made, so that a later start can take down what a killed one left behind.
+
+Place: shell. A record is written *before* the thing it names is made, and replaced atomically, so it may name what was
+never made but never misses what was. It lives in ``/run/gdp``, or without root in ``$XDG_RUNTIME_DIR/gdp``.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import secrets
+import shutil
+import tempfile
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Final
+
+from gdp.errors import LocalError
+from gdp.testbed.processes import Process, boot_id, end_all
+
+__all__ = ["Record", "Run", "Runs", "in_first_user_namespace", "outer_uid"]
+
+log = logging.getLogger(__name__)
+
+_ID_BYTES: Final = 3
+_ALL_IDS: Final = 4_294_967_295  # length of the first user namespace's map; user_namespaces(7)
+
+
+def in_first_user_namespace() -> bool:
+    """Tell whether root here is root of the machine, not of a user namespace."""
+    return int(_uid_map()[2]) == _ALL_IDS
+
+
+def outer_uid() -> int:
+    """Return the user id that the machine knows us by, also inside a user namespace."""
+    inside, outside, _ = map(int, _uid_map()[:3])
+    return os.getuid() - inside + outside
+
+
+def _uid_map() -> list[str]:
+    return Path("/proc/self/uid_map").read_text(encoding="ascii").split()
+
+
+@dataclass(slots=True)
+class Record:
+    """What one run made. ``owner`` is the process that answers for it; a kept run stands without one."""
+
+    run: str
+    boot: str
+    owner: Process
+    kept: bool = False
+    processes: list[Process] = field(default_factory=list)
+    namespaces: list[str] = field(default_factory=list)  # paths of files that hold a network namespace
+    files: list[str] = field(default_factory=list)  # files and directories to delete
+
+    @classmethod
+    def from_text(cls, text: str) -> Record:
+        """Read what ``to_text`` wrote.
+
+        Raises:
+            ValueError: it is something else.
+        """
+        try:
+            items = json.loads(text)
+            items["owner"] = Process(**items["owner"])
+            items["processes"] = [Process(**process) for process in items["processes"]]
+            return cls(**items)
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"not the record of a run: {error}") from error
+
+    def to_text(self) -> str:
+        """Return the record as JSON."""
+        return json.dumps(asdict(self), indent=1)
+
+    @property
+    def dead(self) -> bool:
+        """Tell whether nobody answers for the run any more."""
+        if self.boot != boot_id():
+            return True
+        return not any(process.alive for process in (self.processes if self.kept else [self.owner]))
+
+
+class Run:
+    """A run under way: a scratch directory of its own, and a record that grows with what it makes."""
+
+    def __init__(self, record: Record, path: Path, directory: Path) -> None:
+        self._record = record
+        self._path = path
+        self.directory = directory
+        self._save()
+        directory.mkdir(mode=0o700)
+
+    @property
+    def id(self) -> str:
+        """Return the id of the run, six hex digits."""
+        return self._record.run
+
+    def plan_namespace(self, path: Path) -> None:
+        """Note a namespace that is about to be made."""
+        self._record.namespaces.append(str(path))
+        self._save()
+
+    def note_process(self, pid: int) -> None:
+        """Note a process that was just started as the leader of its group; one that has ended already is left out."""
+        with suppress(ProcessLookupError):
+            self._record.processes.append(Process.of(pid))
+            self._save()
+
+    def keep(self) -> None:
+        """Let everything stand after this process ends, until ``Runs.take_down``."""
+        self._record.kept = True
+        self._save()
+
+    def end(self) -> None:
+        """Take down everything that the record names, and the record."""
+        _take_down(self._record, self._path)
+
+    def _save(self) -> None:
+        fresh = self._path.with_suffix(".new")
+        descriptor = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+            file.write(self._record.to_text())
+        fresh.replace(self._path)
+
+
+class Runs:
+    """The directory of records of one user.
+
+    Args:
+        directory: where records lie; by default the place for run-time files of this user.
+
+    Raises:
+        LocalError: the directory belongs to somebody else, or others may write to it.
+    """
+
+    def __init__(self, directory: Path | None = None) -> None:
+        self._directory = directory or _default_directory()
+        self._directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        status = self._directory.stat()
+        if status.st_uid != os.getuid() or status.st_mode & 0o022:
+            raise LocalError(f"{self._directory} must belong to this user alone, for it names what will be deleted")
+
+    def start(self) -> Run:
+        """Begin a run with a new id and an empty scratch directory (in the directory for temporary files)."""
+        run = secrets.token_hex(_ID_BYTES)
+        directory = Path(tempfile.gettempdir()) / f"gdp-{run}"
+        record = Record(run, boot_id(), Process.of(os.getpid()), files=[str(directory)])
+        return Run(record, self._directory / f"{run}.json", directory)
+
+    def sweep(self) -> list[str]:
+        """Take down every run that nobody answers for; return their ids."""
+        return [record.run for record, path in self._records() if record.dead and _take_down(record, path)]
+
+    def take_down(self) -> list[str]:
+        """Take down every run that was kept, and every dead one; return their ids. Runs under way are left alone."""
+        return [r.run for r, path in self._records() if (r.kept or r.dead) and _take_down(r, path)]
+
+    def _records(self) -> list[tuple[Record, Path]]:
+        found = []
+        for path in sorted(self._directory.glob("*.json")):
+            try:
+                found.append((Record.from_text(path.read_text(encoding="utf-8")), path))
+            except FileNotFoundError:
+                continue  # another start was quicker
+            except ValueError as error:
+                log.warning("record left alone path=%s reason=%s", path, error)
+        return found
+
+
+def _default_directory() -> Path:
+    if in_first_user_namespace() and os.getuid() == 0:
+        return Path("/run/gdp")
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    if runtime and os.access(runtime, os.W_OK):
+        return Path(runtime) / "gdp"
+    return Path(tempfile.gettempdir()) / f"gdp-runs-{outer_uid()}"
+
+
+def _take_down(record: Record, path: Path) -> bool:
+    """Undo what the record names; what is gone already is fine."""
+    from gdp.testbed.netns_files import release  # pyroute2 takes 0.2 s to load, and most records need none of it
+
+    if record.boot == boot_id():
+        end_all(record.processes)
+        for namespace in record.namespaces:
+            release(Path(namespace))
+    for name in record.files:
+        target = Path(name)
+        if target.is_dir() and not target.is_symlink():
+            with suppress(FileNotFoundError):  # somebody else sweeps as well
+                shutil.rmtree(target)
+        else:
+            target.unlink(missing_ok=True)
+    path.unlink(missing_ok=True)
+    return True

@@ -1,0 +1,54 @@
+"""A network namespace without a name: this thread's alone, gone with its last socket, whatever ends the test."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import subprocess
+from pathlib import Path
+
+_CLONE_NEWNET = 0x40000000
+_LIBRARY = ctypes.CDLL(None, use_errno=True)
+
+
+def _call(result: int) -> None:
+    if result:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+
+
+class Space:
+    """Entering moves the thread (and the processes it starts) into a new namespace; leaving moves it back.
+
+    Raises:
+        OSError: not allowed here.
+    """
+
+    def __enter__(self) -> Space:
+        self._before = os.open("/proc/self/ns/net", os.O_RDONLY)
+        try:
+            _call(_LIBRARY.unshare(_CLONE_NEWNET))
+        except OSError:
+            os.close(self._before)
+            raise
+        Path("/proc/sys/net/ipv6/conf/default/disable_ipv6").write_text("1")  # no frames but ours
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        _call(_LIBRARY.setns(self._before, _CLONE_NEWNET))
+        os.close(self._before)
+
+    def ip(self, *words: str) -> None:
+        """Run ``ip link`` here.
+
+        Raises:
+            subprocess.CalledProcessError: it refused.
+        """
+        subprocess.run(["ip", "link", *words], check=True, capture_output=True, text=True)
+
+    def veth(self, one: str, other: str, one_mac: bytes, other_mac: bytes, mtu: int = 1500) -> None:
+        """Make a pair of joined devices, both up."""
+        ends = ("mtu", str(mtu), "address", one_mac.hex(":")), ("mtu", str(mtu), "address", other_mac.hex(":"))
+        self.ip("add", one, *ends[0], "type", "veth", "peer", "name", other, *ends[1])
+        for name in (one, other):
+            self.ip("set", name, "up")

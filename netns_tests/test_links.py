@@ -1,0 +1,80 @@
+"""What the kernel says of devices, heard from it and not from a library."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from gdp.ports.link import Link, LinkWatch
+from netns_tests.spaces import Space
+
+pytestmark = pytest.mark.netns
+
+MAC, PEER_MAC = bytes([2, 0, 0, 0, 0, 1]), bytes([2, 0, 0, 0, 0, 2])
+
+
+@pytest.fixture
+def watch(space: Space) -> Iterator[LinkWatch]:
+    opened = LinkWatch()
+    yield opened
+    opened.close()
+
+
+def last(links: list[Link], ifname: str) -> Link:
+    return [link for link in links if link.ifname == ifname][-1]
+
+
+def test_every_device_is_listed_with_its_facts(watch: LinkWatch, space: Space) -> None:
+    space.veth("one", "two", MAC, PEER_MAC, mtu=1_400)
+    one = last(watch.all(), "one")
+    assert (one.mac, one.mtu, one.up, one.gone) == (MAC, 1_400, True, False)
+    assert {link.ifname for link in watch.all()} >= {"lo", "one", "two"}
+
+
+def test_nothing_new_is_an_empty_list(watch: LinkWatch) -> None:
+    watch.news()
+    assert watch.news() == []
+
+
+@pytest.mark.parametrize(
+    ("words", "seen"),
+    [
+        (("set", "two", "down"), lambda link: not link.up),
+        (("set", "one", "down"), lambda link: not link.up),
+        (("set", "one", "mtu", "1300"), lambda link: link.mtu == 1_300),
+        (("set", "one", "address", "02:00:00:00:00:09"), lambda link: link.mac[-1] == 9),
+        (("del", "one"), lambda link: link.gone and not link.up),
+    ],
+    ids=["carrier lost", "switched off", "mtu", "address", "deleted"],
+)
+def test_a_change_is_news(
+    words: tuple[str, ...], seen: Callable[[Link], bool], watch: LinkWatch, space: Space
+) -> None:
+    space.veth("one", "two", MAC, PEER_MAC)
+    watch.news()
+    space.ip(*words)
+    assert seen(last(watch.news(), "one"))
+
+
+def test_a_device_that_leaves_a_bridge_is_not_gone(watch: LinkWatch, space: Space) -> None:
+    space.veth("one", "two", MAC, PEER_MAC)
+    space.ip("add", "bridge", "type", "bridge")
+    space.ip("set", "one", "master", "bridge")
+    watch.news()
+    space.ip("set", "one", "nomaster")
+    assert not any(link.gone for link in watch.news())
+
+
+def test_news_that_the_kernel_had_to_skip_is_made_up_for(watch: LinkWatch, space: Space) -> None:
+    space.veth("one", "two", MAC, PEER_MAC)
+    space.veth("three", "four", MAC, PEER_MAC)
+    watch.news()
+    watch._news.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2_048)  # room for a message or two
+    for mtu in range(1_000, 1_020):
+        space.ip("set", "one", "mtu", str(mtu))
+    space.ip("del", "three")
+    news = watch.news()
+    assert last(news, "one").mtu == 1_019
+    assert last(news, "three").gone

@@ -1,0 +1,4 @@
+"""The ROS side: endpoints that speak one dialect each, serialisation that speaks none, and the bridge between them.
+
+Place: above ``gdp``, which knows nothing of it. ``proxy.serial`` thinks; ``proxy.endpoints`` does I/O.
+"""

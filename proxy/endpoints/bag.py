@@ -1,0 +1,10 @@
+"""The ``bag`` endpoint: recordings in, recordings out.
+
+Place: I/O. The halves are in ``bag_reader`` and ``bag_writer``.
+"""
+
+from proxy.endpoints.bag_reader import BagReader
+from proxy.endpoints.bag_source import Message
+from proxy.endpoints.bag_writer import BagWriter
+
+__all__ = ["BagReader", "BagWriter", "Message"]

@@ -1,0 +1,125 @@
+"""Between rosbags' connections and channels, in both directions.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import Enum
+from typing import TypeVar
+
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag1,
+    ConnectionExtRosbag2,
+    MessageDefinitionFormat,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.interfaces import Qos as RosbagsQos
+
+from gdp.errors import LocalError
+from proxy.serial.channel import Channel, DefinitionFormat, Qos
+from proxy.serial.standard import standard_definition, type_hash
+
+__all__ = ["from_connection", "from_ros2", "to_qos"]
+
+_FORMATS: dict[MessageDefinitionFormat, DefinitionFormat] = {
+    MessageDefinitionFormat.MSG: "msg",
+    MessageDefinitionFormat.IDL: "idl",
+    MessageDefinitionFormat.NONE: "",
+}
+_Policy = TypeVar("_Policy", bound=Enum)
+
+
+def from_connection(connection: Connection) -> Channel:
+    """Return the channel of one of rosbags' connections.
+
+    Raises:
+        LocalError: its messages are not CDR.
+    """
+    extra = connection.ext
+    definition_format = _FORMATS[connection.msgdef.format]
+    if isinstance(extra, ConnectionExtRosbag1):
+        return Channel(
+            topic=connection.topic,
+            type_name=connection.msgtype,
+            ros=1,
+            hash=connection.digest,
+            definition=connection.msgdef.data,
+            definition_format=definition_format,
+            latched=bool(extra.latching),
+            callerid=extra.callerid,
+        )
+    if not isinstance(extra, ConnectionExtRosbag2) or extra.serialization_format != "cdr":
+        raise LocalError(f"topic {connection.topic} is not in CDR")
+    return from_ros2(
+        connection.topic,
+        connection.msgtype,
+        connection.digest,
+        connection.msgdef.data,
+        definition_format,
+        extra.offered_qos_profiles,
+    )
+
+
+def from_ros2(
+    topic: str,
+    type_name: str,
+    digest: str,
+    definition: str,
+    definition_format: DefinitionFormat,
+    profiles: Sequence[RosbagsQos],
+) -> Channel:
+    """Return a ROS 2 channel, with the standard definition and the hash filled in where the recording has none."""
+    if not definition_format:
+        standard = standard_definition(type_name)
+        if standard is not None:
+            definition, definition_format = standard, "msg"
+    return Channel(
+        topic=topic,
+        type_name=type_name,
+        ros=2,
+        hash=digest or type_hash(type_name, definition, definition_format),
+        definition=definition,
+        definition_format=definition_format,
+        qos=tuple(_from_qos(profile) for profile in profiles),
+        latched=any(profile.durability is QosDurability.TRANSIENT_LOCAL for profile in profiles),
+    )
+
+
+def _from_qos(profile: RosbagsQos) -> Qos:
+    return Qos(
+        history=profile.history.name.lower(),
+        depth=profile.depth,
+        reliability=profile.reliability.name.lower(),
+        durability=profile.durability.name.lower(),
+        deadline=(profile.deadline.sec, profile.deadline.nsec),
+        lifespan=(profile.lifespan.sec, profile.lifespan.nsec),
+        liveliness=profile.liveliness.name.lower(),
+        lease=(profile.liveliness_lease_duration.sec, profile.liveliness_lease_duration.nsec),
+        plain_names=profile.avoid_ros_namespace_conventions,
+    )
+
+
+def to_qos(profile: Qos) -> RosbagsQos:
+    """Return rosbags' form of a profile; words it does not know become ``unknown``."""
+    return RosbagsQos(
+        history=_policy(QosHistory, profile.history, QosHistory.UNKNOWN),
+        depth=profile.depth,
+        reliability=_policy(QosReliability, profile.reliability, QosReliability.UNKNOWN),
+        durability=_policy(QosDurability, profile.durability, QosDurability.UNKNOWN),
+        deadline=QosTime(*profile.deadline),
+        lifespan=QosTime(*profile.lifespan),
+        liveliness=_policy(QosLiveliness, profile.liveliness, QosLiveliness.UNKNOWN),
+        liveliness_lease_duration=QosTime(*profile.lease),
+        avoid_ros_namespace_conventions=profile.plain_names,
+    )
+
+
+def _policy(policies: type[_Policy], word: str, unknown: _Policy) -> _Policy:
+    return next((policy for policy in policies if policy.name.lower() == word), unknown)

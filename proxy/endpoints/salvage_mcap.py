@@ -1,0 +1,176 @@
+"""An MCAP file read record by record, without its summary: one that ends in the middle, or was never indexed.
+
+Place: I/O, reading only.
+Source: MCAP format specification, https://mcap.dev/spec (opcodes 0x01 to 0x0F, little-endian).
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from rosbags.rosbag2.errors import ReaderError
+from rosbags.rosbag2.metadata import parse_qos
+
+from proxy.endpoints.bag_channel import from_ros2
+from proxy.endpoints.bag_source import Chunk, Place, SalvageError, ScannedSource, Tally, unpack
+from proxy.serial.channel import Channel, DefinitionFormat
+
+__all__ = ["MAGIC", "is_indexed", "scan"]
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+_FOOTER_BYTES: Final = 37  # the record and the closing magic
+_FOOTER: Final = b"\x02\x14" + bytes(7)
+
+_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END, _END = 0x03, 0x04, 0x05, 0x06, 0x0F, 0x02
+_RECORD: Final = struct.Struct("<BQ")
+_ID: Final = struct.Struct("<H")
+_IDS: Final = struct.Struct("<HH")
+_COUNT: Final = struct.Struct("<I")
+_MESSAGE_HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_CHUNK_HEAD: Final = struct.Struct("<QQQI")  # first time, last time, unpacked bytes, crc
+_LENGTH: Final = struct.Struct("<Q")
+_FORMATS: Final[dict[str, DefinitionFormat]] = {"ros2msg": "msg", "ros2idl": "idl", "omgidl": "idl"}
+
+
+def is_indexed(path: Path) -> bool:
+    """Whether the file has its end and a summary."""
+    with path.open("rb") as file:
+        if file.seek(0, os.SEEK_END) < len(MAGIC) + _FOOTER_BYTES:
+            return False
+        file.seek(-_FOOTER_BYTES, os.SEEK_END)
+        footer = file.read()
+    return footer.endswith(MAGIC) and footer.startswith(_FOOTER) and footer[9:17] != bytes(8)
+
+
+def scan(path: Path) -> ScannedSource:
+    """Return what can be read.
+
+    Raises:
+        SalvageError: nothing can.
+        OSError: the file cannot be opened.
+    """
+    found = _Found()
+    with path.open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(0)
+        if file.read(len(MAGIC)) != MAGIC:
+            raise SalvageError("not an MCAP file")
+        reason = found.walk(file, size)
+    if not found.channels:
+        raise SalvageError(reason or "no channel in it")
+    source = ScannedSource(path, found.channels, found.chunks, found.places)
+    if reason:
+        source.unread = found.tally.text(reason)
+    return source
+
+
+class _Found:
+    def __init__(self) -> None:
+        self.channels: list[Channel] = []
+        self.chunks: list[Chunk] = []
+        self.places: list[Place] = []
+        self.tally = Tally()
+        self._schemas: dict[int, tuple[str, DefinitionFormat, str]] = {}
+        self._index: dict[int, int] = {}  # channel id to index
+
+    def walk(self, file: BinaryIO, size: int) -> str:
+        """Take every record; return why it ended early, empty where it did not."""
+        while True:
+            at = file.tell()
+            head = file.read(_RECORD.size)
+            if len(head) < _RECORD.size:
+                return f"the file ends in the middle, at byte {size}"
+            code, length = _RECORD.unpack(head)
+            start = at + _RECORD.size
+            if code in (_DATA_END, _END):
+                return ""
+            there = min(length, size - start)
+            try:
+                if code == _CHUNK:
+                    self._chunk(file.read(there), start)
+                elif there == length and code == _MESSAGE:
+                    self._message(file.read(_MESSAGE_HEAD.size), -1, start, length)
+                elif there == length and code in (_SCHEMA, _CHANNEL):
+                    self._describe(code, file.read(there))
+            except (struct.error, UnicodeDecodeError, ReaderError, SalvageError) as error:
+                return f"a record at byte {at} cannot be read ({error})"
+            if there < length:
+                return f"the file ends in the middle, at byte {size}"
+            file.seek(start + length)
+
+    def _chunk(self, record: bytes, start: int) -> None:
+        _, _, unpacked_size, _ = _CHUNK_HEAD.unpack_from(record)
+        compression, at = _string(record, _CHUNK_HEAD.size)
+        (size,) = _LENGTH.unpack_from(record, at)
+        at += _LENGTH.size
+        size = min(size, len(record) - at)
+        data = unpack(compression, record[at : at + size])
+        if len(data) < unpacked_size:
+            self.tally.missing_bytes = unpacked_size - len(data)
+        self.tally.walked_bytes += len(data)
+        self.chunks.append(Chunk(start + at, size, compression))
+        at = 0
+        while at + _RECORD.size <= len(data):
+            code, length = _RECORD.unpack_from(data, at)
+            at += _RECORD.size
+            if at + length > len(data):
+                return
+            if code == _MESSAGE:
+                self._message(data[at : at + _MESSAGE_HEAD.size], len(self.chunks) - 1, at, length)
+            elif code in (_SCHEMA, _CHANNEL):
+                self._describe(code, data[at : at + length])
+            at += length
+
+    def _message(self, head: bytes, chunk: int, start: int, length: int) -> None:
+        channel, _, stamp_ns, _ = _MESSAGE_HEAD.unpack(head)
+        if channel not in self._index or length < _MESSAGE_HEAD.size:
+            raise SalvageError(f"a message of an unknown channel {channel}")
+        size = length - _MESSAGE_HEAD.size
+        self.tally.messages += 1
+        self.places.append(
+            Place(stamp_ns, len(self.places), self._index[channel], chunk, start + _MESSAGE_HEAD.size, size)
+        )
+
+    def _describe(self, code: int, record: bytes) -> None:
+        if code == _SCHEMA:
+            (number,) = _ID.unpack_from(record)
+            name, at = _string(record, _ID.size)
+            encoding, at = _string(record, at)
+            text, _ = _string(record, at)
+            self._schemas[number] = (name, _FORMATS.get(encoding, ""), text)
+            return
+        number, schema = _IDS.unpack_from(record)
+        if number in self._index:
+            return
+        topic, at = _string(record, _IDS.size)
+        encoding, at = _string(record, at)
+        if encoding != "cdr":
+            raise SalvageError(f"topic {topic} is in {encoding}, not CDR")
+        name, definition_format, definition = self._schemas.get(schema, ("", "", ""))
+        metadata = _map(record, at)
+        profiles = parse_qos(metadata.get("offered_qos_profiles", ""))
+        digest = metadata.get("topic_type_hash", "")
+        self._index[number] = len(self.channels)
+        self.channels.append(from_ros2(topic, name, digest, definition, definition_format, profiles))
+
+
+def _string(record: bytes, at: int) -> tuple[str, int]:
+    (size,) = _COUNT.unpack_from(record, at)
+    end = at + _COUNT.size + size
+    if end > len(record):
+        raise SalvageError("a text longer than its record")
+    return record[at + _COUNT.size : end].decode(), end
+
+
+def _map(record: bytes, at: int) -> dict[str, str]:
+    (size,) = _COUNT.unpack_from(record, at)
+    at += _COUNT.size
+    end = min(at + size, len(record))
+    items = {}
+    while at < end:
+        key, at = _string(record, at)
+        items[key], at = _string(record, at)
+    return items

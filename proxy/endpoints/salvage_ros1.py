@@ -1,0 +1,157 @@
+"""A ROS 1 bag read chunk by chunk, without its index: one that was never closed, or ends in the middle.
+
+Place: I/O, reading only.
+Source: ROS 1 bag format 2.0, http://wiki.ros.org/Bags/Format/2.0 (records of a header and data, little-endian).
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from rosbags.typesys.msg import normalize_msgtype
+
+from proxy.endpoints.bag_source import Chunk, Place, SalvageError, ScannedSource, Tally, unpack
+from proxy.serial.channel import Channel
+
+__all__ = ["MAGIC", "scan"]
+
+MAGIC: Final = b"#ROSBAG V2.0\n"
+
+_MESSAGE, _BAG, _CHUNK, _CONNECTION = 2, 3, 5, 7
+_SIZE: Final = struct.Struct("<I")
+_LENGTH: Final = struct.Struct("<Q")
+_TIME: Final = struct.Struct("<II")
+
+
+def scan(path: Path) -> ScannedSource:
+    """Return what can be read.
+
+    Raises:
+        SalvageError: nothing can.
+        OSError: the file cannot be opened.
+    """
+    found = _Found()
+    with path.open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(0)
+        if file.read(len(MAGIC)) != MAGIC:
+            raise SalvageError("not a ROS 1 bag of format 2.0")
+        reason = found.walk(file, size)
+    if not found.channels:
+        raise SalvageError(reason or "no connection in it")
+    source = ScannedSource(path, found.channels, found.chunks, found.places)
+    source.unread = found.tally.text(reason or "the recording was never closed")
+    return source
+
+
+class _Found:
+    def __init__(self) -> None:
+        self.channels: list[Channel] = []
+        self.chunks: list[Chunk] = []
+        self.places: list[Place] = []
+        self.tally = Tally()
+        self._index: dict[int, int] = {}  # connection id to index
+
+    def walk(self, file: BinaryIO, size: int) -> str:
+        """Take every record; return why it ended early, empty where it did not."""
+        while True:
+            at = file.tell()
+            if at == size:
+                return ""
+            try:
+                header = _fields(_sized(file, size))
+                (length,) = _SIZE.unpack(file.read(_SIZE.size))
+                start = file.tell()
+                data = file.read(min(length, size - start))
+                code = _code(header)
+                if code == _BAG:
+                    (index_at,) = _LENGTH.unpack(header.get(b"index_pos", bytes(8)))
+                    self.tally.missing_bytes = max(0, index_at - size)
+                    self.tally.walked_bytes = size
+                elif code == _CHUNK:
+                    self._chunk(header, data, start)
+                elif len(data) == length:
+                    self._record(code, header, data, -1, start)
+            except (struct.error, EOFError):
+                return f"the file ends in the middle, at byte {size}"
+            except (UnicodeDecodeError, KeyError, SalvageError) as error:
+                return f"a record at byte {at} cannot be read ({error})"
+            if len(data) < length:
+                return f"the file ends in the middle, at byte {size}"
+
+    def _chunk(self, header: dict[bytes, bytes], packed: bytes, start: int) -> None:
+        compression = header[b"compression"].decode()
+        data = unpack(compression, packed)
+        self.chunks.append(Chunk(start, len(packed), compression))
+        at = 0
+        while at + _SIZE.size <= len(data):
+            (size,) = _SIZE.unpack_from(data, at)
+            fields = data[at + _SIZE.size : at + _SIZE.size + size]
+            at += _SIZE.size + size
+            if at + _SIZE.size > len(data):
+                return
+            (size,) = _SIZE.unpack_from(data, at)
+            at += _SIZE.size
+            if at + size > len(data):
+                return
+            inner = _fields(fields)
+            self._record(_code(inner), inner, data[at : at + size], len(self.chunks) - 1, at)
+            at += size
+
+    def _record(self, code: int, header: dict[bytes, bytes], data: bytes, chunk: int, start: int) -> None:
+        if code not in (_MESSAGE, _CONNECTION):
+            return
+        (number,) = _SIZE.unpack(header[b"conn"])
+        if code == _MESSAGE:
+            seconds, nanoseconds = _TIME.unpack(header[b"time"])
+            if number not in self._index:
+                raise SalvageError(f"a message of an unknown connection {number}")
+            self.tally.messages += 1
+            stamp_ns = seconds * 1_000_000_000 + nanoseconds
+            self.places.append(Place(stamp_ns, len(self.places), self._index[number], chunk, start, len(data)))
+        elif number not in self._index:
+            self._index[number] = len(self.channels)
+            self.channels.append(_channel(header[b"topic"].decode(), _fields(data)))
+
+
+def _channel(topic: str, about: dict[bytes, bytes]) -> Channel:
+    callerid = about.get(b"callerid")
+    return Channel(
+        topic=topic,
+        type_name=normalize_msgtype(about[b"type"].decode()),
+        ros=1,
+        hash=about[b"md5sum"].decode(),
+        definition=about[b"message_definition"].decode(),
+        definition_format="msg",
+        latched=about.get(b"latching") == b"1",
+        callerid=None if callerid is None else callerid.decode(),
+    )
+
+
+def _sized(file: BinaryIO, limit: int) -> bytes:
+    (size,) = _SIZE.unpack(file.read(_SIZE.size))
+    if file.tell() + size > limit:
+        raise EOFError
+    return file.read(size)
+
+
+def _fields(data: bytes) -> dict[bytes, bytes]:
+    fields = {}
+    at = 0
+    while at < len(data):
+        (size,) = _SIZE.unpack_from(data, at)
+        at += _SIZE.size
+        name, equals, value = data[at : at + size].partition(b"=")
+        if not equals or at + size > len(data):
+            raise SalvageError("not a header")
+        fields[name] = value
+        at += size
+    return fields
+
+
+def _code(header: dict[bytes, bytes]) -> int:
+    code = header[b"op"]
+    return code[0] if code else 0

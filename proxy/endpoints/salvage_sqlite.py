@@ -1,0 +1,150 @@
+"""A sqlite3 recording read row by row: one whose file ends in the middle, or whose journal was never folded in.
+
+Place: I/O, reading only.
+Source: SQLite file format, section 1.3 (the header says how many pages there should be); rosbag2 schemas 1 to 4.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Final
+from urllib.parse import quote
+
+from rosbags.rosbag2.metadata import parse_qos
+
+from proxy.endpoints.bag_channel import from_ros2
+from proxy.endpoints.bag_source import Message, SalvageError, Tally
+from proxy.serial.channel import Channel, DefinitionFormat
+
+__all__ = ["MAGIC", "SqliteSource", "is_whole"]
+
+MAGIC: Final = b"SQLite format 3\0"
+_FORMATS: Final[dict[str, DefinitionFormat]] = {"ros2msg": "msg", "ros2idl": "idl"}
+
+
+def _pages(path: Path) -> tuple[int, int]:
+    """Return the bytes of a page and how many pages there should be."""
+    with path.open("rb") as file:
+        head = file.read(100)
+    page = int.from_bytes(head[16:18], "big")
+    return (65_536 if page == 1 else page), int.from_bytes(head[28:32], "big")
+
+
+def _missing_bytes(path: Path) -> int:
+    size, count = _pages(path)
+    return max(0, size * count - path.stat().st_size)
+
+
+def _whole_pages(path: Path) -> tuple[tempfile.TemporaryDirectory[str] | None, Path]:
+    """Return a copy without the last, broken page, which SQLite would fill up with zeros and take for data."""
+    size, _ = _pages(path)
+    whole = path.stat().st_size // max(1, size) * size
+    if whole == path.stat().st_size:
+        return None, path
+    folder = tempfile.TemporaryDirectory(prefix="whole-pages-")
+    copy = Path(folder.name) / path.name
+    shutil.copyfile(path, copy)
+    os.truncate(copy, whole)
+    return folder, copy
+
+
+def _journal(path: Path) -> Path:
+    return path.with_name(path.name + "-wal")
+
+
+def is_whole(path: Path) -> bool:
+    """Whether the file has all its pages and nothing waits in a journal."""
+    journal = _journal(path)
+    return not _missing_bytes(path) and not (journal.exists() and journal.stat().st_size)
+
+
+class SqliteSource:
+    """What can be read of a database.
+
+    Raises:
+        SalvageError: not even its topics.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.channels: list[Channel] = []
+        self.unread = ""
+        self._index: dict[int, int] = {}  # topic id to index
+        self._order: list[tuple[int, int, int]] = []  # stamp, row, topic id
+        self._tally = Tally()
+        self._tally.missing_bytes = _missing_bytes(path)
+        self._tally.walked_bytes = path.stat().st_size
+        self._copy, file = _whole_pages(path) if self._tally.missing_bytes else (None, path)
+        mode = "mode=ro" if _journal(path).exists() and file == path else "immutable=1"
+        self._db = sqlite3.connect(f"file:{quote(str(file))}?{mode}", uri=True)
+        try:
+            # Without this SQLite refuses a file with fewer pages than its header says.
+            self._db.execute("PRAGMA writable_schema=ON")
+            self._read_topics()
+        except sqlite3.Error as error:
+            self.close()
+            raise SalvageError(f"the database cannot be read: {error}") from error
+        self._find_messages()
+
+    @property
+    def count(self) -> int:
+        """Messages found."""
+        return len(self._order)
+
+    def messages(self) -> Iterator[Message]:
+        """Yield messages in time order."""
+        for stamp_ns, row, topic in self._order:
+            with closing(self._db.execute("SELECT data FROM messages WHERE id = ?", (row,))) as rows:
+                (raw,) = rows.fetchone()
+            yield Message(self._index[topic], stamp_ns, bytes(raw))
+
+    def close(self) -> None:
+        """Close the database."""
+        self._db.close()
+        if self._copy is not None:
+            self._copy.cleanup()
+
+    def _columns(self, table: str) -> set[str]:
+        with closing(self._db.execute(f"PRAGMA table_info({table})")) as rows:
+            return {str(row[1]) for row in rows}
+
+    def _read_topics(self) -> None:
+        definitions: dict[str, tuple[DefinitionFormat, str]] = {}
+        if self._columns("message_definitions"):
+            query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+            for type_name, encoding, text in self._db.execute(query):
+                definitions[str(type_name)] = (_FORMATS.get(encoding, ""), str(text))
+        columns = self._columns("topics")
+        qos = "offered_qos_profiles" if "offered_qos_profiles" in columns else "''"
+        digest = "type_description_hash" if "type_description_hash" in columns else "''"
+        query = f"SELECT id, name, type, serialization_format, {qos}, {digest} FROM topics ORDER BY id"
+        for number, topic, type_name, form, profiles, type_hash in self._db.execute(query):
+            if form != "cdr":
+                raise SalvageError(f"topic {topic} is in {form}, not CDR")
+            definition_format, definition = definitions.get(type_name, ("", ""))
+            self._index[int(number)] = len(self.channels)
+            self.channels.append(
+                from_ros2(topic, type_name, type_hash, definition, definition_format, parse_qos(profiles))
+            )
+
+    def _find_messages(self) -> None:
+        reason = ""
+        try:
+            # the data is asked for as well, so that a row whose pages are gone is found out here
+            rows = self._db.execute("SELECT id, topic_id, timestamp, data FROM messages ORDER BY id")
+            for row, topic, stamp_ns, _ in rows:
+                if topic in self._index:
+                    self._order.append((int(stamp_ns), int(row), int(topic)))
+                    self._tally.messages += 1
+        except sqlite3.Error as error:
+            reason = f"the file ends in the middle ({error})"
+        self._order.sort()
+        if self._tally.missing_bytes and not reason:
+            reason = "the file ends in the middle"
+        if reason:
+            self.unread = self._tally.text(reason)

@@ -1,0 +1,92 @@
+"""How a ROS message travels inside a sealed message, and what describes it.
+
+Place: pure. Wire form of a parcel, big-endian: ``version (1) | channel (2) | stamp in ns (8) | body``. A description is a
+CBOR map: the encoding of all bodies, and the channels that the parcels' numbers mean.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import cbor2
+
+from gdp.errors import DropReason, LocalError, RemoteError
+from proxy.serial.channel import CHANNEL_MAX_BYTES, Channel
+from proxy.serial.serializer import Encoding
+
+__all__ = ["Description", "Parcel"]
+
+VERSION: Final = 1
+CHANNELS_MAX: Final = 256
+_HEAD: Final = struct.Struct("!BHQ")
+_ENCODINGS: Final[dict[object, Encoding]] = {"json": "json", "cbor": "cbor", "cdr": "cdr"}
+
+
+class Parcel(NamedTuple):
+    """One ROS message.
+
+    ``channel`` numbers the description's channels; ``stamp_ns`` is the wall clock of the sending proxy when it took the
+    message in.
+    """
+
+    channel: int
+    stamp_ns: int
+    body: bytes
+
+    def to_wire(self) -> bytes:
+        """Return the wire form."""
+        return _HEAD.pack(VERSION, self.channel, self.stamp_ns) + self.body
+
+    @classmethod
+    def from_wire(cls, wire: bytes) -> Parcel:
+        """Read the wire form.
+
+        Raises:
+            RemoteError: MALFORMED.
+        """
+        if len(wire) < _HEAD.size:
+            raise RemoteError(DropReason.MALFORMED, "parcel")
+        version, channel, stamp_ns = _HEAD.unpack_from(wire)
+        if version != VERSION:
+            raise RemoteError(DropReason.BAD_VERSION, f"parcel version {version}")
+        return cls(channel, stamp_ns, wire[_HEAD.size :])
+
+
+@dataclass(frozen=True, slots=True)
+class Description:
+    """What the parcels of one publisher of one topic are."""
+
+    encoding: Encoding
+    channels: tuple[Channel, ...]
+
+    def to_wire(self) -> bytes:
+        """Return the wire form.
+
+        Raises:
+            LocalError: too many channels.
+        """
+        if len(self.channels) > CHANNELS_MAX:
+            raise LocalError(f"{len(self.channels)} connections of one topic; at most {CHANNELS_MAX} are allowed")
+        return cbor2.dumps({"e": self.encoding, "c": [channel.to_wire() for channel in self.channels]})
+
+    @classmethod
+    def from_wire(cls, wire: bytes) -> Description:
+        """Read the wire form.
+
+        Raises:
+            RemoteError: MALFORMED, whatever else these bytes are.
+        """
+        if len(wire) > CHANNEL_MAX_BYTES * CHANNELS_MAX:
+            raise RemoteError(DropReason.MALFORMED, "description")
+        try:
+            fields = cbor2.loads(wire)
+        except (cbor2.CBORDecodeError, RecursionError, ValueError) as error:
+            raise RemoteError(DropReason.MALFORMED, "description") from error
+        match fields:
+            case {"e": str(encoding), "c": [*channels]} if encoding in _ENCODINGS and 0 < len(channels) <= CHANNELS_MAX:
+                wires = [each for each in channels if isinstance(each, bytes)]
+                if len(wires) == len(channels):
+                    return cls(_ENCODINGS[encoding], tuple(map(Channel.from_wire, wires)))
+        raise RemoteError(DropReason.MALFORMED, "description")

@@ -1,0 +1,119 @@
+"""The ``gdp-replay`` command.
+
+Place: command.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from gdp.cli.node import Check, Config, Json, Verbose, emit, failing_clearly, set_up_logging
+from gdp.errors import LocalError
+from proxy.cli import GOODBYE_S, check_proxy
+from proxy.config import ProxyConfig
+from proxy.endpoints.bag import BagReader
+from proxy.node import ProxyNode, run_node
+from proxy.outbound import Outbound
+from proxy.replayer import Played, Replayer
+
+__all__ = ["main"]
+
+log = logging.getLogger(__name__)
+
+ATTACH_PATIENCE_S: Final = 30.0
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+@app.command(epilog="Example: gdp-replay drive.mcap --config proxy.yaml --rate 2")
+def replay(
+    bag: Annotated[Path, typer.Argument(help="A ROS 1 bag, an MCAP file, a .db3 file or a rosbag2 folder.")],
+    config: Config,
+    rate: Annotated[float, typer.Option(min=0.0, help="1: as recorded; 0: as fast as readers confirm.")] = 1.0,
+    wait_readers: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for a reader of every topic.")] = 15.0,
+    check: Check = False,
+    json: Json = False,
+    verbose: Verbose = False,
+) -> None:
+    """Replay a recording's exposed topics onto the overlay with the recorded timing."""
+    set_up_logging(verbose=verbose)
+    with failing_clearly():
+        settings = ProxyConfig.load(config)
+        with BagReader(bag) as reader:
+            if check:
+                check_proxy(settings, json=json)
+                return
+            with run_node(settings) as node:
+                is_complete = _replay(node, reader, settings, rate, wait_readers, json=json)
+    raise typer.Exit(0 if is_complete else 1)
+
+
+def _replay(
+    node: ProxyNode, reader: BagReader, settings: ProxyConfig, rate: float, wait_s: float, *, json: bool
+) -> bool:
+    outbound = Outbound(node, settings.expose, reader.channels)
+    if not outbound.publishers:
+        raise LocalError(f"{reader.path}: no topic of it is exposed by the configuration")
+    if not node.runtime.run(lambda: node.member.attachment.is_attached, time.monotonic() + ATTACH_PATIENCE_S):
+        raise LocalError(f"no switch answered on {settings.iface} within {ATTACH_PATIENCE_S:g} s")
+    refused = [each for each in node.member.attachment.claims if each.refused is not None]
+    for each in refused:
+        log.warning("claim refused name=%s reason=%s", each.subject.name.short, each.refused)
+    if json:
+        emit("ready", name=node.member.name.to_text())
+
+    def tick(played: Played) -> None:
+        if json:
+            emit(
+                "progress",
+                sent=played.sent,
+                total=reader.count,
+                bytes=played.sent_bytes,
+                acknowledged=replayer.acknowledged,
+            )
+
+    replayer = Replayer(node, reader, outbound, rate, tick)
+    for topic in replayer.wait_for_readers(wait_s):
+        log.warning("nobody reads topic=%s", topic)
+    is_complete = replayer.play() and replayer.finish() and not refused and not outbound.too_large
+    tick(replayer.played)
+    node.member.leave()
+    node.linger(GOODBYE_S)
+    _report(reader, replayer, is_complete=is_complete, json=json)
+    return is_complete
+
+
+def _report(reader: BagReader, replayer: Replayer, *, is_complete: bool, json: bool) -> None:
+    played = replayer.played
+    topics = [
+        {
+            "topic": channel.topic,
+            "type": channel.type_name,
+            "messages": played.by_channel[at],
+            "bytes": played.bytes_by_channel[at],
+        }
+        for at, channel in enumerate(reader.channels)
+        if played.by_channel[at]
+    ]
+    if json:
+        emit("done", sent=played.sent, topics=topics, unread=reader.unread or None)
+        return
+    typer.echo(f"{played.sent} messages sent, {replayer.acknowledged} confirmed")
+    if reader.unread:
+        typer.echo(f"the recording could not be read to its end: {reader.unread}", err=True)
+    if not is_complete:
+        typer.echo("not everything was confirmed by its readers", err=True)
+
+
+def main() -> None:
+    """Run the command."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""All processes of a run, watched together: while one thing is awaited, the end of any that must stand ends the wait.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections.abc import Coroutine, Iterable, Sequence
+from typing import Final, TypeVar
+
+from gdp.testbed.namespaces import Namespaces
+from gdp.testbed.runs import Run
+from proxy.ring.child import Child
+from proxy.ring.events import Event
+
+__all__ = ["READY_S", "Children", "cancel"]
+
+READY_S: Final = 30.0
+
+T = TypeVar("T")
+
+
+class Children:
+    """The processes of one run.
+
+    Args:
+        run: notes each of them, so that whoever takes the run down ends it.
+        kept: they are to outlive us; otherwise the kernel kills them when we end, however that comes about.
+    """
+
+    def __init__(self, run: Run, *, kept: bool) -> None:
+        self._run = run
+        self._kept = kept
+        self._all: list[Child] = []
+        self._standing: list[Child] = []
+
+    def start(self, label: str, argv: Sequence[str], *, heard: bool = True) -> Child:
+        """Start a process; its log is called like its label."""
+        child = Child(label, argv, self._run.directory / f"{label.replace(' ', '-')}.log", heard=heard)
+        self._run.note_process(child.pid)
+        self._all.append(child)
+        return child
+
+    def start_in(
+        self, namespaces: Namespaces, node: str, role: str, arguments: Sequence[str], *, heard: bool = True
+    ) -> Child:
+        """Start Python with these arguments in the namespace of a switch."""
+        argv = namespaces.command(node, [sys.executable, *arguments], dies_with_us=not self._kept)
+        return self.start(f"{role} {node}", argv, heard=heard)
+
+    async def ready(self, children: Sequence[Child]) -> None:
+        """Wait until each has said ``ready``; from then on they must stand.
+
+        Raises:
+            ChildError: one did not, or one that must stand ended.
+        """
+        await self.guarded(_all(child.wait_for("ready", READY_S) for child in children))
+        self._standing += children
+
+    def may_end(self, child: Child) -> None:
+        """Expect the end of this process from now on."""
+        self._standing.remove(child)
+
+    async def guarded(self, work: Coroutine[None, None, T]) -> T:
+        """Do ``work``, but stop at once if a process that must stand ends.
+
+        Raises:
+            ChildError: one ended.
+        """
+        task = asyncio.ensure_future(work)
+        fallen = asyncio.ensure_future(self._first_to_fall())
+        try:
+            await asyncio.wait([task, fallen], return_when=asyncio.FIRST_COMPLETED)
+            if not task.done():
+                child = fallen.result()
+                raise child.failed(f"ended with code {child.ended.result()}")
+            return task.result()
+        finally:
+            await cancel(task, fallen)
+
+    def forget(self) -> None:
+        """Close our ends; the processes are left as they are."""
+        for child in self._all:
+            child.forget()
+
+    async def _first_to_fall(self) -> Child:
+        nobody: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+        endings = [child.ended for child in self._standing]
+        await asyncio.wait([nobody, *endings], return_when=asyncio.FIRST_COMPLETED)
+        return next(child for child in self._standing if child.ended.done())
+
+
+async def cancel(*tasks: asyncio.Future[T] | asyncio.Future[Child]) -> None:
+    """Cancel what is still under way and wait until it has stopped; what it raises then, others have told already."""
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _all(works: Iterable[Coroutine[None, None, Event]]) -> None:
+    await asyncio.gather(*works)

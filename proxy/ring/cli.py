@@ -1,0 +1,198 @@
+"""``python -m proxy.ring``, which ``scripts/ring_topology.sh`` runs once everything is set up.
+
+Place: shell. Exit codes: 0 passed, 1 failed, 2 wrong input, 130 and 143 for Ctrl-C and SIGTERM.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+from pathlib import Path
+from typing import Annotated, Final, TypeVar, get_args
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from gdp.errors import GdpError, LocalError
+from gdp.testbed.runs import Run, Runs
+from gdp.testbed.topology import MTU_BYTES
+from proxy.config import Encoding
+from proxy.ring.child import ChildError
+from proxy.ring.hints import hints
+from proxy.ring.options import Cut, Options, RingPlane
+from proxy.ring.progress import Teller
+from proxy.ring.result import Result
+from proxy.ring.run import Ring, make_demo
+from proxy.ring.table import table, verdict
+
+__all__ = ["main"]
+
+ENCODINGS: Final[tuple[Encoding, ...]] = get_args(Encoding)
+PLANES: Final[tuple[RingPlane, ...]] = get_args(RingPlane)
+_PASSED: Final = 0
+_FAILED: Final = 1
+_WRONG_INPUT: Final = 2
+_ENDING_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_WIDE: Final = 200  # columns where no terminal says how many there are
+
+_EXAMPLES: Final = """\b
+Examples:
+  scripts/ring_topology.sh                           a generated robot drive
+  scripts/ring_topology.sh my.bag --encoding cdr     the bytes as they are
+  scripts/ring_topology.sh --rate 0 --json out.json  as fast as it goes
+  scripts/ring_topology.sh --cut nuc2-nuc3@5         a link fails after 5 s
+  scripts/ring_topology.sh --keep                    leave it up to look around
+  scripts/ring_topology.sh --down                    and take it down
+"""
+
+T = TypeVar("T")
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+@app.command(epilog=_EXAMPLES)
+def ring(
+    bag: Annotated[Path | None, typer.Argument(metavar="[BAG]", help="A recording: .bag, .mcap, .db3, folder.")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON.")] = None,
+    rate: Annotated[float, typer.Option(help="Pace of the replay; 0: as fast as it goes.")] = 1.0,
+    encoding: Annotated[str, typer.Option(help=f"Of messages: {', '.join(ENCODINGS)}.")] = "json",
+    data_plane: Annotated[str, typer.Option(help=f"Of the switches: {', '.join(PLANES)}.")] = "raw",
+    mtu: Annotated[int, typer.Option(help="Of the links, in bytes.")] = MTU_BYTES,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the received recording here.")] = None,
+    pcap: Annotated[Path | None, typer.Option(metavar="FILE", help="Write what an eavesdropper on nuc3 sees.")] = None,
+    cut: Annotated[list[str] | None, typer.Option(metavar="A-B@S", help="Cut a link S seconds later.")] = None,
+    keep: Annotated[bool, typer.Option("--keep", help="Leave the ring up, and say what to try.")] = False,
+    down: Annotated[bool, typer.Option("--down", help="Take down every ring that was kept, and end.")] = False,
+) -> None:
+    """Send a recording from a robot at nuc1 over a ring of five name-routed switches to a server at nuc5, and compare.
+
+    Switches, RIBs and proxies are processes in network namespaces; keys and certificates are made for the run. The
+    exit code is 0 only if every message came out identical and in order.
+    """
+    errors = Console(stderr=True)
+    try:
+        runs = Runs()
+        if down:
+            taken = runs.take_down()
+            errors.print(f"taken down: {', '.join(taken)}" if taken else "nothing was left up", highlight=False)
+            raise typer.Exit(_PASSED)
+        options = Options(
+            bag=_absolute(bag),
+            rate=rate,
+            encoding=_one_of("encoding", encoding, ENCODINGS),
+            data_plane=_one_of("data-plane", data_plane, PLANES),
+            mtu=mtu,
+            out=_absolute(out),
+            json=_absolute(json_file),
+            pcap=_absolute(pcap),
+            cuts=tuple(Cut.from_text(text) for text in cut or ()),
+            keep=keep,
+        )
+        for swept in runs.sweep():
+            errors.print(f"took down what run {swept} had left behind", highlight=False)
+        code = _run(options, runs.start(), errors)
+    except ChildError as error:
+        errors.print(f"[bold red]failed[/bold red]: {escape(str(error))}", highlight=False, soft_wrap=True)
+        code = _FAILED
+    except GdpError as error:
+        errors.print(escape(str(error)), highlight=False, soft_wrap=True)
+        code = _WRONG_INPUT
+    raise typer.Exit(code)
+
+
+def main() -> None:
+    """Run the command; never returns."""
+    app(prog_name="ring_topology.sh")
+
+
+def _run(options: Options, run: Run, errors: Console) -> int:
+    """Do one run, and take down what it made unless it is to be kept."""
+    kept = False
+    try:
+        code = asyncio.run(_interruptible(options, run, errors))
+        kept = options.keep and code in (_PASSED, _FAILED)
+    finally:
+        if kept:
+            run.keep()
+        else:
+            for number in _ENDING_SIGNALS:
+                signal.signal(number, signal.SIG_IGN)  # this takes seconds at most, and must be done to the end
+            run.end()
+    return code
+
+
+async def _interruptible(options: Options, run: Run, errors: Console) -> int:
+    """Do the run; a signal cancels it, wherever it is."""
+    loop = asyncio.get_running_loop()
+    work = asyncio.ensure_future(_go(options, run, errors))
+    caught: list[int] = []
+
+    def stop(number: int) -> None:
+        caught.append(number)
+        work.cancel()
+
+    for number in _ENDING_SIGNALS:
+        loop.add_signal_handler(number, stop, number)
+    try:
+        return await work
+    except asyncio.CancelledError:
+        errors.print("interrupted; taking everything down")
+        return 128 + caught[0]
+
+
+async def _go(options: Options, run: Run, errors: Console) -> int:
+    with Teller(errors) as teller:
+        bag = options.bag
+        if bag is None:
+            teller.step("making a recording: ten seconds of a robot's drive")
+            bag = await make_demo(run)
+        if options.out is not None:
+            options.out.mkdir(parents=True, exist_ok=True)
+        standing = Ring(options, run, teller, bag)
+        try:
+            result = await standing.result()
+        finally:
+            standing.forget()
+    _show(result)
+    _write(options, result, standing.recording)
+    if options.keep:
+        again = standing.start_again()
+        errors.print(f"\nThe ring of run {run.id} stands. Try:", highlight=False)
+        for purpose, command in hints(standing, again):
+            errors.print(f"  [dim]# {escape(purpose)}[/dim]\n  {escape(command)}", highlight=False, soft_wrap=True)
+        standing.forget()
+    return _PASSED if result.passed else _FAILED
+
+
+def _show(result: Result) -> None:
+    output = Console()
+    if not output.is_terminal:
+        output = Console(width=_WIDE)
+    output.print(table(result))
+    output.print(verdict(result), highlight=False, soft_wrap=True)
+
+
+def _write(options: Options, result: Result, recording: Path) -> None:
+    """Write the files that were asked for; under sudo they belong to the person who asked."""
+    if options.json is not None:
+        options.json.write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")
+    person = os.environ.get("SUDO_UID"), os.environ.get("SUDO_GID")
+    if os.getuid() == 0 and all(person):
+        recorded = (options.out, recording) if options.out is not None else ()
+        for made in (options.json, options.pcap, *recorded):
+            if made is not None and made.exists():
+                os.chown(made, int(person[0] or 0), int(person[1] or 0))
+
+
+def _absolute(path: Path | None) -> Path | None:
+    return path.expanduser().absolute() if path is not None else None
+
+
+def _one_of(option: str, text: str, choices: tuple[T, ...]) -> T:
+    for choice in choices:
+        if choice == text:
+            return choice
+    raise LocalError(f"--{option} is one of {', '.join(map(str, choices))}, not {text!r}")

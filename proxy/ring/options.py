@@ -1,0 +1,110 @@
+"""What a person may ask of the ring.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+from gdp.errors import LocalError
+from gdp.testbed.topology import MTU_BYTES, Topology, ring5
+from proxy.config import Encoding
+
+__all__ = ["Cut", "Options", "RingPlane"]
+
+RingPlane = Literal["raw", "scapy"]
+
+_CUT: Final = re.compile(r"([^@]+?)-([^@-]+)@(\d+(?:\.\d+)?)\Z")
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """A link that goes down while the recording is replayed.
+
+    Args:
+        a: one end.
+        b: the other end.
+        after_s: seconds after the first message may leave.
+    """
+
+    a: str
+    b: str
+    after_s: float
+
+    @classmethod
+    def from_text(cls, text: str) -> Cut:
+        """Read ``nuc2-nuc3@5``.
+
+        Raises:
+            LocalError: anything else.
+        """
+        found = _CUT.match(text)
+        if found is None:
+            raise LocalError(f"a cut is written like nuc2-nuc3@5 (link, seconds after the start), not {text!r}")
+        return cls(found[1], found[2], float(found[3]))
+
+    def __str__(self) -> str:
+        return f"{self.a}-{self.b}@{self.after_s:g}"
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """One run of the ring. Paths are absolute, for the processes that read them stand elsewhere.
+
+    Args:
+        bag: the recording; None: a generated robot drive.
+        rate: 1 is the recorded pace, 0 as fast as it goes.
+        keep: leave everything up afterwards.
+        out: directory, made if need be, where the received recording stays; None: it goes with the run.
+        pcap: where to write what passes through the middle of the ring.
+
+    Raises:
+        LocalError: a rate that is no pace, a cut of a link that is not there, a directory that is missing.
+    """
+
+    bag: Path | None = None
+    rate: float = 1.0
+    encoding: Encoding = "json"
+    data_plane: RingPlane = "raw"
+    mtu: int = MTU_BYTES
+    out: Path | None = None
+    json: Path | None = None
+    pcap: Path | None = None
+    cuts: tuple[Cut, ...] = ()
+    keep: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.rate < math.inf:
+            raise LocalError(f"a rate is 0 or more, not {self.rate:g}")
+        if self.bag is not None and not self.bag.exists():
+            raise LocalError(f"no such recording: {self.bag}")
+        for file in (self.json, self.pcap):
+            if file is not None and not file.parent.is_dir():
+                raise LocalError(f"no such directory: {file.parent}")
+        topology = self.topology()
+        for cut in self.cuts:
+            topology.link(cut.a, cut.b)
+
+    def topology(self) -> Topology:
+        """Return the ring with the wanted MTU.
+
+        Raises:
+            LocalError: no link can have that MTU.
+        """
+        return ring5(self.mtu)
+
+    def settings(self) -> dict[str, object]:
+        """Return the options as the JSON result states them."""
+        return {
+            "recording": str(self.bag) if self.bag else "demo",
+            "rate": self.rate,
+            "encoding": self.encoding,
+            "data_plane": self.data_plane,
+            "mtu": self.mtu,
+            "cuts": [str(cut) for cut in self.cuts],
+        }

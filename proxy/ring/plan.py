@@ -1,0 +1,150 @@
+"""The configuration files of a ring, as data.
+
+Place: pure. What is written here is what the commands' own ``--check`` accepts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, TypeAlias
+
+from gdp.names import Name
+from gdp.testbed.topology import Attachment, DomainPlan, Topology
+from proxy.config import Encoding
+from proxy.serial.channel import Channel
+
+__all__ = [
+    "METRICS_PORTS",
+    "Credentials",
+    "Topic",
+    "Yaml",
+    "proxy_yaml",
+    "rib_yaml",
+    "rule_yaml",
+    "switch_yaml",
+    "topics_of",
+    "upper_rib",
+]
+
+Yaml: TypeAlias = "dict[str, object]"
+
+METRICS_PORTS: Final = {"switch": 9_101, "rib": 9_102, "proxy": 9_103}  # loopback of a namespace of its own
+AUTHOR: Final = "ring"
+
+
+@dataclass(frozen=True, slots=True)
+class Credentials:
+    """Where a node finds who it is and whom it believes."""
+
+    identity: Path
+    root: Path
+    trusts: tuple[Path, ...]
+
+    def to_yaml(self) -> Yaml:
+        """Return the two keys that every node's file begins with."""
+        return {
+            "identity": str(self.identity),
+            "domain": {"root": str(self.root), "trusts": [str(root) for root in self.trusts]},
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic of the recording, as it is named in the overlay."""
+
+    topic: str
+    type_name: str
+    latched: bool
+
+    @property
+    def metadata(self) -> dict[str, str | int]:
+        """Return what the topic's name digests."""
+        return {"kind": "topic", "name": self.topic, "type": self.type_name, "author": AUTHOR}
+
+
+def topics_of(channels: Iterable[Channel]) -> tuple[Topic, ...]:
+    """Return each topic once, though several nodes may have published it; latched if any of them latched."""
+    latched: dict[tuple[str, str], bool] = {}
+    for channel in channels:
+        key = (channel.topic, channel.type_name)
+        latched[key] = latched.get(key, False) or channel.latched
+    return tuple(Topic(topic, type_name, latch) for (topic, type_name), latch in latched.items())
+
+
+def switch_yaml(topology: Topology, node: str, credentials: Credentials, data_plane: str, *, metrics: bool) -> Yaml:
+    """Return ``switch.yaml`` of one switch."""
+    return {
+        **credentials.to_yaml(),
+        "ports": [{"iface": link.other(node), "cost": link.cost} for link in topology.links_of(node)],
+        "attach": [at.ifname for at in topology.attachments if at.switch == node],
+        "data_plane": data_plane,
+        **_metrics("switch", wanted=metrics),
+    }
+
+
+def rib_yaml(at: Attachment, credentials: Credentials, upper: Name | None, *, metrics: bool) -> Yaml:
+    """Return ``rib.yaml`` of one domain's RIB."""
+    return {
+        **credentials.to_yaml(),
+        "iface": at.ifname,
+        "upper": upper.to_text() if upper is not None else None,
+        **_metrics("rib", wanted=metrics),
+    }
+
+
+def rule_yaml(topic: Topic, owner: Path, encoding: Encoding) -> Yaml:
+    """Return the rule by which a topic crosses: complete, and known in every domain."""
+    return {
+        "name": topic.topic,
+        "kind": "topic",
+        "type": topic.type_name,
+        "metadata": {"author": AUTHOR},
+        "owner": str(owner),
+        "encoding": encoding,
+        "reliable": True,
+        "latched": topic.latched,
+        "global": True,
+    }
+
+
+def proxy_yaml(
+    at: Attachment,
+    credentials: Credentials,
+    delegations: Path,
+    ros: int,
+    rules: Mapping[str, Sequence[Yaml]],
+    record: Path | None,
+    *,
+    metrics: bool,
+) -> Yaml:
+    """Return ``proxy.yaml`` of one proxy.
+
+    Args:
+        at: where it is attached.
+        credentials: who it is.
+        delegations: directory of what owners gave it.
+        ros: 1 or 2.
+        rules: by ``expose`` and ``import``.
+        record: the file to write what arrives into.
+    """
+    form = "ros1" if ros == 1 else "mcap"
+    return {
+        **credentials.to_yaml(),
+        "iface": at.ifname,
+        "delegations": str(delegations),
+        "ros": ros,
+        **{side: list(each) for side, each in rules.items()},
+        **({"record": {"path": str(record), "format": form}} if record is not None else {}),
+        **_metrics("proxy", wanted=metrics),
+    }
+
+
+def upper_rib(topology: Topology, domain: DomainPlan) -> Attachment | None:
+    """Return the RIB of the tier above a domain."""
+    return topology.rib_of(domain.upper) if domain.upper is not None else None
+
+
+def _metrics(role: str, *, wanted: bool) -> Yaml:
+    return {"metrics": {"port": METRICS_PORTS[role]}} if wanted else {}

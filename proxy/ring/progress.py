@@ -1,0 +1,94 @@
+"""How a run is told on standard error: a moving bar in a terminal, plain lines elsewhere.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Final
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+__all__ = ["Teller", "Traffic"]
+
+_PLAIN_EVERY_S: Final = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Traffic:
+    """How far the replay is, put together from both ends.
+
+    Args:
+        latency_ms: one way, of the latest message; None before the first.
+    """
+
+    total: int = 0
+    sent: int = 0
+    received: int = 0
+    lost: int = 0
+    latency_ms: float | None = None
+
+    def rate(self, before: Traffic, elapsed_s: float) -> float:
+        """Return messages received a second since ``before``."""
+        return (self.received - before.received) / elapsed_s if elapsed_s > 0 else 0.0
+
+    def words(self, rate: float) -> str:
+        """Return the figures as one line."""
+        latency = "-" if self.latency_ms is None else f"{self.latency_ms:.1f} ms"
+        return f"{rate:5.0f} msg/s  delivered {self.received}  lost {self.lost}  latency {latency}"
+
+
+class Teller:
+    """Tells steps and traffic as they come.
+
+    Args:
+        console: on standard error.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._bar: Progress | None = None
+        self._task = TaskID(0)
+        self._told = Traffic()
+        self._told_s = time.monotonic()
+        self._began_s = self._told_s
+
+    def __enter__(self) -> Teller:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.end_traffic()
+
+    def step(self, text: str) -> None:
+        """Tell what is being done now."""
+        self._console.print(f"[dim]{time.monotonic() - self._began_s:6.1f} s[/dim]  {text}", highlight=False)
+
+    def begin_traffic(self, total: int) -> None:
+        """Begin to tell traffic of ``total`` messages."""
+        self._told, self._told_s = Traffic(total), time.monotonic()
+        if self._console.is_terminal:
+            columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.fields[words]}"))
+            self._bar = Progress(*columns, console=self._console, transient=True)
+            self._task = self._bar.add_task("", total=total, words="")
+            self._bar.start()
+
+    def traffic(self, now: Traffic) -> None:
+        """Tell the traffic so far; plain lines come at most every two seconds."""
+        elapsed_s = time.monotonic() - self._told_s
+        if self._bar is not None:
+            if elapsed_s >= 0.4:  # both ends report twice a second; a rate over less would jump
+                self._bar.update(self._task, completed=now.received, words=now.words(now.rate(self._told, elapsed_s)))
+                self._told, self._told_s = now, time.monotonic()
+        elif elapsed_s >= _PLAIN_EVERY_S:
+            self.step(f"{now.received}/{now.total}  {now.words(now.rate(self._told, elapsed_s))}")
+            self._told, self._told_s = now, time.monotonic()
+
+    def end_traffic(self) -> None:
+        """Take the bar away."""
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None

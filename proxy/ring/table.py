@@ -1,0 +1,74 @@
+"""The table at the end of a run.
+
+Place: shell; makes rich renderables, prints nothing.
+"""
+
+from __future__ import annotations
+
+from rich.markup import escape
+from rich.table import Table
+
+from proxy.ring.result import Journey, Result, TopicResult
+
+__all__ = ["hops_in_words", "table", "verdict"]
+
+_EDGE_SWITCHES = 2
+
+
+def table(result: Result) -> Table:
+    """Return one row per topic."""
+    of = result.settings
+    title = f"{of['encoding']}, {of['data_plane']}, MTU {of['mtu']}"
+    cuts = of["cuts"]
+    if isinstance(cuts, list) and cuts:
+        title += ", cut " + ", ".join(f"{cut} s" for cut in cuts)
+    drawn = Table(title=title, title_justify="left", title_style="bold")
+    for heading in ("topic", "type"):
+        drawn.add_column(heading, overflow="fold")
+    for heading in ("messages", "bytes", "delivered", "lost", "duplicated"):
+        drawn.add_column(heading, justify="right", no_wrap=True)
+    drawn.add_column("identical", no_wrap=True)
+    for heading in ("median ms", "p99 ms", "max ms", "parts"):
+        drawn.add_column(heading, justify="right", no_wrap=True)
+    drawn.add_column("hops")
+    for row in result.topics:
+        drawn.add_row(*_cells(row), style="red" if row.faults else None)
+    return drawn
+
+
+def verdict(result: Result) -> str:
+    """Return the last line, with markup."""
+    if result.passed:
+        count = sum(row.comparison.messages for row in result.topics)
+        note = f" [yellow]Not all could be read: {escape(result.unread)}[/yellow]" if result.unread else ""
+        return f"[bold green]passed[/bold green]: {count} messages on {len(result.topics)} topics, all identical.{note}"
+    return f"[bold red]failed[/bold red]: {escape('; '.join(result.faults))}"
+
+
+def hops_in_words(journey: Journey) -> str:
+    """Return the switches that messages passed, such as ``5 (3 between)``; several ways in the order they came."""
+    ways = journey.hops_seen or ((journey.hops,) if journey.hops else ())
+    return ", ".join(f"{hops} ({max(hops - _EDGE_SWITCHES, 0)} between)" for hops in ways) or "-"
+
+
+def _cells(row: TopicResult) -> list[str]:
+    of, way = row.comparison, row.journey
+    return [
+        escape(of.topic),
+        escape(of.type_name),
+        str(of.messages),
+        f"{of.bytes:,}",
+        str(of.delivered),
+        str(of.lost),
+        str(row.duplicated),
+        "yes" if of.identical else "no",
+        _ms(way.median_ms),
+        _ms(way.p99_ms),
+        _ms(way.max_ms),
+        str(way.parts or "-"),
+        hops_in_words(way),
+    ]
+
+
+def _ms(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"

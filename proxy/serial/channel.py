@@ -1,0 +1,182 @@
+"""What a reader must know about a topic's messages; travels sealed, once per reader.
+
+Place: pure. The wire form is a CBOR map with one-letter keys, bounded, refused whole when anything in it is not as it
+should be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal, TypeAlias
+
+import cbor2
+
+from gdp.errors import DropReason, LocalError, RemoteError
+
+__all__ = ["Channel", "DefinitionFormat", "Qos", "RosVersion"]
+
+RosVersion: TypeAlias = Literal[1, 2]
+DefinitionFormat: TypeAlias = Literal["msg", "idl", ""]
+
+CHANNEL_MAX_BYTES: Final = 1 << 20
+_TEXT_MAX: Final = 1024
+_DEFINITION_MAX: Final = 900_000
+_QOS_MAX: Final = 64
+_TIME_MAX: Final = 1 << 63
+
+
+@dataclass(frozen=True, slots=True)
+class Qos:
+    """One offered QoS profile. Policies are ROS 2's words in lower case; durations are (seconds, nanoseconds)."""
+
+    history: str
+    depth: int
+    reliability: str
+    durability: str
+    deadline: tuple[int, int]
+    lifespan: tuple[int, int]
+    liveliness: str
+    lease: tuple[int, int]
+    plain_names: bool  # avoid_ros_namespace_conventions
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One publisher's topic, or one topic of a recording.
+
+    Args:
+        topic: as the robot calls it.
+        type_name: as ROS 2 writes it (``sensor_msgs/msg/Image``), for ROS 1 too.
+        ros: whose wire form the messages have.
+        hash: md5 sum for ROS 1, ``RIHS01_...`` for ROS 2; empty where unknown.
+        definition: full text, used types included; empty where unknown, or for a type without fields.
+        definition_format: of ``definition``; empty: there is none.
+        qos: offered profiles, ROS 2 only.
+        latched: late joiners want the last message.
+        callerid: the publishing node, ROS 1 only, where known.
+    """
+
+    topic: str
+    type_name: str
+    ros: RosVersion
+    hash: str = ""
+    definition: str = ""
+    definition_format: DefinitionFormat = ""
+    qos: tuple[Qos, ...] = ()
+    latched: bool = False
+    callerid: str | None = None
+
+    def to_wire(self) -> bytes:
+        """Return the bounded CBOR form.
+
+        Raises:
+            LocalError: a part is longer than a peer would take.
+        """
+        fields: dict[str, object] = {
+            "t": self.topic,
+            "n": self.type_name,
+            "r": self.ros,
+            "h": self.hash,
+            "d": self.definition,
+            "f": self.definition_format,
+            "l": self.latched,
+        }
+        if self.qos:
+            fields["q"] = [_qos_fields(profile) for profile in self.qos]
+        if self.callerid is not None:
+            fields["c"] = self.callerid
+        wire = cbor2.dumps(fields, canonical=True)
+        try:
+            Channel.from_wire(wire)
+        except RemoteError as error:
+            raise LocalError(f"{self.topic}: cannot be described to a reader: {error.detail}") from error
+        return wire
+
+    @classmethod
+    def from_wire(cls, wire: bytes) -> Channel:
+        """Read what ``to_wire`` wrote.
+
+        Raises:
+            RemoteError: anything else, whatever the bytes.
+        """
+        if len(wire) > CHANNEL_MAX_BYTES:
+            raise RemoteError(DropReason.MALFORMED, f"a description of {len(wire)} bytes")
+        try:
+            fields = cbor2.loads(wire)
+        except (cbor2.CBORDecodeError, RecursionError, ValueError, TypeError, OverflowError) as error:
+            raise RemoteError(DropReason.MALFORMED, "a description that is not CBOR") from error
+        if not isinstance(fields, dict):
+            raise RemoteError(DropReason.MALFORMED, "a description that is not a map")
+        ros = _whole(fields.get("r"))
+        definition_format = _text(fields.get("f"))
+        if ros not in (1, 2) or definition_format not in ("msg", "idl", ""):
+            raise RemoteError(DropReason.MALFORMED, "a description of another ROS or form")
+        profiles = fields.get("q", [])
+        if not isinstance(profiles, list) or len(profiles) > _QOS_MAX:
+            raise RemoteError(DropReason.MALFORMED, "QoS profiles")
+        callerid = fields.get("c")
+        return cls(
+            topic=_text(fields.get("t")),
+            type_name=_text(fields.get("n")),
+            ros=1 if ros == 1 else 2,
+            hash=_text(fields.get("h")),
+            definition=_text(fields.get("d"), _DEFINITION_MAX),
+            definition_format="msg" if definition_format == "msg" else "idl" if definition_format == "idl" else "",
+            qos=tuple(_qos(profile) for profile in profiles),
+            latched=_flag(fields.get("l")),
+            callerid=None if callerid is None else _text(callerid),
+        )
+
+
+def _qos_fields(profile: Qos) -> list[object]:
+    return [
+        profile.history,
+        profile.depth,
+        profile.reliability,
+        profile.durability,
+        list(profile.deadline),
+        list(profile.lifespan),
+        profile.liveliness,
+        list(profile.lease),
+        profile.plain_names,
+    ]
+
+
+def _qos(fields: object) -> Qos:
+    if not isinstance(fields, list) or len(fields) != 9:
+        raise RemoteError(DropReason.MALFORMED, "a QoS profile")
+    return Qos(
+        history=_text(fields[0]),
+        depth=_whole(fields[1]),
+        reliability=_text(fields[2]),
+        durability=_text(fields[3]),
+        deadline=_duration(fields[4]),
+        lifespan=_duration(fields[5]),
+        liveliness=_text(fields[6]),
+        lease=_duration(fields[7]),
+        plain_names=_flag(fields[8]),
+    )
+
+
+def _text(value: object, limit: int = _TEXT_MAX) -> str:
+    if not isinstance(value, str) or len(value) > limit:
+        raise RemoteError(DropReason.MALFORMED, f"a text of at most {limit} characters was expected")
+    return value
+
+
+def _whole(value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= _TIME_MAX:
+        raise RemoteError(DropReason.MALFORMED, "a whole number was expected")
+    return value
+
+
+def _flag(value: object) -> bool:
+    if not isinstance(value, bool):
+        raise RemoteError(DropReason.MALFORMED, "true or false was expected")
+    return value
+
+
+def _duration(value: object) -> tuple[int, int]:
+    if not isinstance(value, list) or len(value) != 2:
+        raise RemoteError(DropReason.MALFORMED, "a duration was expected")
+    return _whole(value[0]), _whole(value[1])

@@ -1,0 +1,81 @@
+"""Where numbers lie: a run of them, of fixed size, packed and unpacked in one call whatever its alignment.
+
+Place: pure.
+Source: CORBA CDR 15.3 (a primitive is aligned to its size, counted from the start of the body); ROS 1 packs tightly.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+from proxy.serial.dialect import BITS
+from proxy.serial.schema import SIZES, Array, Number, Record, Type
+
+__all__ = ["Wire", "inline_codes", "structs_for"]
+
+_INLINE_MAX: Final = 256  # numbers in one record that still count as one run
+
+
+class Wire:
+    """A wire form: ROS 1, or CDR (XCDR1) of either byte order.
+
+    Args:
+        cdr: aligned, strings terminated; otherwise ROS 1.
+        order: ``<`` or ``>``.
+    """
+
+    __slots__ = ("cdr", "order")
+
+    def __init__(self, *, cdr: bool, order: str = "<") -> None:
+        self.cdr = cdr
+        self.order = order
+
+    def structs(self, codes: str, *, as_bits: bool) -> tuple[struct.Struct, ...]:
+        """Return the struct of a run for each place modulo 8 that it may start at."""
+        letters = "".join(BITS.get(code, code) for code in codes) if as_bits else codes
+        if not self.cdr:
+            return (struct.Struct(self.order + letters),) * 8
+        return tuple(struct.Struct(self.order + _padded(letters, phase)) for phase in range(8))
+
+
+def structs_for(wire: Wire, code: str) -> struct.Struct:
+    """Return the struct of one number without padding."""
+    return struct.Struct(wire.order + code)
+
+
+def _padded(letters: str, phase: int) -> str:
+    parts = []
+    at = phase
+    for letter in letters:
+        size = SIZES[letter]
+        pad = -at % size
+        parts.append("x" * pad + letter)
+        at += pad + size
+    return "".join(parts)
+
+
+def inline_codes(kind: Type, inline_max: int, known: dict[int, str | None]) -> str | None:
+    """Return the codes of a type that is only numbers and of fixed size, None for any other.
+
+    Args:
+        kind: a field's type.
+        inline_max: longest fixed array that may count.
+        known: answers already found, by the record's identity; filled.
+    """
+    if isinstance(kind, Number):
+        return kind.code
+    if isinstance(kind, Array) and isinstance(kind.item, Number) and not kind.item.octet:
+        return kind.item.code * kind.count if kind.count <= inline_max else None
+    if not isinstance(kind, Record):
+        return None
+    if id(kind) not in known:
+        codes: str | None = ""
+        for _, field in kind.fields:
+            more = inline_codes(field, inline_max, known)
+            if more is None or codes is None or len(codes) + len(more) > _INLINE_MAX:
+                codes = None
+                break
+            codes += more
+        known[id(kind)] = codes
+    return known[id(kind)]

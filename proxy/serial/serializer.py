@@ -1,0 +1,201 @@
+"""One channel's messages in one encoding: bytes as ROS writes them to a body for the overlay, and back.
+
+Place: pure. What is compiled for a channel is compiled once.
+Source: DESIGN section 8; OMG CDR encapsulation (RTPS 2.2, section 10): two bytes of scheme, two of options.
+"""
+
+from __future__ import annotations
+
+import struct
+from functools import lru_cache
+from typing import Final, Literal, TypeAlias
+
+import cbor2
+import orjson
+import pybase64
+
+from gdp.errors import DropReason, RemoteError
+from proxy.serial.cbor_dialect import CborDialect
+from proxy.serial.channel import Channel
+from proxy.serial.dialect import Dialect, MisfitError, Wide
+from proxy.serial.json_dialect import JsonDialect
+from proxy.serial.layout import Wire
+from proxy.serial.native_dialect import NativeDialect
+from proxy.serial.reader import Reader, read_with
+from proxy.serial.schema import Array as ArrayType
+from proxy.serial.schema import DefinitionError, Record, Sequence, Text, Type, parse
+from proxy.serial.writer import Writer, write_with
+
+__all__ = ["Encoding", "Serializer", "canonical"]
+
+_LITTLE: Final = b"\x00\x01"  # CDR_LE
+_BIG: Final = b"\x00\x00"  # CDR_BE
+_PREFIX: Final = b"\x00\x01\x00\x00"
+_PAD_MAX: Final = 3  # bytes that a writer may add to reach a multiple of four
+_RAW: Final = "$raw"  # no field can be called so
+_NATIVE: Final = NativeDialect()
+
+
+# How a body is written; ``cdr``: the bytes as they are, whichever ROS wrote them.
+Encoding: TypeAlias = Literal["json", "cbor", "cdr"]
+
+
+class Serializer:
+    """Bodies of one channel in one encoding.
+
+    A message that does not fit the channel's definition, and every message of a channel without one, travels opaque:
+    ``{"$raw": bytes}``. Nothing is lost; only the readable form is.
+
+    Args:
+        channel: what the messages are.
+        encoding: how bodies look.
+    """
+
+    __slots__ = ("_codec", "_encoding", "channel", "opaque")
+
+    def __init__(self, channel: Channel, encoding: Encoding) -> None:
+        self.channel = channel
+        self._encoding = encoding
+        self.opaque = ""  # why messages travel opaque, empty where they do not
+        self._codec: _Codec | None = None
+        if encoding != "cdr":
+            try:
+                self._codec = _codec(channel, encoding)
+            except DefinitionError as error:
+                self.opaque = str(error)
+
+    def encode(self, raw: bytes) -> bytes:
+        """Return the body of a message.
+
+        Args:
+            raw: the message in the channel's ROS version's wire form; CDR with its four bytes of encapsulation.
+        """
+        if self._encoding == "cdr":
+            return raw
+        tree = self._codec.to_tree(raw) if self._codec else None
+        if self._encoding == "json":
+            if tree is None:
+                tree = {_RAW: pybase64.b64encode_as_string(raw)}
+            return orjson.dumps(tree, option=orjson.OPT_SERIALIZE_NUMPY)
+        return cbor2.dumps({_RAW: raw} if tree is None else tree)
+
+    def decode(self, body: bytes) -> bytes:
+        """Return the message of a body: little-endian CDR, padding zeroed, or ROS 1.
+
+        Raises:
+            RemoteError: the body is not what the definition and the encoding say.
+        """
+        if self._encoding == "cdr":
+            return body
+        try:
+            tree = orjson.loads(body) if self._encoding == "json" else cbor2.loads(body)
+            if isinstance(tree, dict) and _RAW in tree:
+                return _raw_of(tree[_RAW])
+            if self._codec is None:
+                raise MisfitError("a channel without a usable definition")
+            return self._codec.to_raw(tree)
+        except (
+            ArithmeticError,
+            LookupError,
+            RecursionError,
+            TypeError,
+            ValueError,
+            cbor2.CBORDecodeError,
+            struct.error,
+        ) as error:
+            detail = f"{self._encoding}: {type(error).__name__}: {error}"[:200]
+            raise RemoteError(DropReason.MALFORMED, detail) from error
+
+
+def canonical(channel: Channel, raw: bytes) -> bytes:
+    """Return the message read and written once: little-endian, padding zeroed, nothing after the last field.
+
+    A message that does not fit the definition comes back as it is.
+    """
+    try:
+        codec = _native(channel.type_name, channel.definition, channel.definition_format, channel.ros)
+    except DefinitionError:
+        return raw
+    tree = codec.to_tree(raw)
+    return raw if tree is None else codec.to_raw(tree)
+
+
+def _raw_of(value: object) -> bytes:
+    if isinstance(value, bytes):
+        return value
+    if isinstance(value, str):
+        return pybase64.b64decode(value, validate=True)
+    raise MisfitError("not bytes")
+
+
+class _Codec:
+    """Readers for each way a message of the type may lie, and the one writer."""
+
+    __slots__ = ("_dialect", "_readers", "_record", "_ros", "_turned", "_write")
+
+    def __init__(self, record: Record, ros: int, dialect: Dialect, turned: _Codec | None) -> None:
+        self._record = record
+        self._ros = ros
+        self._dialect = dialect
+        self._turned = turned  # reads what is big-endian; None where this one does itself
+        wire = Wire(cdr=ros == 2)
+        layouts = tuple(Wide) if _has_wide(record, set()) else (Wide.FOUR,)
+        self._readers: dict[bytes, tuple[Reader, ...]] = {
+            _LITTLE: tuple(read_with(record, wire, dialect, layout) for layout in layouts)
+        }
+        if turned is None:
+            big = Wire(cdr=True, order=">")
+            self._readers[_BIG] = tuple(read_with(record, big, dialect, layout) for layout in layouts)
+        self._write: Writer = write_with(record, wire, dialect)
+
+    def to_tree(self, raw: bytes) -> object | None:
+        """Return the tree of a message, None where it does not fit the type."""
+        if self._ros == 1:
+            return _first_fit(self._readers[_LITTLE], memoryview(raw), 0)
+        if len(raw) < len(_PREFIX):
+            return None
+        order = raw[:2]
+        if order == _BIG and self._turned is not None:
+            tree = self._turned.to_tree(raw)
+            return None if tree is None else self.to_tree(self._turned.to_raw(tree))
+        readers = self._readers.get(order)
+        return None if readers is None else _first_fit(readers, memoryview(raw)[len(_PREFIX) :], _PAD_MAX)
+
+    def to_raw(self, tree: object) -> bytes:
+        """Return the message of a tree; raises what the writer raises."""
+        body = bytearray()
+        self._write(body, tree)
+        return bytes(body) if self._ros == 1 else b"".join((_PREFIX, body))
+
+
+def _first_fit(readers: tuple[Reader, ...], body: memoryview, pad_max: int) -> object | None:
+    for read in readers:
+        try:
+            tree, end = read(body, 0)
+        except (MisfitError, struct.error):
+            continue
+        if end <= len(body) <= end + pad_max:
+            return tree
+    return None
+
+
+def _has_wide(kind: Type, seen: set[int]) -> bool:
+    if isinstance(kind, Text):
+        return kind.wide
+    if isinstance(kind, ArrayType | Sequence):
+        return _has_wide(kind.item, seen)
+    if not isinstance(kind, Record) or id(kind) in seen:
+        return False
+    seen.add(id(kind))
+    return any(_has_wide(field, seen) for _, field in kind.fields)
+
+
+@lru_cache(maxsize=1024)
+def _native(type_name: str, definition: str, definition_format: str, ros: int) -> _Codec:
+    return _Codec(parse(type_name, definition, definition_format, ros), ros, _NATIVE, None)
+
+
+def _codec(channel: Channel, encoding: Encoding) -> _Codec:
+    named = (channel.type_name, channel.definition, channel.definition_format, channel.ros)
+    dialect: Dialect = JsonDialect() if encoding == "json" else CborDialect()
+    return _Codec(parse(*named), channel.ros, dialect, _native(*named))

@@ -1,0 +1,297 @@
+#!/usr/bin/env python3
+"""Make the demonstration recording: a small robot drives a circle in a room. The same arguments give the same bytes."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from gdp.errors import LocalError
+from proxy.endpoints.bag import BagWriter
+from proxy.serial.channel import Channel, Qos, RosVersion
+
+START_NS: Final = 1_700_000_000_000_000_000
+WIDTH, HEIGHT = 640, 480
+TEXTURE: Final = 1024  # pixels a side; repeats
+ROOM_M: Final = (8.0, 6.0)
+RADIUS_M, SPEED_M_S = 1.5, 0.6
+BEAMS: Final = 720
+RANGE_M: Final = (0.12, 6.5)
+MAP_CELL_M: Final = 0.05
+
+TYPES: Final = {  # topic: type, messages a second (0: one, latched)
+    "/tf_static": ("tf2_msgs/msg/TFMessage", 0),
+    "/map": ("nav_msgs/msg/OccupancyGrid", 0),
+    "/camera/image": ("sensor_msgs/msg/Image", 10),
+    "/scan": ("sensor_msgs/msg/LaserScan", 10),
+    "/imu": ("sensor_msgs/msg/Imu", 100),
+    "/odom": ("nav_msgs/msg/Odometry", 20),
+    "/tf": ("tf2_msgs/msg/TFMessage", 20),
+}
+
+
+def scene() -> NDArray[np.uint8]:
+    """Return the floor that the camera passes over: uint8 [TEXTURE, TEXTURE, 3], RGB; integers only, so exact."""
+    random = np.random.default_rng(7)
+    total = np.zeros((TEXTURE, TEXTURE, 3), np.int64)
+    for cells, weight in ((8, 4), (32, 2), (128, 1)):
+        patch = TEXTURE // cells
+        coarse = random.integers(0, 256, (cells, cells, 3), dtype=np.int64)
+        far_y, far_x = np.roll(coarse, -1, 0), np.roll(coarse, -1, 1)
+        far = np.roll(far_y, -1, 1)
+        across = np.arange(patch, dtype=np.int64)
+        y = across[:, None, None]
+        x = across[None, :, None]
+        for row in range(cells):
+            for column in range(cells):
+                here = row, column
+                smooth = (
+                    coarse[here] * (patch - y) * (patch - x)
+                    + far_y[here] * y * (patch - x)
+                    + far_x[here] * (patch - y) * x
+                    + far[here] * y * x
+                ) // (patch * patch)
+                total[row * patch : (row + 1) * patch, column * patch : (column + 1) * patch] += weight * smooth
+    floor = total // 7
+    ticks = np.arange(TEXTURE) % 128 < 3  # tile joints
+    floor[ticks] //= 3
+    floor[:, ticks] //= 3
+    return floor.astype(np.uint8)
+
+
+class Drive:
+    """The robot and its messages, for either ROS."""
+
+    def __init__(self, ros: RosVersion) -> None:
+        self.ros = ros
+        self.store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
+        if ros == 1:  # the one type that rosbags does not bring
+            transforms = "geometry_msgs/TransformStamped[] transforms\n"
+            self.store.register(get_types_from_msg(transforms, "tf2_msgs/msg/TFMessage"))
+        self.floor = np.tile(scene(), (2, 2, 1))
+        self.seq = 0
+
+    def make(self, type_name: str, **fields: object) -> object:
+        """Return a message."""
+        return self.store.types[type_name](**fields)  # type: ignore[arg-type]
+
+    def channel(self, topic: str) -> Channel:
+        """Return a topic's channel, with definition and hash."""
+        type_name, rate = TYPES[topic]
+        definition, md5 = self.store.generate_msgdef(type_name, ros_version=self.ros)
+        latched = rate == 0
+        if self.ros == 1:
+            return Channel(topic, type_name, 1, md5, definition, "msg", latched=latched, callerid="/robot")
+        durability = "transient_local" if latched else "volatile"
+        never = (2_147_483_647, 4_294_967_295)
+        qos = Qos("keep_last", 10, "reliable", durability, never, never, "automatic", never, plain_names=False)
+        digest = self.store.hash_rihs01(type_name)
+        return Channel(topic, type_name, 2, digest, definition, "msg", qos=(qos,), latched=latched)
+
+    def raw(self, topic: str, at_ns: int) -> bytes:
+        """Return a topic's message of a moment, in wire form."""
+        type_name = TYPES[topic][0]
+        message = {
+            "/tf_static": self.static_transforms,
+            "/map": self.map,
+            "/camera/image": self.image,
+            "/scan": self.scan,
+            "/imu": self.imu,
+            "/odom": self.odometry,
+            "/tf": self.transforms,
+        }[topic](at_ns)
+        if self.ros == 1:
+            return bytes(self.store.serialize_ros1(message, type_name))
+        return bytes(self.store.serialize_cdr(message, type_name, little_endian=True))
+
+    def header(self, at_ns: int, frame: str) -> object:
+        seconds, nanoseconds = divmod(START_NS + at_ns, 1_000_000_000)
+        stamp = self.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+        if self.ros == 2:
+            return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+        self.seq += 1
+        return self.make("std_msgs/msg/Header", seq=self.seq, stamp=stamp, frame_id=frame)
+
+    def pose_at(self, at_ns: int) -> tuple[float, float, float]:
+        """Return x, y in metres and the heading in radians; rounded, so that no library's last digit shows."""
+        turned = SPEED_M_S * at_ns / 1e9 / RADIUS_M
+        x, y = RADIUS_M * math.sin(turned), -RADIUS_M * math.cos(turned)
+        return round(x, 9), round(y, 9), round(turned, 9)
+
+    def vector(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> object:
+        return self.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+    def quaternion(self, heading: float) -> object:
+        z, w = round(math.sin(heading / 2), 9), round(math.cos(heading / 2), 9)
+        return self.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=z, w=w)
+
+    def transform(self, at_ns: int, frames: tuple[str, str], at: tuple[float, float, float], heading: float) -> object:
+        return self.make(
+            "geometry_msgs/msg/TransformStamped",
+            header=self.header(at_ns, frames[0]),
+            child_frame_id=frames[1],
+            transform=self.make(
+                "geometry_msgs/msg/Transform", translation=self.vector(*at), rotation=self.quaternion(heading)
+            ),
+        )
+
+    def static_transforms(self, at_ns: int) -> object:
+        camera = self.transform(at_ns, ("base_link", "camera"), (0.2, 0.0, 0.3), 0.0)
+        laser = self.transform(at_ns, ("base_link", "laser"), (0.1, 0.0, 0.2), 0.0)
+        return self.make("tf2_msgs/msg/TFMessage", transforms=[camera, laser])
+
+    def transforms(self, at_ns: int) -> object:
+        x, y, heading = self.pose_at(at_ns)
+        return self.make(
+            "tf2_msgs/msg/TFMessage",
+            transforms=[self.transform(at_ns, ("odom", "base_link"), (x, y, 0.0), heading)],
+        )
+
+    def map(self, at_ns: int) -> object:
+        columns, rows = (round(side / MAP_CELL_M) for side in ROOM_M)
+        cells = np.zeros((rows, columns), np.int8)
+        cells[0] = cells[-1] = cells[:, 0] = cells[:, -1] = 100
+        cells[rows // 3 : rows // 2, -1] = -1  # the door: unknown
+        origin = self.make(
+            "geometry_msgs/msg/Pose",
+            position=self.make("geometry_msgs/msg/Point", x=-ROOM_M[0] / 2, y=-ROOM_M[1] / 2, z=0.0),
+            orientation=self.quaternion(0.0),
+        )
+        header = self.header(at_ns, "map")
+        info = self.make(
+            "nav_msgs/msg/MapMetaData",
+            map_load_time=self.make("builtin_interfaces/msg/Time", sec=START_NS // 1_000_000_000, nanosec=0),
+            resolution=MAP_CELL_M,
+            width=columns,
+            height=rows,
+            origin=origin,
+        )
+        return self.make("nav_msgs/msg/OccupancyGrid", header=header, info=info, data=cells.reshape(-1))
+
+    def image(self, at_ns: int) -> object:
+        x, y, _ = self.pose_at(at_ns)
+        left, top = (round(256 * value) % TEXTURE for value in (x, y))
+        view = self.floor[top : top + HEIGHT, left : left + WIDTH]
+        return self.make(
+            "sensor_msgs/msg/Image",
+            header=self.header(at_ns, "camera"),
+            height=HEIGHT,
+            width=WIDTH,
+            encoding="rgb8",
+            is_bigendian=0,
+            step=3 * WIDTH,
+            data=np.ascontiguousarray(view).reshape(-1),
+        )
+
+    def scan(self, at_ns: int) -> object:
+        x, y, heading = self.pose_at(at_ns)
+        angles = -math.pi + np.arange(BEAMS) * (2 * math.pi / BEAMS)
+        ahead, aside = np.cos(angles + heading), np.sin(angles + heading)
+        to_x = np.where(ahead > 0, ROOM_M[0] / 2 - x, -ROOM_M[0] / 2 - x) / np.where(ahead == 0, 1e-9, ahead)
+        to_y = np.where(aside > 0, ROOM_M[1] / 2 - y, -ROOM_M[1] / 2 - y) / np.where(aside == 0, 1e-9, aside)
+        ranges = np.round(np.minimum(to_x, to_y), 3).astype(np.float32)
+        door = (to_x < to_y) & (ahead > 0) & (np.abs(y + to_x * aside) < 0.5)
+        ranges[door] = np.inf  # nothing to see
+        ranges[BEAMS // 2 - 2 : BEAMS // 2 + 2] = -np.inf  # too close: the robot's own bumper
+        ranges[at_ns // 100_000_000 % BEAMS :: 97] = np.nan  # no return
+        intensities = np.where(np.isfinite(ranges), 1000, 0).astype(np.float32)
+        return self.make(
+            "sensor_msgs/msg/LaserScan",
+            header=self.header(at_ns, "laser"),
+            angle_min=-math.pi,
+            angle_max=math.pi,
+            angle_increment=2 * math.pi / BEAMS,
+            time_increment=0.1 / BEAMS,
+            scan_time=0.1,
+            range_min=RANGE_M[0],
+            range_max=RANGE_M[1],
+            ranges=ranges,
+            intensities=intensities,
+        )
+
+    def imu(self, at_ns: int) -> object:
+        _, _, heading = self.pose_at(at_ns)
+        shake = round(0.05 * math.sin(at_ns / 1e9 * 40), 9)
+        unknown = np.zeros(9)
+        unknown[0] = -1
+        return self.make(
+            "sensor_msgs/msg/Imu",
+            header=self.header(at_ns, "base_link"),
+            orientation=self.quaternion(heading),
+            orientation_covariance=np.diag([1e-3] * 3).reshape(-1),
+            angular_velocity=self.vector(z=SPEED_M_S / RADIUS_M),
+            angular_velocity_covariance=unknown,
+            linear_acceleration=self.vector(shake, SPEED_M_S**2 / RADIUS_M, 9.81),
+            linear_acceleration_covariance=unknown,
+        )
+
+    def odometry(self, at_ns: int) -> object:
+        x, y, heading = self.pose_at(at_ns)
+        spread = np.diag([1e-4] * 6).reshape(-1)
+        pose = self.make(
+            "geometry_msgs/msg/Pose",
+            position=self.make("geometry_msgs/msg/Point", x=x, y=y, z=0.0),
+            orientation=self.quaternion(heading),
+        )
+        twist = self.make(
+            "geometry_msgs/msg/Twist",
+            linear=self.vector(SPEED_M_S),
+            angular=self.vector(z=SPEED_M_S / RADIUS_M),
+        )
+        return self.make(
+            "nav_msgs/msg/Odometry",
+            header=self.header(at_ns, "odom"),
+            child_frame_id="base_link",
+            pose=self.make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=spread),
+            twist=self.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=spread),
+        )
+
+
+def moments(seconds: float) -> Iterator[tuple[int, str]]:
+    """Yield (nanoseconds from the start, topic) in time order."""
+    events = []
+    for order, (topic, (_, rate)) in enumerate(TYPES.items()):
+        period_ns = 1_000_000_000 // rate if rate else 0
+        count = math.ceil(seconds * rate) if rate else 1
+        events += [(number * period_ns, order, topic) for number in range(count)]
+    for at_ns, _, topic in sorted(events):
+        yield at_ns, topic
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: scripts/make_demo_bag.py --seconds 10 -o drive.mcap",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("-o", "--output", type=Path, help="the file to make (demo.mcap, with --ros1 demo.bag)")
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of the drive (default: %(default)s)")
+    parser.add_argument("--ros1", action="store_true", help="a ROS 1 bag instead of ROS 2 MCAP")
+    arguments = parser.parse_args()
+    if not 0 < arguments.seconds <= 3_600:
+        parser.error("--seconds: expected more than 0 and at most 3600")
+    output = arguments.output or Path("demo.bag" if arguments.ros1 else "demo.mcap")
+    drive = Drive(1 if arguments.ros1 else 2)
+    try:
+        with BagWriter(output, drive.ros) as bag:
+            handles = {topic: bag.add(drive.channel(topic)) for topic in TYPES}
+            for at_ns, topic in moments(arguments.seconds):
+                bag.write(handles[topic], START_NS + at_ns, drive.raw(topic, at_ns))
+    except LocalError as error:
+        print(error, file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,95 @@
+#!/usr/bin/env bash
+# Makes .venv with this package and what it needs; does nothing, in well under a second, if that is done already.
+#
+#   scripts/setup.sh          to run
+#   scripts/setup.sh --dev    to test as well
+#
+# Needs: python3 >= 3.10. System packages are installed only where something is missing, and only as root.
+set -euo pipefail
+
+root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
+cd "$root"
+venv=$root/.venv
+extras=""
+[[ "${1:-}" == "--dev" ]] && extras="[dev]"
+
+say() { printf 'setup: %s\n' "$*" >&2; }
+fail() { say "$@"; exit 1; }
+
+find_python() {
+    local candidate
+    for candidate in python3 python3.14 python3.13 python3.12 python3.11 python3.10; do
+        if "$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null; then
+            command -v "$candidate"
+            return
+        fi
+    done
+    fail "python3 of version 3.10 or later is needed; found: $(python3 --version 2>&1 || true)"
+}
+
+# package <name> <why>: installs one Debian package
+package() {
+    say "installing $1 ($2)"
+    command -v apt-get >/dev/null || fail "$1 is missing ($2), and there is no apt-get here: install it with your own tool"
+    [[ $(id -u) -eq 0 ]] || fail "$1 is missing ($2): run 'sudo apt-get install $1', or this script with sudo"
+    local log
+    log=$(mktemp)
+    local install=(env DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends "$1")
+    if ! "${install[@]}" >"$log" 2>&1 && ! { apt-get update >"$log" 2>&1 && "${install[@]}" >"$log" 2>&1; }; then
+        tail -n 20 "$log" >&2
+        rm -f "$log"
+        fail "apt-get could not install $1"
+    fi
+    rm -f "$log"
+}
+
+# hand_over <path>...: under sudo, what was made belongs to the person, not to root
+hand_over() {
+    if [[ $(id -u) -eq 0 && -n "${SUDO_UID:-}" && "${SUDO_UID}" != 0 ]]; then
+        chown -R --no-dereference "$SUDO_UID:${SUDO_GID:-$SUDO_UID}" "$@"
+    fi
+}
+
+# compile_own: byte-compiles our packages, lest root leaves caches that their owner cannot delete
+compile_own() {
+    "$venv/bin/python" -m compileall -q gdp proxy fog || fail "the source does not compile"
+    if [[ $(id -u) -eq 0 && -n "${SUDO_UID:-}" ]]; then
+        find gdp proxy fog -name __pycache__ -user 0 -exec chown -R "$SUDO_UID:${SUDO_GID:-$SUDO_UID}" {} +
+    fi
+}
+
+python=$(find_python)
+wanted=$({ cat pyproject.toml; "$python" --version; echo "$root"; } | sha256sum | cut -d' ' -f1)
+# What was installed for testing is enough for running.
+for stamp in "$venv/.installed$extras" "$venv/.installed[dev]"; do
+    if [[ -f "$stamp" && $(<"$stamp") == "$wanted" ]] && "$venv/bin/python" -c '' 2>/dev/null; then
+        compile_own
+        exit 0
+    fi
+done
+
+command -v ip >/dev/null || [[ -x /usr/sbin/ip ]] || package iproute2 "ip netns: to look into the namespaces of a ring"
+for tool in nsenter setpriv unshare; do
+    command -v "$tool" >/dev/null || package util-linux "$tool: to start processes inside namespaces"
+done
+"$python" -c 'import ensurepip, venv' 2>/dev/null || package python3-venv "python3 cannot make virtual environments without it"
+if [[ -n "$extras" ]]; then
+    command -v openssl >/dev/null || package openssl "tests read our certificates with it"
+fi
+
+if ! "$venv/bin/python" -c '' 2>/dev/null; then
+    say "making .venv with $("$python" --version)"
+    "$python" -m venv --clear "$venv"
+fi
+say "installing this package and what it needs (once; about a minute)"
+log=$(mktemp)
+trap 'rm -f "$log"' EXIT
+if ! "$venv/bin/python" -m pip install --disable-pip-version-check --no-input -e ".$extras" >"$log" 2>&1; then
+    tail -n 25 "$log" >&2
+    fail "pip could not install the package; the lines above say why"
+fi
+rm -f "$venv"/.installed*
+printf '%s\n' "$wanted" >"$venv/.installed$extras"
+compile_own
+hand_over "$venv" ./*.egg-info
+say "done"

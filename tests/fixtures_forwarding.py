@@ -1,0 +1,114 @@
+"""One list of frames and what must become of them, driven through ``decide`` and through every data plane.
+
+A case is a frame from the Ethernet header on, and what leaves. The planes run it on port 0 ("in"); ports 1 ("wide") and
+2 ("narrow") lead out; port 3 does not exist, which is how a port that is down looks to the table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from gdp.errors import DropReason
+from gdp.frame.codec import Header, encode
+from gdp.frame.kinds import ETHERTYPE, Flag, Kind
+from gdp.switch.table import NOWHERE, Hops
+
+IN, WIDE, NARROW, ABSENT = range(4)
+MTUS = {IN: 1500, WIDE: 1500, NARROW: 700}
+IN_MAC, WIDE_MAC, NARROW_MAC = (bytes([2, 0, 0, 0, port, 1]) for port in (IN, WIDE, NARROW))
+PEER_MACS = {port: bytes([2, 0, 0, 0, port, 2]) for port in (IN, WIDE, NARROW)}
+
+SOURCE, OTHER_SOURCE = bytes([0x50]) * 32, bytes([0x51]) * 32
+ONE, BOTH, SPLIT, GONE, HALF, NOBODY, DEAD = (bytes([0xD0 + n]) * 32 for n in range(7))
+
+TO_WIDE = (WIDE, PEER_MACS[WIDE] + WIDE_MAC)
+TO_NARROW = (NARROW, PEER_MACS[NARROW] + NARROW_MAC)
+TO_ABSENT = (ABSENT, bytes(12))
+ENTRIES: dict[bytes, Hops] = {
+    ONE: (TO_WIDE,),
+    BOTH: (TO_WIDE, TO_NARROW),
+    SPLIT: (TO_WIDE,),
+    SPLIT + OTHER_SOURCE: (TO_NARROW,),
+    GONE: (TO_WIDE,),
+    GONE + OTHER_SOURCE: NOWHERE,
+    HALF: (TO_ABSENT, TO_WIDE),
+    DEAD: (TO_ABSENT,),
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A frame in, and what leaves it: copies by port, drops by reason, or a hand-up."""
+
+    name: str
+    frame: bytes
+    out: dict[int, bytes] = field(default_factory=dict)
+    drops: tuple[DropReason, ...] = ()
+    handed_up: bool = False
+
+
+def frame(
+    destination: bytes,
+    payload: bytes = b"payload",
+    *,
+    source: bytes = SOURCE,
+    kind: int = Kind.DATA,
+    flags: int = Flag.LAST,
+    hops_left: int = 64,
+    length: int | None = None,
+    padding: bytes = b"",
+) -> bytes:
+    """Return a frame as it comes in on port 0."""
+    size = len(payload) if length is None else length
+    header = Header(kind, flags, hops_left, 7, size, 0x0102030405060708, 3, 9, 0xAABBCCDDEEFF0011, destination, source)
+    ether = IN_MAC + PEER_MACS[IN] + ETHERTYPE.to_bytes(2, "big")
+    return ether + encode(header) + payload + padding
+
+
+def leaves(before: bytes, *ports: int) -> dict[int, bytes]:
+    """Return the copies that a frame becomes on these ports, written down independently of the code under test."""
+    macs = {WIDE: TO_WIDE[1], NARROW: TO_NARROW[1]}
+    return {port: macs[port] + before[12:17] + bytes([before[17] - 1]) + before[18:] for port in ports}
+
+
+def _changed(before: bytes, at: int, value: int) -> bytes:
+    return before[:at] + bytes([value]) + before[at + 1 :]
+
+
+def _forwarded(name: str, before: bytes, *ports: int, drops: tuple[DropReason, ...] = ()) -> Case:
+    return Case(name, before, leaves(before, *ports), drops)
+
+
+CASES = [
+    _forwarded("unicast", frame(ONE), WIDE),
+    _forwarded("an empty payload", frame(ONE, b""), WIDE),
+    _forwarded("padding is kept", frame(ONE, b"x", padding=b"padding"), WIDE),
+    _forwarded("unknown flags and kinds pass", frame(ONE, kind=0x7F, flags=0xFF), WIDE),
+    _forwarded("two hops left become one", frame(ONE, hops_left=2), WIDE),
+    _forwarded("255 hops left become 254", frame(ONE, hops_left=255), WIDE),
+    _forwarded("the widest frame", frame(ONE, bytes(1500 - 96)), WIDE),
+    _forwarded("copies", frame(BOTH), WIDE, NARROW),
+    _forwarded("the widest frame for both", frame(BOTH, bytes(700 - 96)), WIDE, NARROW),
+    _forwarded("too big for one of two", frame(BOTH, bytes(701 - 96)), WIDE, drops=(DropReason.TOO_BIG,)),
+    _forwarded("padding fills a link", frame(BOTH, bytes(600), padding=b"1234"), WIDE, NARROW),
+    _forwarded("padding overfills it", frame(BOTH, bytes(600), padding=b"12345"), WIDE, drops=(DropReason.TOO_BIG,)),
+    _forwarded("destination alone", frame(SPLIT), WIDE),
+    _forwarded("source and destination come first", frame(SPLIT, source=OTHER_SOURCE), NARROW),
+    _forwarded("one of two ports is down", frame(HALF), WIDE, drops=(DropReason.PORT_DOWN,)),
+    Case("the only port is down", frame(DEAD), drops=(DropReason.PORT_DOWN,)),
+    Case("a negative entry", frame(GONE, source=OTHER_SOURCE), drops=(DropReason.NO_ROUTE,)),
+    _forwarded("a negative entry is of one source", frame(GONE), WIDE),
+    Case("a miss", frame(NOBODY), handed_up=True),
+    Case("a neighbour's word", frame(ONE, kind=Kind.HELLO), handed_up=True),
+    Case("a neighbour's unknown word", frame(ONE, kind=0xFF, hops_left=0), handed_up=True),
+    Case("a neighbour's word whose length is wrong", frame(ONE, kind=0x80, length=60_000), handed_up=True),
+    Case("one hop left", frame(ONE, hops_left=1), drops=(DropReason.HOPS_EXPIRED,)),
+    Case("no hops left", frame(ONE, hops_left=0), drops=(DropReason.HOPS_EXPIRED,)),
+    Case("a miss with one hop left", frame(NOBODY, hops_left=1), drops=(DropReason.HOPS_EXPIRED,)),
+    Case("a payload that is not there", frame(ONE, length=8), drops=(DropReason.TRUNCATED,)),
+    Case("half a header", frame(ONE)[:61], drops=(DropReason.TRUNCATED,)),
+    Case("one byte short of a header", frame(ONE, b"")[:-1], drops=(DropReason.TRUNCATED,)),
+    Case("version 0", _changed(frame(ONE), 14, 0), drops=(DropReason.BAD_VERSION,)),
+    Case("version 2", _changed(frame(ONE), 14, 2), drops=(DropReason.BAD_VERSION,)),
+    Case("version 2 of a neighbour", _changed(frame(ONE, kind=Kind.HELLO), 14, 2), drops=(DropReason.BAD_VERSION,)),
+]

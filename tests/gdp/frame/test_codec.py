@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gdp.errors import DropReason, FrameError
+from gdp.frame.codec import AAD_BYTES, HEADER_BYTES, HOPS_AT, Header, authenticated, decode, encode, ethernet
+from tests.gdp.frame.frames import frames
+
+VECTORS = json.loads((Path(__file__).parents[2] / "vectors" / "frames.json").read_text())["frames"]
+
+
+@given(frames())
+def test_what_is_encoded_decodes_to_the_same(made: tuple[Header, bytes, bytes]) -> None:
+    header, payload, padding = made
+    assert decode(encode(header) + payload + padding) == header
+
+
+@given(st.binary(max_size=200))
+def test_arbitrary_bytes_decode_or_raise_frame_error(data: bytes) -> None:
+    try:
+        header = decode(data)
+    except FrameError:
+        return
+    assert HEADER_BYTES + header.length <= len(data)
+
+
+@given(frames(), st.integers(0, 255))
+def test_a_seal_covers_everything_but_hops_left(made: tuple[Header, bytes, bytes], hops_left: int) -> None:
+    header = made[0]
+    covered = authenticated(encode(header))
+    assert len(covered) == AAD_BYTES
+    assert covered == authenticated(encode(header._replace(hops_left=hops_left)))
+    assert covered != authenticated(encode(header._replace(kind=header.kind ^ 1)))
+
+
+def test_hops_left_stands_where_the_codec_says() -> None:
+    header = Header(1, 2, 0x99, 4, 0, 5, 0, 1, 6, bytes(32), bytes(32))
+    assert encode(header)[HOPS_AT] == 0x99
+
+
+def test_the_ethernet_header_carries_the_ethertype() -> None:
+    assert ethernet(b"\x01" * 6, b"\x02" * 6).hex() == "010101010101" "020202020202" "88b5"
+
+
+@pytest.mark.parametrize("vector", VECTORS, ids=lambda vector: vector["what"])
+def test_the_published_frames_come_out(vector: dict[str, object]) -> None:
+    wire = bytes.fromhex(str(vector["hex"]))
+    if "refused" in vector:
+        with pytest.raises(FrameError) as caught:
+            decode(wire)
+        assert caught.value.reason.label == vector["refused"]
+        return
+    header = decode(wire)
+    fields = {key: value.hex() if isinstance(value, bytes) else value for key, value in header._asdict().items()}
+    for key in ("number", "incarnation"):
+        fields[key] = str(fields[key])
+    assert fields == vector["header"]
+    payload, padding = bytes.fromhex(str(vector["payload"])), bytes.fromhex(str(vector["padding"]))
+    assert encode(header) + payload + padding == wire
+
+
+def test_each_refusal_has_a_published_frame() -> None:
+    refused = {vector["refused"] for vector in VECTORS if "refused" in vector}
+    assert refused == {r.label for r in (DropReason.TRUNCATED, DropReason.BAD_VERSION, DropReason.BAD_PARTS)}

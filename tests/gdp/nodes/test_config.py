@@ -1,0 +1,143 @@
+"""switch.yaml and rib.yaml as people write them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gdp.errors import ConfigError
+from gdp.limits import DEAD_S, HELLO_S, RIB_NAMES_PER_SENDER
+from gdp.names import Name
+from gdp.nodes.config import PortConfig, RibConfig, SwitchConfig
+from gdp.nodes.yaml_source import ConfigFileError
+
+SWITCH = """\
+identity: id
+domain: {root: root.crt, trusts: [other.crt]}
+"""
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    (tmp_path / "id").mkdir()
+    for name in ("root.crt", "other.crt"):
+        (tmp_path / name).write_text("a certificate")
+    return tmp_path
+
+
+def switch(place: Path, text: str) -> SwitchConfig:
+    (place / "switch.yaml").write_text(text)
+    return SwitchConfig.load(place / "switch.yaml")
+
+
+def refusals(place: Path, text: str) -> list[str]:
+    with pytest.raises(ConfigFileError) as caught:
+        switch(place, text)
+    return [line.removeprefix(f"{place}/") for line in str(caught.value).splitlines()]
+
+
+def test_a_switch_needs_no_more_than_who_it_is(place: Path) -> None:
+    config = switch(place, SWITCH)
+    assert (config.ports, config.attach, config.data_plane, config.metrics) == ((), (), "auto", None)
+    assert (config.hello_s, config.dead_s) == (HELLO_S, DEAD_S)
+    assert config.domain.transit is None
+
+
+def test_paths_are_relative_to_the_file(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir("/")
+    config = switch(place, SWITCH)
+    assert config.identity == place / "id"
+    assert config.domain.root == place / "root.crt"
+    assert config.domain.trusts == (place / "other.crt",)
+
+
+def test_ports_carry_their_cost(place: Path) -> None:
+    config = switch(place, SWITCH + "ports:\n  - iface: eth0\n  - {iface: eth1, cost: 100}\n")
+    assert config.ports == (PortConfig(iface="eth0", cost=10), PortConfig(iface="eth1", cost=100))
+
+
+def test_devices_of_the_command_line_are_added_once(place: Path) -> None:
+    config = switch(place, SWITCH + "ports: [{iface: eth0, cost: 5}]\n").with_ifaces(["eth0", "eth1", "eth1"])
+    assert [(port.iface, port.cost) for port in config.ports] == [("eth0", 5), ("eth1", 10)]
+
+
+def test_a_configuration_does_not_change(place: Path) -> None:
+    config = switch(place, SWITCH)
+    with pytest.raises(ValueError, match="frozen"):
+        config.hello_s = 1.0
+
+
+def test_every_error_of_a_file_is_listed_in_its_order(place: Path) -> None:
+    text = "identity: nowhere\ndomain:\n  root: root.crt\n  trust: []\nports:\n  - {iface: a, cost: dear}\nspeed: 1\n"
+    assert refusals(place, text) == [
+        f"switch.yaml:1:11: identity: no such directory: {place}/nowhere",
+        "switch.yaml:4:3: domain.trust: unknown key; expected one of root, trusts, transit",
+        "switch.yaml:6:22: ports[0].cost: expected a whole number, not 'dear'",
+        "switch.yaml:7:1: speed: unknown key; expected one of identity, domain, ports, attach, data_plane, metrics, "
+        "hello_s, dead_s",
+    ]
+
+
+def test_a_missing_key_is_told_at_what_should_hold_it(place: Path) -> None:
+    assert refusals(place, SWITCH + "metrics: {}\n") == ["switch.yaml:3:10: metrics.port: required, but not there"]
+
+
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [
+        ("data_plane: xdp", "data_plane: expected 'auto', 'raw' or 'scapy', not 'xdp'"),
+        ("ports: [{iface: a/b}]", "ports[0].iface: a device's name has 1 to 15 characters without '/', ':' or blanks"),
+        ("ports: [{iface: a, cost: true}]", "ports[0].cost: expected a whole number, not True"),
+        ("ports: [{iface: a, cost: 0}]", "ports[0].cost: expected greater than or equal to 1, not 0"),
+        ("ports: [{iface: a}, {iface: a}]", "ports: a stands twice"),
+        ("attach: [a, a]", "attach: a stands twice"),
+        ("attach: [over_13_chars!]", "attach[0]: at most 13 characters, for the switch's end is called over_13_chars!-s"),
+        ("dead_s: 0.3", "dead_s: at least twice hello_s (0.25), so that one lost hello loses no neighbour"),
+        ("hello_s: .inf", "hello_s: expected a number, not '.inf'"),
+        ("metrics: {port: 70000}", "metrics.port: expected less than or equal to 65535, not 70000"),
+        ("attach: proxy", "attach: expected a list, not 'proxy'"),
+    ],
+)
+def test_a_wrong_value_says_what_was_expected(place: Path, line: str, complaint: str) -> None:
+    (refusal,) = refusals(place, f"{SWITCH}{line}\n")
+    assert refusal.startswith("switch.yaml:3:")
+    assert refusal.split(": ", 1)[1] == complaint
+
+
+def test_an_attachment_is_not_a_port_as_well(place: Path) -> None:
+    (refusal,) = refusals(place, SWITCH + "attach: [proxy]\nports: [{iface: proxy-s}]\n")
+    assert refusal.endswith("attach: proxy is already the name of a port")
+
+
+def test_a_missing_file_is_a_configuration_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.yaml: a readable file is expected: No such file"):
+        SwitchConfig.load(tmp_path / "none.yaml")
+
+
+def test_a_rib_names_the_tier_above(place: Path) -> None:
+    upper = Name(bytes(range(32)))
+    (place / "rib.yaml").write_text(f"{SWITCH}iface: rib\nupper: {upper.to_text()}\n")
+    config = RibConfig.load(place / "rib.yaml")
+    assert config.upper == upper
+    assert isinstance(config.upper, Name)
+
+
+@pytest.mark.parametrize("line", ["", "upper: null\n", "upper: ~\n"])
+def test_the_top_tier_has_none_above(place: Path, line: str) -> None:
+    (place / "rib.yaml").write_text(f"{SWITCH}iface: rib\n{line}")
+    config = RibConfig.load(place / "rib.yaml")
+    assert config.upper is None
+    assert not config.allow_unowned
+    assert config.quotas.names_per_sender == RIB_NAMES_PER_SENDER
+
+
+def test_a_name_of_digits_alone_is_read_as_text(place: Path) -> None:
+    (place / "rib.yaml").write_text(f"{SWITCH}iface: rib\nupper: {'1' * 64}\n")
+    assert RibConfig.load(place / "rib.yaml").upper == Name(b"\x11" * 32)
+
+
+def test_a_shortened_name_is_refused(place: Path) -> None:
+    (place / "rib.yaml").write_text(f"{SWITCH}iface: rib\nupper: 75e…0fc\n")
+    with pytest.raises(ConfigFileError, match=r"rib\.yaml:4:8: upper: a name is written as 64 hex digits"):
+        RibConfig.load(place / "rib.yaml")

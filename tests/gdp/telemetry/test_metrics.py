@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from urllib.request import urlopen
+
+import pytest
+
+from gdp.errors import DropReason, LocalError
+from gdp.telemetry.metrics import Histogram, Metrics, Sources
+
+
+def drops(**counts: int) -> list[int]:
+    listed = [0] * len(DropReason)
+    for name, count in counts.items():
+        listed[DropReason[name]] = count
+    return listed
+
+
+@pytest.fixture
+def metrics() -> Iterator[Metrics]:
+    made = Metrics(Sources(frames=lambda: {"in": 3}))
+    yield made
+    made.close()
+
+
+def test_frames_are_counted_by_direction() -> None:
+    text = Metrics(Sources(frames=lambda: {"in": 3, "out": 2})).text()
+    assert 'gdp_frames_total{direction="in"} 3.0' in text
+    assert 'gdp_frames_total{direction="out"} 2.0' in text
+
+
+def test_drops_of_several_lists_are_added_by_reason() -> None:
+    text = Metrics(Sources(drops=[lambda: drops(TRUNCATED=1), lambda: drops(TRUNCATED=2, NO_ROUTE=5)])).text()
+    assert 'gdp_drops_total{reason="truncated"} 3.0' in text
+    assert 'gdp_drops_total{reason="no-route"} 5.0' in text
+    assert text.count("gdp_drops_total{") == len(DropReason)
+
+
+def test_every_number_of_a_node_has_its_name() -> None:
+    text = Metrics(
+        Sources(
+            table_entries=lambda: 7,
+            parked_frames=lambda: 8,
+            rib_answers=lambda: {"found": 1},
+            rib_refusals=lambda: {"expired": 2},
+            messages=lambda: {"in": 3},
+            message_bytes=lambda: {"in": 4},
+            repairs=lambda: {"asked": 5},
+        )
+    ).text()
+    for line in (
+        "gdp_table_entries 7.0",
+        "gdp_parked_frames 8.0",
+        'gdp_rib_answers_total{answer="found"} 1.0',
+        'gdp_rib_refusals_total{reason="expired"} 2.0',
+        'gdp_messages_total{direction="in"} 3.0',
+        'gdp_message_bytes_total{direction="in"} 4.0',
+        'gdp_repairs_total{step="asked"} 5.0',
+    ):
+        assert line in text.splitlines()
+
+
+def test_a_number_that_a_node_does_not_have_is_not_named() -> None:
+    assert Metrics(Sources()).text() == ""
+
+
+def test_a_histogram_counts_a_duration_in_every_bucket_from_its_own_on() -> None:
+    seen = Histogram((0.1, 0.2))
+    for duration_s in (0.05, 0.1, 0.15, 9.0):
+        seen.observe(duration_s)
+    assert seen.counts == [2, 1, 1]
+    text = Metrics(Sources(latency=lambda: seen)).text()
+    assert 'gdp_latency_seconds_bucket{le="0.1"} 2.0' in text
+    assert 'gdp_latency_seconds_bucket{le="0.2"} 3.0' in text
+    assert 'gdp_latency_seconds_bucket{le="+Inf"} 4.0' in text
+    assert "gdp_latency_seconds_count 4.0" in text
+    assert "gdp_latency_seconds_sum 9.3" in text
+
+
+def test_each_scrape_asks_anew() -> None:
+    counts = {"in": 1}
+    metrics = Metrics(Sources(frames=lambda: counts))
+    before = metrics.text()
+    counts["in"] = 2
+    assert before != metrics.text()
+
+
+def test_making_metrics_asks_no_source() -> None:
+    def never() -> dict[str, int]:
+        raise AssertionError("asked too early")
+
+    Metrics(Sources(frames=never))
+
+
+def test_a_scrape_over_http_gets_the_text(metrics: Metrics) -> None:
+    port = metrics.serve(0)
+    with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as answer:
+        assert answer.read().decode() == metrics.text()
+
+
+def test_only_this_machine_can_scrape(metrics: Metrics) -> None:
+    port = metrics.serve(0)
+    with socket.socket() as other, pytest.raises(ConnectionRefusedError):
+        other.connect(("127.0.0.2", port))
+
+
+def test_closing_frees_the_port(metrics: Metrics) -> None:
+    port = metrics.serve(0)
+    metrics.close()
+    assert metrics.serve(port) == port
+
+
+def test_a_taken_port_is_said_plainly(metrics: Metrics) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(LocalError, match="metrics port"):
+            metrics.serve(taken.getsockname()[1])
+
+
+def test_serving_twice_is_our_own_fault(metrics: Metrics) -> None:
+    metrics.serve(0)
+    with pytest.raises(LocalError):
+        metrics.serve(0)

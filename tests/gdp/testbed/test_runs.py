@@ -1,0 +1,109 @@
+"""Records of runs, and what the next start does about dead ones."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from gdp.errors import LocalError
+from gdp.testbed.processes import Process
+from gdp.testbed.runs import Record, Run, Runs
+
+
+@pytest.fixture
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Runs:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    return Runs(tmp_path / "runs")
+
+
+def rewrite(run: Run, folder: Path, change: Callable[[Record], None]) -> None:
+    path = folder / "runs" / f"{run.id}.json"
+    record = Record.from_text(path.read_text())
+    change(record)
+    path.write_text(record.to_text())
+
+
+def orphan(record: Record) -> None:
+    record.owner = Process(record.owner.pid, record.owner.started - 1)
+
+
+def test_a_run_under_way_is_left_alone(runs: Runs) -> None:
+    run = runs.start()
+    assert runs.sweep() == []
+    assert runs.take_down() == []
+    assert run.directory.is_dir()
+    run.end()
+
+
+def test_the_end_of_a_run_leaves_nothing(runs: Runs, tmp_path: Path) -> None:
+    run = runs.start()
+    (run.directory / "keys").mkdir()
+    (run.directory / "keys" / "a").write_text("secret")
+    run.end()
+    assert list(tmp_path.rglob("*")) == [tmp_path / "runs"]
+
+
+def test_only_this_user_sees_a_run(runs: Runs, tmp_path: Path) -> None:
+    run = runs.start()
+    assert run.directory.stat().st_mode & 0o777 == 0o700
+    assert (tmp_path / "runs" / f"{run.id}.json").stat().st_mode & 0o777 == 0o600
+    run.end()
+
+
+def test_the_run_of_a_killed_process_is_swept_with_its_processes(runs: Runs, tmp_path: Path) -> None:
+    run = runs.start()
+    with subprocess.Popen([sys.executable, "-c", "import signal; signal.pause()"], start_new_session=True) as left:
+        run.note_process(left.pid)
+        rewrite(run, tmp_path, orphan)
+        assert runs.sweep() == [run.id]
+        assert left.wait(5) != 0
+    assert not run.directory.exists()
+
+
+def test_a_kept_run_outlives_its_process_until_it_is_taken_down(runs: Runs, tmp_path: Path) -> None:
+    run = runs.start()
+    with subprocess.Popen([sys.executable, "-c", "import signal; signal.pause()"], start_new_session=True) as left:
+        run.note_process(left.pid)
+        run.keep()
+        rewrite(run, tmp_path, orphan)
+        assert runs.sweep() == []
+        assert left.poll() is None
+        assert runs.take_down() == [run.id]
+        assert left.wait(5) != 0
+
+
+def test_a_kept_run_whose_processes_all_died_is_swept(runs: Runs) -> None:
+    run = runs.start()
+    run.keep()
+    assert runs.sweep() == [run.id]
+
+
+def test_after_a_boot_no_process_is_touched_on_the_word_of_an_old_record(runs: Runs, tmp_path: Path) -> None:
+    run = runs.start()
+    with subprocess.Popen([sys.executable, "-c", "import signal; signal.pause()"], start_new_session=True) as stranger:
+        run.note_process(stranger.pid)
+        rewrite(run, tmp_path, lambda record: setattr(record, "boot", "another"))
+        assert runs.sweep() == [run.id]
+        assert stranger.poll() is None
+        stranger.kill()
+
+
+def test_a_record_that_cannot_be_read_is_left_alone(runs: Runs, tmp_path: Path) -> None:
+    strange = tmp_path / "runs" / "abc.json"
+    for text in ("", "[]", "{}", json.dumps({"run": "abc", "owner": 1, "processes": []})):
+        strange.write_text(text)
+        assert runs.sweep() == []
+    assert strange.exists()
+
+
+def test_records_that_others_could_have_written_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "open").mkdir()
+    os.chmod(tmp_path / "open", 0o777)
+    with pytest.raises(LocalError, match="must belong to this user alone"):
+        Runs(tmp_path / "open")

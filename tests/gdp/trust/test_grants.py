@@ -1,0 +1,89 @@
+"""Topic secrets and how they reach a node."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+
+import pytest
+
+from gdp.crypto.keys import SigningKey
+from gdp.crypto.statements import StatementType, parse, sign
+from gdp.errors import DropReason, LocalError, StatementError
+from gdp.names import Name
+from gdp.trust.grants import EPOCH_MAX, Grant, make_grant, open_grant, topic_secret
+from tests.gdp.trust.world import CAMERA, GATEWAY, LAB, ROBOT
+
+WIRE = make_grant(LAB.key, LAB.master, CAMERA, 3, ROBOT.name, ROBOT.kem.public)
+
+
+def refusal(wire: bytes) -> DropReason:
+    with pytest.raises(StatementError) as caught:
+        open_grant(ROBOT, wire)
+    return caught.value.reason
+
+
+def test_a_node_opens_what_it_was_granted() -> None:
+    assert open_grant(ROBOT, WIRE) == Grant(CAMERA.name, 3, topic_secret(LAB.master, CAMERA.name, 3))
+
+
+def test_a_secret_is_hkdf_of_the_master_as_the_text_says() -> None:
+    name, master = Name(bytes(range(32))), b"m" * 32
+    extracted = hmac.digest(bytes(32), master, hashlib.sha256)
+    expanded = hmac.digest(extracted, b"gdp-topic-secret-1" + name + b"\x01\x02" + b"\x01", hashlib.sha256)
+    assert topic_secret(master, name, 0x0102) == expanded
+
+
+def test_every_topic_and_epoch_has_a_secret_of_its_own() -> None:
+    names = [CAMERA.name, ROBOT.name]
+    assert len({topic_secret(LAB.master, name, epoch) for name in names for epoch in range(4)}) == 8
+
+
+def test_another_node_does_not_open_it() -> None:
+    with pytest.raises(StatementError) as caught:
+        open_grant(GATEWAY, WIRE)
+    assert caught.value.reason is DropReason.NOT_FOR_US
+
+
+def test_only_the_owner_grants() -> None:
+    with pytest.raises(LocalError):
+        make_grant(ROBOT.key, LAB.master, CAMERA, 3, ROBOT.name, ROBOT.kem.public)
+
+
+def altered(**changes: object) -> bytes:
+    body = {**parse(WIRE).fields, **changes}
+    return sign(StatementType.GRANT, body, CAMERA.name, LAB.key)
+
+
+def test_a_secret_does_not_open_under_another_epoch() -> None:
+    assert refusal(altered(epoch=4)) is DropReason.BAD_TAG
+
+
+def test_an_altered_seal_does_not_open() -> None:
+    assert refusal(altered(sealed=bytes(1_168))) is DropReason.BAD_TAG
+
+
+def test_a_grant_signed_by_another_is_refused() -> None:
+    wire = sign(StatementType.GRANT, dict(parse(WIRE).fields), CAMERA.name, SigningKey.generate())
+    assert refusal(wire) is DropReason.BAD_SIGNATURE
+
+
+def test_a_grant_in_anothers_name_is_refused() -> None:
+    wire = sign(StatementType.GRANT, dict(parse(WIRE).fields), ROBOT.name, LAB.key)
+    assert refusal(wire) is DropReason.WRONG_NAME
+
+
+@pytest.mark.parametrize("epoch", [-1, EPOCH_MAX + 1])
+def test_an_epoch_that_the_frame_cannot_carry_is_our_own_mistake(epoch: int) -> None:
+    with pytest.raises(LocalError):
+        topic_secret(LAB.master, CAMERA.name, epoch)
+
+
+def test_a_master_of_another_length_is_our_own_mistake() -> None:
+    with pytest.raises(LocalError):
+        topic_secret(b"short", CAMERA.name, 0)
+
+
+def test_a_repr_shows_no_secret() -> None:
+    grant = open_grant(ROBOT, WIRE)
+    assert repr(grant.secret) not in repr(grant)

@@ -1,0 +1,86 @@
+"""Two domains, their nodes and an owner, for the tests of trust. Wall clock: ``NOW``, in unix seconds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from gdp.crypto.certificates import Role
+from gdp.crypto.identity import Identity, NodeKeys
+from gdp.crypto.issuing import DomainAuthority
+from gdp.crypto.keys import SigningKey
+from gdp.crypto.subject import Subject
+from gdp.crypto.validity import Validity
+from gdp.metadata import Metadata
+from gdp.trust.adcert import AdCert
+from gdp.trust.card import Card
+from gdp.trust.claim import make_claim
+from gdp.trust.domain import Policy
+from gdp.trust.owner import Owner
+from gdp.trust.right import Right
+from gdp.trust.rtcert import RtCert
+from gdp.trust.verifier import ClaimVerifier
+
+NOW = 1_800_000_000
+DAY = Validity(NOW, NOW + 86_400)
+HOUR = Validity(NOW, NOW + 3_600)
+LATER = NOW + 7_200  # after the hour, within the day
+
+SCHOOL = DomainAuthority.found("school", SigningKey.generate(), DAY)
+CLOUD = DomainAuthority.found("cloud", SigningKey.generate(), DAY)
+SWITCH = NodeKeys.generate(Role.SWITCH, "nuc1").join(SCHOOL, DAY)
+ROBOT = NodeKeys.generate(Role.PROXY, "robot").join(SCHOOL, DAY)
+GATEWAY = NodeKeys.generate(Role.PROXY, "gateway").join(SCHOOL, DAY)
+STRANGER = NodeKeys.generate(Role.PROXY, "stranger").join(CLOUD, DAY)
+
+LAB = Owner(SigningKey.generate(), bytes(range(32)))
+CAMERA_METADATA = Metadata({"kind": "topic", "name": "/camera/image", "type": "sensor_msgs/msg/Image"})
+CAMERA = LAB.subject(CAMERA_METADATA)
+
+
+def card(node: Identity = ROBOT) -> Card:
+    """Return a node's card, verified."""
+    return Card.from_wire(Card.make(node))
+
+
+def adcert(
+    node: Identity = ROBOT,
+    rights: Sequence[Right] = (Right.PUBLISH,),
+    *,
+    subject: Subject = CAMERA,
+    key: SigningKey = LAB.key,
+    issuer: Identity | None = None,
+    validity: Validity = DAY,
+    may_delegate: bool = False,
+) -> bytes:
+    """Return an AdCert, by the owner unless ``issuer`` is given."""
+    by, signing = (subject.name, key) if issuer is None else (issuer.name, issuer.key)
+    return AdCert.make(signing, by, subject, node.subject, rights, validity, may_delegate=may_delegate)
+
+
+def claim(
+    node: Identity = ROBOT,
+    right: Right = Right.PUBLISH,
+    subject: Subject = CAMERA,
+    *,
+    chain: Sequence[bytes] | None = None,
+    rtcert: bytes | None = None,
+    sequence: int = 1,
+    lease_s: float = 60.0,
+) -> bytes:
+    """Return a claim; by default the robot's, to publish the camera, and it holds."""
+    return make_claim(
+        node,
+        right,
+        subject,
+        rtcert=RtCert.make(node, SWITCH.name, DAY) if rtcert is None else rtcert,
+        sequence=sequence,
+        incarnation=7,
+        lease_s=lease_s,
+        is_global=True,
+        chain=[adcert(node)] if chain is None else chain,
+    )
+
+
+def verifier(*, allow_unowned: bool = False) -> ClaimVerifier:
+    """Return a verifier of the school that trusts nobody else and remembers nothing yet."""
+    return ClaimVerifier(Policy(SCHOOL.root), allow_unowned=allow_unowned)

@@ -1,0 +1,105 @@
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from proxy.compare import TopicComparison, compare
+from proxy.endpoints.bag import BagWriter
+from proxy.serial.channel import Channel
+from tests.proxy.recordings import READABLE, recording
+
+TYPE = "std_msgs/msg/UInt8"
+
+
+def message(value: int, rubbish: int = 0) -> bytes:
+    """A byte and a double, with whatever the recorder left between them."""
+    return b"\x00\x01\x00\x00" + bytes([value]) + bytes([rubbish]) * 7 + struct.pack("<d", value)
+
+
+def record(path: Path, messages: Sequence[bytes]) -> Path:
+    about = Channel("/a", TYPE, 2, "RIHS01_0", "uint8 a\nfloat64 b\n", "msg")
+    with BagWriter(path, 2) as bag:
+        handle = bag.add(about)
+        for stamp, raw in enumerate(messages):
+            bag.write(handle, 1 + stamp, raw)
+    return path
+
+
+def judged(folder: Path, sent: Sequence[bytes], received: Sequence[bytes], *, exact: bool = True) -> TopicComparison:
+    (verdict,) = compare(record(folder / "a.mcap", sent), record(folder / "b.mcap", received), exact=exact)
+    return verdict
+
+
+SENT = [message(value) for value in range(5)]
+
+
+def test_what_arrived_whole_is_identical_and_in_order(tmp_path: Path) -> None:
+    size = sum(map(len, SENT))
+    assert judged(tmp_path, SENT, SENT) == TopicComparison("/a", TYPE, 5, size, 5, 0, 0, 0, True, True)
+
+
+def test_a_lost_message_is_counted(tmp_path: Path) -> None:
+    verdict = judged(tmp_path, SENT, SENT[:2] + SENT[3:])
+    assert (verdict.delivered, verdict.lost, verdict.identical, verdict.in_order) == (4, 1, False, True)
+
+
+def test_a_duplicate_is_counted_and_is_no_disorder(tmp_path: Path) -> None:
+    verdict = judged(tmp_path, SENT, [*SENT[:3], SENT[0], *SENT[3:], SENT[4]])
+    assert (verdict.delivered, verdict.duplicated, verdict.identical, verdict.in_order) == (5, 2, True, True)
+
+
+def test_equal_messages_sent_twice_are_no_duplicates(tmp_path: Path) -> None:
+    verdict = judged(tmp_path, [SENT[0], SENT[0]], [SENT[0], SENT[0]])
+    assert (verdict.delivered, verdict.duplicated, verdict.identical) == (2, 0, True)
+
+
+def test_another_order_is_seen(tmp_path: Path) -> None:
+    verdict = judged(tmp_path, SENT, [SENT[1], SENT[0], *SENT[2:]])
+    assert (verdict.identical, verdict.in_order) == (True, False)
+
+
+def test_an_altered_message_is_neither_delivered_nor_identical(tmp_path: Path) -> None:
+    verdict = judged(tmp_path, SENT, [*SENT[:4], message(9)])
+    assert (verdict.delivered, verdict.lost, verdict.altered, verdict.identical) == (4, 1, 1, False)
+
+
+def test_rubbish_in_padding_counts_only_where_bytes_are_compared(tmp_path: Path) -> None:
+    (tmp_path / "exact").mkdir()
+    sent = [message(value, rubbish=value) for value in range(5)]
+    assert not judged(tmp_path / "exact", sent, SENT, exact=True).identical
+    assert judged(tmp_path, sent, SENT, exact=False).identical
+
+
+def test_a_topic_on_one_side_alone_is_listed(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "empty.mcap", 2) as bag:
+        bag.add(Channel("/other", TYPE, 2, "RIHS01_0", "uint8 data\n", "msg"))
+    sent = record(tmp_path / "a.mcap", SENT)
+    gone, none = compare(sent, tmp_path / "empty.mcap", exact=False)
+    assert (gone.topic, gone.lost, gone.identical) == ("/a", 5, False)
+    assert (none.topic, none.messages, none.identical) == ("/other", 0, True)
+
+
+def test_publishers_of_one_topic_are_in_order_each_by_itself(tmp_path: Path) -> None:
+    def bag(name: str, order: str) -> Path:
+        with BagWriter(tmp_path / name, 1) as out:
+            handles = {
+                who: out.add(Channel("/a", TYPE, 1, "7c81", "uint8 data\n", "msg", callerid=f"/{who}")) for who in "xy"
+            }
+            counts = dict.fromkeys("xy", 0)
+            for stamp, who in enumerate(order):
+                out.write(handles[who], 1 + stamp, bytes([counts[who] + (100 if who == "y" else 0)]))
+                counts[who] += 1
+        return tmp_path / name
+
+    (verdict,) = compare(bag("a.bag", "xyxyxy"), bag("b.bag", "xxyyxy"), exact=True)
+    assert verdict.identical
+    assert verdict.in_order
+
+
+@pytest.mark.parametrize("name", READABLE)
+def test_a_shared_recording_equals_itself(name: str) -> None:
+    verdicts = compare(recording(name), recording(name), exact=True)
+    assert all(verdict.identical and verdict.in_order and not verdict.duplicated for verdict in verdicts)
