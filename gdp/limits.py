@@ -13,9 +13,9 @@ FRAME_MAX_BYTES: Final = 65_535  # largest Ethernet frame any port may carry, he
 MTU_MIN_BYTES: Final = 576  # a link below this is refused: a signed hello would no longer fit in a few parts
 
 # Messages
-MESSAGE_MAX_BYTES: Final = 64 << 20  # serialised message, before sealing
+MESSAGE_MAX_BYTES: Final = 24 << 20  # serialised message, before sealing; it must fit, in parts, into JOIN_SOURCE_BYTES
 PARTS_MAX: Final = 1 << 17  # 64 MiB over the smallest link
-JOIN_SOURCE_BYTES: Final = 64 << 20  # reassembly memory of one source
+JOIN_SOURCE_BYTES: Final = 48 << 20  # reassembly memory of one source, so that one cannot starve all others
 JOIN_TOTAL_BYTES: Final = 64 << 20  # reassembly memory of a node
 JOIN_MESSAGES_MAX: Final = 1_024  # unfinished messages of one source
 JOIN_PATIENCE_S: Final = 5.0  # an unfinished best-effort message is given back after this long without a new part

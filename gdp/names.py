@@ -19,7 +19,7 @@ _PREFIX: Final = b"gdp-name-1"
 
 
 class Name(bytes):
-    """Thirty-two bytes; equal to, and hashed like, the same plain bytes, so that a slice of a frame finds it in a table.
+    """Thirty-two bytes; equal to, and hashed like, the same plain bytes: a slice of a frame finds it in a table.
 
     Raises:
         LocalError: not exactly 32 bytes.

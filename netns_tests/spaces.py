@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import ctypes
 import os
+import select
 import subprocess
 from pathlib import Path
 
+from gdp.ports.link import LinkWatch
+
+_PATIENCE_S = 10.0
 _CLONE_NEWNET = 0x40000000
 _LIBRARY = ctypes.CDLL(None, use_errno=True)
 
@@ -47,8 +51,24 @@ class Space:
         subprocess.run(["ip", "link", *words], check=True, capture_output=True, text=True)
 
     def veth(self, one: str, other: str, one_mac: bytes, other_mac: bytes, mtu: int = 1500) -> None:
-        """Make a pair of joined devices, both up."""
+        """Make a pair of joined devices; return when both are up."""
         ends = ("mtu", str(mtu), "address", one_mac.hex(":")), ("mtu", str(mtu), "address", other_mac.hex(":"))
         self.ip("add", one, *ends[0], "type", "veth", "peer", "name", other, *ends[1])
         for name in (one, other):
             self.ip("set", name, "up")
+        self.ready(one, other)
+
+    def ready(self, *names: str) -> None:
+        """Return when the kernel says that these devices can send.
+
+        Raises:
+            TimeoutError: they did not come up.
+        """
+        watch = LinkWatch()
+        try:
+            while not all(link and link.up for link in map(watch.ask, names)):
+                if not select.select([watch], [], [], _PATIENCE_S)[0]:
+                    raise TimeoutError(f"{names} did not come up")
+                watch.news()
+        finally:
+            watch.close()

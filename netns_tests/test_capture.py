@@ -68,7 +68,7 @@ def test_every_frame_of_both_links_is_in_the_file_when_it_is_ended(
     with RawPcapReader(str(file)) as reader:
         assert not isinstance(reader, PcapNgReader)
         assert (reader.nano, reader.linktype) == (True, 1)
-        seen = [(data, meta) for data, meta in reader]
+        seen = sorted(reader, key=lambda read: (read[1].sec, read[1].usec))
     assert [data for data, _ in seen if data[13] == 0xB5] == [*map(frame, range(300)), frame(1_000)]
     assert len(seen) == 302
     assert all(meta.sec > 1_600_000_000 and meta.wirelen == len(data) for data, meta in seen)

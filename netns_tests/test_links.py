@@ -33,6 +33,16 @@ def test_every_device_is_listed_with_its_facts(watch: LinkWatch, space: Space) -
     assert {link.ifname for link in watch.all()} >= {"lo", "one", "two"}
 
 
+def test_one_device_is_found_by_its_name(watch: LinkWatch, space: Space) -> None:
+    space.veth("one", "two", MAC, PEER_MAC)
+    assert watch.ask("one") == last(watch.all(), "one")
+
+
+def test_a_name_that_no_device_has_finds_none(watch: LinkWatch) -> None:
+    assert watch.ask("nothing") is None
+    assert watch.ask("a-name-longer-than-any") is None
+
+
 def test_nothing_new_is_an_empty_list(watch: LinkWatch) -> None:
     watch.news()
     assert watch.news() == []

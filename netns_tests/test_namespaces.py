@@ -149,7 +149,8 @@ signal.pause()
 
 def test_what_a_killed_process_left_behind_is_swept_by_the_next(runs: Runs, tmp_path: Path) -> None:
     argv = [sys.executable, "-c", ORPHAN, str(tmp_path)]
-    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": "."}) as process:
+    where = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, env=where) as process:
         assert process.stdout is not None
         leashed, free, path = process.stdout.readline().split()
         leash, loose = os.pidfd_open(int(leashed)), Process.of(int(free))

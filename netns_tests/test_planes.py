@@ -304,6 +304,7 @@ def test_a_cut_link_is_noticed_and_so_is_its_repair(
     assert switch.counters.drops[DropReason.PORT_DOWN] == 1
     space.ip("set", "q1", "up")
     poll_until(switch, lambda: heard == [(WIDE, False), (WIDE, True)])
+    space.ready("q1")
     ends[WIDE].close()
     ends[WIDE] = far_end("q1")
     ends[IN].send(MARK)
@@ -320,6 +321,7 @@ def test_a_device_switched_off_is_a_port_down_and_works_again_when_on(
     assert node.transmit(0, PEER_MACS[IN], [bytes(96)]) == 0
     space.ip("set", "p0", "up")
     poll_until(node, lambda: heard == [(0, False), (0, True)])
+    space.ready("q0")
     ends[IN].send(MARK)
     assert len(take_in(node, 1)) == 1
 

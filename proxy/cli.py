@@ -102,9 +102,8 @@ def _work(node: ProxyNode, inbound: Inbound, *, json: bool) -> None:
 def _tell_refusals(node: ProxyNode) -> None:
     for each in node.member.attachment.claims:
         if each.refused is not None:
-            log.warning(
-                "claim refused name=%s right=%s reason=%s", each.subject.name.short, each.right.value, each.refused.label
-            )
+            name, right, reason = each.subject.name.short, each.right.value, each.refused.label
+            log.warning("claim refused name=%s right=%s reason=%s", name, right, reason)
 
 
 def main() -> None:

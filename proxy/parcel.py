@@ -1,7 +1,7 @@
 """How a ROS message travels inside a sealed message, and what describes it.
 
-Place: pure. Wire form of a parcel, big-endian: ``version (1) | channel (2) | stamp in ns (8) | body``. A description is a
-CBOR map: the encoding of all bodies, and the channels that the parcels' numbers mean.
+Place: pure. Wire form of a parcel, big-endian: ``version (1) | channel (2) | stamp in ns (8) | body``. A description is
+a map in deterministic CBOR: ``e`` the encoding of all bodies, ``c`` the channels that the parcels' numbers mean.
 """
 
 from __future__ import annotations
@@ -10,8 +10,7 @@ import struct
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-import cbor2
-
+from gdp.crypto.cbor import decode, encode
 from gdp.errors import DropReason, LocalError, RemoteError
 from proxy.serial.channel import CHANNEL_MAX_BYTES, Channel
 from proxy.serial.serializer import Encoding
@@ -69,7 +68,7 @@ class Description:
         """
         if len(self.channels) > CHANNELS_MAX:
             raise LocalError(f"{len(self.channels)} connections of one topic; at most {CHANNELS_MAX} are allowed")
-        return cbor2.dumps({"e": self.encoding, "c": [channel.to_wire() for channel in self.channels]})
+        return encode({"e": self.encoding, "c": [channel.to_wire() for channel in self.channels]})
 
     @classmethod
     def from_wire(cls, wire: bytes) -> Description:
@@ -78,13 +77,7 @@ class Description:
         Raises:
             RemoteError: MALFORMED, whatever else these bytes are.
         """
-        if len(wire) > CHANNEL_MAX_BYTES * CHANNELS_MAX:
-            raise RemoteError(DropReason.MALFORMED, "description")
-        try:
-            fields = cbor2.loads(wire)
-        except (cbor2.CBORDecodeError, RecursionError, ValueError) as error:
-            raise RemoteError(DropReason.MALFORMED, "description") from error
-        match fields:
+        match decode(wire, CHANNEL_MAX_BYTES * CHANNELS_MAX):
             case {"e": str(encoding), "c": [*channels]} if encoding in _ENCODINGS and 0 < len(channels) <= CHANNELS_MAX:
                 wires = [each for each in channels if isinstance(each, bytes)]
                 if len(wires) == len(channels):

@@ -48,7 +48,7 @@ class Tally:
             "refused": self.refused,
             "latency_ms": latency,
             "parts": self.parts,
-            "hops": self.hops.most_common(1)[0][0] if self.hops else None,
+            "hops": self.hops.most_common(1)[0][0] if self.hops else 0,
             "hops_seen": sorted(self.hops),
         }
 

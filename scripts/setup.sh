@@ -29,9 +29,9 @@ find_python() {
 
 # package <name> <why>: installs one Debian package
 package() {
-    say "installing $1 ($2)"
     command -v apt-get >/dev/null || fail "$1 is missing ($2), and there is no apt-get here: install it with your own tool"
     [[ $(id -u) -eq 0 ]] || fail "$1 is missing ($2): run 'sudo apt-get install $1', or this script with sudo"
+    say "installing $1 ($2)"
     local log
     log=$(mktemp)
     local install=(env DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends "$1")
@@ -72,12 +72,13 @@ command -v ip >/dev/null || [[ -x /usr/sbin/ip ]] || package iproute2 "ip netns:
 for tool in nsenter setpriv unshare; do
     command -v "$tool" >/dev/null || package util-linux "$tool: to start processes inside namespaces"
 done
-"$python" -c 'import ensurepip, venv' 2>/dev/null || package python3-venv "python3 cannot make virtual environments without it"
+"$python" -c 'import ensurepip, venv; ensurepip.version()' 2>/dev/null ||
+    package "$(basename "$python")-venv" "python3 cannot make virtual environments without it"
 if [[ -n "$extras" ]]; then
     command -v openssl >/dev/null || package openssl "tests read our certificates with it"
 fi
 
-if ! "$venv/bin/python" -c '' 2>/dev/null; then
+if ! "$venv/bin/python" -c 'import pip' 2>/dev/null; then
     say "making .venv with $("$python" --version)"
     "$python" -m venv --clear "$venv"
 fi

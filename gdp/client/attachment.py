@@ -65,6 +65,11 @@ class Claimed:
     is_taken: bool = False
     refused: DropReason | None = None
 
+    @property
+    def is_judged(self) -> bool:
+        """Return whether the overlay has said yes or no."""
+        return self.is_taken or self.refused is not None
+
 
 class Attachment:
     """One node's hold on the overlay."""
@@ -95,7 +100,7 @@ class Attachment:
     @property
     def is_attached(self) -> bool:
         """Return whether a switch is there and has judged every claim."""
-        return self._switch is not None and all(each.is_taken or each.refused for each in self._claims.values())
+        return self._switch is not None and all(each.is_judged for each in self._claims.values())
 
     @property
     def claims(self) -> list[Claimed]:
@@ -153,6 +158,8 @@ class Attachment:
         if header.kind in (Kind.JOIN, Kind.LEAVE):
             statement.verify(switch.key)
             return statement
+        if header.kind == Kind.REVOKE:
+            return statement  # it proves itself
         raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
 
     def port_changed(self, port: int, up: bool, now: Instant) -> None:
@@ -170,7 +177,7 @@ class Attachment:
             return
         for each in self._claims.values():
             if each.claim_at_s <= now.mono_s:
-                each.claim_at_s = now.mono_s + (CLAIM_LEASE_S / 3 if each.is_taken else _CLAIM_AGAIN_S)
+                each.claim_at_s = now.mono_s + (CLAIM_LEASE_S / 3 if each.is_judged else _CLAIM_AGAIN_S)
                 self._say(Kind.ADVERTISE, self._claim_wire(each, now))
 
     def next_timeout(self) -> float | None:
@@ -243,6 +250,7 @@ class Attachment:
             each.claim_at_s = now_s  # an earlier life of ours was ahead: try again above it
         else:
             each.refused = verdict.refused
+            each.claim_at_s = now_s + CLAIM_LEASE_S / 3  # it may be taken later, but not for asking often
 
     def _say(self, kind: Kind, wire: bytes) -> None:
         assert self._switch is not None

@@ -9,8 +9,10 @@ delivers: a reliable topic in order and complete, a best-effort one in order and
 from __future__ import annotations
 
 from collections import Counter, deque
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from enum import Enum
+from itertools import count
 from typing import Final
 
 from gdp.client.publisher import Secrets
@@ -20,7 +22,6 @@ from gdp.errors import DropReason, EnvelopeError, RemoteError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import (
-    JOIN_SOURCE_BYTES,
     NACKS_PER_REPORT,
     REPLAY_WINDOW_MESSAGES,
     REPORT_DELAY_S,
@@ -37,6 +38,7 @@ from gdp.names import Name
 __all__ = ["Delivered", "Feed", "FeedState", "Reader"]
 
 ANNOUNCE_S: Final = 0.1
+_READY_OVERHEAD_BYTES: Final = 256  # what a message that waits for others costs beside its bytes
 _WAITING: Final = Flag.RELIABLE | Flag.LATCHED  # topics whose readers wait for what is missing
 
 
@@ -49,10 +51,11 @@ class FeedState(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Reader:
-    """Who reads, in this life of its process."""
+    """Who reads, in this life of its process: one for all its feeds, since they share its numbers for notes."""
 
     name: Name
     incarnation: int
+    note_numbers: Iterator[int] = field(default_factory=lambda: count(1), compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,9 +88,19 @@ class Feed:
         self._topic = topic
         self._reader = reader
         self._secrets = secrets
+        self._budget = budget
         self._openers: dict[tuple[int, int], Opener] = {}
+        epoch = max(secrets)
         self._note = NoteSealer(
-            secrets[max(secrets)], max(secrets), Kind.REPORT, reader.name, reader.incarnation, publisher, topic
+            secrets[epoch],
+            epoch,
+            Kind.REPORT,
+            reader.name,
+            reader.incarnation,
+            publisher,
+            topic,
+            incarnation,
+            reader.note_numbers,
         )
         self._data = Joiner(publisher, lambda epoch: self._opener(Kind.DATA, epoch), writer, budget)
         self._status = Joiner(publisher, lambda epoch: self._opener(Kind.STATUS, epoch), writer, budget)
@@ -96,12 +109,12 @@ class Feed:
         self._is_reliable: bool | None = None
         self._expected = 0  # next number to deliver, once LIVE
         self._known_next = 0  # the publisher has numbered everything below this
-        self._ready: dict[int, Joined] = {}
-        self._ready_bytes = 0
+        self._ready: dict[int, Joined] = {}  # whole, behind a gap
         self._out = deque[Delivered]()
         self._report_at_s = now_s
         self._unreported_bytes = 0
-        self.claim_sequence = 0  # of the claim that brought this incarnation
+        self.claim = b""  # of the publisher, the newest
+        self.claim_sequence = 0
         self.lost = 0
         self.delivered = 0
 
@@ -128,13 +141,13 @@ class Feed:
 
     def timeout(self, now_s: float) -> None:
         """Give back what waited too long for its parts (best effort), and let a due report go."""
-        if not self._is_reliable:
-            self._data.expire(now_s)
-        self._status.expire(now_s)
+        is_final = self.state is FeedState.LIVE and not self._is_reliable
+        self._data.expire(now_s, for_good=is_final)
+        self._status.expire(now_s, for_good=False)
 
     def next_timeout(self) -> float:
         """Return the monotonic second of the next timer."""
-        expiries = [self._status.next_expiry(), None if self._is_reliable else self._data.next_expiry()]
+        expiries = [self._status.next_expiry(), self._data.next_expiry()]
         return min([self._report_at_s, *(expiry for expiry in expiries if expiry is not None)])
 
     def take_report(self, now_s: float) -> bytes | None:
@@ -160,6 +173,8 @@ class Feed:
         """Give back all memory; return the frame that says goodbye."""
         self._data.close()
         self._status.close()
+        for number in list(self._ready):
+            self._take_ready(number)
         return self._note.seal(Report(ReportFlag.BYE, self._expected, 0, ()).to_wire())
 
     def _opener(self, kind: Kind, epoch: int) -> Opener:
@@ -185,12 +200,25 @@ class Feed:
             self._unreported_bytes += header.length
             self._plan_report(header, highest, now_s)
         if joined is not None:
-            self._ready[joined.number] = joined
-            self._ready_bytes += len(joined.message)
+            self._arrange(joined)
+
+    def _arrange(self, joined: Joined) -> None:
+        """Put a whole message where it belongs, and hand out what is next."""
+        if self.state is FeedState.LIVE and (not self._is_reliable or joined.number == self._expected):
+            if joined.number > self._expected:
+                self._skip_to(joined.number)
+            self._hand_out(joined)
+            self._expected = joined.number + 1
             self._deliver()
-            if self._ready_bytes > JOIN_SOURCE_BYTES:  # too much waits behind a gap: go on without what is missing
-                self._skip_to(min(self._ready))
-                self._deliver()
+        elif self._budget.reserve(self.publisher, len(joined.message) + _READY_OVERHEAD_BYTES):
+            self._ready[joined.number] = joined
+        elif self.state is FeedState.NEW:
+            self._data.drops[DropReason.MEMORY_FULL] += 1
+        else:  # too much waits behind a gap: go on without what is missing
+            self._skip_to(joined.number)
+            self._hand_out(joined)
+            self._expected += 1
+            self._deliver()
 
     def _plan_report(self, header: Header, highest: int, now_s: float) -> None:
         if self.state is FeedState.NEW or not self._is_reliable:
@@ -211,7 +239,8 @@ class Feed:
     def _missing(self) -> tuple[Missing, ...]:
         """Return what is known to be lacking: gaps below the newest part, and all that a status announced."""
         missing: list[Missing] = []
-        for number in range(self._expected, max(self._data.highest + 1, self._known_next)):
+        end = max(self._data.highest + 1, self._known_next)
+        for number in self._data.window.unfinished(self._expected, end):
             room = NACKS_PER_REPORT - len(missing)
             if room <= 0:
                 break
@@ -232,9 +261,9 @@ class Feed:
             self.state = FeedState.LIVE
             self._expected = status.starts[self._reader.name]
             self.description = status.description
-            self._data.forget(self._expected)
-            for number in [number for number in self._ready if number < self._expected]:
-                self._ready_bytes -= len(self._ready.pop(number).message)
+            for number in [n for n in self._ready if not 0 <= n - self._expected < REPLAY_WINDOW_MESSAGES]:
+                self._take_ready(number)
+            self._data.begin(self._expected, self._ready)
         self._known_next = max(self._known_next, status.next_number)
         if status.oldest > self._expected:
             self._skip_to(status.oldest)
@@ -246,27 +275,24 @@ class Feed:
         here = sorted(each for each in self._ready if each < number)
         self.lost += number - self._expected - len(here)
         for each in here:
-            self._hand_out(self._ready.pop(each))
+            self._hand_out(self._take_ready(each))
         self._expected = number
         self._data.forget(number)
 
     def _deliver(self) -> None:
         if self.state is FeedState.NEW:
             return
-        if self._is_reliable:
-            while (joined := self._ready.pop(self._expected, None)) is not None:
-                self._hand_out(joined)
-                self._expected += 1
-        elif self._ready:
-            for number in sorted(self._ready):
-                if number >= self._expected:
-                    self.lost += number - self._expected
-                    self._hand_out(self._ready.pop(number))
-                    self._expected = number + 1
-            self._ready.clear()
-            self._ready_bytes = 0
+        while self._expected in self._ready:
+            self._hand_out(self._take_ready(self._expected))
+            self._expected += 1
+        if self._ready and not self._is_reliable:
+            self._skip_to(max(self._ready) + 1)
+
+    def _take_ready(self, number: int) -> Joined:
+        joined = self._ready.pop(number)
+        self._budget.release(self.publisher, len(joined.message) + _READY_OVERHEAD_BYTES)
+        return joined
 
     def _hand_out(self, joined: Joined) -> None:
         self.delivered += 1
-        self._ready_bytes -= len(joined.message)
         self._out.append(Delivered(self.publisher, joined.number, joined.message, joined.parts, joined.hops))

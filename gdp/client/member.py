@@ -2,9 +2,9 @@
 
 Place: pure; a shell or a simulated network feeds it frames and time, and takes out frames and messages.
 
-The walk of a message out: ``publish`` -> Publisher (number, seal, keep) -> the switch. And in: DATA or STATUS -> the feed of
-its topic and source -> ``take_messages``. Whose word counts as a publisher's is decided here, by the claim that the
-switch hands on and this member verifies itself.
+The walk of a message out: ``publish`` -> Publisher (number, seal, keep) -> the switch. And in: DATA or STATUS -> the
+feed of its topic and source -> ``take_messages``. Whose word counts as a publisher's is decided here, by the claim that
+the switch hands on and this member verifies itself.
 """
 
 from __future__ import annotations
@@ -69,6 +69,7 @@ class Member:
     def __init__(self, identity: Identity, policy: Policy, settings: AttachmentSettings) -> None:
         self._identity = identity
         self._incarnation = settings.incarnation
+        self._reader = Reader(identity.name, settings.incarnation)  # one: its feeds share the numbers of their notes
         self._verifier = ClaimVerifier(policy)
         self._budget = Budget()
         self._publishers: dict[Name, Publisher] = {}
@@ -112,6 +113,8 @@ class Member:
         """
         if Right.PUBLISH not in topic.delegation.rights:
             raise LocalError(f"no delegation to publish {topic.name.short}")
+        if topic.name in self._publishers:  # a second one would count, and make nonces, from 1 again
+            raise LocalError(f"{topic.name.short} is published already")
         source = Source(self.name, self._incarnation, self._identity.key)
         publisher = Publisher(topic.name, source, topic.secrets, description, reliable=reliable, depth=depth)
         self._publishers[topic.name] = publisher
@@ -130,6 +133,10 @@ class Member:
         self._subscriptions[topic.name] = _Subscription(topic)
         delegation = topic.delegation
         self.attachment.claim(delegation.subject, Right.READ, delegation.chain, is_global=False)
+
+    def subscribed(self) -> list[Topic]:
+        """Return the topics that are read."""
+        return [subscription.topic for subscription in self._subscriptions.values()]
 
     def publishers(self) -> list[Publisher]:
         """Return what is being published, one publisher for each topic."""
@@ -192,8 +199,8 @@ class Member:
     def next_timeout(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         times = [self.attachment.next_timeout()]
-        times += [publisher.next_timeout() for publisher in self._publishers.values()]
-        if self.attachment.switch is not None:
+        if self.attachment.switch is not None:  # alone, nothing can be sent: hellos alone are due
+            times += [publisher.next_timeout() for publisher in self._publishers.values()]
             times += [feed.next_timeout() for feed in self.feeds()]
         return min((time for time in times if time is not None), default=None)
 
@@ -244,6 +251,8 @@ class Member:
             publisher = self._publishers.get(join.topic)
             if publisher is not None and join.publisher == self.name and join.lease_s > 0:
                 publisher.tree_stands(join.mtu)
+        elif statement.type is StatementType.REVOKE:
+            self._revoke(statement, now)
         elif statement.type is StatementType.ANSWER:
             self._take_publisher(Answer.from_fields(statement.fields), now)
 
@@ -260,17 +269,37 @@ class Member:
         if claim.right is not Right.PUBLISH or claim.name != answer.name or claim.node != answer.advertiser:
             raise StatementError(DropReason.WRONG_NAME, "a publisher's claim about something else")
         if feed is not None:
-            if feed.incarnation == claim.incarnation or claim.sequence <= feed.claim_sequence:
-                feed.claim_sequence = max(feed.claim_sequence, claim.sequence)
+            if claim.sequence <= feed.claim_sequence:
+                return
+            if feed.incarnation == claim.incarnation:
+                feed.claim_sequence, feed.claim = claim.sequence, claim.wire
                 return
             self._close(subscription, feed)
         topic = subscription.topic
-        reader = Reader(self.name, self._incarnation)
         feed = Feed(
-            topic.name, reader, claim.node, claim.incarnation, claim.member.key, topic.secrets, self._budget, now.mono_s
+            topic.name,
+            self._reader,
+            claim.node,
+            claim.incarnation,
+            claim.member.key,
+            topic.secrets,
+            self._budget,
+            now.mono_s,
         )
-        feed.claim_sequence = claim.sequence
+        feed.claim_sequence, feed.claim = claim.sequence, claim.wire
         subscription.feeds[claim.node] = feed
+
+    def _revoke(self, statement: Statement, now: Instant) -> None:
+        """Open nothing more of a publisher whose claim rests on what was taken back."""
+        if self._verifier.revoke(statement.wire, now.unix_s) is None:
+            return
+        for subscription in self._subscriptions.values():
+            for feed in list(subscription.feeds.values()):
+                try:
+                    self._verifier.verify(feed.claim, now.unix_s)
+                except StatementError as error:
+                    self._drops[error.reason] += 1
+                    self._close(subscription, feed)
 
     def _close(self, subscription: _Subscription, feed: Feed) -> None:
         self.attachment.send([feed.close()])

@@ -2,13 +2,17 @@
 
 Place: pure; time comes in as ``now_s`` (monotonic seconds). Frames come out of ``take`` and go to the switch.
 
-A message is sealed once. Without a reader nothing is sealed; the last ``depth`` messages of a latched topic wait for late
-joiners.
+A message is sealed once. Without a reader nothing is sealed; the last ``depth`` messages of a latched topic wait for
+late joiners.
+
+A reader is known by its notes. One that falls silent is forgotten; one that stands still, or lags while others are
+through, holds the window no longer: it gets what is sent, and is told to skip what is gone, until after a penance it
+may hold the window again.
 """
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -18,7 +22,7 @@ from gdp.crypto.note import NoteOpener
 from gdp.errors import DropReason, EnvelopeError, FrameError, LocalError, RemoteError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Flag, Kind
-from gdp.limits import MTU_MIN_BYTES, READER_LEASE_S
+from gdp.limits import MTU_MIN_BYTES, READER_LEASE_S, WINDOW_BYTES
 from gdp.message.report import Report, ReportFlag
 from gdp.message.status import STARTS_MAX, Status
 from gdp.message.window import SendWindow
@@ -27,6 +31,11 @@ from gdp.names import Name
 __all__ = ["Publisher", "Secrets", "Source"]
 
 _READERS_MAX: Final = 1_024
+_LIVES_MAX: Final = 4_096  # incarnations of readers whose old notes are known as such
+_STATUS_GAP_S: Final = 0.02  # between two statuses
+_STATUS_BYTES_PER_S: Final = 8 << 20  # ... and longer after a large one
+_PENANCE_MIN_S: Final = 2 * READER_LEASE_S
+_PENANCE_MAX_S: Final = 16 * READER_LEASE_S
 
 Secrets = Mapping[int, bytes]  # key epoch -> topic secret, 32 bytes
 
@@ -43,9 +52,10 @@ class Source:
 @dataclass(slots=True)
 class _Reader:
     opener: NoteOpener
-    incarnation: int
-    epoch: int
     heard_s: float
+    start: int | None = None  # its first message; None once it has begun to confirm
+    out_until_s: float = 0.0  # it may not hold the window before
+    penance_s: float = _PENANCE_MIN_S
 
 
 class Publisher:
@@ -77,9 +87,12 @@ class Publisher:
         self._status_number = 0
         self._mtu: int | None = None  # unknown until a tree stands
         self._readers: dict[bytes, _Reader] = {}
+        self._lives: OrderedDict[tuple[bytes, int, int], NoteOpener] = OrderedDict()
         self._starts: dict[bytes, int] = {}
         self._status_wanted = False
-        self._waiting = deque[bytes]()  # best-effort and status frames
+        self._status_at_s = float("-inf")  # when the next one may go
+        self._waiting = deque[list[bytes]]()  # best-effort messages
+        self._waiting_bytes = 0
         self._early = deque[bytes](maxlen=depth or None)  # latched messages from before the first reader
         self.drops: Counter[DropReason] = Counter()
         self.messages = 0
@@ -132,7 +145,7 @@ class Publisher:
         if self._repairs_wanted:
             self._window.add(number, frames)
         else:
-            self._waiting.extend(frames)
+            self._wait(frames)
         return number
 
     def receive_report(self, header: Header, frame: bytes, now_s: float) -> None:
@@ -144,22 +157,24 @@ class Publisher:
             return
         name = header.source
         if ReportFlag.BYE in report.flags:
-            del self._readers[name]
-            self._window.drop_reader(name)
+            self._forget(name)
         elif ReportFlag.NEW in report.flags:
             self._welcome(name, now_s)
-        elif self._window.has_reader(name):
-            self._window.report(name, report, now_s)
-            oldest = self._window.oldest
-            if report.missing and (oldest is None or report.missing[0].number < oldest):
-                self._status_wanted = True  # it asks for what is gone
+        else:
+            self._readers[name].start = None
+            if self._repairs_wanted:
+                self._take_report(name, report, now_s)
 
     def timeout(self, now_s: float) -> None:
-        """Let silent readers go, and ask those that owe a report."""
-        silent = [name for name, reader in self._readers.items() if now_s - reader.heard_s > READER_LEASE_S]
-        for name in silent:
-            del self._readers[name]
+        """Let silent readers go, let laggards hold nothing, and ask those that owe a report."""
+        for name in [name for name, reader in self._readers.items() if now_s - reader.heard_s > READER_LEASE_S]:
+            self._forget(name)
+        for name in self._window.laggards(now_s):
+            reader = self._readers[name]
+            reader.out_until_s = now_s + reader.penance_s
+            reader.penance_s = min(2 * reader.penance_s, _PENANCE_MAX_S)
             self._window.drop_reader(name)
+            self._status_wanted = True
         if self._window.probe_due(now_s):
             self._status_wanted = True
 
@@ -167,6 +182,8 @@ class Publisher:
         """Return the monotonic second of the next timer, or None."""
         lease = min((reader.heard_s for reader in self._readers.values()), default=None)
         times = [self._window.next_probe(), None if lease is None else lease + READER_LEASE_S + 0.001]
+        if self._status_wanted and self._readers and self._mtu is not None:
+            times.append(self._status_at_s)
         return min((time for time in times if time is not None), default=None)
 
     def take(self, now_s: float) -> list[bytes]:
@@ -175,10 +192,11 @@ class Publisher:
             return []
         while self._early:
             self.publish(self._early.popleft())
-        if self._status_wanted:
-            self._waiting.extend(self._seal_status())
-        frames = list(self._waiting)
+        frames = [frame for message in self._waiting for frame in message]
         self._waiting.clear()
+        self._waiting_bytes = 0
+        if self._status_wanted and now_s >= self._status_at_s:
+            frames += self._seal_status(now_s)
         return frames + self._window.take(now_s)
 
     def _sealer(self, kind: Kind) -> Sealer:
@@ -187,33 +205,74 @@ class Publisher:
         return Sealer(secret, self._epoch, kind, source.name, source.incarnation, self.topic, source.signer)
 
     def _open_report(self, header: Header, frame: bytes, now_s: float) -> Report:
-        name = header.source
-        reader = self._readers.get(name)
-        if reader is None or reader.incarnation != header.incarnation or reader.epoch != header.epoch:
+        name, life = header.source, (header.source, header.incarnation, header.epoch)
+        opener = self._lives.get(life)
+        is_known = opener is not None
+        if opener is None:
             secret = self._secrets.get(header.epoch)
             if secret is None:
                 raise EnvelopeError(DropReason.UNKNOWN_EPOCH)
-            if reader is None and len(self._readers) >= _READERS_MAX:
-                raise EnvelopeError(DropReason.QUOTA, "readers")
-            opener = NoteOpener(secret, Kind.REPORT, name, header.incarnation, self._source.name)
-            reader = _Reader(opener, header.incarnation, header.epoch, now_s)
-        report = Report.from_wire(reader.opener.open(header, frame))
-        if self._readers.get(name) is not reader and ReportFlag.NEW not in report.flags:
-            raise FrameError(DropReason.UNKNOWN_SENDER, "a report from a reader that never began")
-        self._readers[name] = reader
+            source = self._source
+            opener = NoteOpener(
+                secret, Kind.REPORT, name, header.incarnation, source.name, self.topic, source.incarnation
+            )
+        report = Report.from_wire(opener.open(header, frame))
+        reader = self._readers.get(name)
+        if reader is None and len(self._readers) >= _READERS_MAX:
+            raise EnvelopeError(DropReason.QUOTA, "readers")
+        is_current = is_known if reader is None else reader.opener is opener
+        if not is_current and ReportFlag.NEW not in report.flags:
+            raise FrameError(DropReason.UNKNOWN_SENDER, "a report of a life that never began, or is over")
+        self._lives[life] = opener
+        self._lives.move_to_end(life)
+        if len(self._lives) > _LIVES_MAX:
+            self._lives.popitem(last=False)
+        if reader is None or reader.opener is not opener:
+            self._forget(name)
+            reader = self._readers[name] = _Reader(opener, now_s)
         reader.heard_s = now_s
         return report
 
+    def _forget(self, name: bytes) -> None:
+        if self._readers.pop(name, None) is not None:
+            self._starts.pop(name, None)
+            self._window.drop_reader(name)
+
     def _welcome(self, name: bytes, now_s: float) -> None:
+        """Give a new reader its first message; one that asks again gets the same answer."""
+        reader = self._readers[name]
         if name not in self._starts and len(self._starts) < STARTS_MAX:
             oldest = self._window.oldest
-            start = oldest if self._depth and oldest is not None else self._next_number
-            if self._repairs_wanted:
-                self._window.add_reader(name, start, now_s)
-            self._starts[name] = start
+            is_gone = oldest is not None and reader.start is not None and reader.start < oldest
+            if reader.start is None or is_gone or not self._repairs_wanted:
+                reader.start = self._next_number
+                if self._depth and oldest is not None:
+                    reader.start = max(oldest, self._next_number + len(self._early) - self._depth)
+                if self._repairs_wanted and now_s >= reader.out_until_s:
+                    self._window.add_reader(name, reader.start, now_s)
+            self._starts[name] = reader.start
         self._status_wanted = True
 
-    def _seal_status(self) -> list[bytes]:
+    def _take_report(self, name: bytes, report: Report, now_s: float) -> None:
+        reader, window = self._readers[name], self._window
+        oldest = window.oldest
+        if not window.has_reader(name) and now_s >= reader.out_until_s:  # it was gone, or lagged
+            first = report.next_number if oldest is None else max(report.next_number, oldest)
+            window.add_reader(name, min(first, self._next_number), now_s)
+        if window.has_reader(name):
+            window.report(name, report, now_s)
+        if report.missing and (oldest is None or report.missing[0].number < oldest):
+            self._status_wanted = True  # it asks for what is gone
+
+    def _wait(self, frames: list[bytes]) -> None:
+        """Queue a best-effort message; the oldest go when nobody takes them."""
+        self._waiting.append(frames)
+        self._waiting_bytes += sum(map(len, frames))
+        while self._waiting_bytes > WINDOW_BYTES and len(self._waiting) > 1:
+            self._waiting_bytes -= sum(map(len, self._waiting.popleft()))
+            self.drops[DropReason.MEMORY_FULL] += 1
+
+    def _seal_status(self, now_s: float) -> list[bytes]:
         assert self._mtu is not None
         oldest = self._window.oldest
         about = self._description if self._starts else b""
@@ -221,4 +280,6 @@ class Publisher:
         self._starts.clear()
         self._status_wanted = False
         self._status_number += 1
-        return self._status.seal(self._status_number, self._flags, status.to_wire(), self._mtu)
+        wire = status.to_wire()
+        self._status_at_s = now_s + max(_STATUS_GAP_S, len(wire) / _STATUS_BYTES_PER_S)
+        return self._status.seal(self._status_number, self._flags, wire, self._mtu)

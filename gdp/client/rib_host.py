@@ -1,7 +1,7 @@
 """A RIB on the overlay: the RIB's machine with a hold on a switch.
 
-Place: pure; a shell or a simulated network feeds it frames and time. A RIB claims no name: its hello says what it is, and
-its switch says so to all (``control/link_state.py``).
+Place: pure; a shell or a simulated network feeds it frames and time. A RIB claims no name: its hello says what it is,
+and its switch says so to all (``control/link_state.py``).
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from gdp.client.attachment import Attachment, AttachmentSettings
 from gdp.control.frames import ControlJoiner
 from gdp.crypto.identity import Identity
+from gdp.crypto.statements import StatementType
 from gdp.effects import Arrival, Instant, Transmit
 from gdp.errors import DropReason, FrameError, RemoteError
 from gdp.frame.codec import decode
@@ -78,7 +79,9 @@ class RibHost:
     def _take(self, arrival: Arrival, now: Instant) -> None:
         header = decode(arrival.frame)
         if header.kind >= CONTROL_FROM:
-            self.attachment.receive_control(arrival, header, now)
+            statement = self.attachment.receive_control(arrival, header, now)
+            if statement is not None and statement.type is StatementType.REVOKE:
+                self.rib.revoke(statement.wire, now)
             return
         if header.destination != self.name:
             raise FrameError(DropReason.NOT_FOR_US)

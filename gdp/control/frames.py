@@ -1,7 +1,8 @@
 """A statement in frames: split where it is longer than a link carries, joined under tight bounds.
 
 Place: pure; time comes in as ``now_s`` (monotonic seconds). Statements are signed, not sealed; until one is whole
-nobody knows who wrote it, so memory is bounded per claimed source and in all, and patience is short.
+nobody knows who wrote it, so memory is bounded per claimed source and in all, and patience is short. Where a bound is met
+the oldest unfinished statement makes room: a flood of beginnings ends its own, hardly one whose parts come together.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ __all__ = ["ControlJoiner", "ControlSplitter"]
 
 _COST_BYTES: Final = 200  # what an unfinished statement costs beside its bytes
 _FAR_MTU: Final = 1_400  # behind the first link there may be a tunnel
+
+_Key = tuple[bytes, int, int, int]  # source, kind, incarnation, number
 
 
 class ControlSplitter:
@@ -65,8 +68,6 @@ class ControlSplitter:
         ]
 
 
-
-
 @dataclass(slots=True)
 class _Unfinished:
     parts: int
@@ -80,19 +81,25 @@ class ControlJoiner:
 
     def __init__(self) -> None:
         self._budget = Budget(CONTROL_JOIN_BYTES, CONTROL_JOIN_SOURCE_BYTES)
-        self._unfinished: dict[tuple[bytes, int, int, int], _Unfinished] = {}
+        self._unfinished: dict[_Key, _Unfinished] = {}
+        self._by_source: dict[bytes, dict[_Key, None]] = {}  # in order of their beginning
         self.drops: Counter[DropReason] = Counter()
 
     @property
-    def unfinished(self) -> Mapping[tuple[bytes, int, int, int], object]:
+    def unfinished(self) -> Mapping[_Key, object]:
         """Return what waits for parts, keyed by (source, kind, incarnation, number)."""
         return self._unfinished
+
+    @property
+    def held_bytes(self) -> int:
+        """Return how much memory unfinished statements hold."""
+        return self._budget.held_bytes
 
     def add(self, header: Header, frame: bytes, now_s: float) -> bytes | None:
         """Take a part; return the statement when it is whole.
 
         Raises:
-            FrameError: it cannot be a part of a statement, or there is no room for it.
+            FrameError: it cannot be a part of a statement.
         """
         payload = frame[HEADER_BYTES : HEADER_BYTES + header.length]
         if header.parts == 1:
@@ -103,14 +110,19 @@ class ControlJoiner:
         key = (header.source, header.kind, header.incarnation, header.number)
         waiting = self._unfinished.get(key)
         if waiting is None:
-            if not self._budget.reserve(header.source, _COST_BYTES):
-                raise FrameError(DropReason.MEMORY_FULL, "statements")
+            self._reserve(header.source, _COST_BYTES)
             waiting = self._unfinished[key] = _Unfinished(header.parts, now_s)
+            self._by_source.setdefault(header.source, {})[key] = None
         if waiting.parts != header.parts:
             raise FrameError(DropReason.BAD_PARTS, "the number of parts changed")
         if header.part in waiting.chunks:
             raise FrameError(DropReason.DUPLICATE, "statement")
-        if not self._budget.reserve(header.source, len(payload)):
+        if waiting.held_bytes + len(payload) > CONTROL_MAX_BYTES + _COST_BYTES:
+            self._drop(key)
+            raise FrameError(DropReason.TOO_BIG, "statement")
+        self._reserve(header.source, len(payload))
+        if key not in self._unfinished:  # it was the oldest itself
+            self._budget.release(header.source, len(payload))
             raise FrameError(DropReason.MEMORY_FULL, "statements")
         waiting.held_bytes += len(payload)
         waiting.chunks[header.part] = payload
@@ -128,5 +140,18 @@ class ControlJoiner:
             self._drop(key)
             self.drops[DropReason.ABANDONED] += 1
 
-    def _drop(self, key: tuple[bytes, int, int, int]) -> None:
-        self._budget.release(key[0], self._unfinished.pop(key).held_bytes)
+    def _reserve(self, source: bytes, size: int) -> None:
+        """Take memory, from the oldest of this source or of all where there is none left."""
+        while not self._budget.reserve(source, size):
+            mine = self._by_source.get(source)
+            held = sum(self._unfinished[key].held_bytes for key in mine or ())
+            is_mine = held + size > CONTROL_JOIN_SOURCE_BYTES
+            self._drop(next(iter(mine if mine and is_mine else self._unfinished)))
+            self.drops[DropReason.MEMORY_FULL] += 1
+
+    def _drop(self, key: _Key) -> None:
+        source = key[0]
+        self._budget.release(source, self._unfinished.pop(key).held_bytes)
+        del self._by_source[source][key]
+        if not self._by_source[source]:
+            del self._by_source[source]

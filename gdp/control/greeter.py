@@ -3,7 +3,8 @@
 Place: pure; every node that has a port greets: switches, RIBs, proxies.
 
 A hello is signed by a member of a trusted domain and carries its certificate. It counts as two-way when it echoes the
-nonce of our port's present session, so a recorded hello brings nobody up.
+nonce of our port's present session, and is newer than all that came of its own, so a recorded hello brings nobody up: of
+sessions that ended, too, the last sequence number is remembered.
 """
 
 from __future__ import annotations
@@ -21,12 +22,15 @@ from gdp.effects import BROADCAST, Arrival, Instant, Transmit
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
 from gdp.limits import DEAD_S, HELLO_S, MTU_MIN_BYTES
+from gdp.message.replay import ReplayWindow
 from gdp.names import Name
 from gdp.trust.domain import Policy
 
 __all__ = ["Change", "Greeter", "LinkPort"]
 
 NEIGHBOURS_PER_PORT: Final = 32
+_ENDED_MAX: Final = 1_024  # sessions of the far ends, remembered for one session of a port
+_JOINS_WINDOW: Final = 1_024  # how far joins may overtake each other
 _ANSWER_S: Final = 0.02  # a stranger's hello is answered at once, but not more often than this
 
 Change = tuple[Neighbour, NeighbourState]  # a neighbour after the change, and its state before
@@ -46,6 +50,33 @@ class LinkPort:
     hello_at_s: float = 0.0
     said_s: float = float("-inf")
     neighbours: dict[Name, Neighbour] = field(default_factory=dict)
+    ended: dict[bytes, int] = field(default_factory=dict)  # nonce of a session to its last sequence number
+    joins: dict[Name, ReplayWindow] = field(default_factory=dict)  # which joins were taken in this session
+
+    def last_of(self, name: Name, nonce: bytes) -> int:
+        """Return the last sequence number that came of a neighbour's session, or -1."""
+        known = self.neighbours.get(name)
+        return known.sequence if known is not None and known.nonce == nonce else self.ended.get(nonce, -1)
+
+    def end(self, neighbour: Neighbour) -> None:
+        """Remember how far a session came."""
+        if neighbour.nonce:
+            self.ended.pop(neighbour.nonce, None)
+            self.ended[neighbour.nonce] = neighbour.sequence
+            if len(self.ended) > _ENDED_MAX:
+                del self.ended[next(iter(self.ended))]
+
+    def take_join(self, name: Name, sequence: int) -> bool:
+        """Note a verified join or leave of a neighbour; False when it came before, or is too old to tell."""
+        window = self.joins.get(name)
+        if window is None:
+            if len(self.joins) >= _ENDED_MAX:
+                del self.joins[next(iter(self.joins))]
+            window = self.joins[name] = ReplayWindow(_JOINS_WINDOW)
+        if window.is_finished(sequence):
+            return False
+        window.finish(sequence)
+        return True
 
 
 class Greeter:
@@ -65,7 +96,7 @@ class Greeter:
         *,
         hello_s: float = HELLO_S,
         dead_s: float = DEAD_S,
-        digest_for: Callable[[LinkPort], bytes] = lambda port: bytes(DIGEST_BYTES),
+        digest_for: Callable[[LinkPort], bytes] = lambda _: bytes(DIGEST_BYTES),
     ) -> None:
         self._identity = identity
         self._policy = policy
@@ -107,7 +138,7 @@ class Greeter:
         if member.name != statement.signer:
             raise StatementError(DropReason.BAD_CERTIFICATE, "a hello under another's certificate")
         known = port.neighbours.get(member.name)
-        if known is not None and known.nonce == hello.nonce and hello.sequence <= known.sequence:
+        if hello.sequence <= port.last_of(member.name, hello.nonce):
             raise StatementError(DropReason.REPLAYED, "hello")
         statement.verify(member.key)
         if known is None:
@@ -123,6 +154,8 @@ class Greeter:
         if is_new_session and not is_two_way and known.state is NeighbourState.UP:
             known.candidate = hello.nonce  # a restart, or an old hello played back: only an echo of our nonce will tell
             return None
+        if is_new_session:
+            port.end(known)
         known.mac, known.mtu, known.nonce, known.candidate = arrival.mac, min(hello.mtu, port.mtu), hello.nonce, b""
         known.sequence, known.digest, known.heard_s = hello.sequence, hello.digest, now.mono_s
         change = self._step(known, NeighbourEvent.TWO_WAY if is_two_way else NeighbourEvent.ONE_WAY)
@@ -138,6 +171,8 @@ class Greeter:
         port.is_up = up
         if up:
             port.nonce = self._random_bytes(NONCE_BYTES)
+            port.ended.clear()
+            port.joins.clear()
             port.hello_at_s = now_s
             return []
         return self._lose(port, list(port.neighbours.values()), NeighbourEvent.LINK_LOST)
@@ -174,6 +209,7 @@ class Greeter:
     def _lose(self, port: LinkPort, lost: list[Neighbour], event: NeighbourEvent) -> list[Change]:
         for neighbour in lost:
             del port.neighbours[neighbour.name]
+            port.end(neighbour)
         return [change for neighbour in lost if (change := self._step(neighbour, event)) is not None]
 
     @staticmethod

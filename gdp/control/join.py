@@ -1,12 +1,13 @@
 """A request of one switch to the next towards a publisher: let this tree grow (or shrink) here.
 
-Place: pure.
+Place: pure. A recorded join or leave moves nothing: each names the receiver's present session and counts up.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gdp.control.hello import NONCE_BYTES
 from gdp.control.query import TRANSIT_MAX
 from gdp.crypto.fields import Fields
 from gdp.crypto.keys import SigningKey
@@ -28,6 +29,8 @@ class Join:
         mtu: smallest on the way down from here, in bytes after the Ethernet header.
         lease_s: how long the branch stands unless renewed; 0 takes it down (LEAVE).
         evidence: the signed claim of a reader further down; whoever passes a join on checks it.
+        session: nonce of the receiver's port, as its hellos say it.
+        sequence: rises with every join and leave of the sender, over its restarts too.
     """
 
     topic: Name
@@ -38,6 +41,8 @@ class Join:
     mtu: int
     lease_s: float
     evidence: bytes
+    session: bytes
+    sequence: int
 
     def to_wire(self, signer: Name, key: SigningKey) -> bytes:
         """Return the signed statement."""
@@ -50,6 +55,8 @@ class Join:
             "m": self.mtu,
             "l": float(self.lease_s),
             "e": self.evidence,
+            "i": self.session,
+            "s": self.sequence,
         }
         return sign(StatementType.JOIN, body, signer, key)
 
@@ -69,4 +76,6 @@ class Join:
             fields.uint("m", FRAME_MAX_BYTES),
             fields.number("l", 0, LEASE_MAX_S),
             fields.bytes_("e"),
+            fields.bytes_("i", NONCE_BYTES),
+            fields.uint("s"),
         )

@@ -1,4 +1,4 @@
-"""Deterministic CBOR: written shortest, read strictly.
+"""Deterministic CBOR: written shortest (in ``cbor_writer``), read strictly (here).
 
 Place: pure.
 Source: RFC 8949, section 4.2.1. A peer's bytes have one reading or none: what this reader accepts, the writer would
@@ -14,9 +14,8 @@ from __future__ import annotations
 import struct
 from typing import Final, NoReturn, TypeAlias
 
-import cbor2
-
-from gdp.errors import DropReason, LocalError, StatementError
+from gdp.crypto.cbor_writer import encode
+from gdp.errors import DropReason, StatementError
 from gdp.limits import CBOR_DEPTH_MAX, CONTROL_MAX_BYTES
 
 __all__ = ["ITEMS_MAX", "Value", "decode", "encode"]
@@ -27,19 +26,6 @@ ITEMS_MAX: Final = 4_096  # bounds the work of one decode to about 2 ms
 _SIMPLE: Final[dict[int, bool | None]] = {0xF4: False, 0xF5: True, 0xF6: None}
 _FLOATS: Final = {0xF9: struct.Struct("!e"), 0xFA: struct.Struct("!f"), 0xFB: struct.Struct("!d")}
 _NAN: Final = b"\xf9\x7e\x00"
-
-
-def encode(value: object) -> bytes:
-    """Return the one deterministic encoding of ``value``.
-
-    Raises:
-        LocalError: a type that CBOR cannot carry. What it carries under a tag only (sets, dates, integers beyond 64
-            bits) is written, and refused by every reader: such values have no place in a statement.
-    """
-    try:
-        return cbor2.dumps(value, canonical=True)
-    except (cbor2.CBOREncodeError, ValueError, TypeError) as error:
-        raise LocalError(f"cannot be written as CBOR: {error}") from error
 
 
 def decode(wire: bytes, max_bytes: int = CONTROL_MAX_BYTES) -> Value:

@@ -1,16 +1,16 @@
 """Sealing a message into frames, and opening its parts one by one.
 
 Place: pure; no clock, no memory of messages (that is ``gdp/message``).
-Source: DESIGN section 4; NIST SP 800-38D (GCM), RFC 5869 (HKDF), FIPS 186-5 (ECDSA). Byte-exact text: ``frame/spec.md``.
+Source: DESIGN section 4; NIST SP 800-38D (GCM), RFC 5869 (HKDF), FIPS 186-5 (ECDSA). To the byte: ``frame/spec.md``.
 
 ::
 
     part 0            part 1                  last part
     header|c0|tag     header|c1|tag    ...    header|cn|tag|signature
 
-Each part is AES-256-GCM under a key that belongs to (topic secret, kind, source, incarnation, destination); the nonce is
-message number || part, the additional data the header without hops left. The signature covers SHA-256 over the header
-fields that all parts share and every payload (ciphertext and tag) in order.
+Each part is AES-256-GCM under a key that belongs to (topic secret, kind, source, incarnation, destination); the nonce
+is message number || part, the additional data the header without hops left. The signature covers SHA-256 over the
+header fields that all parts share and every payload (ciphertext and tag) in order.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ Source: HPKE, RFC 9180, single-shot, base mode, with KEM MLKEM768-X25519, HKDF-S
     public   ML-KEM (1184) || X25519 (32)
     sealed   encapsulated key (1120) || ciphertext || tag (16)
 
-The library has this from version 47 on; where it is older, each call says so with a ``LocalError``.
+The library has this from version 47 on, its wheels from 48; where it is missing, each call says so (``LocalError``).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _MLKEM_PUBLIC_BYTES: Final = 1_184
 _X25519_BYTES: Final = 32
 KEM_PRIVATE_BYTES: Final = _SEED_BYTES + _X25519_BYTES
 KEM_PUBLIC_BYTES: Final = _MLKEM_PUBLIC_BYTES + _X25519_BYTES
-_TOO_OLD: Final = "handing over topic secrets needs the package cryptography, version 47 or later, with ML-KEM"
+_TOO_OLD: Final = "handing over topic secrets needs the package cryptography, version 48 or later, with ML-KEM"
 
 
 @dataclass(frozen=True, slots=True)

@@ -59,6 +59,7 @@ _UNDERSTOOD: Final = frozenset(
 _FOREIGN_ERRORS: Final = (
     ValueError,
     TypeError,
+    LookupError,  # some versions have it for string types that they do not know
     UnsupportedAlgorithm,
     x509.InvalidVersion,
     x509.DuplicateExtension,

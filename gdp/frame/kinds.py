@@ -33,6 +33,7 @@ class Kind(IntEnum):
     ADVERTISE = 0x84  # an attached node's claim, to its switch
     WITHDRAW = 0x85
     VERDICT = 0x86  # the switch's answer to an attached node: taken, or refused and why
+    REVOKE = 0x87  # to the neighbour, who passes it on: this certificate no longer counts
 
 
 class Flag(IntFlag):

@@ -3,14 +3,18 @@
 Place: pure; time comes in as ``now_s`` (monotonic seconds).
 
 A part is opened before it is kept, so that nothing injected or altered costs memory. What is kept is bounded by a
-``Budget`` and given back after a patience. The running hash follows the parts in order; a part that came early keeps its
-ciphertext until the hash has reached it.
+``Budget`` and given back after a patience. The running hash follows the parts in order; a part that came early keeps
+its ciphertext until the hash has reached it.
+
+Whoever holds the topic's secret can make parts that open, though never a message that verifies. So nothing that such
+a part says lasts: a message whose signature is bad is forgotten, not finished; of two counts of parts the later one
+holds; and when there are too many unfinished messages, the one that is needed last gives way.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -18,7 +22,7 @@ from gdp.crypto.envelope import digest_of
 from gdp.errors import DropReason, EnvelopeError, RemoteError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Flag
-from gdp.limits import HOPS_MAX, JOIN_MESSAGES_MAX, JOIN_PATIENCE_S
+from gdp.limits import HOPS_MAX, JOIN_MESSAGES_MAX, JOIN_PATIENCE_S, REPLAY_WINDOW_MESSAGES
 from gdp.message.memory import Budget
 from gdp.message.replay import ReplayWindow
 
@@ -26,6 +30,7 @@ __all__ = ["ALL_PARTS", "Joined", "Joiner", "OpensParts", "VerifiesDigest"]
 
 ALL_PARTS = 0xFFFF_FFFF
 _PART_OVERHEAD_BYTES = 128  # what a kept part costs beside its bytes
+_SCAN_PARTS = 4_096  # above the parts that an honest publisher has under way
 
 
 class OpensParts(Protocol):
@@ -80,7 +85,7 @@ class Joiner:
         opener_of: gives the opener for a key epoch, or raises ``EnvelopeError`` (UNKNOWN_EPOCH).
         writer: the key that must have signed.
         budget: shared by all joiners of the node.
-        patience_s: an unfinished message is given back this long after its last new part; None: only ``forget`` ends it.
+        patience_s: an unfinished message is given back this long after its last new part.
     """
 
     def __init__(
@@ -90,7 +95,7 @@ class Joiner:
         writer: VerifiesDigest,
         budget: Budget,
         *,
-        patience_s: float | None = JOIN_PATIENCE_S,
+        patience_s: float = JOIN_PATIENCE_S,
     ) -> None:
         self._source = source
         self._opener_of = opener_of
@@ -113,27 +118,44 @@ class Joiner:
         if message is not None and header.part in message.plain:
             self.drops[DropReason.DUPLICATE] += 1
             return None
-        if message is None and len(self._unfinished) >= JOIN_MESSAGES_MAX:
-            self.drops[DropReason.MEMORY_FULL] += 1
-            return None
         try:
             plain, sealed, signature = self._opener_of(header.epoch).open(header, frame)
         except EnvelopeError as error:
             self.drops[error.reason] += 1
             return None
+        if header.parts == 1:
+            return self._take_whole(header, plain, sealed, signature)
+        if message is None and not self._make_room(number):
+            self.drops[DropReason.MEMORY_FULL] += 1
+            return None
         return self._keep(header, plain, sealed, signature, now_s)
+
+    def _take_whole(self, header: Header, plain: bytes, sealed: bytes, signature: bytes) -> Joined | None:
+        number = header.number
+        running = digest_of(header)
+        running.update(sealed)
+        if not self._is_signed(signature, running):
+            return None
+        if number in self._unfinished:  # somebody else said that it has more parts
+            self._drop(number)
+            self.drops[DropReason.BAD_PARTS] += 1
+        self.highest = max(self.highest, number)
+        self.new_parts += 1
+        self.window.finish(number)
+        return Joined(number, header.flags & ~Flag.LAST, plain, 1, max(HOPS_MAX - header.hops_left, 0))
 
     def _keep(self, header: Header, plain: bytes, sealed: bytes, signature: bytes, now_s: float) -> Joined | None:
         number = header.number
         message = self._unfinished.get(number)
+        if message is not None and message.parts != header.parts:
+            self.drops[DropReason.BAD_PARTS] += 1
+            self._drop(number)
+            message = None
         if message is None:
             message = _Unfinished(header.parts, digest_of(header), now_s)
-        elif message.parts != header.parts:
-            self.drops[DropReason.BAD_PARTS] += 1
-            return None
         in_order = header.part == message.hashed
         cost = len(plain) + _PART_OVERHEAD_BYTES + (0 if in_order else len(sealed))
-        if not self._budget.reserve(self._source, cost):
+        if not self._reserve(number, cost):
             self.drops[DropReason.MEMORY_FULL] += 1
             return None
         self._unfinished[number] = message
@@ -164,22 +186,55 @@ class Joiner:
     def _finish(self, header: Header, message: _Unfinished) -> Joined | None:
         number = header.number
         self._drop(number)
-        try:
-            self._writer.verify_digest(message.signature, message.running.digest())
-        except RemoteError as error:  # not finished: the writer's own parts may still come
-            self.drops[error.reason] += 1
-            return None
+        if not self._is_signed(message.signature, message.running):
+            return None  # not finished: the writer's own parts may still come
         self.window.finish(number)
-        plain = message.plain
-        whole = plain[0] if message.parts == 1 else b"".join([plain[part] for part in range(message.parts)])
+        whole = b"".join([message.plain[part] for part in range(message.parts)])
         return Joined(number, header.flags & ~Flag.LAST, whole, message.parts, message.hops)
 
-    def _drop(self, number: int) -> bool:
-        message = self._unfinished.pop(number, None)
-        if message is None:
+    def _is_signed(self, signature: bytes, running: _Hash) -> bool:
+        try:
+            self._writer.verify_digest(signature, running.digest())
+        except RemoteError as error:
+            self.drops[error.reason] += 1
             return False
-        self._budget.release(self._source, message.held_bytes)
         return True
+
+    def _drop(self, number: int) -> None:
+        self._budget.release(self._source, self._unfinished.pop(number).held_bytes)
+
+    def _make_room(self, number: int) -> bool:
+        """Return whether one more message may be begun; the highest number gives way to a lower one."""
+        if len(self._unfinished) < JOIN_MESSAGES_MAX:
+            return True
+        highest = max(self._unfinished)
+        if number > highest:
+            return False
+        self._drop(highest)
+        self.drops[DropReason.ABANDONED] += 1
+        return True
+
+    def _reserve(self, number: int, cost: int) -> bool:
+        """Take memory for a part of a message, if need be from messages with higher numbers."""
+        while not self._budget.reserve(self._source, cost):
+            highest = max(self._unfinished, default=-1)
+            if number >= highest:
+                return False
+            self._drop(highest)
+            self.drops[DropReason.ABANDONED] += 1
+        return True
+
+    def begin(self, first: int, finished: Collection[int]) -> None:
+        """Start to count at ``first``: forget what was believed until now, but for these finished messages.
+
+        Unfinished messages from ``first`` on stay as far as the replay window reaches.
+        """
+        for number in [n for n in self._unfinished if not 0 <= n - first < REPLAY_WINDOW_MESSAGES]:
+            self._drop(number)
+        self.window = ReplayWindow()
+        for number in finished:
+            self.window.finish(number)
+        self.highest = max([first - 1, *finished, *self._unfinished])
 
     def forget(self, below: int) -> int:
         """Give up every message numbered under ``below``; return how many unfinished ones that ended."""
@@ -191,20 +246,25 @@ class Joiner:
             ended += 1
         return ended
 
-    def expire(self, now_s: float) -> int:
-        """Give back what waited longer than the patience; return how many messages that ended."""
-        if self._patience_s is None:
-            return 0
+    def expire(self, now_s: float, *, for_good: bool = True) -> int:
+        """Give back what waited longer than the patience; return how many messages that ended.
+
+        Args:
+            for_good: their late parts are dropped; otherwise they may begin again, and be asked for.
+        """
         late = [n for n, message in self._unfinished.items() if now_s - message.touched_s >= self._patience_s]
         for number in late:
             self._drop(number)
-            self.window.finish(number)
             self.drops[DropReason.ABANDONED] += 1
+            if for_good:
+                self.window.finish(number)
+        if late and not for_good:
+            self.highest = max([self.window.top, *self._unfinished])  # what expired may never have been
         return len(late)
 
     def next_expiry(self) -> float | None:
         """Return the monotonic second at which ``expire`` has something to do, or None."""
-        if self._patience_s is None or not self._unfinished:
+        if not self._unfinished:
             return None
         return min(message.touched_s for message in self._unfinished.values()) + self._patience_s
 
@@ -216,25 +276,27 @@ class Joiner:
         """Return the lacking parts of a message as inclusive ranges; of one never seen, ``(0, 2**32 - 1)``.
 
         Of the newest message only gaps count, unless ``to_end``: what lies beyond its highest part may be on its way.
+        No more than ``_SCAN_PARTS`` parts are looked at; further gaps show when these are filled.
         """
         if self.window.is_finished(number):
             return []
         message = self._unfinished.get(number)
         if message is None:
             return [(0, ALL_PARTS)] if to_end or number < self.highest else []
-        end = message.top if number == self.highest and not to_end else message.parts
         ranges: list[tuple[int, int]] = []
-        start = -1
-        for part in range(message.hashed, end + 1):
-            lacking = part < message.parts and part not in message.plain
-            if lacking and start < 0:
-                start = part
-            elif not lacking and start >= 0:
-                ranges.append((start, part - 1))
-                start = -1
-                if len(ranges) == limit:
-                    break
-        return ranges
+        lacking_from = message.hashed
+        seen_to = min(message.top + 1, message.hashed + _SCAN_PARTS)
+        for part in range(message.hashed, seen_to):
+            if part in message.plain:
+                if lacking_from < part:
+                    ranges.append((lacking_from, part - 1))
+                lacking_from = part + 1
+        if seen_to <= message.top:
+            if not ranges:
+                ranges.append((lacking_from, seen_to - 1))
+        elif lacking_from < message.parts and (to_end or number != self.highest):
+            ranges.append((lacking_from, message.parts - 1))
+        return ranges[:limit]
 
     def progress(self, number: int) -> int:
         """Return the first part of a message that is lacking (0 for one never seen)."""

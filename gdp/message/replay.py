@@ -6,6 +6,8 @@ Source: the anti-replay window of RFC 4303, section 3.4.3, with messages for pac
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from gdp.limits import REPLAY_WINDOW_MESSAGES
 
 __all__ = ["ReplayWindow"]
@@ -21,6 +23,11 @@ class ReplayWindow:
         self._top = -1  # highest finished number
         self._bits = 0  # bit i: number top - i is finished
 
+    @property
+    def top(self) -> int:
+        """Return the highest finished number; -1 when there is none."""
+        return self._top
+
     def is_finished(self, number: int) -> bool:
         """Return whether a message was finished, or is too old to tell."""
         behind = self._top - number
@@ -34,3 +41,20 @@ class ReplayWindow:
             self._top = number
         elif -ahead < self._size:
             self._bits |= 1 << -ahead
+
+    def unfinished(self, begin: int, end: int) -> Iterator[int]:
+        """Yield, rising, the numbers from ``begin`` up to, not including, ``end`` that are not finished.
+
+        Each costs the same, however many finished ones lie between and however far apart the two bounds are.
+        """
+        begin = max(begin, self._top - self._size + 1)
+        behind = self._top - begin
+        if behind >= 0:
+            holes = ~self._bits & (2 << behind) - 1
+            while holes:
+                at = holes.bit_length() - 1
+                if self._top - at >= end:
+                    return
+                yield self._top - at
+                holes ^= 1 << at
+        yield from range(max(begin, self._top + 1), end)

@@ -1,7 +1,7 @@
 """What a publisher tells its readers about its topic: what it still holds, where each begins, what the messages are.
 
-Place: pure. It travels as a sealed and signed message. Wire form, big-endian: ``oldest (8) | next (8) | starts (2)``, for
-each start ``reader (32) | number (8)``, then the description, empty when this status brings none.
+Place: pure. It travels as a sealed and signed message. Wire form, big-endian: ``oldest (8) | next (8) | starts (2)``,
+for each start ``reader (32) | number (8)``, then the description, empty when this status brings none.
 """
 
 from __future__ import annotations

@@ -8,13 +8,17 @@ with Karn's rule. Positions count bytes of frames from the first message on.
 
     released | kept, acknowledged by some | under way | waiting to go
              oldest                    acked        sent          end
+
+A reader can make work for its publisher, but only so much: all readers together get at most a flight of repairs in a
+round trip, and one that stands still, or that lags while others are through, no longer holds the window.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict, deque
-from dataclasses import dataclass
-from itertools import chain, islice
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Final
 
 from gdp.limits import (
     FLIGHT_MAX_BYTES,
@@ -26,9 +30,12 @@ from gdp.limits import (
     READER_LEASE_S,
     WINDOW_BYTES,
 )
-from gdp.message.report import Report
+from gdp.message.report import Missing, Report
 
 __all__ = ["SendWindow"]
+
+_SCAN_PARTS: Final = 8_192  # parts looked at for one report; a flight of small frames has fewer
+_ROUND_MIN_S: Final = PROBE_MIN_S / 3
 
 
 @dataclass(slots=True)
@@ -36,6 +43,11 @@ class _Kept:
     frames: list[bytes]
     begin_at: int
     size: int
+    repaired_s: dict[int, float] = field(default_factory=dict)  # part -> when it was last sent again
+
+    @property
+    def end_at(self) -> int:
+        return self.begin_at + self.size
 
     def position(self, part: int) -> int:
         """Return where a part begins; all parts but the last have one length."""
@@ -46,7 +58,9 @@ class _Kept:
 class _Reader:
     acked_at: int
     next_number: int
-    heard_s: float
+    moved_s: float  # when it last confirmed something new, or had everything
+    mark_at: int  # what had been sent at ``mark_s``; the mark moves on when the reader has confirmed that
+    mark_s: float
 
 
 class SendWindow:
@@ -54,7 +68,8 @@ class SendWindow:
 
     Args:
         keep_last: messages that are kept for late joiners, acknowledged or not.
-        budget_bytes: how much is kept; when full, ``has_room`` is false, and past twice that ``add`` lets the oldest go.
+        budget_bytes: how much is kept; when full, ``has_room`` is false, and past twice that ``add`` lets the oldest
+            go.
     """
 
     def __init__(self, keep_last: int = 0, budget_bytes: int = WINDOW_BYTES) -> None:
@@ -64,7 +79,9 @@ class SendWindow:
         self._readers: dict[bytes, _Reader] = {}
         self._next = deque[tuple[int, int]]()  # (number, first part not sent), oldest first
         self._repairs: OrderedDict[tuple[int, int], None] = OrderedDict()
-        self._repaired_s: dict[tuple[int, int], float] = {}
+        self._repaired = 0  # parts of kept messages that were sent again
+        self._round_s = float("-inf")  # when the present round of repairs began
+        self._round_bytes = 0  # what it may still bring
         self._newest = 0
         self._end_at = 0
         self._sent_at = 0
@@ -86,12 +103,22 @@ class SendWindow:
         return next(iter(self._kept), None)
 
     @property
+    def kept_bytes(self) -> int:
+        """Return how many bytes of frames are kept."""
+        return self._kept_bytes
+
+    @property
+    def flight_bytes(self) -> int:
+        """Return how many bytes may be under way."""
+        return self._flight_bytes
+
+    @property
     def readers(self) -> int:
         """Return how many readers hold the window."""
         return len(self._readers)
 
     def has_reader(self, reader: bytes) -> bool:
-        """Return whether a reader is known."""
+        """Return whether a reader holds the window."""
         return reader in self._readers
 
     def has_room(self) -> bool:
@@ -122,29 +149,42 @@ class SendWindow:
     def add_reader(self, reader: bytes, first_number: int, now_s: float) -> None:
         """Let a reader hold the window from a message on."""
         kept = self._kept.get(first_number)
-        self._readers[reader] = _Reader(kept.begin_at if kept else self._end_at, first_number, now_s)
+        acked_at = min(kept.begin_at, self._sent_at) if kept else self._sent_at
+        self._readers[reader] = _Reader(acked_at, first_number, now_s, self._sent_at, now_s)
 
     def drop_reader(self, reader: bytes) -> None:
         """Let a reader hold nothing any more."""
         if self._readers.pop(reader, None) is not None:
             self._release_acknowledged()
 
-    def expire_readers(self, now_s: float) -> list[bytes]:
-        """Drop and return the readers that have not reported for ``READER_LEASE_S``."""
-        silent = [name for name, reader in self._readers.items() if now_s - reader.heard_s > READER_LEASE_S]
-        for name in silent:
-            self.drop_reader(name)
-        return silent
+    def laggards(self, now_s: float) -> list[bytes]:
+        """Return the readers that hold the window for nothing, whose time it is to let go.
+
+        Such a one has confirmed nothing new of what was sent for ``READER_LEASE_S``; or not, in that time, what was
+        then under way, while another has.
+        """
+        return [
+            name
+            for name, reader in self._readers.items()
+            if reader.acked_at < self._sent_at
+            and (
+                now_s - reader.moved_s > READER_LEASE_S
+                or (
+                    now_s - reader.mark_s > READER_LEASE_S
+                    and reader.acked_at < reader.mark_at
+                    and any(other.acked_at >= reader.mark_at for other in self._readers.values())
+                )
+            )
+        ]
 
     def report(self, reader: bytes, report: Report, now_s: float) -> None:
         """Take a known reader's report: release, grow or shrink, and queue repairs."""
         state = self._readers[reader]
-        state.heard_s = now_s
         state.next_number = max(state.next_number, report.next_number)
         kept = self._kept.get(report.next_number)
         position = kept.position(report.next_part) if kept else self._position_of(report.next_number)
         before = self._acked_at()
-        state.acked_at = max(state.acked_at, min(position, self._sent_at))
+        self._confirm(state, min(position, self._sent_at), now_s)
         self._grow(self._acked_at() - before, now_s)
         if self._queue_repairs(report, now_s) and now_s - self._halved_s > (self._rtt_s or PROBE_MIN_S):
             self._threshold_bytes = max(self._flight_bytes // 2, FLIGHT_MIN_BYTES)
@@ -159,11 +199,14 @@ class SendWindow:
             (number, part), _ = self._repairs.popitem(last=False)
             if (kept := self._kept.get(number)) is not None:
                 frames.append(kept.frames[part])
-                self._repaired_s[number, part] = now_s
+                self._repaired += part not in kept.repaired_s
+                kept.repaired_s[part] = now_s
                 self.repairs += 1
                 self._sample = None  # Karn: nothing is learnt from what was sent twice
         if self._sent_at == self._acked_at():
             self._quiet_s = now_s
+        if self._next:
+            self._start_clocks(now_s)
         may_reach = self._acked_at() + self._flight_bytes
         below = self._least_number() + FLIGHT_MESSAGES_MAX
         while self._next and self._sent_at < may_reach and len(frames) < limit and self._next[0][0] < below:
@@ -178,8 +221,10 @@ class SendWindow:
                 self._next[0] = (number, part + len(batch))
             else:
                 self._next.popleft()
-        if frames and self._sample is None and not self._repaired_s:
+        if frames and self._sample is None and not self._repaired:
             self._sample = (self._sent_at, now_s)
+        if not self._readers and not self._next:
+            self._release_acknowledged()
         return frames
 
     def probe_due(self, now_s: float) -> bool:
@@ -207,6 +252,19 @@ class SendWindow:
         oldest = self.oldest
         return self._kept[oldest].begin_at if oldest is not None and number < oldest else self._end_at
 
+    def _confirm(self, reader: _Reader, position: int, now_s: float) -> None:
+        if position > reader.acked_at:
+            reader.acked_at = position
+            reader.moved_s = now_s
+        if reader.acked_at >= reader.mark_at:
+            reader.mark_at, reader.mark_s = self._sent_at, now_s
+
+    def _start_clocks(self, now_s: float) -> None:
+        """Begin to wait only now for readers that owed nothing."""
+        for reader in self._readers.values():
+            if reader.acked_at >= self._sent_at:
+                reader.moved_s = reader.mark_s = now_s
+
     def _grow(self, acknowledged_bytes: int, now_s: float) -> None:
         if acknowledged_bytes <= 0:
             return
@@ -230,38 +288,45 @@ class SendWindow:
 
     def _queue_repairs(self, report: Report, now_s: float) -> bool:
         """Queue what is missing and was sent, but not sent again within a round trip; return whether any was."""
-        again_s = now_s - max(1.5 * (self._rtt_s or 0.0), PROBE_MIN_S / 3)
-        budget = self._flight_bytes
+        wait_s = max(1.5 * (self._rtt_s or 0.0), _ROUND_MIN_S)
+        if now_s - self._round_s >= wait_s:
+            self._round_s, self._round_bytes = now_s, self._flight_bytes
+        steps = _SCAN_PARTS
         queued = False
         for missing in report.missing:
             kept = self._kept.get(missing.number)
             if kept is None:
                 continue
-            for part in range(missing.first, min(missing.last + 1, len(kept.frames))):
-                if budget <= 0 or kept.position(part) >= self._sent_at:
-                    break
+            for part in self._sent_parts(kept, missing, steps):
+                steps -= 1
+                if self._round_bytes <= 0:
+                    return queued
                 key = (missing.number, part)
-                if key in self._repairs or self._repaired_s.get(key, float("-inf")) > again_s:
+                if key in self._repairs or kept.repaired_s.get(part, float("-inf")) > now_s - wait_s:
                     continue
                 self._repairs[key] = None
-                budget -= len(kept.frames[part])
+                self._round_bytes -= len(kept.frames[part])
                 queued = True
         return queued
+
+    def _sent_parts(self, kept: _Kept, missing: Missing, limit: int) -> range:
+        """Return those of the parts that exist and have been sent, at most ``limit``."""
+        sent = -(-(self._sent_at - kept.begin_at) // len(kept.frames[0]))
+        end = min(missing.last + 1, len(kept.frames), max(sent, 0), missing.first + limit)
+        return range(missing.first, end)
 
     def _release_acknowledged(self) -> None:
         least = self._least_number()
         spare = len(self._kept) - self._keep_last
         for number in list(islice(self._kept, max(spare, 0))):
-            if number >= least:
+            if number >= least or (self._readers and self._kept[number].end_at > self._sent_at):
                 break
             self._release(number)
 
     def _release(self, number: int) -> None:
         kept = self._kept.pop(number)
         self._kept_bytes -= kept.size
-        self._sent_at = max(self._sent_at, kept.begin_at + kept.size)
+        self._repaired -= len(kept.repaired_s)
+        self._sent_at = max(self._sent_at, kept.end_at)
         while self._next and self._next[0][0] <= number:
             self._next.popleft()
-        for key in [key for key in chain(self._repairs, self._repaired_s) if key[0] == number]:
-            self._repairs.pop(key, None)
-            self._repaired_s.pop(key, None)

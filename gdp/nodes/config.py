@@ -24,7 +24,7 @@ _ATTACH_MAX: Final = 13  # leaves room for the "-s" of the switch's end
 
 def _attach_name(text: str) -> str:
     if len(text) > _ATTACH_MAX:
-        raise ValueError(f"at most {_ATTACH_MAX} characters, for the switch's end is called {text}-s")
+        raise ValueError(f"at most {_ATTACH_MAX} characters, for the switch's end is {text}-s")
     return text
 
 
@@ -40,7 +40,7 @@ class PortConfig(Section):
 
 class SwitchConfig(Section):
     """``switch.yaml``. For each ``NAME`` of ``attach`` the command makes a veth pair ``NAME``/``NAME-s``; a RIB or
-    proxy on this host takes ``NAME`` as its device.
+    proxy on this host takes ``NAME`` as its device. Files in ``revocations`` are read at start and on SIGHUP.
     """
 
     identity: Directory
@@ -48,6 +48,7 @@ class SwitchConfig(Section):
     ports: tuple[PortConfig, ...] = ()
     attach: Annotated[tuple[AttachName, ...], Unique] = ()
     data_plane: DataPlane = "auto"
+    revocations: Directory | None = None
     metrics: Metrics | None = None
     hello_s: float = Field(default=HELLO_S, ge=0.01, le=60.0)
     dead_s: float = Field(default=DEAD_S, ge=0.02, le=600.0)

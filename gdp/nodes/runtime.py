@@ -90,8 +90,12 @@ class Runtime:
         self._deadline_s = self._machine.next_timeout()
 
     @contextlib.contextmanager
-    def signals(self) -> Iterator[None]:
-        """End ``run`` on SIGINT and SIGTERM while within; a blocked ``poll`` wakes up for them."""
+    def signals(self, reload: Callable[[], None] | None = None) -> Iterator[None]:
+        """End ``run`` on SIGINT and SIGTERM while within; a blocked ``poll`` wakes up for them.
+
+        Args:
+            reload: called within the loop after a SIGHUP.
+        """
         reading, writing = socket.socketpair()
         reading.setblocking(False)
         writing.setblocking(False)
@@ -101,12 +105,18 @@ class Runtime:
             log.info("stopping signal=%d", number)
             self.stop()
 
+        def hang_up(number: int, frame: FrameType | None) -> None:
+            """Do nothing here: the number on the socket is what counts."""
+            del number, frame
+
         def drain() -> None:
             with contextlib.suppress(BlockingIOError):
-                while reading.recv(64):
-                    continue
+                while numbers := reading.recv(64):
+                    if signal.SIGHUP in numbers and reload is not None:
+                        reload()
 
         before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        before[signal.SIGHUP] = signal.signal(signal.SIGHUP, hang_up)
         woken_before = signal.set_wakeup_fd(writing.fileno(), warn_on_full_buffer=False)
         self._plane.watch(reading, drain)
         try:

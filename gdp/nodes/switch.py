@@ -12,12 +12,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from gdp.crypto.certificates import Role
-from gdp.errors import DropReason, LocalError
+from gdp.errors import DropReason, LocalError, StatementError
 from gdp.names import Name
 from gdp.nodes.config import SwitchConfig
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.nodes.pairs import attach_pairs, switch_end
-from gdp.nodes.runtime import Runtime
+from gdp.nodes.runtime import Runtime, now
+from gdp.ports.link import LinkWatch
 from gdp.ports.plane import Plane
 from gdp.ports.raw import RawPlane
 from gdp.switch.machine import Switch, SwitchSettings
@@ -49,13 +50,13 @@ def run_switch(config: SwitchConfig, ready: Callable[[Name, str], None]) -> None
     )
     switch = Switch(identity, policy, table, settings)
     ifaces = [port.iface for port in config.ports]
-    mtu = max((_mtu_of(iface) for iface in ifaces), default=_MTU_FALLBACK)
     with contextlib.ExitStack() as stack:
-        stack.enter_context(attach_pairs(config.attach, identity.name, mtu))
+        stack.enter_context(attach_pairs(config.attach, identity.name, _widest(ifaces)))
         plane = _open_plane(config.data_plane, [*ifaces, *map(switch_end, config.attach)], table)
         stack.callback(plane.close)
         runtime = Runtime(switch, plane, {port.iface: port.cost for port in config.ports})
-        stack.enter_context(runtime.signals())
+        stack.enter_context(runtime.signals(lambda: _revoke(switch, config.revocations)))
+        _revoke(switch, config.revocations)
         if config.metrics is not None:
             metrics = Metrics(_sources(switch, plane))
             metrics.serve(config.metrics.port)
@@ -71,11 +72,20 @@ def count_list(counts: Mapping[DropReason, int]) -> list[int]:
     return [counts.get(reason, 0) for reason in DropReason]
 
 
-def _mtu_of(iface: str) -> int:
-    try:
-        return int(Path(f"/sys/class/net/{iface}/mtu").read_text())
-    except (OSError, ValueError):
-        return _MTU_FALLBACK  # it is not there: opening the port will say so
+def _revoke(switch: Switch, directory: Path | None) -> None:
+    """Take in, and spread, the revocations that the operator has put into a directory; known ones are no news."""
+    for path in sorted(directory.iterdir()) if directory is not None else ():
+        try:
+            switch.revoke(path.read_bytes(), now())
+        except (OSError, StatementError) as error:
+            log.error("revocation not taken file=%s reason=%s", path, error)
+
+
+def _widest(ifaces: Sequence[str]) -> int:
+    """Return the largest MTU of these devices; what is not there, opening the port will tell."""
+    with contextlib.closing(LinkWatch()) as links:
+        mtus = [link.mtu for link in links.all() if link.ifname in ifaces]
+    return max(mtus, default=_MTU_FALLBACK)
 
 
 def _open_plane(kind: str, ifaces: Sequence[str], table: Table) -> Plane:

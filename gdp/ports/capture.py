@@ -8,8 +8,9 @@ Source: packet(7); the pcap format, draft-ietf-opsawg-pcap, with nanosecond stam
     file    magic (4)  2 (2)  4 (2)  zero (4)  zero (4)  longest frame (4)  link type 1, Ethernet (4)
     frame   seconds (4)  nanoseconds (4)  bytes here (4)  bytes on the wire (4)  frame
 
-Everything that comes and goes is written, both ways, of every EtherType. It prints one JSON line when it listens and
-one when it ends (on SIGINT or SIGTERM), and leaves a whole file even then.
+Everything that comes and goes is written, both ways, of every EtherType. Where there are several devices a frame of one
+may stand before an earlier one of another; the stamps are the kernel's and right. It prints one JSON line when it
+listens and one when it ends (on SIGINT or SIGTERM), and leaves a whole file even then.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ _INFO: Final = struct.Struct("=BxHiII")
 _ATTRIBUTE: Final = struct.Struct("=HH")
 
 _RTMGRP_LINK: Final = 1
-_NLMSG_DONE: Final = 3
+_NLMSG_ERROR, _NLMSG_DONE = 2, 3
 _RTM_NEWLINK, _RTM_DELLINK, _RTM_GETLINK = 16, 17, 18
 _NLM_F_REQUEST, _NLM_F_DUMP = 0x1, 0x300
 _IFLA_ADDRESS, _IFLA_IFNAME, _IFLA_MTU = 1, 3, 4
@@ -36,7 +36,12 @@ _FOREVER_S: Final = 5.0  # a dump is answered by the kernel at once; this only k
 
 
 class Link(NamedTuple):
-    """One device as the kernel describes it; ``gone`` when it was deleted (or moved to another namespace)."""
+    """One device as the kernel describes it.
+
+    Attributes:
+        up: switched on and with a carrier.
+        gone: deleted, or moved to another namespace.
+    """
 
     ifindex: int
     ifname: str
@@ -65,18 +70,35 @@ class LinkWatch:
     def close(self) -> None:
         self._news.close()
 
+    def ask(self, ifname: str) -> Link | None:
+        """Ask for one device; None when there is none of that name.
+
+        A device with a carrier swallows what is sent until the kernel has activated it, a little later; since Linux 6.8
+        this question (and no other) waits for that, so ``up`` is true of the first frame.
+        """
+        name = ifname.encode() + b"\0"
+        padding = bytes(-len(name) % 4)
+        attribute = _ATTRIBUTE.pack(_ATTRIBUTE.size + len(name), _IFLA_IFNAME) + name + padding
+        return next(iter(self._question(attribute, 0)), None)
+
     def all(self) -> list[Link]:
         """Ask for every device there is now."""
-        request = _HEADER.pack(_HEADER.size + _INFO.size, _RTM_GETLINK, _NLM_F_REQUEST | _NLM_F_DUMP, 1, 0)
+        return self._question(b"", _NLM_F_DUMP)
+
+    def _question(self, attribute: bytes, flags: int) -> list[Link]:
+        """Ask the kernel, in a socket of its own so that news does not come between."""
+        body = _INFO.pack(socket.AF_UNSPEC, 0, 0, 0, 0) + attribute
         links: list[Link] = []
         with _open(0) as question:
             question.settimeout(_FOREVER_S)
-            question.send(request + _INFO.pack(socket.AF_UNSPEC, 0, 0, 0, 0))
+            question.send(_HEADER.pack(_HEADER.size + len(body), _RTM_GETLINK, _NLM_F_REQUEST | flags, 1, 0) + body)
             while True:
-                for kind, body in _messages(question.recv(_READ_BYTES)):
-                    if kind == _NLMSG_DONE:
+                for kind, answer in _messages(question.recv(_READ_BYTES)):
+                    if kind in (_NLMSG_DONE, _NLMSG_ERROR):
                         return links
-                    links += _links(kind, body)
+                    links += _links(kind, answer)
+                if not flags:
+                    return links
 
     def news(self) -> list[Link]:
         """Return what changed since last asked, in order.

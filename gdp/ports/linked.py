@@ -122,7 +122,7 @@ class LinkedPlane(ABC):
     def add_port(self, ifname: str) -> int:
         if any(port.ifname == ifname for port in self._ports.values()):
             raise LocalError(f"port {ifname}: given twice")
-        link = next((link for link in self._links.all() if link.ifname == ifname), None)
+        link = self._links.ask(ifname)
         if link is None:
             raise LocalError(f"port {ifname}: no such device")
         if link.mtu < MTU_MIN_BYTES:

@@ -55,6 +55,7 @@ class Above:
         question.watch_until_s = max(question.watch_until_s, now_s + watch_s if watch_s else 0.0)
         if question.is_answered and not is_known:
             question.is_answered, question.asked_s, question.again_s = False, now_s, now_s + RETRY_S
+            question.askers = []
             is_new = True
         if not question.is_answered and not is_known and asker not in question.askers:
             question.askers.append(asker)
@@ -71,14 +72,13 @@ class Above:
         return question is not None and not question.is_answered
 
     def answered(self, name: Name, now_s: float) -> list[Name]:
-        """Note an answer; return who waited for it."""
+        """Note an answer; return who waited for it. There may be more answers to come, for the same askers."""
         question = self._open.get(name)
         if question is None:
             return []
-        askers, question.askers = question.askers, []
         question.is_answered = True
         question.again_s = now_s + WATCH_AGAIN_S
-        return askers
+        return list(question.askers)
 
     def due(self, now_s: float) -> tuple[list[tuple[Name, float]], list[tuple[Name, list[Name]]]]:
         """Return what to ask now, as (name, watch seconds), and what was given up, as (name, askers)."""
@@ -88,6 +88,8 @@ class Above:
             if question.again_s > now_s:
                 continue
             is_watched = question.watch_until_s > now_s
+            if question.is_answered:
+                question.askers = []
             if not question.is_answered and question.askers and now_s - question.asked_s >= GIVE_UP_S:
                 given_up.append((name, question.askers))
                 question.askers = []

@@ -101,6 +101,22 @@ class Rib:
         except RemoteError as error:
             self.refusals[error.reason] += 1
 
+    def revoke(self, wire: bytes, now: Instant) -> None:
+        """Take a certificate back: what rests on it is gone, and whoever watched is told. What does not hold is counted."""
+        try:
+            revocation = self._verifier.revoke(wire, now.unix_s)
+        except RemoteError as error:
+            self.refusals[error.reason] += 1
+            return
+        if revocation is None:
+            return
+        for route in self._store.resting_on(revocation.fingerprint):
+            try:
+                self._verifier.verify(route.claim, now.unix_s)
+            except StatementError:
+                self._store.withdraw(route.name, route.advertiser)
+                self._tell_gone(route, now.mono_s)
+
     def timeout(self, now: Instant) -> None:
         """Let expired routes go and tell who watched them; ask above again what is open."""
         for route in self._store.expire(now.mono_s, now.unix_s):
@@ -138,6 +154,8 @@ class Rib:
             return
         try:
             claim = self._verifier.verify_statement(passed_on, now.unix_s)
+            if is_own_switch and claim.switch != member.name:
+                raise StatementError(DropReason.NOT_DELEGATED, "the RtCert names another switch than the relay")
             known = self._check_news(claim, member)
         except StatementError as error:
             self._refuse(passed_on, member, error)
@@ -162,10 +180,10 @@ class Rib:
             raise StatementError(DropReason.LEASE_BOUNDS)
         known = self._store.get(claim.name, claim.node)
         if known is not None and claim.sequence <= known.sequence:
-            is_repeated = isinstance(known, Route) and known.claim == claim.wire
+            is_repeated = isinstance(known, Route) and (known.claim, known.domain) == (claim.wire, member.domain)
             if not is_repeated:
                 raise StatementError(DropReason.STALE, str(known.sequence))
-        is_new = not isinstance(known, Route)
+        is_new = known is None or known.sender != member.name
         if is_new and self._store.count_of(member.name) >= self._settings.names_per_sender:
             raise StatementError(DropReason.QUOTA, "names of one sender")
         return known
@@ -184,6 +202,7 @@ class Rib:
             is_from_above=False,
             expires_s=now.mono_s + min(claim.lease_s, left_s),
             valid_until_unix_s=claim.valid_until_unix_s,
+            fingerprints=claim.fingerprints,
         )
 
     def _take_withdrawal(self, withdrawal: Statement, member: Membership, now: Instant) -> None:
@@ -233,7 +252,7 @@ class Rib:
         statement.verify(member.key)
         query = Query.from_fields(fields)
         if query.watch_s > 0:
-            self._watches.add(query.name, member.name, now.mono_s + query.watch_s)
+            self._watch(query, member.name, now.mono_s)
         routes = [route for route in self._store.routes(query.name) if self._may_tell(route, member)]
         for route in routes:
             self._answer(route, member.name, now.mono_s)
@@ -242,6 +261,13 @@ class Rib:
             self._ask_above(query.name, self._above.watch_s(query.name))
         elif not routes and not self._above.is_waiting(query.name):
             self._answer_nobody(query.name, member.name)
+
+    def _watch(self, query: Query, watcher: Name, now_s: float) -> None:
+        """Watch for an asker; where there are too many watches it is answered all the same, and will ask again."""
+        try:
+            self._watches.add(query.name, watcher, now_s + query.watch_s)
+        except StatementError as error:
+            self.refusals[error.reason] += 1
 
     def _may_tell(self, route: Route, asker: Membership) -> bool:
         """Return whether an asker may learn of a route: what is not global stays in its domain."""
@@ -291,8 +317,8 @@ class Rib:
             raise StatementError(DropReason.WRONG_DOMAIN, "an answer from no tier above")
         statement.verify(member.key)
         answer = Answer.from_fields(fields)
-        askers = self._above.answered(answer.name, now.mono_s)
         if answer.is_nobody:
+            askers = self._above.answered(answer.name, now.mono_s)
             if not self._store.routes(answer.name):
                 for asker in askers:
                     self._answer_nobody(answer.name, asker)
@@ -303,11 +329,9 @@ class Rib:
                 self._store.withdraw(answer.name, answer.advertiser)
                 self._tell_gone(known, now.mono_s)
             return
-        self._learn_from_above(answer, member, known, askers, now)
+        self._learn_from_above(answer, member, known, now)
 
-    def _learn_from_above(
-        self, answer: Answer, member: Membership, known: object, askers: list[Name], now: Instant
-    ) -> None:
+    def _learn_from_above(self, answer: Answer, member: Membership, known: object, now: Instant) -> None:
         claim = self._verifier.verify(answer.claim, now.unix_s)
         if claim.name != answer.name or claim.node != answer.advertiser:
             raise StatementError(DropReason.WRONG_NAME, "an answer about something else than its claim")
@@ -322,6 +346,7 @@ class Rib:
             expires_s=now.mono_s + answer.lease_s,
         )
         self._store.put(route)
+        askers = self._above.answered(answer.name, now.mono_s)
         for asker in dict.fromkeys([*askers, *self._watches.watchers(route.name, now.mono_s)]):
             self._answer(route, asker, now.mono_s)
 

@@ -24,6 +24,7 @@ class Route:
         is_from_above: learnt from the tier above, to be passed down only.
         expires_s: end of the lease, monotonic seconds.
         valid_until_unix_s: when the claim's evidence runs out; it cannot be played back after that.
+        fingerprints: of that evidence; a revocation names one of them.
     """
 
     name: Name
@@ -37,11 +38,16 @@ class Route:
     is_from_above: bool
     expires_s: float
     valid_until_unix_s: int
+    fingerprints: frozenset[bytes]
 
 
 @dataclass(frozen=True, slots=True)
 class Withdrawn:
-    """What stays of a withdrawn or expired advertisement: the sequence number that a new one must pass."""
+    """What stays of a withdrawn or expired advertisement: the sequence number that a new one must pass.
 
+    It counts against its sender's quota like a route: else claiming and withdrawing in turn would fill the store.
+    """
+
+    sender: Name
     sequence: int
     valid_until_unix_s: int

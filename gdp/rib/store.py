@@ -42,7 +42,10 @@ class Store(Protocol):
         """Return the monotonic second of the next lease end, or None."""
 
     def count_of(self, sender: Name) -> int:
-        """Return how many routes a sender has relayed."""
+        """Return how many routes, withdrawn ones that are not forgotten too, are kept for a sender."""
+
+    def resting_on(self, fingerprint: bytes) -> list[Route]:
+        """Return the routes whose evidence includes a certificate; looks at all."""
 
 
 class MemoryStore:
@@ -71,7 +74,9 @@ class MemoryStore:
     def put(self, route: Route) -> None:
         """Add or replace a route."""
         self._take(route.name, route.advertiser)
-        self._withdrawn.pop((route.name, route.advertiser), None)
+        withdrawn = self._withdrawn.pop((route.name, route.advertiser), None)
+        if withdrawn is not None:
+            self._uncount(withdrawn.sender)
         self._routes.setdefault(route.name, {})[route.advertiser] = route
         self._counts[route.sender] = self._counts.get(route.sender, 0) + 1
         self._size += 1
@@ -81,7 +86,8 @@ class MemoryStore:
         """Take a route away, keep its sequence number; return it."""
         route = self._take(name, advertiser)
         if route is not None:
-            self._withdrawn[name, advertiser] = Withdrawn(route.sequence, route.valid_until_unix_s)
+            self._withdrawn[name, advertiser] = Withdrawn(route.sender, route.sequence, route.valid_until_unix_s)
+            self._counts[route.sender] = self._counts.get(route.sender, 0) + 1
             heapq.heappush(self._forget, (route.valid_until_unix_s, name, advertiser))
         return route
 
@@ -99,6 +105,7 @@ class MemoryStore:
             withdrawn = self._withdrawn.get((name, advertiser))
             if withdrawn is not None and withdrawn.valid_until_unix_s <= unix_s:
                 del self._withdrawn[name, advertiser]
+                self._uncount(withdrawn.sender)
         return gone
 
     def next_expiry(self) -> float | None:
@@ -106,8 +113,12 @@ class MemoryStore:
         return self._ends[0][0] if self._ends else None
 
     def count_of(self, sender: Name) -> int:
-        """Return how many routes a sender has relayed."""
+        """Return how many routes, withdrawn ones that are not forgotten too, are kept for a sender."""
         return self._counts.get(sender, 0)
+
+    def resting_on(self, fingerprint: bytes) -> list[Route]:
+        """Return the routes whose evidence includes a certificate; looks at all."""
+        return [each for of_name in self._routes.values() for each in of_name.values() if fingerprint in each.fingerprints]
 
     def _take(self, name: Name, advertiser: Name) -> Route | None:
         of_name = self._routes.get(name, {})
@@ -117,9 +128,12 @@ class MemoryStore:
         if not of_name:
             del self._routes[name]
         self._size -= 1
-        left = self._counts[route.sender] - 1
-        if left:
-            self._counts[route.sender] = left
-        else:
-            del self._counts[route.sender]
+        self._uncount(route.sender)
         return route
+
+    def _uncount(self, sender: Name) -> None:
+        left = self._counts[sender] - 1
+        if left:
+            self._counts[sender] = left
+        else:
+            del self._counts[sender]

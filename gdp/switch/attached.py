@@ -65,6 +65,10 @@ class Attached:
             self._by_name.pop(name, None)
         return gone
 
+    def all(self) -> list[Attachment]:
+        """Return every claim."""
+        return [each for claims in self._by_name.values() for each in claims.values()]
+
     def of(self, advertiser: Name) -> list[Attachment]:
         """Return all claims of one node."""
         return [claims[advertiser] for claims in self._by_name.values() if advertiser in claims]

@@ -141,7 +141,7 @@ class Inquirer:
             self._attached.remove(place.name, place.advertiser)  # it has moved to another switch
             self._unicast.forget(place.name)
         before = self._places.put(place, now_s)
-        if before is not None and (before.switch, before.domain) != (place.switch, place.domain):
+        if before is None or (before.switch, before.domain) != (place.switch, place.domain):
             self._unicast.forget(place.name)
         self._planter.publisher_found(place, now_s)
         if before is None or before.claim != place.claim:

@@ -36,6 +36,7 @@ from gdp.switch.outbox import Outbox
 from gdp.switch.parked import Parked
 from gdp.switch.places import Places
 from gdp.switch.planter import Planter
+from gdp.switch.revoker import Revoker
 from gdp.switch.table import Table
 from gdp.switch.unicast import Unicast
 from gdp.trust.claim import ClaimBody
@@ -72,6 +73,7 @@ class Switch:
         self.table = table
         self._splitter = ControlSplitter(identity.name, settings.incarnation)
         self._joiner = ControlJoiner()
+        self._hellos = ControlJoiner()
         self.greeter = Greeter(
             identity,
             policy,
@@ -89,9 +91,14 @@ class Switch:
         self.attached = Attached()
         self.places = Places()
         self.parked = Parked()
-        self.planter = Planter(identity, policy, table, self._paths, self.attached, self._outbox)
+        self.planter = Planter(
+            identity, policy, table, self._paths, self.attached, self._outbox, settings.first_sequence
+        )
         self.unicast = Unicast(
             policy.own, policy.transit, table, self._paths, self.places, self.attached, self.parked, self._outbox
+        )
+        self._revoker = Revoker(
+            self._verifier, self.greeter, self.attached, self.planter, self.unicast, self._outbox
         )
         self._seen_version = -1
         self.inquirer = Inquirer(
@@ -117,7 +124,8 @@ class Switch:
 
     def drops(self) -> Mapping[DropReason, int]:
         """Return what the control plane dropped, by reason."""
-        return self._drops + self._joiner.drops + self.parked.drops + self.planter.drops + self.unicast.drops
+        joiners = self._joiner.drops + self._hellos.drops
+        return self._drops + joiners + self.parked.drops + self.planter.drops + self.unicast.drops
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Instant) -> None:
         """Begin to use a port."""
@@ -148,6 +156,7 @@ class Switch:
         self._flooding.timeout(now_s)
         self._follow_links(now_s)
         self._joiner.expire(now_s)
+        self._hellos.expire(now_s)
         self.parked.expire(now_s)
         self.places.expire(now_s)
         for key in self.table.expire(now_s):
@@ -175,8 +184,20 @@ class Switch:
         """Return, once, what is to be sent."""
         return self._outbox.take()
 
+    def _revoke(self, statement: Statement, neighbour: Neighbour | None, now: Instant) -> None:
+        for topic in self._revoker.take(statement, neighbour, now):
+            self.places.unwatch(topic)
+
     def _digest_for(self, port: LinkPort) -> bytes:
         return self._flooding.digest_for(port)
+
+    def revoke(self, wire: bytes, now: Instant) -> None:
+        """Take a revocation from this node's operator, and spread it.
+
+        Raises:
+            StatementError: it does not hold.
+        """
+        self._revoke(parse(wire), None, now)
 
     # -- frames
 
@@ -184,12 +205,18 @@ class Switch:
         if header.kind >= CONTROL_FROM:
             if header.kind not in _CONTROL:
                 raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
-            wire = self._joiner.add(header, arrival.frame, now.mono_s)
+            joiner = self._joiner
+            if header.kind == Kind.HELLO:
+                joiner = self._hellos
+            else:
+                self._sender(arrival)  # for strangers no state is kept
+            wire = joiner.add(header, arrival.frame, now.mono_s)
             if wire is not None:
                 self._take_control(arrival, header.kind, parse(wire), now)
         elif header.destination == self.name:
             self._take_own(header, arrival.frame, now)
         else:
+            self._sender(arrival)  # nor is anything looked for in their name
             self.unicast.miss(header, arrival.frame[: HEADER_BYTES + header.length], now.mono_s)
 
     def _take_control(self, arrival: Arrival, kind: int, statement: Statement, now: Instant) -> None:
@@ -212,6 +239,8 @@ class Switch:
             self._take_withdrawal(neighbour, statement, now)
         elif kind in (Kind.JOIN, Kind.LEAVE):
             self._take_join(neighbour, statement, now)
+        elif kind == Kind.REVOKE:
+            self._revoke(statement, neighbour, now)
         else:
             raise FrameError(DropReason.UNKNOWN_KIND, str(kind))
 
@@ -249,6 +278,7 @@ class Switch:
         if NeighbourState.UP in (neighbour.state, before):
             self._flooding.neighbour_changed(now_s)
         if neighbour.state is NeighbourState.UP:
+            self._revoker.tell_all(neighbour)
             if neighbour.role is Role.SWITCH:
                 self._flooding.sync(neighbour, now_s)
         elif before is NeighbourState.UP:
@@ -285,6 +315,10 @@ class Switch:
             self._refuse(neighbour, statement, error)
             raise
         at = (neighbour.port, neighbour.mac)
+        if claim.sequence < self._sequence_of(claim.name, neighbour):
+            error = StatementError(DropReason.STALE, "a claim that its maker has renewed")
+            self._refuse(neighbour, statement, error)
+            raise error
         if claim.right is Right.READ:
             if self.planter.add_reader(claim, at, self.places.of(claim.name, now.mono_s), now.mono_s):
                 self.places.want(claim.name, now.mono_s, watch=True)
@@ -299,6 +333,13 @@ class Switch:
                 if tree.publisher == claim.node:
                     tree.renew_at_s = now.mono_s
         self.inquirer.ask(now.mono_s)
+
+    def _sequence_of(self, name: Name, neighbour: Neighbour) -> int:
+        """Return the highest sequence number of what an attached node claims on a name here, or -1."""
+        attachment = self.attached.get(name, neighbour.name)
+        reading = self.planter.claim_of(name, (neighbour.port, neighbour.mac))
+        known = [reading] if attachment is None else [reading, attachment.claim]
+        return max((claim.sequence for claim in known if claim is not None), default=-1)
 
     def _refuse(self, neighbour: Neighbour, statement: Statement, error: StatementError) -> None:
         """Tell an attached node why its claim was not taken."""
@@ -319,6 +360,8 @@ class Switch:
             raise StatementError(DropReason.UNKNOWN_SENDER, "a withdrawal that its maker did not bring")
         statement.verify(neighbour.key)
         name = fields.name("n")
+        if fields.uint("s") <= self._sequence_of(name, neighbour):
+            raise StatementError(DropReason.STALE, "a withdrawal of what was claimed anew")
         if self.planter.remove_reader(name, (neighbour.port, neighbour.mac)):
             self.places.unwatch(name)
         if self.attached.remove(name, neighbour.name) is not None:
@@ -330,6 +373,9 @@ class Switch:
         if neighbour.role is not Role.SWITCH or statement.signer != neighbour.name:
             raise StatementError(DropReason.UNKNOWN_SENDER, "a join is from a neighbouring switch")
         statement.verify(neighbour.key)
+        port = self.greeter.ports[neighbour.port]
+        if join.session != port.nonce or not port.take_join(neighbour.name, join.sequence):
+            raise StatementError(DropReason.REPLAYED, "join")
         if join.lease_s > 0:
             claim = self._verifier.verify(join.evidence, now.unix_s)
             if claim.right is not Right.READ or claim.name != join.topic:

@@ -50,13 +50,17 @@ class Paths:
         return min(borders, key=lambda way: way.distance, default=None)
 
     def to_rib(self, rib: Name, allowed: frozenset[Name]) -> tuple[Way | None, Name | None]:
-        """Return the way to the nearest switch from which a RIB is reached, and that switch (self: no way needed)."""
+        """Return the way to the nearest switch from which a RIB is reached, and that switch (self: no way needed).
+
+        Args:
+            allowed: domains to pass through; the one that the RIB stands in may be another.
+        """
         self._refresh()
-        ways = self._to_all(allowed)
         hosts = self._ribs.get(rib, set())
         if self._me in hosts:
             return None, self._me
-        reachable = [(ways[host], host) for host in hosts if host in ways]
+        found = ((self.to_switch(host, self._domains[host], allowed | {self._domains[host]}), host) for host in hosts)
+        reachable = [(way, host) for way, host in found if way is not None]
         return min(reachable, key=lambda each: each[0].distance, default=(None, None))
 
     def is_switch(self, name: Name) -> bool:

@@ -19,6 +19,7 @@ __all__ = ["WATCH_S", "Place", "Places"]
 
 RETRY_S: Final = 0.25
 TRIES_MAX: Final = 8
+QUESTIONS_MAX: Final = 4_096  # open at once; each costs a signature at every try
 WATCH_S: Final = 20.0
 WATCH_AGAIN_S: Final = 6.0
 
@@ -52,6 +53,8 @@ class Places:
         self._places: dict[Name, dict[Name, Place]] = {}
         self._nobody: dict[Name, float] = {}
         self._questions: dict[Name, _Question] = {}
+        self._watches = 0
+        self._expire_at_s = float("inf")  # no lease ends before
 
     def __len__(self) -> int:
         return len(self._places)
@@ -66,15 +69,29 @@ class Places:
         return self._nobody.get(name, 0.0) > now_s
 
     def want(self, name: Name, now_s: float, *, watch: bool) -> None:
-        """Have the RIB asked for a name, unless it is being asked already."""
-        question = self._questions.setdefault(name, _Question(now_s))
-        question.is_watch |= watch
-        if question.is_answered and not question.is_watch:
-            self._questions[name] = _Question(now_s)
+        """Have the RIB asked for a name, unless it is being asked already, or too much is.
+
+        Watches are for readers who proved themselves, and are always taken on.
+        """
+        question = self._questions.get(name)
+        if question is None:
+            if not watch and len(self._questions) - self._watches >= QUESTIONS_MAX:
+                return
+            question = self._questions[name] = _Question(now_s)
+        if watch and not question.is_watch:
+            question.is_watch = True
+            question.ask_at_s = now_s
+            self._watches += 1
+
+    def is_asked(self, name: Name) -> bool:
+        """Return whether a question for a name is open."""
+        return name in self._questions
 
     def unwatch(self, name: Name) -> None:
         """Ask for a name no more."""
-        self._questions.pop(name, None)
+        question = self._questions.pop(name, None)
+        if question is not None and question.is_watch:
+            self._watches -= 1
 
     def ask_again(self, now_s: float) -> None:
         """Have every open question and every watch asked at once: there is a new RIB."""
@@ -88,10 +105,9 @@ class Places:
         for name, question in list(self._questions.items()):
             if question.ask_at_s > now_s:
                 continue
-            if not question.is_watch and (question.is_answered or question.tries >= TRIES_MAX):
+            if not question.is_watch and question.tries >= TRIES_MAX:
                 del self._questions[name]
-                if not question.is_answered:
-                    given_up.append(name)
+                given_up.append(name)
                 continue
             question.tries += 1
             question.ask_at_s = now_s + (WATCH_AGAIN_S if question.is_answered else RETRY_S)
@@ -109,6 +125,7 @@ class Places:
         known = self._places.setdefault(place.name, {})
         before = known.get(place.advertiser)
         known[place.advertiser] = place
+        self._expire_at_s = min(self._expire_at_s, place.expires_s)
         return before
 
     def remove(self, name: Name, advertiser: Name, now_s: float) -> None:
@@ -124,9 +141,12 @@ class Places:
         self._answered(name, now_s)
         self._places.pop(name, None)
         self._nobody[name] = now_s + NEGATIVE_LEASE_S
+        self._expire_at_s = min(self._expire_at_s, now_s + NEGATIVE_LEASE_S)
 
     def expire(self, now_s: float) -> None:
         """Forget what was believed long enough."""
+        if now_s < self._expire_at_s:
+            return
         for name in list(self._places):
             known = self._places[name]
             for advertiser in [a for a, place in known.items() if place.expires_s <= now_s]:
@@ -135,10 +155,15 @@ class Places:
                 del self._places[name]
         for name in [name for name, until_s in self._nobody.items() if until_s <= now_s]:
             del self._nobody[name]
+        ends = [place.expires_s for known in self._places.values() for place in known.values()]
+        self._expire_at_s = min([*ends, *self._nobody.values()], default=float("inf"))
 
     def _answered(self, name: Name, now_s: float) -> None:
         question = self._questions.get(name)
-        if question is not None:
-            question.is_answered = True
-            question.tries = 0
-            question.ask_at_s = now_s + WATCH_AGAIN_S
+        if question is None:
+            return
+        if not question.is_watch:
+            del self._questions[name]
+            return
+        question.is_answered = True
+        question.ask_at_s = now_s + WATCH_AGAIN_S

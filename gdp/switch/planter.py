@@ -9,7 +9,8 @@ again and again while a branch stands, and asks another one at once when the way
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from gdp.control.join import Join
 from gdp.control.neighbour import Neighbour
@@ -40,11 +41,23 @@ class _Reader:
 
 
 class Planter:
-    """All trees of one switch."""
+    """All trees of one switch.
+
+    Args:
+        first_sequence: of our joins; above those of an earlier life, wall-clock milliseconds do.
+    """
 
     def __init__(
-        self, identity: Identity, policy: Policy, table: Table, paths: Paths, attached: Attached, outbox: Outbox
+        self,
+        identity: Identity,
+        policy: Policy,
+        table: Table,
+        paths: Paths,
+        attached: Attached,
+        outbox: Outbox,
+        first_sequence: int,
     ) -> None:
+        self._sequence = first_sequence
         self._identity = identity
         self._policy = policy
         self._table = table
@@ -58,6 +71,11 @@ class Planter:
     def readers(self, topic: Name) -> list[At]:
         """Return where the readers of a topic are attached."""
         return list(self._readers.get(topic, {}))
+
+    def claim_of(self, topic: Name, at: At) -> Claim | None:
+        """Return the claim of a reader attached there, or None."""
+        reader = self._readers.get(topic, {}).get(at)
+        return None if reader is None else reader.claim
 
     def add_reader(self, claim: Claim, at: At, places: list[Place], now_s: float) -> bool:
         """Take a verified READ claim of an attached node; return whether it is the topic's first reader here."""
@@ -87,12 +105,12 @@ class Planter:
             if reader.claim.node == place.advertiser:
                 continue  # one's own messages do not come back
             allowed = (self._policy.transit & place.transit) | {self._policy.own, place.domain}
-            tree = self._tree(place.name, place.advertiser, reader.claim.wire, allowed)
+            tree = self._tree(place.name, place.advertiser, allowed)
             tree.switch, tree.domain, tree.allowed = place.switch, place.domain, allowed
-            tree.evidence = reader.claim.wire
             lease_s = min(reader.expires_s, place.expires_s)
-            tree.branches[at] = Branch(lease_s, self._outbox.mtu_of(at[0]))
+            tree.branches[at] = Branch(lease_s, self._outbox.mtu_of(at[0]), reader.claim.wire)
             self._plant(tree)
+            self._follow(tree, now_s)
             self._ask_above(tree, now_s)
 
     def publisher_gone(self, topic: Name, publisher: Name) -> None:
@@ -116,14 +134,15 @@ class Planter:
             return
         if self._policy.own not in join.allowed or neighbour.domain not in join.allowed:
             raise StatementError(DropReason.WRONG_DOMAIN, "a tree that must not pass here")
-        tree = self._tree(join.topic, join.publisher, join.evidence, join.allowed)
+        tree = self._tree(join.topic, join.publisher, join.allowed)
         is_known = at in tree.branches
-        tree.switch, tree.domain, tree.allowed, tree.evidence = join.switch, join.domain, join.allowed, join.evidence
+        is_same_place = (tree.switch, tree.domain) == (join.switch, join.domain)
+        tree.switch, tree.domain, tree.allowed = join.switch, join.domain, join.allowed
         mtu = min(join.mtu, neighbour.mtu)
         is_known = is_known and tree.branches[at].mtu == mtu
-        tree.branches[at] = Branch(now_s + min(join.lease_s, JOIN_LEASE_S), mtu)
+        tree.branches[at] = Branch(now_s + min(join.lease_s, JOIN_LEASE_S), mtu, join.evidence)
         self._plant(tree)
-        if not is_known:
+        if not self._follow(tree, now_s) and not (is_known and is_same_place):
             self._ask_above(tree, now_s)
 
     def neighbour_lost(self, at: At) -> None:
@@ -133,13 +152,28 @@ class Planter:
         for tree in self.trees.all():
             self._cut(tree, at)
 
+    def claims(self) -> list[tuple[Name, At, Claim]]:
+        """Return the claims of all readers attached here, with their topic and place."""
+        return [
+            (topic, at, reader.claim) for topic, readers in self._readers.items() for at, reader in readers.items()
+        ]
+
+    def doubt(self, proves: Callable[[bytes], bool], until_s: float, now_s: float) -> None:
+        """Let branches whose evidence holds no more end at ``until_s``, unless another reader's is shown by then.
+
+        Where another branch's evidence still holds, the next switch is shown that one at once.
+        """
+        for tree in self.trees.all():
+            for branch in tree.branches.values():
+                if not proves(branch.evidence):
+                    branch.expires_s = min(branch.expires_s, until_s)
+                    tree.renew_at_s = now_s
+            self._plant(tree)
+
     def reroute(self, now_s: float) -> None:
         """Ask anew where the way to a publisher has changed."""
         for tree in self.trees.all():
-            above = self._above(tree)
-            if (None if above is None else above[:2]) != tree.above:
-                self._leave(tree)
-                self._ask_above(tree, now_s)
+            self._follow(tree, now_s)
 
     def timeout(self, now_s: float) -> list[Name]:
         """Prune, renew upwards; return the topics that lost their last reader here."""
@@ -161,10 +195,10 @@ class Planter:
         times = [time for time in (self.trees.next_event(), min(readers, default=None)) if time is not None]
         return min(times, default=None)
 
-    def _tree(self, topic: Name, publisher: Name, evidence: bytes, allowed: frozenset[Name]) -> Tree:
+    def _tree(self, topic: Name, publisher: Name, allowed: frozenset[Name]) -> Tree:
         tree = self.trees.get(topic, publisher)
         if tree is None:
-            tree = Tree(topic, publisher, self._identity.name, self._policy.own, allowed, evidence)
+            tree = Tree(topic, publisher, self._identity.name, self._policy.own, allowed)
             self.trees.put(tree)
         return tree
 
@@ -195,6 +229,15 @@ class Planter:
             return None  # no way, or it leads back to where the join came from: links are still settling
         return neighbour.port, neighbour.mac, neighbour.name
 
+    def _follow(self, tree: Tree, now_s: float) -> bool:
+        """Leave the one above and ask another where the way to the publisher has changed; return whether it has."""
+        above = self._above(tree)
+        if (None if above is None else above[:2]) == tree.above:
+            return False
+        self._leave(tree)
+        self._ask_above(tree, now_s)
+        return True
+
     def _ask_above(self, tree: Tree, now_s: float) -> None:
         above = self._above(tree)
         tree.renew_at_s = now_s + JOIN_REFRESH_S
@@ -203,17 +246,33 @@ class Planter:
             return
         tree.above, tree.above_name = above[:2], above[2]
         mtu = min(tree.mtu, self._outbox.mtu_of(above[0]))
-        self._say(above[:2], Kind.JOIN, self._join(tree, mtu))
+        self._say(tree, mtu, JOIN_LEASE_S, tree.evidence)
 
     def _leave(self, tree: Tree) -> None:
         if tree.above is not None:
-            self._say(tree.above, Kind.LEAVE, replace(self._join(tree, 1), lease_s=0.0, evidence=b""))
+            self._say(tree, 1, 0.0, b"")
         tree.above = tree.above_name = None
 
-    def _join(self, tree: Tree, mtu: int) -> Join:
-        return Join(
-            tree.topic, tree.publisher, tree.switch, tree.domain, tree.allowed, mtu, JOIN_LEASE_S, tree.evidence
+    def _say(self, tree: Tree, mtu: int, lease_s: float, evidence: bytes) -> None:
+        """Send a join, or with no lease a leave, to the one above."""
+        above = tree.above
+        if above is None or tree.above_name is None:
+            return
+        session = self._outbox.session_of(above[0], tree.above_name)
+        if session is None:
+            return  # it is gone, and with it what it knew of us
+        self._sequence += 1
+        join = Join(
+            tree.topic,
+            tree.publisher,
+            tree.switch,
+            tree.domain,
+            tree.allowed,
+            mtu,
+            lease_s,
+            evidence,
+            session,
+            self._sequence,
         )
-
-    def _say(self, at: At, kind: Kind, join: Join) -> None:
-        self._outbox.say_at(at[0], at[1], kind, join.to_wire(self._identity.name, self._identity.key))
+        kind = Kind.JOIN if lease_s else Kind.LEAVE
+        self._outbox.say_at(*above, kind, join.to_wire(self._identity.name, self._identity.key))

@@ -22,6 +22,7 @@ class Branch:
 
     expires_s: float
     mtu: int  # smallest on the way down
+    evidence: bytes  # the signed claim of a reader down there
 
 
 @dataclass(slots=True)
@@ -33,7 +34,6 @@ class Tree:
     switch: Name  # where the publisher is attached
     domain: Name  # of that switch
     allowed: frozenset[Name]
-    evidence: bytes  # a reader's claim
     branches: dict[At, Branch] = field(default_factory=dict)
     above: At | None = None  # whom the last join went to
     above_name: Name | None = None
@@ -48,6 +48,11 @@ class Tree:
     def mtu(self) -> int:
         """Return the smallest MTU below here."""
         return min(branch.mtu for branch in self.branches.values())
+
+    @property
+    def evidence(self) -> bytes:
+        """Return the claim of the reader whose branch stands longest."""
+        return max(self.branches.values(), key=lambda branch: branch.expires_s).evidence
 
     def expires_s(self) -> float:
         """Return when the last branch ends."""

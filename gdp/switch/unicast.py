@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from gdp.errors import DropReason
-from gdp.frame.codec import HOPS_AT, Header
+from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_AT, SOURCE_AT, Header
 from gdp.names import Name
 from gdp.switch.attached import Attached
 from gdp.switch.outbox import Outbox
@@ -36,6 +36,7 @@ class _Installed:
 
     destination: Name
     source: Name
+    is_negative: bool = False
 
 
 class Unicast:
@@ -61,16 +62,13 @@ class Unicast:
         self._parked = parked
         self._outbox = outbox
         self._installed: dict[bytes, _Installed] = {}
+        self._keys_of: dict[Name, set[bytes]] = {}  # of what is installed, by destination
         self.drops: Counter[DropReason] = Counter()
 
     def miss(self, header: Header, frame: bytes, now_s: float) -> None:
         """Take a frame for which the table had no entry."""
         destination, source = Name(header.destination), Name(header.source)
-        waits_for = self._resolve(destination, source, now_s)
-        if waits_for is not None:
-            self._parked.park(waits_for, frame, now_s)
-        else:
-            self._forward(destination, source, frame)
+        self._find(destination, source, frame, now_s)
 
     def send(self, frames: list[bytes], destination: Name, source: Name, now_s: float) -> None:
         """Send frames of our own to a name, by the way that others' frames go."""
@@ -84,33 +82,53 @@ class Unicast:
     def release(self, name: Name, now_s: float) -> None:
         """Look again at what waited for a name."""
         for frame in self._parked.release(name):
-            destination, source = Name(frame[32:64]), Name(frame[64:96])
-            waits_for = self._resolve(destination, source, now_s)
-            if waits_for is None:
-                self._forward(destination, source, frame)
-            else:
-                self._parked.park(waits_for, frame, now_s)
+            self._find(Name(frame[DESTINATION_AT:SOURCE_AT]), Name(frame[SOURCE_AT:HEADER_BYTES]), frame, now_s)
 
     def refresh(self, now_s: float) -> None:
         """Compute every installed way anew: links have changed."""
         for key, why in list(self._installed.items()):
-            if key not in self._table.entries:
-                del self._installed[key]
-                continue
-            self._table.remove(key)
-            del self._installed[key]
-            if self._resolve(why.destination, why.source, now_s) is not None:
-                self._places.want(why.destination, now_s, watch=False)
+            self._uninstall(key)
+            if not why.is_negative:  # what led nowhere is looked for when the next frame comes
+                self._resolve(why.destination, why.source, now_s)
 
     def forget(self, name: Name) -> None:
-        """Take out the entries to a name whose place has changed."""
-        for key in [key for key, why in self._installed.items() if why.destination == name]:
-            self._table.remove(key)
-            del self._installed[key]
+        """Take out the entries to a name whose place has changed, those too that say there is none."""
+        for key in list(self._keys_of.get(name, ())):
+            self._uninstall(key)
 
     def expired(self, key: bytes) -> None:
         """Learn that the table let an entry go."""
-        self._installed.pop(key, None)
+        self._let_go(key)
+
+    def _let_go(self, key: bytes) -> _Installed | None:
+        why = self._installed.pop(key, None)
+        if why is not None:
+            keys = self._keys_of[why.destination]
+            keys.discard(key)
+            if not keys:
+                del self._keys_of[why.destination]
+        return why
+
+    def _uninstall(self, key: bytes) -> None:
+        """Take out an entry of ours, but not the tree that may have grown in a negative one's place."""
+        why = self._let_go(key)
+        if why is not None and (not why.is_negative or self._table.entries.get(key) == NOWHERE):
+            self._table.remove(key)
+
+    def _note(self, key: bytes, why: _Installed) -> None:
+        self._let_go(key)
+        self._installed[key] = why
+        self._keys_of.setdefault(why.destination, set()).add(key)
+
+    def _find(self, destination: Name, source: Name, frame: bytes, now_s: float) -> None:
+        """Send a frame on, or have it wait for what is asked."""
+        waits_for = self._resolve(destination, source, now_s)
+        if waits_for is None:
+            self._forward(destination, source, frame)
+        elif self._places.is_asked(waits_for):
+            self._parked.park(waits_for, frame, now_s)
+        else:
+            self.drops[DropReason.PARKED_FULL] += 1  # too many questions are open
 
     def _forward(self, destination: Name, source: Name, frame: bytes) -> None:
         hop = self._hop(destination, source)
@@ -137,8 +155,8 @@ class Unicast:
             self._install(destination, b"", self._outbox.hop(neighbour), source, now_s + NODE_LEASE_S)
             return None
         if self._paths.is_switch(destination):
-            domain = self._paths.domain_of(destination)
-            way = self._paths.to_switch(destination, domain or self._own_domain, self._transit)
+            domain = self._paths.domain_of(destination) or self._own_domain
+            way = self._paths.to_switch(destination, domain, self._transit | {domain})
             self._install_way(destination, b"", way, source, now_s + NODE_LEASE_S, now_s)
             return None
         if self._paths.is_rib(destination):
@@ -154,8 +172,7 @@ class Unicast:
             if not places and not self._places.is_nowhere(destination, now_s):
                 self._places.want(destination, now_s, watch=False)
                 return destination
-            self.drops[DropReason.NO_READER if places else DropReason.NO_ROUTE] += 1
-            self._table.install(destination + source, NOWHERE, now_s + NEGATIVE_S)
+            self._install_nowhere(destination, source, DropReason.NO_READER if places else DropReason.NO_ROUTE, now_s)
             return None
         if all(place.domain == self._own_domain for place in takers) and self._is_of_own_domain(source, now_s):
             best = self._nearest(takers, frozenset({self._own_domain}))
@@ -164,8 +181,7 @@ class Unicast:
         transit = self._source_transit(source, now_s)
         if transit is None:
             if self._places.is_nowhere(source, now_s):
-                self.drops[DropReason.NO_ROUTE] += 1
-                self._table.install(destination + source, NOWHERE, now_s + NEGATIVE_S)
+                self._install_nowhere(destination, source, DropReason.NO_ROUTE, now_s)
                 return None
             self._places.want(source, now_s, watch=False)
             return source
@@ -207,14 +223,21 @@ class Unicast:
     ) -> None:
         neighbour = None if way is None else self._outbox.neighbour(way.first)
         if neighbour is None:
-            self.drops[DropReason.NO_ROUTE] += 1
-            self._table.install(destination + source, NOWHERE, now_s + NEGATIVE_S)
-            self._installed[destination + source] = _Installed(destination, source)
+            self._install_nowhere(destination, source, DropReason.NO_ROUTE, now_s)
         else:
             self._install(destination, source_key, self._outbox.hop(neighbour), source, expires_s)
 
     def _install(self, destination: Name, source_key: bytes, hop: Hop, source: Name, expires_s: float) -> None:
         key = destination + source_key
-        self._table.remove(destination + source)  # a negative entry would be found first
+        negative = self._installed.get(destination + source)
+        if negative is not None and negative.is_negative:
+            self._uninstall(destination + source)  # it would be found first
         if self._table.install(key, (hop,), expires_s):
-            self._installed[key] = _Installed(destination, source)
+            self._note(key, _Installed(destination, source))
+
+    def _install_nowhere(self, destination: Name, source: Name, reason: DropReason, now_s: float) -> None:
+        """Have the data plane drop such frames for a moment, unless a tree stands there."""
+        self.drops[reason] += 1
+        key = destination + source
+        if not self._table.entries.get(key) and self._table.install(key, NOWHERE, now_s + NEGATIVE_S):
+            self._note(key, _Installed(destination, source, is_negative=True))

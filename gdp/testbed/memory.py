@@ -24,6 +24,7 @@ from gdp.switch.table import Table
 
 __all__ = ["Cable", "MemoryNetwork", "Tap"]
 
+_SAME_INSTANT_MAX: Final = 100  # timers of one node, before it counts as one that never moves on
 EPOCH_UNIX_S: Final = 1_800_000_000.0
 
 Tap = Callable[[float, str, str, bytes], None]
@@ -58,7 +59,10 @@ class _Node:
     machine: Machine
     table: Table | None
     ports: dict[int, tuple[Cable, _End, _End]] = field(default_factory=dict)  # cable, own end, far end
+    costs: dict[int, int] = field(default_factory=dict)  # by port
     timer_s: float | None = None
+    fired_s: float = float("-inf")
+    fired: int = 0  # times in the instant ``fired_s``
     is_alive: bool = True
 
 
@@ -103,6 +107,7 @@ class MemoryNetwork:
         for own, far in (ends, ends[::-1]):
             node = self._nodes[own.node]
             node.ports[own.port] = (cable, own, far)
+            node.costs[own.port] = cost
             node.machine.add_port(own.port, own.mac, cable.mtu, cost, self.now)
             self._arm(own.node)
         return cable
@@ -122,9 +127,12 @@ class MemoryNetwork:
 
     def replace(self, name: str, machine: Machine, table: Table | None = None) -> None:
         """Start a node anew, with nothing remembered, on the same cables."""
-        node = self._nodes[name] = _Node(machine, table, self._nodes[name].ports)
+        before = self._nodes[name]
+        node = self._nodes[name] = _Node(machine, table, before.ports, before.costs)
         for port, (cable, own, _) in node.ports.items():
-            machine.add_port(port, own.mac, cable.mtu, 10, self.now)
+            machine.add_port(port, own.mac, cable.mtu, node.costs[port], self.now)
+            if not cable.is_up:
+                machine.port_changed(port, False, self.now)
         self._arm(name)
 
     def call(self, delay_s: float, action: Callable[[], None]) -> None:
@@ -136,7 +144,11 @@ class MemoryNetwork:
         self._settle(name)
 
     def run(self, duration_s: float, until: Callable[[], bool] | None = None) -> bool:
-        """Let time go on; return whether ``until`` came true (True without one)."""
+        """Let time go on; return whether ``until`` came true (True without one).
+
+        Raises:
+            LocalError: a machine's timer is due again and again in one instant: on a real clock it would spin.
+        """
         end_s = self._now_s + duration_s
         if until is not None and until():
             return True
@@ -177,6 +189,10 @@ class MemoryNetwork:
         if node.timer_s is None or node.timer_s > self._now_s:
             return
         node.timer_s = None
+        node.fired = node.fired + 1 if node.fired_s == self._now_s else 1
+        node.fired_s = self._now_s
+        if node.fired > _SAME_INSTANT_MAX:
+            raise LocalError(f"{name} wants to be called again and again at {self._now_s}")
         due_s = node.machine.next_timeout()
         if due_s is not None and due_s <= self._now_s + 1e-9:
             node.machine.timeout(Instant(self._now_s + 1e-6, EPOCH_UNIX_S + self._now_s))

@@ -24,7 +24,7 @@ from gdp.rib.store import MemoryStore
 from gdp.switch.machine import Switch, SwitchSettings
 from gdp.switch.table import Table
 from gdp.testbed.memory import EPOCH_UNIX_S, Cable, MemoryNetwork
-from gdp.testbed.topology import Topology
+from gdp.testbed.topology import Attachment, Topology
 from gdp.trust.card import Card
 from gdp.trust.domain import Policy
 from gdp.trust.owner import Owner
@@ -42,6 +42,7 @@ class World:
     Args:
         topology: what to build. Nodes are called by their switch's name, or ``switch/device`` for what is attached.
         trusts: for each domain label, the labels it trusts; None: everyone trusts everyone.
+        transits: for a domain label, the labels through which its traffic may pass; all trusted ones if not given.
         delay_s: of every link between switches.
     """
 
@@ -51,6 +52,7 @@ class World:
     hello_s: float = HELLO_S
     dead_s: float = DEAD_S
     trusts: dict[str, tuple[str, ...]] | None = None
+    transits: dict[str, tuple[str, ...]] | None = None
     network: MemoryNetwork = field(init=False)
     authorities: dict[str, DomainAuthority] = field(default_factory=dict)
     identities: dict[str, Identity] = field(default_factory=dict)
@@ -58,6 +60,7 @@ class World:
     ribs: dict[str, RibHost] = field(default_factory=dict)
     members: dict[str, Member] = field(default_factory=dict)
     cables: dict[frozenset[str], Cable] = field(default_factory=dict)
+    leads: dict[str, Cable] = field(default_factory=dict)  # of members and RIBs, by label
     owner: Owner = field(init=False)
     _incarnation: int = 0
 
@@ -93,7 +96,12 @@ class World:
     def policy(self, domain: str) -> Policy:
         """Return the policy of a domain's nodes."""
         trusted = self.authorities if self.trusts is None else self.trusts.get(domain, ())
-        return Policy(self.authorities[domain].root, [self.authorities[label].root for label in trusted])
+        through = None if self.transits is None else self.transits.get(domain)
+        return Policy(
+            self.authorities[domain].root,
+            [self.authorities[label].root for label in trusted],
+            None if through is None else [self.authorities[label].root.domain for label in through],
+        )
 
     def add_member(self, label: str, switch: str, domain: str | None = None) -> Member:
         """Attach a member to a switch; its domain is the switch's unless given."""
@@ -101,8 +109,22 @@ class World:
         member = Member(self.identity(Role.PROXY, label, domain), self.policy(domain), self._attachment_settings())
         self.members[label] = member
         self.network.add(label, member)
-        self.network.connect(switch, label, Cable(0.0001))
+        self.leads[label] = self.network.connect(switch, label, Cable(0.0001))
         return member
+
+    def restart_member(self, label: str) -> Member:
+        """Start a member anew with nothing remembered, no topic either."""
+        before = self.members[label]
+        identity = next(each for each in self.identities.values() if each.name == before.name)
+        domain = next(domain for domain, each in self.authorities.items() if each.root.domain == identity.root.domain)
+        member = self.members[label] = Member(identity, self.policy(domain), self._attachment_settings())
+        self.network.replace(label, member)
+        return member
+
+    def roam(self, label: str, switch: str) -> None:
+        """Pull a member's cable and put one in at another switch."""
+        self.network.set_link(self.leads[label], up=False)
+        self.leads[label] = self.network.connect(switch, label, Cable(0.0001))
 
     def topic(self, name: str, member: Member, rights: Collection[Right], **metadata: str) -> Topic:
         """Return a topic of the owner's, delegated to a member."""
@@ -118,6 +140,13 @@ class World:
         switch, table = self._switch(name, self.topology.domain_of(name).label)
         self.network.replace(name, switch, table)
         return switch
+
+    def restart_rib(self, domain: str) -> RibHost:
+        """Start a domain's RIB anew with nothing remembered."""
+        label = next(f"{at.switch}/{at.ifname}" for at in self._ribs_of(domain))
+        host = self._rib(domain)
+        self.network.replace(label, host)
+        return host
 
     def settle(self, duration_s: float = 10.0) -> bool:
         """Let time go on until every member is attached; return whether that came true."""
@@ -140,15 +169,21 @@ class World:
         switch = self.switches[name] = Switch(self.identities[name], self.policy(domain), table, settings)
         return switch, table
 
+    def _ribs_of(self, domain: str) -> list[Attachment]:
+        return [at for at in self.topology.attached("rib") if self.topology.domain_of(at.switch).label == domain]
+
     def _add_rib(self, label: str, switch: str) -> None:
-        domain = self.topology.domain_of(switch)
+        self.network.add(label, self._rib(self.topology.domain_of(switch).label))
+        self.leads[label] = self.network.connect(switch, label, Cable(0.0001))
+
+    def _rib(self, label: str) -> RibHost:
+        domain = next(each for each in self.topology.domains if each.label == label)
         upper = None if domain.upper is None else self.identities[f"rib:{domain.upper}"].name
         identity = self.identities[f"rib:{domain.label}"]
         policy = self.policy(domain.label)
         rib = Rib(identity, policy, MemoryStore(), RibSettings(upper))
         host = self.ribs[domain.label] = RibHost(identity, policy, rib, self._attachment_settings())
-        self.network.add(label, host)
-        self.network.connect(switch, label, Cable(0.0001))
+        return host
 
     def _attachment_settings(self) -> AttachmentSettings:
         self._incarnation += 1

@@ -21,7 +21,7 @@ class Journey:
     Args:
         parts: of the largest message.
         hops: switches that most messages passed.
-        hops_seen: all numbers of switches that messages passed, in the order in which they first came.
+        hops_seen: every number of switches that some message passed.
     """
 
     median_ms: float | None = None

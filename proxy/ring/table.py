@@ -46,9 +46,11 @@ def verdict(result: Result) -> str:
 
 
 def hops_in_words(journey: Journey) -> str:
-    """Return the switches that messages passed, such as ``5 (3 between)``; several ways in the order they came."""
-    ways = journey.hops_seen or ((journey.hops,) if journey.hops else ())
-    return ", ".join(f"{hops} ({max(hops - _EDGE_SWITCHES, 0)} between)" for hops in ways) or "-"
+    """Return the switches that messages passed, such as ``5 (3 between)``: the usual number first, then others."""
+    if not journey.hops:
+        return "-"
+    others = "".join(f", also {hops}" for hops in journey.hops_seen if hops != journey.hops)
+    return f"{journey.hops} ({max(journey.hops - _EDGE_SWITCHES, 0)} between){others}"
 
 
 def _cells(row: TopicResult) -> list[str]:

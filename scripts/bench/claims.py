@@ -21,6 +21,7 @@ import secrets
 import statistics
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -109,6 +110,11 @@ def rate(verifier: ClaimVerifier, wires: Sequence[bytes], unix_s: float) -> floa
     return len(wires) / (time.process_time() - begin)
 
 
+def fresh_rate(field: Field, wires: Sequence[bytes]) -> float:
+    """Return the rate of a verifier that has seen nothing yet."""
+    return rate(field.verifier(), wires, field.unix_s)
+
+
 def median_of(measure: Callable[[], float]) -> dict[str, float]:
     """Return median, lowest and highest of several runs."""
     rates = [measure() for _ in range(RUNS)]
@@ -121,7 +127,7 @@ def run(count: int) -> dict[str, dict[str, float]]:
     results: dict[str, dict[str, float]] = {}
     for name, owners, links in (("new", False, 1), ("owners", True, 1), ("chain", False, 2)):
         (wires,) = field.claims(count, owners=owners, links=links)
-        results[name] = median_of(lambda wires=wires: rate(field.verifier(), wires, field.unix_s))
+        results[name] = median_of(partial(fresh_rate, field, wires))
         results[name]["bytes"] = len(wires[0])
     first, *refreshed = field.claims(count, sequences=RUNS + 1)
     verifier = field.verifier()

@@ -4,10 +4,10 @@
 
 Five namespaces in a chain (A - S1 - S2 - S3 - B) joined by veth pairs, one process in each: a source, three switches
 with a static table, a sink. The figure is the highest rate at which the sink gets all but 0.5 % of the frames *and* the
-last one comes within 0.1 s of the last sending: a rate that only fills queues does not count. A rate that fails is tried
-once more, because whatever else a machine does can spoil a single try. Round trips are then taken of single frames of
-100 bytes payload, by ends that sleep in epoll as real ones do (with fewer cores than processes, ends that spin would
-take the switches' time). Everything made is removed, whatever happens.
+last one comes within 0.1 s of the last sending: a rate that only fills queues does not count. A rate that fails is
+tried once more, because whatever else a machine does can spoil a single try. Round trips are then taken of single
+frames of 100 bytes payload, by ends that sleep in epoll as real ones do (with fewer cores than processes, ends that
+spin would take the switches' time). Everything made is removed, whatever happens.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import argparse
 import json
 import os
 import platform
+import signal
 import statistics
 import subprocess
 import sys
@@ -201,6 +202,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=2.0, help="length of one try")
     parser.add_argument("--steps", type=int, default=5, help="bisections")
     options = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
     planes = options.plane or ["raw", "scapy"]
     with Chain(options.mtu) as chain:
         result: dict[str, Any] = {

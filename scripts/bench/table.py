@@ -2,8 +2,8 @@
 
     .venv/bin/python scripts/bench/table.py [--entries 100000] [--json FILE]
 
-The process imports all that a switch runs on, so its size is a switch's. Half of the entries are for a destination, half
-for destination and source, with eight different sets of hops and leases that end one after the other.
+The process imports all that a switch runs on, so its size is a switch's. Half of the entries are for a destination,
+half for destination and source, with eight different sets of hops and leases that end one after the other.
 """
 
 from __future__ import annotations

@@ -134,7 +134,31 @@ def test_more_bytes_than_allowed_are_refused() -> None:
     assert refused(encode(bytes(CONTROL_MAX_BYTES)))
 
 
-@pytest.mark.parametrize("value", [object(), [object()], 1j.__class__])
-def test_what_cbor_cannot_carry_is_our_own_mistake(value: object) -> None:
+@pytest.mark.parametrize(
+    "value",
+    [object(), [object()], {1: 2}, {"a": {b"b": 1}}, {1, 2}, bytearray(b"a"), 1 << 64, -(1 << 64) - 1, "\ud800"],
+    ids=repr,
+)
+def test_what_has_no_place_in_a_statement_is_our_own_mistake(value: object) -> None:
     with pytest.raises(LocalError):
         encode(value)
+
+
+def test_what_is_nested_too_deep_is_not_written() -> None:
+    value: list[object] = []
+    for _ in range(CBOR_DEPTH_MAX):
+        value = [value]
+    with pytest.raises(LocalError):
+        encode(value)
+
+
+@given(values)
+def test_an_independent_reader_reads_the_same(value: Value) -> None:
+    assert cbor2.loads(encode(value)) == value
+
+
+@pytest.mark.parametrize("exponent", range(-30, 16))
+def test_every_magnitude_of_a_half_is_written_in_two_bytes_of_float(exponent: int) -> None:
+    number = math.ldexp(1.0 if exponent < -14 else 1.5, exponent) if exponent >= -24 else 0.0
+    assert len(encode(number)) == 3
+    assert decode(encode(number)) == number

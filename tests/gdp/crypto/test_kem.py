@@ -88,7 +88,7 @@ def test_a_private_key_of_another_length_is_our_own_mistake() -> None:
 
 
 def test_a_library_without_the_kem_is_named(old_library: None) -> None:
-    with pytest.raises(LocalError, match="version 47"):
+    with pytest.raises(LocalError, match="version 48"):
         KemPrivateKey.generate()
 
 

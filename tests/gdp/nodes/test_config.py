@@ -92,7 +92,7 @@ def test_a_missing_key_is_told_at_what_should_hold_it(place: Path) -> None:
         ("ports: [{iface: a, cost: 0}]", "ports[0].cost: expected greater than or equal to 1, not 0"),
         ("ports: [{iface: a}, {iface: a}]", "ports: a stands twice"),
         ("attach: [a, a]", "attach: a stands twice"),
-        ("attach: [over_13_chars!]", "attach[0]: at most 13 characters, for the switch's end is called over_13_chars!-s"),
+        ("attach: [fourteen_chars]", "attach[0]: at most 13 characters, for the switch's end is fourteen_chars-s"),
         ("dead_s: 0.3", "dead_s: at least twice hello_s (0.25), so that one lost hello loses no neighbour"),
         ("hello_s: .inf", "hello_s: expected a number, not '.inf'"),
         ("metrics: {port: 70000}", "metrics.port: expected less than or equal to 65535, not 70000"),

@@ -138,15 +138,15 @@ def test_the_membership_of_another_node_is_not_installed(keys: Path) -> None:
 
 
 def test_a_membership_ends_with_the_root_at_the_latest(keys: Path) -> None:
-    make_domain(keys / "brief", "brief", days=1, unix_s=NOW)
-    identity = make_node(keys / "node", Role.SWITCH, "node", keys / "brief", days=365, unix_s=NOW)
+    make_domain(keys / "short", "short", days=1, unix_s=NOW)
+    identity = make_node(keys / "node", Role.SWITCH, "node", keys / "short", days=365, unix_s=NOW)
     assert identity.member.not_after_unix_s == identity.root.validity.not_after_unix_s
 
 
 def test_a_root_that_has_run_out_admits_nobody(keys: Path) -> None:
-    make_domain(keys / "brief", "brief", days=1, unix_s=NOW)
+    make_domain(keys / "short", "short", days=1, unix_s=NOW)
     with pytest.raises(LocalError, match="run out"):
-        make_node(keys / "node", Role.SWITCH, "node", keys / "brief", unix_s=NOW + 100_000)
+        make_node(keys / "node", Role.SWITCH, "node", keys / "short", unix_s=NOW + 100_000)
 
 
 def test_an_identity_that_has_run_out_is_not_loaded(keys: Path) -> None:

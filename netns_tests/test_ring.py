@@ -1,0 +1,213 @@
+"""The whole journey on real sockets: recordings through the ring, links that fail, an eavesdropper, and hasty ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from gdp.testbed.runs import Runs
+from proxy.endpoints.bag import BagReader
+
+pytestmark = pytest.mark.netns
+
+PROJECT: Final = Path(__file__).parents[1]
+SHARED: Final = PROJECT.parent / "shared" / "data" / "bags"
+RECORDINGS: Final = (
+    "tilt_laser.bag",
+    "rosbag2_test",
+    "ros_numpy_test.bag",
+    "event_camera.bag",
+    "ninety_four_types.mcap",
+    "turtlesim.bag",
+    "aruco_compressed.bag",
+)
+PATIENCE_S: Final = 240
+WHERE: Final = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "proxy.ring", *map(str, arguments)]
+
+
+def ring(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command(*arguments), capture_output=True, text=True, timeout=PATIENCE_S, env=WHERE, cwd=PROJECT, check=False
+    )
+
+
+def topics(result: dict[str, object]) -> list[dict[str, object]]:
+    rows = result["topics"]
+    assert isinstance(rows, list)
+    return rows
+
+
+def crossed(folder: Path, *arguments: object) -> dict[str, object]:
+    """Run the ring, and return its JSON after it passed."""
+    ended = ring(*arguments, "--json", folder / "result.json")
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    result: dict[str, object] = json.loads((folder / "result.json").read_text())
+    assert result["passed"] is True
+    return result
+
+
+def make_demo(folder: Path, seconds: float, *more: str) -> Path:
+    path = folder / ("demo.bag" if "--ros1" in more else "demo.mcap")
+    script = PROJECT / "scripts" / "make_demo_bag.py"
+    argv = [sys.executable, str(script), "--seconds", str(seconds), "-o", str(path), *more]
+    subprocess.run(argv, check=True, env=WHERE, cwd=PROJECT)
+    return path
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_demo(tmp_path_factory.mktemp("demo"), 1)
+
+
+@pytest.fixture(scope="module")
+def longer(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_demo(tmp_path_factory.mktemp("longer"), 5)
+
+
+def test_a_recording_crosses_three_switches_in_between_at_its_own_pace(demo: Path, tmp_path: Path) -> None:
+    result = crossed(tmp_path, demo, "--out", tmp_path / "out")
+    with BagReader(demo) as sent:
+        assert {row["topic"] for row in topics(result)} == {channel.topic for channel in sent.channels}
+        assert sum(int(str(row["messages"])) for row in topics(result)) == sent.count
+    assert {row["hops"] for row in topics(result)} == {5}
+    with BagReader(tmp_path / "out" / "recording.mcap") as received:
+        assert received.count == sum(int(str(row["messages"])) for row in topics(result))
+
+
+@pytest.mark.parametrize("encoding", ["cbor", "cdr"])
+def test_every_encoding_crosses(demo: Path, tmp_path: Path, encoding: str) -> None:
+    result = crossed(tmp_path, demo, "--rate", 0, "--encoding", encoding)
+    settings = result["settings"]
+    assert isinstance(settings, dict)
+    assert settings["encoding"] == encoding
+
+
+def test_a_ros_1_recording_comes_out_as_a_ros_1_bag(tmp_path: Path) -> None:
+    crossed(tmp_path, make_demo(tmp_path, 0.3, "--ros1"), "--rate", 0, "--out", tmp_path)
+    with BagReader(tmp_path / "recording.bag") as received:
+        assert {channel.ros for channel in received.channels} == {1}
+
+
+def test_larger_frames_carry_an_image_in_fewer_parts(demo: Path, tmp_path: Path) -> None:
+    small, large = (crossed(tmp_path, demo, "--rate", 0, "--mtu", mtu) for mtu in (1_500, 9_000))
+    parts = [max(int(str(row["parts"])) for row in topics(result)) for result in (small, large)]
+    assert parts[0] > 5 * parts[1]
+
+
+def test_the_scapy_plane_carries_the_same(tmp_path: Path) -> None:
+    crossed(tmp_path, make_demo(tmp_path, 0.1), "--data-plane", "scapy")
+
+
+def test_with_a_link_cut_in_the_middle_all_still_arrives_by_the_other_way(longer: Path, tmp_path: Path) -> None:
+    result = crossed(tmp_path, longer, "--cut", "nuc2-nuc3@2")
+    (imu,) = (row for row in topics(result) if row["topic"] == "/imu")
+    assert imu["hops_seen"] in ([5, 2], [2, 5])
+
+
+def test_an_eavesdropper_in_the_middle_learns_no_topic_no_type_and_no_content(demo: Path, tmp_path: Path) -> None:
+    crossed(tmp_path, demo, "--rate", 0, "--pcap", tmp_path / "seen.pcap")
+    seen = (tmp_path / "seen.pcap").read_bytes()
+    with BagReader(demo) as sent:
+        names = {text.encode() for channel in sent.channels for text in (channel.topic, channel.type_name)}
+        longest: dict[int, bytes] = {}
+        for message in sent.messages():
+            longest[message.channel] = max(longest.get(message.channel, b""), message.raw, key=len)
+    secrets = {name for name in names if len(name) > 5}  # shorter ones turn up in megabytes of noise
+    words = {b"base_link", b"frame_id", b"position", b"ranges", b"geometry_msgs", b"MSG: "}
+    samples = {raw[at : at + 24] for raw in longest.values() for at in (40, len(raw) // 2) if len(set(raw[at:])) > 8}
+    assert len(seen) > sum(map(len, longest.values()))
+    assert [secret for secret in secrets | words | samples if secret in seen] == []
+
+
+@pytest.mark.parametrize("recording", RECORDINGS)
+def test_a_recording_of_a_real_robot_crosses(recording: str, tmp_path: Path) -> None:
+    if not (SHARED / recording).exists():
+        pytest.skip(f"{SHARED} is not there")
+    crossed(tmp_path, SHARED / recording, "--rate", 0)
+
+
+@pytest.mark.parametrize("recording", ["ninety_four_types.mcap", "tilt_laser.bag"])
+def test_with_cdr_the_very_bytes_cross(recording: str, tmp_path: Path) -> None:
+    if not (SHARED / recording).exists():
+        pytest.skip(f"{SHARED} is not there")
+    crossed(tmp_path, SHARED / recording, "--rate", 0, "--encoding", "cdr")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["/nowhere/my.bag"], "no such recording: /nowhere/my.bag"),
+        ([__file__], "cannot be read: neither a ROS 1 bag nor MCAP nor sqlite3"),
+        (["--cut", "nuc1-nuc3@1"], "no link nuc1-nuc3"),
+        (["--encoding", "xml"], "--encoding is one of json, cbor, cdr, not 'xml'"),
+        (["--mtu", "100"], "an MTU is 576 to 65521 bytes"),
+    ],
+)
+def test_wrong_input_is_told_before_anything_starts(arguments: Sequence[str], complaint: str) -> None:
+    ended = ring(*arguments)
+    assert ended.returncode == 2
+    assert complaint in ended.stderr
+
+
+def started(demo: Path, *more: str) -> tuple[subprocess.Popen[str], str]:
+    """Start a run and wait until traffic flows; return it and its id."""
+    process = subprocess.Popen(command(demo, *more), stderr=subprocess.PIPE, text=True, env=WHERE, cwd=PROJECT)
+    run = ""
+    assert process.stderr is not None
+    for line in process.stderr:
+        if " run " in line and ": five" in line:
+            run = line.split(" run ")[1].split(":")[0]
+        if "replaying" in line:
+            return process, run
+    raise AssertionError("the ring ended before it replayed")
+
+
+def left_of(run: str) -> list[str]:
+    """Return what there is of a run: records, namespaces, files, processes."""
+    places = [Path("/run/gdp"), Path("/run/netns"), Path(tempfile.gettempdir())]
+    files = [str(path) for place in places if place.is_dir() for path in place.iterdir() if run in path.name]
+    commands = [path / "cmdline" for path in Path("/proc").iterdir() if path.name.isdigit()]
+    return files + [str(path) for path in commands if path.exists() and run in path.read_text(errors="replace")]
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupted_run_leaves_nothing(longer: Path, number: signal.Signals, code: int) -> None:
+    process, run = started(longer)
+    with process:
+        process.send_signal(number)
+        assert process.wait(30) == code
+    assert left_of(run) == []
+
+
+def test_what_a_killed_run_left_is_gone_with_the_next(longer: Path, demo: Path, tmp_path: Path) -> None:
+    process, run = started(longer)
+    with process:
+        process.kill()
+    assert left_of(run) != []
+    crossed(tmp_path, demo, "--rate", 0)
+    assert left_of(run) == []
+
+
+def test_a_kept_ring_stands_until_it_is_taken_down(demo: Path) -> None:
+    ended = ring(demo, "--rate", 0, "--keep")
+    assert ended.returncode == 0, ended.stderr
+    run = ended.stderr.split("The ring of run ")[1].split(" ")[0]
+    records = Runs()
+    assert run not in records.sweep()
+    assert left_of(run) != []
+    down = ring("--down")
+    assert run in down.stderr
+    assert left_of(run) == []

@@ -1,0 +1,136 @@
+"""A publisher and its readers joined by a pipe that loses, doubles and reorders frames, under a clock that jumps."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import count
+from random import Random
+
+from gdp.client.feed import Delivered, Feed, Reader
+from gdp.client.publisher import Publisher, Secrets, Source
+from gdp.crypto.keys import SigningKey
+from gdp.frame.codec import decode
+from gdp.frame.kinds import Kind
+from gdp.message.memory import Budget
+from gdp.names import Name
+
+TOPIC = Name(b"t" * 32)
+WRITER = SigningKey.generate()
+SECRETS: Secrets = {1: b"1" * 32}
+DELAY_S = 0.002
+
+
+def publisher_of(*, incarnation: int = 1, secrets: Secrets = SECRETS, reliable: bool = True, depth: int = 0) -> Publisher:
+    source = Source(Name(b"p" * 32), incarnation, WRITER)
+    publisher = Publisher(TOPIC, source, secrets, b"what it is", reliable=reliable, depth=depth)
+    publisher.tree_stands(1500)
+    return publisher
+
+
+@dataclass
+class End:
+    """A reader at the end of the pipe."""
+
+    reader: Reader
+    feed: Feed
+    budget: Budget
+    loss: float = 0.0
+    deaf: bool = False  # hears nothing
+    mute: bool = False  # says nothing
+    delivered: list[Delivered] = field(default_factory=list)
+
+    @property
+    def numbers(self) -> list[int]:
+        return [each.number for each in self.delivered]
+
+    @property
+    def messages(self) -> list[bytes]:
+        return [each.message for each in self.delivered]
+
+
+class Pipe:
+    """One publisher, any number of readers."""
+
+    def __init__(self, publisher: Publisher, *, incarnation: int = 1, seed: int = 1) -> None:
+        self.publisher = publisher
+        self.incarnation = incarnation
+        self.random = Random(seed)
+        self.now_s = 100.0
+        self.jitter_s = 0.0
+        self.doubled = 0.0
+        self.ends: dict[bytes, End] = {}
+        self.seen: list[bytes] = []  # every frame that went over the pipe
+        self._events: list[tuple[float, int, Callable[[], None]]] = []
+        self._order = count()
+
+    def join(self, name: bytes, *, incarnation: int = 7, loss: float = 0.0, secrets: Secrets = SECRETS) -> End:
+        return self.attach(Reader(Name(name * 32), incarnation), loss=loss, secrets=secrets)
+
+    def attach(self, reader: Reader, *, loss: float = 0.0, secrets: Secrets = SECRETS) -> End:
+        budget = Budget()
+        publisher = Name(b"p" * 32)
+        feed = Feed(TOPIC, reader, publisher, self.incarnation, WRITER.public, secrets, budget, self.now_s)
+        end = self.ends[reader.name] = End(reader, feed, budget, loss)
+        return end
+
+    def publish(self, messages: Sequence[bytes]) -> None:
+        for message in messages:
+            self.publisher.publish(message)
+            self._flush()
+
+    def run(self, for_s: float, until: Callable[[], bool] = lambda: False) -> bool:
+        """Let time pass; return whether ``until`` came true."""
+        end_s = self.now_s + for_s
+        turns = 0
+        while not until():
+            turns += 1
+            assert turns < 500_000, "busy without getting anywhere"
+            self._flush()
+            at_s = min(self._next_s(), end_s)
+            if at_s >= end_s:
+                self.now_s = end_s
+                return until()
+            self.now_s = max(self.now_s, at_s)
+            while self._events and self._events[0][0] <= self.now_s:
+                heapq.heappop(self._events)[2]()
+            self.publisher.timeout(self.now_s)
+            for each in self.ends.values():
+                each.feed.timeout(self.now_s)
+        return True
+
+    def _next_s(self) -> float:
+        times = [self.publisher.next_timeout(), *(end.feed.next_timeout() for end in self.ends.values())]
+        times.append(self._events[0][0] if self._events else None)
+        return min((each for each in times if each is not None), default=float("inf"))
+
+    def _flush(self) -> None:
+        for frame in self.publisher.take(self.now_s):
+            self.seen.append(frame)
+            for end in self.ends.values():
+                if not end.deaf:
+                    self._send(frame, end, self._to_reader(end, frame))
+        for end in self.ends.values():
+            report = end.feed.take_report(self.now_s)
+            if report is not None and not end.mute:
+                self.seen.append(report)
+                self._send(report, end, self._to_publisher(report))
+
+    def _send(self, frame: bytes, end: End, arrive: Callable[[], None]) -> None:
+        for _ in range(2 if self.random.random() < self.doubled else 1):
+            if self.random.random() >= end.loss:
+                due_s = self.now_s + DELAY_S + self.random.random() * self.jitter_s
+                heapq.heappush(self._events, (due_s, next(self._order), arrive))
+
+    def _to_reader(self, end: End, frame: bytes) -> Callable[[], None]:
+        def arrive() -> None:
+            header = decode(frame)
+            assert header.kind in (Kind.DATA, Kind.STATUS)
+            end.feed.receive(header, frame, self.now_s)
+            end.delivered += end.feed.take_delivered()
+
+        return arrive
+
+    def _to_publisher(self, report: bytes) -> Callable[[], None]:
+        return lambda: self.publisher.receive_report(decode(report), report, self.now_s)

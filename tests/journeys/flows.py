@@ -1,0 +1,135 @@
+"""A topic from one member of a world to others, and what came of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from gdp.client.feed import Delivered
+from gdp.client.member import Member, Topic
+from gdp.client.publisher import Publisher
+from gdp.frame.codec import ETHER_BYTES, Header, decode
+from gdp.names import Name
+from gdp.testbed.topology import ring5
+from gdp.testbed.world import World
+from gdp.trust.right import Right
+
+ROBOT, SERVER = "nuc1/robot", "nuc5/server"
+
+
+@dataclass(slots=True)
+class Flow:
+    """One publisher of a topic and its readers, by label."""
+
+    world: World
+    name: str
+    source: str
+    topic: Topic
+    publisher: Publisher
+    got: dict[str, list[Delivered]] = field(default_factory=dict)
+
+    @property
+    def member(self) -> Member:
+        """Return the member that publishes."""
+        return self.world.members[self.source]
+
+    def read_by(self, label: str) -> None:
+        """Let a member read the topic from now on."""
+        reader = self.world.members[label]
+        reader.subscribe(self.world.topic(self.name, reader, [Right.READ]))
+        self.got[label] = []
+        self.world.network.touch(label)
+
+    def publish(self, message: bytes) -> None:
+        """Publish now."""
+        self.publisher.publish(message)
+        self.member.flush(self.world.network.now.mono_s)
+        self.world.network.touch(self.source)
+
+    def stream(self, count: int, every_s: float, size: int = 3_000) -> None:
+        """Publish numbered messages from now on, at a steady rate."""
+        for number in range(count):
+            message = number.to_bytes(4, "big") + bytes(size)
+            self.world.network.call(number * every_s, lambda message=message: self.publish(message))
+
+    def collect(self) -> None:
+        """Take what came to each reader."""
+        for label, got in self.got.items():
+            got += [each.delivered for each in self.world.members[label].take_messages() if each.topic == self.topic.name]
+
+    def numbers(self, label: str) -> list[int]:
+        """Return the numbers that ``stream`` gave to the messages that a reader has."""
+        self.collect()
+        return [int.from_bytes(each.message[:4], "big") for each in self.got[label]]
+
+    def has(self, label: str, count: int) -> bool:
+        """Return whether so many messages came to a reader."""
+        self.collect()
+        return len(self.got[label]) >= count
+
+    def hops(self, label: str) -> list[int]:
+        """Return how many switches each message passed on its way to a reader."""
+        self.collect()
+        return [each.hops for each in self.got[label]]
+
+    def is_read_by(self, count: int) -> bool:
+        """Return whether so many readers have introduced themselves."""
+        return self.publisher.readers >= count
+
+
+@dataclass(slots=True)
+class Tap:
+    """Sees the frames of some kinds that enter one cable in one direction."""
+
+    a: str
+    b: str
+    headers: list[Header] = field(default_factory=list)
+    frames: list[bytes] = field(default_factory=list)  # from the header on
+
+    def __call__(self, _at_s: float, a: str, b: str, frame: bytes) -> None:
+        if (a, b) == (self.a, self.b):
+            self.headers.append(decode(frame, ETHER_BYTES))
+            self.frames.append(frame[ETHER_BYTES:])
+
+    def count(self, kind: int, destination: Name | None = None) -> int:
+        """Return how many frames of a kind were seen, to one destination if given."""
+        return sum(1 for each in self.headers if each.kind == kind and destination in (None, each.destination))
+
+
+def ring(seed: int = 1, transits: dict[str, tuple[str, ...]] | None = None) -> World:
+    """Return the ring of five, every member attached."""
+    world = World(ring5(), seed, transits=transits)
+    assert world.settle()
+    return world
+
+
+def advertise(
+    world: World,
+    name: str = "/chatter",
+    source: str = ROBOT,
+    *,
+    reliable: bool = True,
+    depth: int = 0,
+    is_global: bool = True,
+) -> Flow:
+    """Return a topic that a member publishes from now on."""
+    member = world.members[source]
+    topic = world.topic(name, member, [Right.PUBLISH])
+    publisher = member.advertise(topic, b"described", reliable=reliable, depth=depth, is_global=is_global)
+    world.network.touch(source)
+    return Flow(world, name, source, topic, publisher)
+
+
+def flowing(
+    world: World,
+    name: str = "/chatter",
+    source: str = ROBOT,
+    readers: tuple[str, ...] = (SERVER,),
+    *,
+    reliable: bool = True,
+) -> Flow:
+    """Return a topic with readers that have introduced themselves."""
+    flow = advertise(world, name, source, reliable=reliable)
+    for label in readers:
+        flow.read_by(label)
+    assert world.network.run(5, lambda: flow.is_read_by(len(readers)))
+    return flow

@@ -1,0 +1,194 @@
+"""Messages across the ring of five: through three intermediate switches, past failures, to whoever may read."""
+
+from __future__ import annotations
+
+import pytest
+
+from gdp.frame.kinds import Kind
+from gdp.limits import DEAD_S, JOIN_LEASE_S
+from gdp.testbed.topology import ring5
+from gdp.testbed.world import World
+from gdp.trust.right import Right
+from tests.journeys.flows import ROBOT, SERVER, Tap, advertise, flowing, ring
+
+LONG = frozenset(("nuc2", "nuc3"))
+
+
+def test_a_message_takes_the_cheap_way_over_five_switches() -> None:
+    flow = flowing(ring())
+    flow.publish(b"hello")
+    assert flow.world.network.run(1, lambda: flow.has(SERVER, 1))
+    assert [(each.message, each.hops) for each in flow.got[SERVER]] == [(b"hello", 5)]
+
+
+def test_a_cut_in_mid_flow_turns_the_traffic_and_loses_nothing() -> None:
+    flow = flowing(ring())
+    network = flow.world.network
+    flow.stream(100, 0.02)
+    network.call(1.0, lambda: network.set_link(flow.world.cables[LONG], up=False))
+    assert network.run(10, lambda: flow.has(SERVER, 100))
+    assert flow.numbers(SERVER) == list(range(100))
+    hops = flow.hops(SERVER)
+    assert (hops[0], hops[-1]) == (5, 2)
+
+
+def test_a_link_that_dies_without_a_word_is_noticed_by_its_silence() -> None:
+    flow = flowing(ring())
+    flow.stream(100, 0.02)
+    flow.world.network.call(1.0, lambda: setattr(flow.world.cables[LONG], "loss", 1.0))
+    assert flow.world.network.run(10, lambda: flow.has(SERVER, 100))
+    assert (flow.numbers(SERVER), flow.hops(SERVER)[-1]) == (list(range(100)), 2)
+
+
+def test_a_link_that_comes_back_is_used_again() -> None:
+    flow = flowing(ring())
+    network = flow.world.network
+    network.set_link(flow.world.cables[LONG], up=False)
+    network.run(2)
+    network.set_link(flow.world.cables[LONG], up=True)
+    network.run(3)
+    flow.publish(b"back")
+    assert network.run(1, lambda: flow.has(SERVER, 1))
+    assert flow.hops(SERVER) == [5]
+
+
+@pytest.mark.parametrize("name", ["nuc1", "nuc2", "nuc3", "nuc4", "nuc5"])
+def test_a_switch_that_starts_anew_is_taken_back_and_nothing_is_lost(name: str) -> None:
+    flow = flowing(ring())
+    network = flow.world.network
+    flow.stream(200, 0.02, size=100)
+    network.call(1.0, lambda: network.stop(name))
+    network.call(2.5, lambda: (flow.world.restart_switch(name), None)[1])
+    assert network.run(30, lambda: flow.has(SERVER, 200))
+    assert flow.numbers(SERVER) == list(range(200))
+
+
+def test_a_switch_that_starts_anew_in_an_instant_is_noticed_by_its_session() -> None:
+    flow = flowing(ring())
+    flow.stream(100, 0.02)
+    flow.world.network.call(1.0, lambda: (flow.world.restart_switch("nuc3"), None)[1])
+    assert flow.world.network.run(10, lambda: flow.has(SERVER, 100))
+    assert flow.numbers(SERVER) == list(range(100))
+
+
+@pytest.mark.parametrize("label", ["school", "backbone", "cloud"])
+def test_a_rib_that_starts_anew_disturbs_no_flow_and_is_refilled(label: str) -> None:
+    flow = flowing(ring())
+    world = flow.world
+    names = world.ribs[label].rib.names
+    flow.stream(400, 0.1, size=100)
+    world.network.call(1.0, lambda: (world.restart_rib(label), None)[1])
+    world.network.run(40.5)
+    assert flow.numbers(SERVER) == list(range(400))
+    assert world.ribs[label].rib.names == names > 0
+    delays = {each.hops for each in flow.got[SERVER]}
+    assert delays == {5}
+
+
+def test_a_late_joiner_of_a_latched_topic_gets_the_last_messages() -> None:
+    flow = advertise(ring(), depth=3)
+    for number in range(5):
+        flow.publish(b"%d" % number)
+    flow.world.network.run(5)
+    flow.read_by(SERVER)
+    assert flow.world.network.run(3, lambda: flow.has(SERVER, 3))
+    assert [each.message for each in flow.got[SERVER]] == [b"2", b"3", b"4"]
+
+
+def test_two_publishers_of_one_topic_both_reach_its_reader() -> None:
+    world = ring()
+    world.add_member("nuc3/second", "nuc3")
+    assert world.settle()
+    first = flowing(world, readers=(SERVER,))
+    second = advertise(world, source="nuc3/second")
+    second.got = first.got
+    assert world.network.run(3, lambda: second.is_read_by(1))
+    first.publish(b"from the robot")
+    second.publish(b"from the second")
+    assert world.network.run(2, lambda: first.has(SERVER, 2))
+    assert {each.message for each in first.got[SERVER]} == {b"from the robot", b"from the second"}
+
+
+def test_a_publisher_that_comes_after_its_reader_is_found() -> None:
+    world = ring()
+    reader = world.members[SERVER]
+    reader.subscribe(world.topic("/late", reader, [Right.READ]))
+    world.network.run(10)
+    flow = advertise(world, "/late")
+    assert world.network.run(3, lambda: flow.is_read_by(1))
+
+
+def test_two_readers_cost_a_shared_link_one_copy() -> None:
+    world = ring()
+    world.add_member("nuc4/second", "nuc4")
+    assert world.settle()
+    flow = flowing(world, readers=(SERVER, "nuc4/second"))
+    tap = Tap("nuc2", "nuc3")
+    world.network.taps.append(tap)
+    for _ in range(10):
+        flow.publish(b"x" * 100)
+    assert world.network.run(2, lambda: flow.has(SERVER, 10) and flow.has("nuc4/second", 10))
+    assert tap.count(Kind.DATA) == 10
+
+
+def test_a_tree_without_readers_is_taken_down() -> None:
+    flow = flowing(ring())
+    world = flow.world
+    assert any(switch.planter.trees.all() for switch in world.switches.values())
+    world.members[SERVER].leave()
+    world.network.touch(SERVER)
+    world.network.run(JOIN_LEASE_S + 1)
+    assert not any(switch.planter.trees.all() for switch in world.switches.values())
+
+
+def test_loss_on_every_link_costs_no_message() -> None:
+    flow = flowing(ring())
+    for cable in flow.world.cables.values():
+        cable.loss = 0.02
+    flow.stream(200, 0.01)
+    assert flow.world.network.run(30, lambda: flow.has(SERVER, 200))
+    assert flow.numbers(SERVER) == list(range(200))
+    assert flow.world.network.lost > 0
+
+
+def test_frames_that_overtake_each_other_arrive_in_order() -> None:
+    flow = flowing(ring())
+    for cable in flow.world.cables.values():
+        cable.jitter_s = 0.005
+    flow.stream(200, 0.005, size=5_000)
+    assert flow.world.network.run(30, lambda: flow.has(SERVER, 200))
+    assert flow.numbers(SERVER) == list(range(200))
+
+
+def test_the_network_settles_with_loss_from_the_beginning() -> None:
+    world = World(ring5())
+    for cable in world.cables.values():
+        cable.loss = 0.1
+    assert world.settle(30)
+
+
+def test_a_dead_neighbour_is_let_go_after_its_silence() -> None:
+    world = ring()
+    world.network.stop("nuc3")
+    world.network.run(DEAD_S + 0.5)
+    assert all(n.name != world.identities["nuc3"].name for n in world.switches["nuc2"].greeter.all_up())
+
+
+def test_best_effort_over_loss_goes_on_without_what_is_lost() -> None:
+    flow = flowing(ring(), reliable=False)
+    for cable in flow.world.cables.values():
+        cable.loss = 0.05
+    flow.stream(200, 0.01, size=100)
+    flow.world.network.run(5)
+    numbers = flow.numbers(SERVER)
+    assert 100 < len(numbers) < 200
+    assert numbers == sorted(set(numbers))
+
+
+def test_both_directions_flow_at_once() -> None:
+    world = ring()
+    there = flowing(world, "/there")
+    back = flowing(world, "/back", SERVER, (ROBOT,))
+    there.stream(50, 0.01)
+    back.stream(50, 0.01)
+    assert world.network.run(5, lambda: there.has(SERVER, 50) and back.has(ROBOT, 50))

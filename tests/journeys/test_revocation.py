@@ -1,0 +1,105 @@
+"""A revoked certificate closes what it opened, in every tier, within a second."""
+
+from __future__ import annotations
+
+from gdp.crypto.statements import parse
+from gdp.errors import DropReason
+from gdp.frame.kinds import Kind
+from gdp.testbed.world import World
+from gdp.trust.delegation import Delegation
+from gdp.trust.revocation import Revocation
+from tests.journeys.flows import ROBOT, SERVER, Tap, flowing, ring
+
+HERE = "nuc3"  # where the operator hands the revocation in: neither end's domain
+WITHIN_S = 1.0
+
+
+def revoke(world: World, delegation: Delegation) -> None:
+    """Take a delegation's AdCert back, at one switch."""
+    fingerprint = parse(delegation.chain[-1]).fingerprint
+    until = int(world.network.now.unix_s) + 100_000
+    world.switches[HERE].revoke(world.owner.revoke(delegation.subject, fingerprint, until), world.network.now)
+    world.network.touch(HERE)
+
+
+def test_a_publisher_whose_delegation_is_revoked_is_gone_from_every_tier() -> None:
+    flow = flowing(ring())
+    world = flow.world
+    before = {label: host.rib.names for label, host in world.ribs.items()}
+    revoke(world, flow.topic.delegation)
+    world.network.run(WITHIN_S)
+    assert {label: host.rib.names for label, host in world.ribs.items()} == {k: n - 1 for k, n in before.items()}
+    assert not world.members[SERVER].feeds_of(flow.topic.name)
+    assert not any(switch.planter.trees.all() for switch in world.switches.values())
+
+
+def test_what_a_revoked_publisher_still_sends_reaches_nobody() -> None:
+    flow = flowing(ring())
+    revoke(flow.world, flow.topic.delegation)
+    flow.world.network.run(WITHIN_S)
+    flow.publish(b"too late")
+    flow.world.network.run(1)
+    assert not flow.has(SERVER, 1)
+
+
+def test_a_revoked_publisher_that_claims_again_is_refused() -> None:
+    flow = flowing(ring())
+    world = flow.world
+    revoke(world, flow.topic.delegation)
+    world.network.run(30)
+    assert world.switches["nuc1"].drops()[DropReason.REVOKED] > 0
+    assert not any(host.rib.names > 2 for host in world.ribs.values())
+
+
+def test_a_reader_whose_delegation_is_revoked_gets_no_frame_more() -> None:
+    flow = flowing(ring())
+    world = flow.world
+    reader = next(s for s in world.members[SERVER].subscribed() if s.name == flow.topic.name)
+    revoke(world, reader.delegation)
+    world.network.run(WITHIN_S)
+    tap = Tap("nuc1", "nuc2")
+    world.network.taps.append(tap)
+    flow.publish(b"not for you")
+    world.network.run(5)
+    assert tap.count(Kind.DATA) == 0
+    assert not flow.has(SERVER, 1)
+
+
+def test_another_reader_behind_the_same_link_reads_on_without_a_gap() -> None:
+    world = ring()
+    world.add_member("nuc4/other", "nuc4")
+    assert world.settle()
+    flow = flowing(world, readers=(SERVER, "nuc4/other"))
+    flow.stream(100, 0.05)
+    reader = next(s for s in world.members[SERVER].subscribed() if s.name == flow.topic.name)
+    world.network.call(1.0, lambda: revoke(world, reader.delegation))
+    assert world.network.run(10, lambda: flow.has("nuc4/other", 100))
+    assert flow.numbers("nuc4/other") == list(range(100))
+    assert len(flow.numbers(SERVER)) < 60
+
+
+def test_a_revoked_member_is_cut_off_by_its_switch() -> None:
+    flow = flowing(ring())
+    world = flow.world
+    authority = world.authorities["school"]
+    member = world.identities[ROBOT].member
+    wire = Revocation.make(
+        authority.key, authority.root.subject, member.fingerprint, int(world.network.now.unix_s) + 100_000
+    )
+    world.switches["nuc4"].revoke(wire, world.network.now)
+    world.network.touch("nuc4")
+    world.network.run(1.5)  # a hello, and the silence that follows it
+    assert world.ribs["backbone"].rib.names == 1
+    assert flow.member.name not in {each.name for each in world.switches["nuc1"].greeter.all_up()}
+
+
+def test_a_switch_that_was_away_learns_what_was_revoked_meanwhile() -> None:
+    flow = flowing(ring())
+    world = flow.world
+    world.network.stop("nuc1")
+    revoke(world, flow.topic.delegation)
+    world.network.run(2)
+    world.restart_switch("nuc1")
+    world.network.run(5)
+    assert world.switches["nuc1"].drops()[DropReason.REVOKED] > 0
+    assert not world.switches["nuc1"].attached.get(flow.topic.name, flow.member.name)
