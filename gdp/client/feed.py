@@ -39,7 +39,7 @@ __all__ = ["Delivered", "Feed", "FeedState", "Reader"]
 
 ANNOUNCE_S: Final = 0.1
 _READY_OVERHEAD_BYTES: Final = 256  # what a message that waits for others costs beside its bytes
-_WAITING: Final = Flag.RELIABLE | Flag.LATCHED  # topics whose readers wait for what is missing
+_WAITING: Final = int(Flag.RELIABLE | Flag.LATCHED)  # topics whose readers wait for what is missing
 
 
 class FeedState(Enum):
@@ -192,7 +192,7 @@ class Feed:
         if self.state is FeedState.LIVE and not 0 <= header.number - self._expected < REPLAY_WINDOW_MESSAGES:
             joiner.drops[DropReason.LATE if header.number < self._expected else DropReason.MEMORY_FULL] += 1
             return
-        seen, highest = joiner.new_parts, joiner.highest
+        seen, highest, refused = joiner.new_parts, joiner.highest, joiner.drops[DropReason.MEMORY_FULL]
         joined = joiner.add(header, frame, now_s)
         if joiner.new_parts > seen:
             if self._is_reliable is None:
@@ -201,6 +201,9 @@ class Feed:
             self._plan_report(header, highest, now_s)
         if joined is not None:
             self._arrange(joined)
+        elif joiner.drops[DropReason.MEMORY_FULL] > refused and self.state is FeedState.LIVE and self._ready:
+            self._skip_to(min(self._ready))  # what waits behind the gap leaves no room to fill it: go on without
+            self._deliver()
 
     def _arrange(self, joined: Joined) -> None:
         """Put a whole message where it belongs, and hand out what is next."""
@@ -214,7 +217,7 @@ class Feed:
             self._ready[joined.number] = joined
         elif self.state is FeedState.NEW:
             self._data.drops[DropReason.MEMORY_FULL] += 1
-        else:  # too much waits behind a gap: go on without what is missing
+        else:
             self._skip_to(joined.number)
             self._hand_out(joined)
             self._expected += 1

@@ -181,7 +181,7 @@ class Greeter:
         """Let silent neighbours go; return them."""
         changes: list[Change] = []
         for port in self.ports.values():
-            silent = [n for n in port.neighbours.values() if now_s - n.heard_s >= self._dead_s]
+            silent = [n for n in port.neighbours.values() if now_s >= n.heard_s + self._dead_s]
             if silent:
                 changes += self._lose(port, silent, NeighbourEvent.SILENCE)
         return changes

@@ -42,6 +42,7 @@ SOURCE_AT: Final = 64
 AAD_BYTES: Final = HEADER_BYTES - 1
 
 _HEADER: Final = struct.Struct("!BBBBHHQIIQ32s32s")
+_BEHIND_VERSION: Final = struct.Struct("!xBBBHHQIIQ32s32s")
 _ETHERTYPE: Final = ETHERTYPE.to_bytes(2, "big")
 assert _HEADER.size == HEADER_BYTES
 
@@ -75,20 +76,20 @@ def decode(frame: bytes | bytearray | memoryview, at: int = 0) -> Header:
     """
     if len(frame) - at < HEADER_BYTES:
         raise FrameError(DropReason.TRUNCATED, "header")
-    fields = _HEADER.unpack_from(frame, at)
-    header = Header._make(fields[1:])
-    if fields[0] != VERSION:
-        raise FrameError(DropReason.BAD_VERSION, str(fields[0]))
-    if len(frame) - at - HEADER_BYTES < header.length:
+    if frame[at] != VERSION:
+        raise FrameError(DropReason.BAD_VERSION, str(frame[at]))
+    header = Header._make(_BEHIND_VERSION.unpack_from(frame, at))
+    _, _, _, _, length, _, part, parts, _, _, _ = header
+    if len(frame) - at - HEADER_BYTES < length:
         raise FrameError(DropReason.TRUNCATED, "payload")
-    if not header.part < header.parts <= PARTS_MAX:
-        raise FrameError(DropReason.BAD_PARTS, f"{header.part} of {header.parts}")
+    if not part < parts <= PARTS_MAX:
+        raise FrameError(DropReason.BAD_PARTS, f"{part} of {parts}")
     return header
 
 
-def authenticated(header: bytes | bytearray | memoryview) -> bytes:
-    """Return the 95 bytes that a seal covers: a header without hops left, which switches change."""
-    return bytes(header[:HOPS_AT]) + bytes(header[HOPS_AT + 1 : HEADER_BYTES])
+def authenticated(header: bytes) -> bytes:
+    """Return the 95 bytes that a seal covers: a header (or a frame from it on) without hops left."""
+    return header[:HOPS_AT] + header[HOPS_AT + 1 : HEADER_BYTES]
 
 
 def ethernet(destination_mac: bytes, source_mac: bytes) -> bytes:

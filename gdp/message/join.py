@@ -115,7 +115,7 @@ class Joiner:
             self.drops[DropReason.LATE] += 1
             return None
         message = self._unfinished.get(number)
-        if message is not None and header.part in message.plain:
+        if message is not None and message.parts == header.parts and header.part in message.plain:
             self.drops[DropReason.DUPLICATE] += 1
             return None
         try:

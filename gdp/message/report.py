@@ -59,7 +59,7 @@ class Report(NamedTuple):
         if len(wire) < _HEAD.size:
             raise FrameError(DropReason.TRUNCATED, "report")
         flags, number, part, count = _HEAD.unpack_from(wire)
-        if count > NACKS_PER_REPORT or len(wire) != _HEAD.size + count * _RANGE.size or flags > 3:
+        if count > NACKS_PER_REPORT or len(wire) != _HEAD.size + count * _RANGE.size or flags > ReportFlag.BYE:
             raise FrameError(DropReason.MALFORMED, "report")
         ranges = tuple(Missing(*each) for each in _RANGE.iter_unpack(wire[_HEAD.size :]))
         return cls(ReportFlag(flags), number, part, ranges)

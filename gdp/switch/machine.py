@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 from gdp.control.frames import ControlJoiner, ControlSplitter
 from gdp.control.greeter import Change, Greeter, LinkPort
@@ -46,6 +47,8 @@ from gdp.trust.verifier import ClaimVerifier
 
 __all__ = ["Switch", "SwitchSettings"]
 
+_FOLLOW_S: Final = 0.005  # from the first news of links to new paths
+_FOLLOW_AGAIN_S: Final = 0.1  # ... and where news keep coming
 _CONTROL = frozenset(kind.value for kind in Kind if kind >= CONTROL_FROM)
 
 
@@ -101,6 +104,8 @@ class Switch:
             self._verifier, self.greeter, self.attached, self.planter, self.unicast, self._outbox
         )
         self._seen_version = -1
+        self._follow_at_s: float | None = None  # when paths are computed anew
+        self._followed_s = float("-inf")
         self.inquirer = Inquirer(
             identity, policy, self._paths, self.attached, self.places, self.parked, self.planter, self.unicast,
             self._outbox,
@@ -135,7 +140,7 @@ class Switch:
         """Learn that a port's link came or went."""
         for change in self.greeter.port_changed(port, up, now.mono_s):
             self._neighbour_changed(change, now.mono_s)
-        self._follow_links(now.mono_s)
+        self._follow_links(now.mono_s)  # at once: these frames would be lost
 
     def receive(self, arrivals: Sequence[Arrival], now: Instant) -> None:
         """Take frames that the data plane handed up."""
@@ -144,17 +149,21 @@ class Switch:
                 self._take(arrival, decode(arrival.frame), now)
             except RemoteError as error:
                 self._drops[error.reason] += 1
-        self._follow_links(now.mono_s)
+        self._plan_follow(now.mono_s)
 
     def timeout(self, now: Instant) -> None:
         """Do what is due."""
         now_s = now.mono_s
-        for change in self.greeter.expire(now_s):
+        lost = self.greeter.expire(now_s)
+        for change in lost:
             self._neighbour_changed(change, now_s)
         for hello in self.greeter.take(now_s):
             self._outbox.put(hello)
         self._flooding.timeout(now_s)
-        self._follow_links(now_s)
+        if lost or (self._follow_at_s is not None and self._follow_at_s <= now_s):
+            self._follow_links(now_s)
+        else:
+            self._plan_follow(now_s)
         self._joiner.expire(now_s)
         self._hellos.expire(now_s)
         self.parked.expire(now_s)
@@ -170,6 +179,7 @@ class Switch:
     def next_timeout(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         times = [
+            self._follow_at_s,
             self.greeter.next_timeout(),
             self._flooding.next_timeout(),
             self.parked.next_expiry(),
@@ -288,13 +298,24 @@ class Switch:
                     self.attached.remove(attachment.claim.name, neighbour.name)
                     self.unicast.forget(attachment.claim.name)
 
+    def _plan_follow(self, now_s: float) -> None:
+        """See that a change of the links is followed soon, together with those that come right behind it.
+
+        Link states come in bursts; the longest wait is that of OSPF's usual timers, the shortest hardly one.
+        """
+        if self._follow_at_s is None and self._flooding.link_states.version != self._seen_version:
+            is_quiet = now_s - self._followed_s >= _FOLLOW_AGAIN_S
+            self._follow_at_s = now_s + (_FOLLOW_S if is_quiet else _FOLLOW_AGAIN_S)
+
     def _follow_links(self, now_s: float) -> None:
         """Let everything that depends on paths follow a change of the links."""
+        self._follow_at_s = None
         version = self._flooding.link_states.version
         if version == self._seen_version:
             return
         self._flooding.neighbour_changed(now_s)  # what lies inside our domain may have moved
         self._seen_version = self._flooding.link_states.version
+        self._followed_s = now_s
         self.unicast.refresh(now_s)
         self.planter.reroute(now_s)
         self.inquirer.links_changed(now_s)

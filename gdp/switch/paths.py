@@ -101,10 +101,12 @@ class Paths:
     def _compute(self, allowed: frozenset[Name]) -> dict[Name, Way]:
         if self._me not in self._graph:
             return {}
-        through = [n for n in self._graph if self._domains.get(n) in allowed or self._domains.get(n) == self._domain]
-        graph = self._graph.subgraph(through)
-        distances = nx.single_source_dijkstra_path_length(graph, self._me)
-        routes = nx.single_source_dijkstra_path(graph, self._me)
+        open_ = {name for name, domain in self._domains.items() if domain in allowed or domain == self._domain}
+
+        def cost(_from: Name, to: Name, edge: dict[str, int]) -> int | None:
+            return edge["weight"] if to in open_ else None  # None hides an edge
+
+        distances, routes = nx.single_source_dijkstra(self._graph, self._me, weight=cost)
         return {to: Way(route[1], int(distances[to])) for to, route in routes.items() if len(route) > 1}
 
     def _refresh(self) -> None:
@@ -119,13 +121,14 @@ class Paths:
         for state in [*home, *(each for each in borders if each.domain != self._domain)]:
             for rib in state.ribs:
                 self._ribs.setdefault(rib, set()).add(state.origin)
-        self._graph = _graph([*home, *borders])
+        self._graph = _graph([*home, *borders], self._domain)
 
 
-def _graph(states: Iterable[LinkState]) -> nx.DiGraph[Name]:
+def _graph(states: Iterable[LinkState], home: Name) -> nx.DiGraph[Name]:
+    """Return the links; of other domains also the ways between their borders, which hide what lies inside."""
     cost: dict[tuple[Name, Name], int] = {}
     for state in states:
-        for link in [*state.links, *state.inside]:
+        for link in state.links if state.domain == home else [*state.links, *state.inside]:
             edge = (state.origin, link.name)
             cost[edge] = min(cost.get(edge, link.cost), link.cost)
     graph: nx.DiGraph[Name] = nx.DiGraph()

@@ -234,15 +234,15 @@ class Planter:
         above = self._above(tree)
         if (None if above is None else above[:2]) == tree.above:
             return False
-        self._leave(tree)
         self._ask_above(tree, now_s)
         return True
 
     def _ask_above(self, tree: Tree, now_s: float) -> None:
         above = self._above(tree)
         tree.renew_at_s = now_s + JOIN_REFRESH_S
+        if (None if above is None else above[:2]) != tree.above:
+            self._leave(tree)
         if above is None:
-            tree.above = tree.above_name = None
             return
         tree.above, tree.above_name = above[:2], above[2]
         mtu = min(tree.mtu, self._outbox.mtu_of(above[0]))

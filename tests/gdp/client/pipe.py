@@ -22,7 +22,9 @@ SECRETS: Secrets = {1: b"1" * 32}
 DELAY_S = 0.002
 
 
-def publisher_of(*, incarnation: int = 1, secrets: Secrets = SECRETS, reliable: bool = True, depth: int = 0) -> Publisher:
+def publisher_of(
+    *, incarnation: int = 1, secrets: Secrets = SECRETS, reliable: bool = True, depth: int = 0
+) -> Publisher:
     source = Source(Name(b"p" * 32), incarnation, WRITER)
     publisher = Publisher(TOPIC, source, secrets, b"what it is", reliable=reliable, depth=depth)
     publisher.tree_stands(1500)

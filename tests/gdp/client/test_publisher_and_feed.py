@@ -24,19 +24,19 @@ def test_a_reliable_topic_arrives_complete_and_in_order_whatever_is_lost(loss: f
     end = pipe.join(b"a", loss=loss)
     assert pipe.run(30.0, lambda: end.feed.state is FeedState.LIVE)
     pipe.publish(MESSAGES)
-    assert pipe.run(120.0, lambda: pipe.publisher.is_acknowledged())
+    assert pipe.run(120.0, pipe.publisher.is_acknowledged)
     assert end.messages == MESSAGES
     assert end.feed.lost == 0
 
 
-def test_messages_published_as_soon_as_the_publisher_knows_a_reader_are_not_lost_with_the_first_status() -> None:
-    for seed in range(20):
-        pipe = Pipe(publisher_of(), seed=seed)
-        end = pipe.join(b"a", loss=0.4)
-        assert pipe.run(30.0, lambda: pipe.publisher.readers == 1)
-        pipe.publish(MESSAGES[:10])
-        assert pipe.run(60.0, lambda: len(end.delivered) == 10)
-        assert end.messages == MESSAGES[:10]
+@pytest.mark.parametrize("seed", range(20))
+def test_messages_published_as_soon_as_a_reader_is_known_are_not_lost_with_the_first_status(seed: int) -> None:
+    pipe = Pipe(publisher_of(), seed=seed)
+    end = pipe.join(b"a", loss=0.4)
+    assert pipe.run(30.0, lambda: pipe.publisher.readers == 1)
+    pipe.publish(MESSAGES[:10])
+    assert pipe.run(60.0, lambda: len(end.delivered) == 10)
+    assert end.messages == MESSAGES[:10]
 
 
 def test_a_large_message_arrives_over_a_path_that_loses_a_tenth() -> None:
@@ -44,7 +44,7 @@ def test_a_large_message_arrives_over_a_path_that_loses_a_tenth() -> None:
     end = pipe.join(b"a", loss=0.1)
     pipe.run(1.0, lambda: end.feed.state is FeedState.LIVE)
     pipe.publish([b"x" * 921_600])
-    assert pipe.run(60.0, lambda: pipe.publisher.is_acknowledged())
+    assert pipe.run(60.0, pipe.publisher.is_acknowledged)
     assert [len(each) for each in end.messages] == [921_600]
 
 
@@ -166,7 +166,7 @@ def test_a_reader_that_starts_again_is_welcome_and_its_old_notes_are_not() -> No
     pipe.publish([b"two"])
     second.loss = 0.5
     pipe.publish([b"three"] * 20)
-    assert pipe.run(30.0, lambda: pipe.publisher.is_acknowledged())
+    assert pipe.run(30.0, pipe.publisher.is_acknowledged)
     assert first.messages == [b"one"]
     assert second.messages == [b"two"] + [b"three"] * 20
 
@@ -218,7 +218,7 @@ def test_an_older_epoch_still_opens_and_an_unknown_one_is_counted() -> None:
     pipe = Pipe(publisher_of(secrets=SECRETS))
     end = pipe.join(b"a", secrets=SECRETS)
     pipe.run(1.0)
-    end.feed._secrets = reader_has  # type: ignore[assignment]
+    end.feed._secrets = reader_has
     pipe.publish([b"old key"])
     pipe.run(1.0)
     assert end.messages == [b"old key"]
@@ -238,7 +238,7 @@ def test_nothing_of_the_plaintext_stands_in_any_frame() -> None:
     pipe.run(1.0, lambda: end.feed.state is FeedState.LIVE)
     secret_text = b"the robot stands in room 217 "
     pipe.publish([secret_text * 300])
-    assert pipe.run(30.0, lambda: pipe.publisher.is_acknowledged())
+    assert pipe.run(30.0, pipe.publisher.is_acknowledged)
     seen = b"\0".join(pipe.seen)
     assert len(seen) > 300 * len(secret_text)
     pieces = {secret_text[at : at + 6] for at in range(len(secret_text) - 6)} | {b"what it is"}

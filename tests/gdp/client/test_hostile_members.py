@@ -1,0 +1,189 @@
+"""Members of a topic that mean harm: they hold its secret, and must neither stall nor flood the others."""
+
+from __future__ import annotations
+
+from itertools import count
+
+from gdp.client.feed import FeedState
+from gdp.crypto.envelope import Sealer, Signer
+from gdp.crypto.keys import SigningKey
+from gdp.crypto.note import NoteSealer
+from gdp.errors import DropReason
+from gdp.frame.codec import decode
+from gdp.frame.kinds import Flag, Kind
+from gdp.limits import JOIN_PATIENCE_S, JOIN_SOURCE_BYTES, JOIN_TOTAL_BYTES, NACKS_PER_REPORT
+from gdp.message.report import Missing, Report, ReportFlag
+from gdp.message.status import Status
+from gdp.names import Name
+from tests.gdp.client.pipe import SECRETS, TOPIC, WRITER, End, Pipe, publisher_of
+
+PUBLISHER = Name(b"p" * 32)
+MALLORY = SigningKey.generate()
+
+
+def forge(
+    number: int, message: bytes, *, kind: Kind = Kind.DATA, signer: Signer = MALLORY, mtu: int = 1500
+) -> list[bytes]:
+    """Return what a reader can make: parts that open, under a signature that is not the writer's."""
+    return Sealer(SECRETS[1], 1, kind, PUBLISHER, 1, TOPIC, signer).seal(number, Flag.RELIABLE, message, mtu)
+
+
+def give(pipe: Pipe, end: End, frames: list[bytes]) -> None:
+    for frame in frames:
+        end.feed.receive(decode(frame), frame, pipe.now_s)
+
+
+def notes_of(name: bytes, reports: list[Report]) -> list[bytes]:
+    sealer = NoteSealer(SECRETS[1], 1, Kind.REPORT, name, 5, PUBLISHER, TOPIC, 1, count(1))
+    return [sealer.seal(report.to_wire()) for report in reports]
+
+
+def hello_of(name: bytes) -> bytes:
+    return notes_of(name, [Report(ReportFlag.NEW, 0, 0, ())])[0]
+
+
+def live() -> tuple[Pipe, End]:
+    pipe = Pipe(publisher_of())
+    end = pipe.join(b"a")
+    assert pipe.run(2.0, lambda: end.feed.state is FeedState.LIVE)
+    return pipe, end
+
+
+def test_forged_parts_under_the_next_number_delay_a_reliable_message_but_do_not_lose_it() -> None:
+    pipe, end = live()
+    give(pipe, end, forge(1, bytes(50_000))[:5])
+    pipe.publish([b"r" * 9_000, b"s"])
+    assert pipe.run(JOIN_PATIENCE_S + 2.0, pipe.publisher.is_acknowledged)
+    assert end.messages == [b"r" * 9_000, b"s"]
+
+
+def test_a_forged_part_far_ahead_does_not_make_a_reader_ask_for_ever() -> None:
+    pipe, end = live()
+    give(pipe, end, forge(10_000, bytes(5_000))[:1])
+    pipe.run(JOIN_PATIENCE_S + 1.0)
+    pipe.seen.clear()
+    pipe.run(10.0)
+    assert len(pipe.seen) < 15
+    pipe.publish([b"real"])
+    assert pipe.run(1.0, lambda: end.messages == [b"real"])
+
+
+def test_absurd_numbers_before_the_first_status_do_not_stop_a_feed() -> None:
+    pipe = Pipe(publisher_of())
+    end = pipe.join(b"a")
+    end.mute = True
+    give(pipe, end, forge(1 << 63, b"x", signer=WRITER))
+    give(pipe, end, forge((1 << 63) + 1, bytes(5_000))[:1])
+    give(pipe, end, forge((1 << 63) + 1, bytes(5_000), kind=Kind.STATUS)[:1])
+    pipe.run(JOIN_PATIENCE_S + 1.0)
+    end.mute = False
+    pipe.run(1.0)
+    pipe.publish([b"one", b"two"])
+    assert pipe.run(2.0, lambda: end.messages == [b"one", b"two"])
+    assert end.feed.lost == 0
+
+
+def test_messages_that_come_before_the_first_status_are_kept_within_bounds() -> None:
+    pipe = Pipe(publisher_of())
+    end = pipe.join(b"a")
+    sealer = Sealer(SECRETS[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, WRITER)
+    for number in range(1, 80):
+        give(pipe, end, sealer.seal(number, Flag.RELIABLE, bytes(1 << 20), 65_000))
+        assert end.budget.held_bytes <= JOIN_SOURCE_BYTES
+    assert end.feed.drops[DropReason.MEMORY_FULL] > 0
+    end.feed.close()
+    assert end.budget.held_bytes == 0
+
+
+def test_messages_behind_a_gap_that_is_never_filled_are_kept_within_bounds() -> None:
+    pipe, end = live()
+    sealer = Sealer(SECRETS[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, WRITER)
+    for number in range(2, 80):
+        give(pipe, end, sealer.seal(number, Flag.RELIABLE, bytes(1 << 20), 65_000))
+        assert end.budget.held_bytes <= JOIN_TOTAL_BYTES
+    assert [each.number for each in end.feed.take_delivered()][:3] == [2, 3, 4]
+    assert end.feed.lost == 1
+
+
+def test_a_status_of_giant_numbers_costs_a_report_of_the_usual_size() -> None:
+    pipe, end = live()
+    status = Status(0, (1 << 64) - 1, {}, b"").to_wire()
+    give(pipe, end, forge(500, status, kind=Kind.STATUS, signer=WRITER))
+    report = end.feed.take_report(pipe.now_s)
+    assert report is not None
+    assert len(report) < 3_000
+    pipe.publish([b"still here"])
+    assert pipe.run(1.0, lambda: end.messages == [b"still here"])
+
+
+def test_a_status_whose_oldest_is_giant_ends_its_own_feed_and_no_more() -> None:
+    pipe, end = live()
+    status = Status((1 << 64) - 2, (1 << 64) - 1, {}, b"").to_wire()
+    give(pipe, end, forge(500, status, kind=Kind.STATUS, signer=WRITER))
+    pipe.publish([b"x"])
+    pipe.run(2.0)
+    assert end.messages == []
+    assert end.feed.drops[DropReason.LATE] > 0
+
+
+def test_a_signed_status_that_makes_no_sense_is_counted() -> None:
+    pipe, end = live()
+    give(pipe, end, forge(500, b"\xff" * 40, kind=Kind.STATUS, signer=WRITER))
+    assert end.feed.drops[DropReason.MALFORMED] == 1
+
+
+def test_a_reader_that_asks_for_everything_again_and_again_gets_a_flight_in_a_round_trip() -> None:
+    pipe = Pipe(publisher_of(depth=40))
+    honest = pipe.join(b"a")
+    pipe.run(1.0)
+    pipe.publish([bytes(500_000)] * 40)
+    assert pipe.run(30.0, lambda: len(honest.delivered) == 40)
+    everything = tuple(Missing(number, 0, 0xFFFF_FFFF) for number in range(1, NACKS_PER_REPORT))
+    greedy = [Report(ReportFlag.NEW, 0, 0, ())] + [Report(ReportFlag.NONE, 1, 0, everything)] * 400
+    sent = asked = 0
+    begun_s = pipe.now_s
+    for note in notes_of(b"m" * 32, greedy):
+        asked += len(note)
+        pipe.publisher.receive_report(decode(note), note, pipe.now_s)
+        sent += sum(map(len, pipe.publisher.take(pipe.now_s)))
+        pipe.now_s += 0.0001
+    rounds = (pipe.now_s - begun_s) / 0.01 + 1
+    assert sent <= rounds * (4 << 20)
+    assert sent < asked * 25  # unbounded it would be 20 MB for each of 400 reports
+
+
+def test_readers_that_say_they_are_new_again_and_again_get_one_status_in_a_while() -> None:
+    pipe, _ = live()
+    sent = []
+    for note in notes_of(b"m" * 32, [Report(ReportFlag.NEW, 0, 0, ())] * 1_000):
+        pipe.publisher.receive_report(decode(note), note, pipe.now_s)
+        sent += pipe.publisher.take(pipe.now_s)
+    assert len(sent) <= 1
+
+
+def test_more_names_than_the_publisher_takes_are_refused() -> None:
+    pipe, end = live()
+    for at in range(1_100):
+        note = hello_of(at.to_bytes(32, "big"))
+        pipe.publisher.receive_report(decode(note), note, pipe.now_s)
+    assert pipe.publisher.readers == 1_024
+    assert pipe.publisher.drops[DropReason.QUOTA] == 77
+    pipe.publish([b"goes on"])
+    assert pipe.run(10.0, lambda: end.messages == [b"goes on"])
+
+
+def test_what_an_outsider_sends_leaves_nothing_behind() -> None:
+    pipe, end = live()
+    strange = {1: b"?" * 32}
+    sealer = Sealer(strange[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, MALLORY)
+    held = end.budget.held_bytes
+    for number in range(1, 200):
+        give(pipe, end, sealer.seal(number, Flag.RELIABLE, bytes(3_000), 1500))
+    assert end.budget.held_bytes == held
+    assert end.feed.drops == {DropReason.BAD_TAG: 3 * 199}
+    for at in range(50):
+        name = at.to_bytes(32, "big")
+        note = NoteSealer(strange[1], 1, Kind.REPORT, name, 5, PUBLISHER, TOPIC, 1, count(1)).seal(b"x")
+        pipe.publisher.receive_report(decode(note), note, pipe.now_s)
+    assert pipe.publisher.readers == 1
+    assert pipe.publisher.drops == {DropReason.BAD_TAG: 50}

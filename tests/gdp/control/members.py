@@ -1,0 +1,49 @@
+"""Nodes of two domains that trust each other and of one that nobody trusts, for tests of the control plane."""
+
+from __future__ import annotations
+
+from gdp.control.frames import ControlSplitter
+from gdp.control.greeter import Greeter
+from gdp.crypto.certificates import Role
+from gdp.crypto.identity import Identity, NodeKeys
+from gdp.crypto.issuing import DomainAuthority
+from gdp.crypto.keys import SigningKey
+from gdp.crypto.validity import Validity
+from gdp.effects import Instant
+from gdp.trust.domain import Policy
+
+UNIX_S = 1_800_000_000
+YEAR = Validity(UNIX_S - 31_536_000, UNIX_S + 31_536_000)
+
+SCHOOL = DomainAuthority.found("school", SigningKey.generate(), YEAR)
+CLOUD = DomainAuthority.found("cloud", SigningKey.generate(), YEAR)
+ELSEWHERE = DomainAuthority.found("elsewhere", SigningKey.generate(), YEAR)
+POLICY = Policy(SCHOOL.root, [CLOUD.root])
+
+
+def node(label: str, role: Role = Role.SWITCH, domain: DomainAuthority = SCHOOL, validity: Validity = YEAR) -> Identity:
+    """Return a new node of a domain."""
+    return NodeKeys.generate(role, label).join(domain, validity)
+
+
+def at(mono_s: float, unix_s: float = UNIX_S) -> Instant:
+    """Return a moment."""
+    return Instant(mono_s, unix_s)
+
+
+class Nonces:
+    """A source of bytes that never gives the same twice."""
+
+    def __init__(self, salt: int) -> None:
+        self._next = salt << 32
+
+    def __call__(self, size: int) -> bytes:
+        self._next += 1
+        return self._next.to_bytes(size, "big")
+
+
+def greeter(identity: Identity, salt: int, policy: Policy = POLICY) -> Greeter:
+    """Return a greeter with one port, numbered 0."""
+    made = Greeter(identity, policy, ControlSplitter(identity.name, salt), Nonces(salt))
+    made.add_port(0, bytes([2, salt, 0, 0, 0, 0]), 1_500, 10, 0.0)
+    return made

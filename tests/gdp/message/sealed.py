@@ -1,0 +1,44 @@
+"""Sealed messages of one writer, and a joiner for them."""
+
+from __future__ import annotations
+
+from gdp.crypto.envelope import Opener, Sealer, Signer
+from gdp.crypto.keys import SigningKey
+from gdp.errors import DropReason, EnvelopeError
+from gdp.frame.codec import decode
+from gdp.frame.kinds import Kind
+from gdp.limits import JOIN_PATIENCE_S
+from gdp.message.join import Joined, Joiner
+from gdp.message.memory import Budget
+
+SECRET = b"s" * 32
+SOURCE = b"p" * 32
+TOPIC = b"t" * 32
+INCARNATION = 9
+WRITER = SigningKey.generate()
+OTHER = SigningKey.generate()
+MTU = 300  # room for 188 bytes in a part
+
+
+def seal(
+    number: int, message: bytes, *, signer: Signer = WRITER, mtu: int = MTU, secret: bytes = SECRET
+) -> list[bytes]:
+    return Sealer(secret, 1, Kind.DATA, SOURCE, INCARNATION, TOPIC, signer).seal(number, 0, message, mtu)
+
+
+def opener_of(epoch: int) -> Opener:
+    if epoch != 1:
+        raise EnvelopeError(DropReason.UNKNOWN_EPOCH)
+    return Opener(SECRET, Kind.DATA, SOURCE, INCARNATION, TOPIC)
+
+
+def joiner(budget: Budget | None = None, patience_s: float = JOIN_PATIENCE_S) -> Joiner:
+    return Joiner(SOURCE, opener_of, WRITER.public, budget or Budget(), patience_s=patience_s)
+
+
+def add(to: Joiner, frame: bytes, now_s: float = 0.0) -> Joined | None:
+    return to.add(decode(frame), frame, now_s)
+
+
+def add_all(to: Joiner, frames: list[bytes], now_s: float = 0.0) -> list[Joined]:
+    return [joined for frame in frames if (joined := add(to, frame, now_s)) is not None]

@@ -1,0 +1,282 @@
+"""What a publisher keeps, has under way, and sends again."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+
+from gdp.limits import (
+    FLIGHT_MAX_BYTES,
+    FLIGHT_MESSAGES_MAX,
+    FLIGHT_MIN_BYTES,
+    FLIGHT_START_BYTES,
+    NACKS_PER_REPORT,
+    PROBE_MAX_S,
+    READER_LEASE_S,
+)
+from gdp.message.report import Missing, Report, ReportFlag
+from gdp.message.window import SendWindow
+
+A, B = b"a" * 32, b"b" * 32
+PART = 1_000
+
+
+def message(number: int, parts: int) -> list[bytes]:
+    return [number.to_bytes(4, "big") + part.to_bytes(4, "big") + bytes(PART - 8) for part in range(parts)]
+
+
+def window_of(messages: int, parts: int, readers: tuple[bytes, ...] = (A,), keep_last: int = 0) -> SendWindow:
+    window = SendWindow(keep_last)
+    for reader in readers:
+        window.add_reader(reader, 1, 0.0)
+    for number in range(1, messages + 1):
+        window.add(number, message(number, parts))
+    return window
+
+
+def has(number: int, part: int = 0, missing: tuple[Missing, ...] = ()) -> Report:
+    return Report(ReportFlag.NONE, number, part, missing)
+
+
+def size(frames: list[bytes]) -> int:
+    return sum(map(len, frames))
+
+
+def test_no_more_than_the_flight_is_under_way() -> None:
+    window = window_of(20, 100)
+    sent = size(window.take(0.0))
+    assert FLIGHT_START_BYTES - PART < sent <= FLIGHT_START_BYTES + PART
+    assert window.take(1.0) == []
+
+
+def test_what_goes_out_is_every_frame_once_and_in_order() -> None:
+    window = window_of(30, 40)
+    sent: list[bytes] = []
+    now_s = 0.0
+    while not window.is_acknowledged():
+        frames = window.take(now_s)
+        sent += frames
+        now_s += 0.01
+        at, part = divmod(len(sent), 40)
+        window.report(A, has(at + 1, part), now_s)
+    assert sent == [frame for number in range(1, 31) for frame in message(number, 40)]
+    assert window.oldest is None
+    assert window.kept_bytes == 0
+
+
+def test_the_flight_grows_with_what_is_confirmed_up_to_its_bound() -> None:
+    window = window_of(200, 100)
+    seen = [window.flight_bytes]
+    sent = 0
+    for turn in range(1_000):
+        sent += len(window.take(turn / 100))
+        window.report(A, has(sent // 100 + 1, sent % 100), turn / 100 + 0.005)
+        seen.append(window.flight_bytes)
+    assert all(later >= earlier for earlier, later in pairwise(seen))
+    assert seen[1] == 2 * FLIGHT_START_BYTES or seen[1] > FLIGHT_START_BYTES
+    assert FLIGHT_START_BYTES < seen[-1] <= FLIGHT_MAX_BYTES
+
+
+def test_a_loss_halves_the_flight_once_in_a_round_trip_and_never_below_its_bound() -> None:
+    window = window_of(20, 100)
+    window.take(0.0)
+    window.report(A, has(1, 0, (Missing(1, 3, 3),)), 1.0)
+    assert window.flight_bytes == max(FLIGHT_START_BYTES // 2, FLIGHT_MIN_BYTES)
+    window.take(1.0)
+    window.report(A, has(1, 0, (Missing(1, 5, 5),)), 1.001)
+    assert window.flight_bytes >= FLIGHT_MIN_BYTES
+    for turn in range(2, 20):
+        window.report(A, has(1, 0, (Missing(1, turn, turn),)), float(turn))
+    assert window.flight_bytes == FLIGHT_MIN_BYTES
+
+
+def test_a_missing_part_is_sent_again_before_anything_new() -> None:
+    window = window_of(20, 100)
+    window.take(0.0)
+    window.report(A, has(1, 2, (Missing(1, 2, 3), Missing(2, 7, 7))), 0.1)
+    frames = window.take(0.1)
+    assert frames[:3] == [message(1, 100)[2], message(1, 100)[3], message(2, 100)[7]]
+    assert window.repairs == 3
+
+
+def test_a_part_is_not_repaired_twice_in_a_round_trip() -> None:
+    window = window_of(1, 100)
+    window.take(0.0)
+    for at in range(10):
+        window.report(A, has(1, 2, (Missing(1, 2, 2),)), 0.1 + at * 0.0001)
+        window.take(0.1 + at * 0.0001)
+    assert window.repairs == 1
+    window.report(A, has(1, 2, (Missing(1, 2, 2),)), 1.0)
+    window.take(1.0)
+    assert window.repairs == 2
+
+
+def test_what_was_never_sent_is_no_repair() -> None:
+    window = window_of(20, 100)
+    sent = len(window.take(0.0, limit=10))
+    window.report(A, has(1, 0, (Missing(1, 0, 0xFFFF_FFFF), Missing(9, 0, 5), Missing(1 << 63, 0, 5))), 0.1)
+    assert sent == 10
+    window.take(0.1)
+    assert window.repairs == 10
+
+
+def test_all_readers_together_get_one_flight_of_repairs_in_a_round_trip() -> None:
+    readers = tuple(bytes([at]) * 32 for at in range(1, 30))
+    window = SendWindow()
+    for reader in readers:
+        window.add_reader(reader, 1, 0.0)
+    sent = 0
+    for number in range(1, 41):
+        window.add(number, message(number, 1_000))
+        sent += len(window.take(0.0))
+        for reader in readers[1:]:
+            window.report(reader, has(number, 999), 0.0)
+    everything = tuple(Missing(1 + at % 40, 0, 0xFFFF_FFFF) for at in range(NACKS_PER_REPORT))
+    before = window.repairs
+    flight = window.flight_bytes
+    for reader in readers:
+        for at in range(20):
+            window.report(reader, has(1, 0, everything), 10.0 + at * 0.0001)
+            window.take(10.0 + at * 0.0001)
+    assert 0 < (window.repairs - before) * PART <= flight + PART
+
+
+def test_no_more_parts_are_looked_at_for_one_report_than_a_flight_of_small_frames_has() -> None:
+    window = SendWindow()
+    window.add_reader(A, 1, 0.0)
+    window.add(1, [bytes(10)] * 20_000)
+    assert len(window.take(0.0)) == 20_000
+    absurd = tuple(Missing(1, 0, 0xFFFF_FFFF) for _ in range(NACKS_PER_REPORT))
+    for at in range(3):  # the second and third look only at what the first has queued
+        window.report(A, has(1, 0, absurd), 0.1 + at * 1e-6)
+    assert len(window.take(0.2)) == 8_192
+
+
+def test_a_reader_that_claims_what_was_not_sent_takes_nothing_from_another() -> None:
+    window = window_of(20, 100, (A, B))
+    window.take(0.0)
+    window.report(A, has((1 << 64) - 1, 0xFFFF_FFFF), 0.1)
+    assert window.oldest == 1
+    assert not window.is_acknowledged()
+    assert window.acknowledged == 0
+
+
+def test_a_reader_that_claims_what_was_not_sent_does_not_make_it_unsent() -> None:
+    window = window_of(5, 100)
+    sent = window.take(0.0)
+    window.report(A, has((1 << 64) - 1), 0.1)
+    sent += window.take(0.1)
+    assert sent == [frame for number in range(1, 6) for frame in message(number, 100)]
+
+
+def test_the_slowest_reader_holds_the_window() -> None:
+    window = window_of(2, 10, (A, B))
+    window.take(0.0)
+    window.report(A, has(3), 0.1)
+    assert window.oldest == 1
+    window.report(B, has(2), 0.1)
+    assert window.oldest == 2
+    assert window.acknowledged == 1
+
+
+def test_a_reader_that_leaves_holds_nothing_any_more() -> None:
+    window = window_of(2, 10, (A, B))
+    window.take(0.0)
+    window.report(A, has(3), 0.1)
+    window.drop_reader(B)
+    assert window.is_acknowledged()
+    assert window.oldest is None
+
+
+def test_the_last_messages_are_kept_for_late_joiners() -> None:
+    window = window_of(10, 3, keep_last=4)
+    window.take(0.0)
+    window.report(A, has(11), 0.1)
+    assert window.oldest == 7
+    window.drop_reader(A)
+    assert window.oldest == 7
+
+
+def test_a_full_window_says_so_and_lets_the_oldest_go_at_twice_its_budget() -> None:
+    window = SendWindow(budget_bytes=10 * PART)
+    window.add_reader(A, 1, 0.0)
+    for number in range(1, 11):
+        assert window.has_room()
+        window.add(number, message(number, 1))
+    assert not window.has_room()
+    for number in range(11, 26):
+        window.add(number, message(number, 1))
+    assert window.let_go == 5
+    assert window.kept_bytes <= 20 * PART
+    assert window.oldest == 6
+
+
+def test_numbers_under_way_stay_within_the_readers_replay_window() -> None:
+    window = SendWindow()
+    window.add_reader(A, 1, 0.0)
+    for number in range(1, FLIGHT_MESSAGES_MAX + 500):
+        window.add(number, [b"x" * 10])
+    assert len(window.take(0.0)) == FLIGHT_MESSAGES_MAX
+
+
+def test_probes_come_when_readers_are_silent_and_back_off() -> None:
+    window = window_of(1, 10)
+    assert window.next_probe() is None
+    window.take(5.0)
+    times = []
+    now_s = 5.0
+    for _ in range(10):
+        due_s = window.next_probe()
+        assert due_s is not None
+        assert not window.probe_due(due_s - 0.001)
+        assert window.probe_due(due_s)
+        times.append(due_s - now_s)
+        now_s = due_s
+    assert times == sorted(times)
+    assert times[-1] == pytest.approx(PROBE_MAX_S)
+    window.report(A, has(2), now_s)
+    assert window.next_probe() is None
+
+
+def test_a_reader_that_does_not_move_for_its_lease_is_a_laggard() -> None:
+    window = window_of(1, 10, (A, B))
+    window.take(0.0)
+    window.report(A, has(2), 0.1)
+    for at in range(1, 6):
+        window.report(B, has(1), float(at))
+    assert window.laggards(READER_LEASE_S - 0.1) == []
+    assert window.laggards(READER_LEASE_S + 0.2) == [B]
+
+
+def test_a_reader_that_moves_too_slowly_is_a_laggard_only_where_others_wait_for_it() -> None:
+    for readers, expected in (((A, B), [B]), ((B,), [])):
+        window = window_of(1, 200, readers)
+        window.take(0.0)
+        if A in readers:
+            window.report(A, has(2), 0.1)
+        for at in range(1, 10):
+            window.report(B, has(1, at), float(at))
+        assert window.laggards(9.0) == expected
+
+
+def test_a_reader_that_owed_nothing_for_long_is_no_laggard_when_something_new_goes_out() -> None:
+    window = window_of(1, 10)
+    window.take(0.0)
+    window.report(A, has(2), 0.1)
+    window.add(2, message(2, 10))
+    window.take(1_000.0)
+    assert window.laggards(1_000.1) == []
+    assert window.laggards(1_000.1 + READER_LEASE_S) == [A]
+
+
+def test_a_newcomer_begins_at_its_message() -> None:
+    window = window_of(3, 10, keep_last=3)
+    window.take(0.0)
+    window.report(A, has(4), 0.1)
+    window.add_reader(B, 2, 0.2)
+    assert not window.is_acknowledged()
+    window.report(B, has(2, 0, (Missing(2, 0, 0xFFFF_FFFF), Missing(3, 0, 0xFFFF_FFFF))), 0.3)
+    assert window.take(0.3) == message(2, 10) + message(3, 10)
+    window.report(B, has(4), 0.4)
+    assert window.is_acknowledged()

@@ -1,0 +1,55 @@
+"""Reports and statuses on the wire."""
+
+from __future__ import annotations
+
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from gdp.errors import FrameError
+from gdp.limits import NACKS_PER_REPORT
+from gdp.message.report import Missing, Report, ReportFlag
+from gdp.message.status import STARTS_MAX, Status
+
+U64 = st.integers(0, (1 << 64) - 1)
+U32 = st.integers(0, (1 << 32) - 1)
+MISSING = st.lists(st.builds(Missing, U64, U32, U32), max_size=NACKS_PER_REPORT).map(tuple)
+REPORTS = st.builds(Report, st.sampled_from([ReportFlag.NONE, ReportFlag.NEW, ReportFlag.BYE]), U64, U32, MISSING)
+STARTS = st.dictionaries(st.binary(min_size=32, max_size=32), U64, max_size=STARTS_MAX)
+
+
+@given(REPORTS)
+def test_a_report_comes_back_as_it_was(report: Report) -> None:
+    assert Report.from_wire(report.to_wire()) == report
+
+
+@given(U64, U64, STARTS, st.binary(max_size=100))
+def test_a_status_comes_back_as_it_was(one: int, other: int, starts: dict[bytes, int], description: bytes) -> None:
+    status = Status(min(one, other), max(one, other), starts, description)
+    assert Status.from_wire(status.to_wire()) == status
+
+
+@given(st.binary(max_size=200))
+@example(b"")
+@example(bytes(13) + b"\xff\xff")
+def test_arbitrary_bytes_are_a_report_or_a_frame_error(wire: bytes) -> None:
+    try:
+        report = Report.from_wire(wire)
+    except FrameError:
+        return
+    assert report.to_wire() == wire
+
+
+@given(st.binary(max_size=200))
+@example(bytes(16) + b"\xff\xff")
+def test_arbitrary_bytes_are_a_status_or_a_frame_error(wire: bytes) -> None:
+    try:
+        status = Status.from_wire(wire)
+    except FrameError:
+        return
+    assert status.oldest <= status.next_number
+    assert len(status.starts) <= STARTS_MAX
+
+
+def test_ranges_beyond_the_limit_wait_for_the_next_report() -> None:
+    ranges = tuple(Missing(number, 0, 1) for number in range(NACKS_PER_REPORT + 10))
+    assert Report.from_wire(Report(ReportFlag.NONE, 0, 0, ranges).to_wire()).missing == ranges[:NACKS_PER_REPORT]

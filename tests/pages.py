@@ -1,0 +1,85 @@
+"""The pages for people, as tests read them: code blocks, tables, links, and the commands that they show."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PAGES = (ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "gdp/frame/spec.md")
+
+_FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_LINK = re.compile(r"\]\(([^)\s]+)\)")
+_HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
+_WRAPPED = re.compile(r"\\\n\s*")
+_PROGRAM = re.compile(r"(?:gdp(?:-\w+)?|scripts/\w+\.(?:sh|py)|scripts/bench/\w+\.py)\Z")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A code block; ``title`` is its first line where that is a comment, such as ``on the robot``."""
+
+    page: Path
+    language: str
+    text: str
+
+    @property
+    def title(self) -> str:
+        first = self.text.partition("\n")[0]
+        return first[2:] if first.startswith("# ") else ""
+
+    @property
+    def lines(self) -> list[str]:
+        """Command lines, each whole, without comments between them; a loop is one."""
+        found: list[str] = []
+        depth = 0
+        for line in _WRAPPED.sub("", self.text).splitlines():
+            if not line.strip() or line.startswith("#"):
+                continue
+            if depth:
+                found[-1] += "\n" + line
+            else:
+                found.append(line)
+            depth += line.startswith("for ") - (line == "done")
+        return found
+
+
+def blocks(page: Path) -> list[Block]:
+    """Return the code blocks of a page, in order."""
+    return [Block(page, language, text) for language, text in _FENCE.findall(page.read_text())]
+
+
+def blocks_between(page: Path, heading: str) -> list[Block]:
+    """Return the code blocks under one heading of the second level."""
+    parts = re.split(r"^## ", page.read_text(), flags=re.MULTILINE)
+    (part,) = (part for part in parts if part.startswith(heading + "\n"))
+    return [Block(page, language, text) for language, text in _FENCE.findall(part)]
+
+
+def links(page: Path) -> list[str]:
+    """Return where a page's links lead."""
+    return _LINK.findall(_FENCE.sub("", page.read_text()))
+
+
+def anchors(page: Path) -> set[str]:
+    """Return what can follow ``#`` in a link to a page, as GitHub makes it of headings."""
+    headings = _HEADING.findall(_FENCE.sub("", page.read_text()))
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def rows(text: str) -> Iterator[tuple[str, str]]:
+    """Yield the first two cells of each table row whose first is code, without the marks."""
+    for key, value in re.findall(r"^\| `([^`|]+)` \| ([^|]+?) \|", text, re.MULTILINE):
+        yield key, value.strip("`")
+
+
+def commands(lines: Sequence[str]) -> Iterator[list[str]]:
+    """Yield the words of each command of ours; what a shell would fill in is passed over."""
+    for line in lines:
+        words = shlex.split(line.removesuffix("&"), comments=True)
+        words = words[words[:1] == ["sudo"] :]
+        if words and _PROGRAM.match(words[0]) and "$" not in line and not line.startswith("for "):
+            yield words

@@ -1,0 +1,232 @@
+"""What the pages say holds: commands parse and run, examples load, links lead somewhere, numbers are the code's."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+import typer
+import yaml
+
+from gdp import limits
+from gdp.cli import gdp, rib, switch
+from gdp.crypto.keys import SigningKey
+from gdp.errors import ConfigError
+from gdp.nodes.config import RibConfig, SwitchConfig
+from gdp.nodes.schema import Section
+from proxy import cli, replay_cli
+from proxy.config import ProxyConfig, Rule
+from proxy.ring import cli as ring
+from tests.machines import Machines
+from tests.pages import PAGES, ROOT, Block, anchors, blocks, blocks_between, commands, links, rows
+
+README = ROOT / "README.md"
+CONFIGURATION = ROOT / "docs/configuration.md"
+SECURITY = ROOT / "docs/security.md"
+
+APPS = {
+    "gdp": gdp.app,
+    "gdp-switch": switch.app,
+    "gdp-rib": rib.app,
+    "gdp-proxy": cli.app,
+    "gdp-replay": replay_cli.app,
+    "scripts/ring_topology.sh": ring.app,
+}
+MODELS: dict[str, type[Section]] = {"switch.yaml": SwitchConfig, "rib.yaml": RibConfig, "proxy.yaml": ProxyConfig}
+NODES = ("gdp-switch ", "gdp-rib ", "gdp-proxy ")
+UNITS = {"": 1, "s": 1, "KiB": 1 << 10, "MiB": 1 << 20}
+
+
+def _every_command() -> Iterator[Any]:
+    for page in PAGES:
+        for block in blocks(page):
+            if block.language == "bash":
+                for words in commands(block.lines):
+                    yield pytest.param(words, id=f"{page.name}: {' '.join(words)[:60]}")
+
+
+def _parse(command: Any, words: list[str]) -> None:
+    """Read a command line as the command would, without running it."""
+    program, *rest = words
+    while hasattr(command, "commands"):
+        program, *rest = rest
+        command = command.commands[program]
+    command.make_context(program, rest)
+
+
+@pytest.mark.parametrize("words", list(_every_command()))
+def test_a_command_that_a_page_shows_is_understood(words: list[str]) -> None:
+    if words[0] in APPS:
+        _parse(typer.main.get_command(APPS[words[0]]), words)
+    else:
+        assert os.access(ROOT / words[0], os.X_OK)
+
+
+def test_a_command_that_is_not_understood_would_be_noticed() -> None:
+    command = typer.main.get_command(APPS["gdp"])
+    with pytest.raises(Exception, match="No such option"):
+        _parse(command, ["gdp", "cert", "issue", "--domain", "lab", "--nod", "x"])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_of_a_page_lead_somewhere(page: Path) -> None:
+    for link in links(page):
+        if link.startswith("https://"):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+def test_scripts_that_a_page_names_exist() -> None:
+    for page in PAGES:
+        for path in re.findall(r"`(scripts/[\w/]+\.(?:py|sh))[` ]", page.read_text()):
+            assert (ROOT / path).is_file(), path
+
+
+def test_source_files_that_a_page_names_exist() -> None:
+    text = "".join(page.read_text() for page in PAGES)
+    for path in re.findall(r"`((?:gdp|proxy)/[\w/]+\.py)`", text):
+        assert (ROOT / path).is_file(), path
+
+
+def _constant(dotted: str) -> float:
+    room, _, name = dotted.rpartition(".")
+    return getattr(importlib.import_module(f"gdp.{room}") if room else limits, name)
+
+
+def test_limits_that_a_page_states_are_the_limits() -> None:
+    stated = [row for page in PAGES for row in rows(page.read_text()) if re.fullmatch(r"[a-z_.]*[A-Z][A-Z_]+", row[0])]
+    assert len(stated) > 30
+    for name, text in stated:
+        number, _, unit = text.replace(",", "").partition(" ")
+        assert float(number) * UNITS[unit] == _constant(name), name
+
+
+def _keys(model: type[Section], prefix: str = "") -> Iterator[tuple[str, object]]:
+    """Yield the keys of a model as the pages write them, with their defaults."""
+    for name, field in model.model_fields.items():
+        key = prefix + (field.alias or name)
+        inner = _sections(field.annotation)
+        is_list = "tuple" in str(field.annotation)
+        default = "required" if field.is_required() else field.get_default(call_default_factory=True)
+        if inner is Rule or not inner or is_list:
+            yield key, default
+        if inner and inner is not Rule:
+            hidden = "none" if default is None else None
+            for each, its in _keys(inner, key + ("[]." if is_list else ".")):
+                yield each, "none" if hidden and its == "required" else its
+
+
+def _sections(annotation: object) -> type[Section] | None:
+    if isinstance(annotation, type) and issubclass(annotation, Section):
+        return annotation
+    return next((found for each in get_args(annotation) if (found := _sections(each))), None)
+
+
+def _section_text(heading: str) -> str:
+    parts = re.split(r"^## ", CONFIGURATION.read_text(), flags=re.MULTILINE)
+    return next(part for part in parts if part.startswith(heading))
+
+
+def _stated(text: str) -> dict[str, object]:
+    return {key: value if value in ("required", "none") else yaml.safe_load(value) for key, value in rows(text)}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_key_is_explained_with_its_default(name: str) -> None:
+    before, _, rule = _section_text(name).partition("A rule, under")
+    stated = {**_stated(_section_text("In every file")), **_stated(before)}
+    known = {key: list(value) if isinstance(value, tuple) else value for key, value in _keys(MODELS[name])}
+    assert stated == known
+    assert not rule or _stated(rule) == dict(_keys(Rule))
+
+
+@pytest.mark.parametrize(("model", "key"), [(Rule, "max_bytes")])
+def test_a_bound_in_the_text_is_the_models(model: type[Section], key: str) -> None:
+    bounds = str(model.model_fields[key].metadata)
+    highest = re.findall(rf"^\| `{key}` .* to (\d+) \|$", CONFIGURATION.read_text(), re.MULTILINE)
+    assert highest == re.findall(r"le=(\d+)", bounds)
+
+
+def _furnish(folder: Path, text: str) -> None:
+    """Make the files and directories that an example names."""
+    example = yaml.safe_load(text)
+    domain = example["domain"]
+    rules = [*example.get("expose", ()), *example.get("import", ())]
+    for file in [domain["root"], *domain.get("trusts", ()), *(rule["owner"] for rule in rules)]:
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).write_bytes(SigningKey.generate().public.to_pem())
+    for key in {"identity", "delegations", "revocations"} & example.keys():
+        (folder / example[key]).mkdir(parents=True, exist_ok=True)
+
+
+def _every_example() -> Iterator[Any]:
+    for page in PAGES:
+        for block in blocks(page):
+            if block.language == "yaml" and Path(block.title).name in MODELS:
+                yield pytest.param(block, id=f"{page.name}: {block.title}")
+
+
+@pytest.mark.parametrize("block", list(_every_example()))
+def test_an_example_of_a_configuration_loads(block: Block, tmp_path: Path) -> None:
+    _furnish(tmp_path, block.text)
+    path = tmp_path / Path(block.title).name
+    path.write_text(block.text)
+    load: Callable[[Path], Section] = MODELS[path.name].load  # type: ignore[attr-defined]
+    assert load(path)
+
+
+def test_the_example_of_errors_is_what_is_printed(tmp_path: Path) -> None:
+    shown = blocks_between(CONFIGURATION, "Errors")
+    _furnish(tmp_path, shown[0].text)
+    (tmp_path / "swich").rmdir()
+    (tmp_path / "wrong.yaml").write_text(shown[0].text)
+    with pytest.raises(ConfigError) as caught:
+        SwitchConfig.load(tmp_path / "wrong.yaml")
+    assert str(caught.value).replace(f"{tmp_path}/", "") == shown[1].text.rstrip()
+
+
+def test_the_readme_fits_on_two_screens_of_paper() -> None:
+    assert len(README.read_text().splitlines()) <= 200
+
+
+@pytest.fixture(scope="module")
+def machines(tmp_path_factory: pytest.TempPathFactory) -> Machines:
+    """Two machines set up as the README says."""
+    two = Machines(tmp_path_factory.mktemp("machines"))
+    for block in blocks_between(README, "Two machines of your own"):
+        if block.language == "yaml":
+            two.write(block)
+        elif block.title:
+            for line in block.lines:
+                if line.startswith(NODES):
+                    two.run(f"{line.removesuffix(' &')} --check", two.home_of(block))
+                elif line.startswith(("gdp ", "for ", "cp ", "scp ", "sed ", "echo ")):
+                    two.run(line, two.home_of(block))
+    return two
+
+
+def test_following_the_readme_makes_two_machines_whose_commands_accept_their_files(machines: Machines) -> None:
+    checked = [line.split()[0] for line in machines.done if line.endswith("--check")]
+    assert checked == ["gdp-switch", "gdp-rib", "gdp-switch", "gdp-proxy"]
+
+
+def test_both_machines_of_the_readme_mean_the_same_name(machines: Machines) -> None:
+    sent = machines.run("gdp-proxy --config robot/proxy.yaml --check", machines.robot)
+    wanted = machines.run("gdp-proxy --config server/proxy.yaml --check", machines.server)
+    assert re.findall(r"as (\w{64})", sent) == re.findall(r"as (\w{64})", wanted) != []
+
+
+def test_the_commands_of_the_security_page_work_one_after_the_other(machines: Machines) -> None:
+    for heading in ("Keys that stay where they were made", "New epochs", "Taking back"):
+        for block in blocks_between(SECURITY, heading):
+            for line in block.lines:
+                machines.run(line, machines.home_of(block))
+    assert len(list((machines.robot / "revoked").iterdir())) == 2
