@@ -60,4 +60,4 @@ class Machine(Protocol):
         """Return the monotonic second of the next timer, or None."""
 
     def take(self) -> list[Transmit]:
-        """Return, once, what is to be sent."""
+        """Return, once, what is to be sent; more may come at the next call, until nothing does."""

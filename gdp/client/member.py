@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from gdp.client.attachment import Attachment, AttachmentSettings
 from gdp.client.feed import Delivered, Feed, Reader
@@ -32,6 +32,8 @@ from gdp.trust.delegation import Delegation
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.verifier import ClaimVerifier
+
+FRAMES_AT_ONCE: Final = 64  # of one topic, before another's turn
 
 __all__ = ["Member", "Message", "Topic"]
 
@@ -75,6 +77,7 @@ class Member:
         self._publishers: dict[Name, Publisher] = {}
         self._subscriptions: dict[Name, _Subscription] = {}
         self._messages: list[Message] = []
+        self._now_s = 0.0
         self._drops: Counter[DropReason] = Counter()
         self._closed_drops: Counter[DropReason] = Counter()
         self.attachment = Attachment(identity, policy, settings)
@@ -187,8 +190,9 @@ class Member:
         """Hand what publishers and feeds have ready to the switch."""
         if self.attachment.switch is None:
             return
+        self._now_s = now_s
         for publisher in self._publishers.values():
-            frames = publisher.take(now_s)
+            frames = publisher.take(now_s, FRAMES_AT_ONCE)
             if frames:
                 self.attachment.send(frames)
         for feed in self.feeds():
@@ -205,8 +209,16 @@ class Member:
         return min((time for time in times if time is not None), default=None)
 
     def take(self) -> list[Transmit]:
-        """Return, once, what is to be sent."""
-        return self.attachment.take()
+        """Return, once, what is to be sent; more comes at the next call, until nothing does.
+
+        So the first frames of a large message are on their way while the next ones are being sealed, and the topics
+        take turns.
+        """
+        out = self.attachment.take()
+        if not out:
+            self.flush(self._now_s)
+            out = self.attachment.take()
+        return out
 
     def take_messages(self) -> list[Message]:
         """Return, once, the messages that arrived, in order within each feed."""
@@ -240,10 +252,8 @@ class Member:
         publisher = self._publishers.get(topic_of(header, frame))  # type: ignore[call-overload]
         if publisher is None:
             raise StatementError(DropReason.NOT_FOR_US)
+        self._now_s = now_s
         publisher.receive_report(header, frame, now_s)
-        frames = publisher.take(now_s)
-        if frames:
-            self.attachment.send(frames)
 
     def _take_statement(self, statement: Statement, now: Instant) -> None:
         if statement.type is StatementType.JOIN:

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from gdp.crypto.envelope import Sealer, Signer
+from gdp.crypto.envelope import Sealed, Sealer, Signer
 from gdp.crypto.note import NoteOpener
 from gdp.errors import DropReason, EnvelopeError, FrameError, LocalError, RemoteError
 from gdp.frame.codec import Header
@@ -31,6 +31,7 @@ from gdp.names import Name
 __all__ = ["Publisher", "Secrets", "Source"]
 
 _READERS_MAX: Final = 1_024
+_ALL: Final = 1 << 30
 _LIVES_MAX: Final = 4_096  # incarnations of readers whose old notes are known as such
 _STATUS_GAP_S: Final = 0.02  # between two statuses
 _STATUS_BYTES_PER_S: Final = 8 << 20  # ... and longer after a large one
@@ -91,7 +92,7 @@ class Publisher:
         self._starts: dict[bytes, int] = {}
         self._status_wanted = False
         self._status_at_s = float("-inf")  # when the next one may go
-        self._waiting = deque[list[bytes]]()  # best-effort messages
+        self._waiting = deque[Sealed]()  # best-effort messages
         self._waiting_bytes = 0
         self._early = deque[bytes](maxlen=depth or None)  # latched messages from before the first reader
         self.drops: Counter[DropReason] = Counter()
@@ -143,7 +144,7 @@ class Publisher:
         self.messages += 1
         self.payload_bytes += len(message)
         if self._repairs_wanted:
-            self._window.add(number, frames)
+            self._window.add(number, frames, frames.size_bytes)
         else:
             self._wait(frames)
         return number
@@ -186,8 +187,8 @@ class Publisher:
             times.append(self._status_at_s)
         return min((time for time in times if time is not None), default=None)
 
-    def take(self, now_s: float) -> list[bytes]:
-        """Return the frames that may go now."""
+    def take(self, now_s: float, limit: int = _ALL) -> list[bytes]:
+        """Return frames that may go now, about ``limit`` at a time: the rest is sealed when it is asked for."""
         if self._mtu is None or not self._readers:
             return []
         while self._early:
@@ -197,7 +198,7 @@ class Publisher:
         self._waiting_bytes = 0
         if self._status_wanted and now_s >= self._status_at_s:
             frames += self._seal_status(now_s)
-        return frames + self._window.take(now_s)
+        return frames + self._window.take(now_s, max(limit - len(frames), 1))
 
     def _sealer(self, kind: Kind) -> Sealer:
         source = self._source
@@ -264,12 +265,12 @@ class Publisher:
         if report.missing and (oldest is None or report.missing[0].number < oldest):
             self._status_wanted = True  # it asks for what is gone
 
-    def _wait(self, frames: list[bytes]) -> None:
+    def _wait(self, frames: Sealed) -> None:
         """Queue a best-effort message; the oldest go when nobody takes them."""
         self._waiting.append(frames)
-        self._waiting_bytes += sum(map(len, frames))
+        self._waiting_bytes += frames.size_bytes
         while self._waiting_bytes > WINDOW_BYTES and len(self._waiting) > 1:
-            self._waiting_bytes -= sum(map(len, self._waiting.popleft()))
+            self._waiting_bytes -= self._waiting.popleft().size_bytes
             self.drops[DropReason.MEMORY_FULL] += 1
 
     def _seal_status(self, now_s: float) -> list[bytes]:
@@ -282,4 +283,4 @@ class Publisher:
         self._status_number += 1
         wire = status.to_wire()
         self._status_at_s = now_s + max(_STATUS_GAP_S, len(wire) / _STATUS_BYTES_PER_S)
-        return self._status.seal(self._status_number, self._flags, wire, self._mtu)
+        return list(self._status.seal(self._status_number, self._flags, wire, self._mtu))

@@ -17,7 +17,8 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from typing import Final, Protocol
+from collections.abc import Sequence
+from typing import Final, Protocol, overload
 
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives import hashes
@@ -29,7 +30,7 @@ from gdp.frame.codec import HEADER_BYTES, HOPS_AT, Header, authenticated
 from gdp.frame.kinds import VERSION, Flag
 from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, PARTS_MAX
 
-__all__ = ["SIGNATURE_BYTES", "TAG_BYTES", "Opener", "Sealer", "Signer", "digest_of", "part_room", "seal_key"]
+__all__ = ["SIGNATURE_BYTES", "TAG_BYTES", "Opener", "Sealed", "Sealer", "Signer", "digest_of", "part_room", "seal_key"]
 
 TAG_BYTES: Final = 16
 SIGNATURE_BYTES: Final = 64
@@ -99,8 +100,11 @@ class Sealer:
         self._fixed = (epoch, kind, incarnation, destination, source)
         self._last_number = -1
 
-    def seal(self, number: int, flags: int, message: bytes | bytearray | memoryview, mtu: int) -> list[bytes]:
-        """Return the frames of a message, each from the header on and at most ``mtu`` bytes long.
+    def seal(self, number: int, flags: int, message: bytes, mtu: int) -> Sealed:
+        """Return a message as its frames, each from the header on and at most ``mtu`` bytes long.
+
+        A part is encrypted when its frame is first asked for, so that the first ones may be on their way before the
+        last ones are sealed.
 
         Args:
             number: message number; above every number this sealer was given before.
@@ -118,23 +122,58 @@ class Sealer:
             raise LocalError(f"a message of {size} bytes in {parts} parts is above the limit")
         self._last_number = number
         epoch, kind, incarnation, destination, source = self._fixed
-        running = digest_of(Header(kind, flags, 0, epoch, 0, number, 0, parts, incarnation, destination, source))
-        encrypt, update, view = self._aead.encrypt, running.update, memoryview(message)
+        header = Header(kind, flags, HOPS_MAX, epoch, 0, number, 0, parts, incarnation, destination, source)
+        return Sealed(self._aead, self._signer, header, message, room)
+
+
+class Sealed(Sequence[bytes]):
+    """The frames of one message, sealed in order and as far as they have been asked for; always the same bytes."""
+
+    def __init__(self, aead: AESGCM, signer: Signer, header: Header, message: bytes, room: int) -> None:
+        self._encrypt = aead.encrypt
+        self._signer = signer
+        self._header = header
+        self._message = memoryview(message)
+        self._room = room
+        self._running = digest_of(header)
+        self._frames: list[bytes] = []
+        self.size_bytes = len(message) + header.parts * (HEADER_BYTES + TAG_BYTES) + SIGNATURE_BYTES
+
+    def __len__(self) -> int:
+        return self._header.parts
+
+    @overload
+    def __getitem__(self, at: int) -> bytes: ...
+
+    @overload
+    def __getitem__(self, at: slice) -> list[bytes]: ...
+
+    def __getitem__(self, at: int | slice) -> bytes | list[bytes]:
+        parts = self._header.parts
+        end = at.indices(parts)[1] if isinstance(at, slice) else at % parts + 1 if -parts <= at < parts else parts
+        if end > len(self._frames):
+            self._seal_until(end)
+        return self._frames[at]
+
+    def _seal_until(self, end: int) -> None:
+        kind, flags, _, epoch, _, number, _, parts, incarnation, destination, source = self._header
+        room, message, encrypt, update = self._room, self._message, self._encrypt, self._running.update
         pack, pack_nonce = _AAD.pack, _NONCE.pack
-        frames = []
-        last = parts - 1
-        for part in range(parts):
-            plain = view[part * room : (part + 1) * room]
+        for part in range(len(self._frames), end):
+            plain = message[part * room : (part + 1) * room]
             length = len(plain) + TAG_BYTES
-            if part == last:
+            is_last = part == parts - 1
+            if is_last:
                 flags |= _LAST
                 length += SIGNATURE_BYTES
             aad = pack(VERSION, kind, flags, epoch, length, number, part, parts, incarnation, destination, source)
             sealed = encrypt(pack_nonce(number, part), plain, aad)
             update(sealed)
-            frames.append(aad[:HOPS_AT] + _HOPS + aad[HOPS_AT:] + sealed)
-        frames[last] += self._signer.sign_digest(running.digest())
-        return frames
+            frame = aad[:HOPS_AT] + _HOPS + aad[HOPS_AT:] + sealed
+            if is_last:
+                frame += self._signer.sign_digest(self._running.digest())
+                self._message = message[:0]  # the frames hold all of it now
+            self._frames.append(frame)
 
 
 class Opener:

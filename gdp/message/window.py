@@ -16,6 +16,7 @@ round trip, and one that stands still, or that lags while others are through, no
 from __future__ import annotations
 
 from collections import OrderedDict, deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Final
@@ -40,7 +41,7 @@ _ROUND_MIN_S: Final = PROBE_MIN_S / 3
 
 @dataclass(slots=True)
 class _Kept:
-    frames: list[bytes]
+    frames: Sequence[bytes]
     begin_at: int
     size: int
     repaired_s: dict[int, float] = field(default_factory=dict)  # part -> when it was last sent again
@@ -134,9 +135,8 @@ class SendWindow:
         """Return the highest message number that every reader has confirmed, with all before it."""
         return min(self._least_number(), self._newest + 1) - 1
 
-    def add(self, number: int, frames: list[bytes]) -> None:
-        """Queue a sealed message; numbers rise."""
-        size = sum(map(len, frames))
+    def add(self, number: int, frames: Sequence[bytes], size: int) -> None:
+        """Queue a message of ``size`` bytes of frames, which may be sealed as they are asked for; numbers rise."""
         while self._kept and self._kept_bytes + size > 2 * self._budget_bytes:
             self._release(next(iter(self._kept)))
             self.let_go += 1

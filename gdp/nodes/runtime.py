@@ -85,8 +85,9 @@ class Runtime:
 
     def flush(self) -> None:
         """Send what the machine has to say, and ask when it wants to be called next."""
-        for port, mac, frames in self._machine.take():
-            self._plane.transmit(port, mac, frames)
+        while transmits := self._machine.take():
+            for port, mac, frames in transmits:
+                self._plane.transmit(port, mac, frames)
         self._deadline_s = self._machine.next_timeout()
 
     @contextlib.contextmanager

@@ -200,8 +200,9 @@ class MemoryNetwork:
 
     def _settle(self, name: str) -> None:
         node = self._nodes[name]
-        for transmit in node.machine.take():
-            self._transmit(node, transmit)
+        while transmits := node.machine.take():
+            for transmit in transmits:
+                self._transmit(node, transmit)
         self._arm(name)
 
     def _transmit(self, node: _Node, transmit: Transmit) -> None:

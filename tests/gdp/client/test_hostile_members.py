@@ -25,7 +25,7 @@ def forge(
     number: int, message: bytes, *, kind: Kind = Kind.DATA, signer: Signer = MALLORY, mtu: int = 1500
 ) -> list[bytes]:
     """Return what a reader can make: parts that open, under a signature that is not the writer's."""
-    return Sealer(SECRETS[1], 1, kind, PUBLISHER, 1, TOPIC, signer).seal(number, Flag.RELIABLE, message, mtu)
+    return list(Sealer(SECRETS[1], 1, kind, PUBLISHER, 1, TOPIC, signer).seal(number, Flag.RELIABLE, message, mtu))
 
 
 def give(pipe: Pipe, end: End, frames: list[bytes]) -> None:
@@ -88,7 +88,7 @@ def test_messages_that_come_before_the_first_status_are_kept_within_bounds() -> 
     end = pipe.join(b"a")
     sealer = Sealer(SECRETS[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, WRITER)
     for number in range(1, 80):
-        give(pipe, end, sealer.seal(number, Flag.RELIABLE, bytes(1 << 20), 65_000))
+        give(pipe, end, list(sealer.seal(number, Flag.RELIABLE, bytes(1 << 20), 65_000)))
         assert end.budget.held_bytes <= JOIN_SOURCE_BYTES
     assert end.feed.drops[DropReason.MEMORY_FULL] > 0
     end.feed.close()
@@ -99,7 +99,7 @@ def test_messages_behind_a_gap_that_is_never_filled_are_kept_within_bounds() -> 
     pipe, end = live()
     sealer = Sealer(SECRETS[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, WRITER)
     for number in range(2, 80):
-        give(pipe, end, sealer.seal(number, Flag.RELIABLE, bytes(1 << 20), 65_000))
+        give(pipe, end, list(sealer.seal(number, Flag.RELIABLE, bytes(1 << 20), 65_000)))
         assert end.budget.held_bytes <= JOIN_TOTAL_BYTES
     assert [each.number for each in end.feed.take_delivered()][:3] == [2, 3, 4]
     assert end.feed.lost == 1
@@ -178,7 +178,7 @@ def test_what_an_outsider_sends_leaves_nothing_behind() -> None:
     sealer = Sealer(strange[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, MALLORY)
     held = end.budget.held_bytes
     for number in range(1, 200):
-        give(pipe, end, sealer.seal(number, Flag.RELIABLE, bytes(3_000), 1500))
+        give(pipe, end, list(sealer.seal(number, Flag.RELIABLE, bytes(3_000), 1500)))
     assert end.budget.held_bytes == held
     assert end.feed.drops == {DropReason.BAD_TAG: 3 * 199}
     for at in range(50):

@@ -223,11 +223,11 @@ def test_an_older_epoch_still_opens_and_an_unknown_one_is_counted() -> None:
     pipe.run(1.0)
     assert end.messages == [b"old key"]
     sealer = Sealer(b"2" * 32, 2, Kind.DATA, Name(b"p" * 32), 1, TOPIC, WRITER)
-    (frame,) = sealer.seal(2, Flag.RELIABLE, b"new key", 1500)
+    (frame,) = list(sealer.seal(2, Flag.RELIABLE, b"new key", 1500))
     end.feed.receive(decode(frame), frame, pipe.now_s)
     assert [each.message for each in end.feed.take_delivered()] == [b"new key"]
     sealer = Sealer(b"3" * 32, 3, Kind.DATA, Name(b"p" * 32), 1, TOPIC, WRITER)
-    (frame,) = sealer.seal(3, Flag.RELIABLE, b"strange key", 1500)
+    (frame,) = list(sealer.seal(3, Flag.RELIABLE, b"strange key", 1500))
     end.feed.receive(decode(frame), frame, pipe.now_s)
     assert end.feed.drops[DropReason.UNKNOWN_EPOCH] == 1
 

@@ -23,7 +23,7 @@ MTU = 300  # room for 188 bytes in a part
 def seal(
     number: int, message: bytes, *, signer: Signer = WRITER, mtu: int = MTU, secret: bytes = SECRET
 ) -> list[bytes]:
-    return Sealer(secret, 1, Kind.DATA, SOURCE, INCARNATION, TOPIC, signer).seal(number, 0, message, mtu)
+    return list(Sealer(secret, 1, Kind.DATA, SOURCE, INCARNATION, TOPIC, signer).seal(number, 0, message, mtu))
 
 
 def opener_of(epoch: int) -> Opener:

@@ -26,12 +26,16 @@ def message(number: int, parts: int) -> list[bytes]:
     return [number.to_bytes(4, "big") + part.to_bytes(4, "big") + bytes(PART - 8) for part in range(parts)]
 
 
+def put(window: SendWindow, number: int, frames: list[bytes]) -> None:
+    window.add(number, frames, size(frames))
+
+
 def window_of(messages: int, parts: int, readers: tuple[bytes, ...] = (A,), keep_last: int = 0) -> SendWindow:
     window = SendWindow(keep_last)
     for reader in readers:
         window.add_reader(reader, 1, 0.0)
     for number in range(1, messages + 1):
-        window.add(number, message(number, parts))
+        put(window, number, message(number, parts))
     return window
 
 
@@ -128,7 +132,7 @@ def test_all_readers_together_get_one_flight_of_repairs_in_a_round_trip() -> Non
         window.add_reader(reader, 1, 0.0)
     sent = 0
     for number in range(1, 41):
-        window.add(number, message(number, 1_000))
+        put(window, number, message(number, 1_000))
         sent += len(window.take(0.0))
         for reader in readers[1:]:
             window.report(reader, has(number, 999), 0.0)
@@ -145,7 +149,7 @@ def test_all_readers_together_get_one_flight_of_repairs_in_a_round_trip() -> Non
 def test_no_more_parts_are_looked_at_for_one_report_than_a_flight_of_small_frames_has() -> None:
     window = SendWindow()
     window.add_reader(A, 1, 0.0)
-    window.add(1, [bytes(10)] * 20_000)
+    put(window, 1, [bytes(10)] * 20_000)
     assert len(window.take(0.0)) == 20_000
     absurd = tuple(Missing(1, 0, 0xFFFF_FFFF) for _ in range(NACKS_PER_REPORT))
     for at in range(3):  # the second and third look only at what the first has queued
@@ -203,10 +207,10 @@ def test_a_full_window_says_so_and_lets_the_oldest_go_at_twice_its_budget() -> N
     window.add_reader(A, 1, 0.0)
     for number in range(1, 11):
         assert window.has_room()
-        window.add(number, message(number, 1))
+        put(window, number, message(number, 1))
     assert not window.has_room()
     for number in range(11, 26):
-        window.add(number, message(number, 1))
+        put(window, number, message(number, 1))
     assert window.let_go == 5
     assert window.kept_bytes <= 20 * PART
     assert window.oldest == 6
@@ -216,7 +220,7 @@ def test_numbers_under_way_stay_within_the_readers_replay_window() -> None:
     window = SendWindow()
     window.add_reader(A, 1, 0.0)
     for number in range(1, FLIGHT_MESSAGES_MAX + 500):
-        window.add(number, [b"x" * 10])
+        put(window, number, [b"x" * 10])
     assert len(window.take(0.0)) == FLIGHT_MESSAGES_MAX
 
 
@@ -264,7 +268,7 @@ def test_a_reader_that_owed_nothing_for_long_is_no_laggard_when_something_new_go
     window = window_of(1, 10)
     window.take(0.0)
     window.report(A, has(2), 0.1)
-    window.add(2, message(2, 10))
+    put(window, 2, message(2, 10))
     window.take(1_000.0)
     assert window.laggards(1_000.1) == []
     assert window.laggards(1_000.1 + READER_LEASE_S) == [A]
