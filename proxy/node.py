@@ -16,7 +16,7 @@ from gdp.client.attachment import AttachmentSettings
 from gdp.client.member import Member, Topic
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
-from gdp.errors import LocalError
+from gdp.errors import GdpError, LocalError
 from gdp.names import Name
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.nodes.runtime import Runtime
@@ -79,7 +79,7 @@ def run_node(config: ProxyConfig) -> Iterator[ProxyNode]:
         plane = RawPlane([config.iface])
         stack.callback(plane.close)
         runtime = Runtime(member, plane)
-        stack.enter_context(runtime.signals())
+        stack.enter_context(runtime.signals(lambda: _renew(config, identity, member)))
         node = ProxyNode(member, runtime, plane, topics, Histogram())
         if config.metrics is not None:
             metrics = Metrics(node.sources())
@@ -106,6 +106,18 @@ def open_topics(config: ProxyConfig, identity: Identity) -> dict[Name, Topic]:
             )
         topics[rule.overlay_name] = _open(rule, delegation, identity)
     return topics
+
+
+def _renew(config: ProxyConfig, identity: Identity, member: Member) -> None:
+    """Read the delegations anew: new epochs and longer validity take effect without a message lost."""
+    try:
+        topics = open_topics(config, identity)
+    except GdpError as error:
+        log.error("delegations not renewed reason=%s", error)
+        return
+    for topic in topics.values():
+        member.renew(topic)
+    log.info("delegations renewed topics=%d", len(topics))
 
 
 def _open(rule: Rule, delegation: Delegation, identity: Identity) -> Topic:

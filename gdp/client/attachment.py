@@ -117,6 +117,11 @@ class Attachment:
         """Claim a name from now on."""
         self._claims[subject.name, right] = Claimed(subject, right, chain, is_global)
 
+    def renew(self, name: Name, right: Right, chain: tuple[bytes, ...]) -> None:
+        """Claim a name that is claimed already by a newer delegation, at once."""
+        claimed = self._claims[name, right]
+        claimed.chain, claimed.claim_at_s, claimed.refused = chain, 0.0, None
+
     def withdraw(self, name: Name, right: Right) -> None:
         """Claim a name no more, and say so."""
         if self._claims.pop((name, right), None) is not None and self._switch is not None:

@@ -38,6 +38,7 @@ from gdp.names import Name
 __all__ = ["Delivered", "Feed", "FeedState", "Reader"]
 
 ANNOUNCE_S: Final = 0.1
+ANNOUNCE_TRIES: Final = 3  # under one epoch, before the next is tried
 _READY_OVERHEAD_BYTES: Final = 256  # what a message that waits for others costs beside its bytes
 _WAITING: Final = int(Flag.RELIABLE | Flag.LATCHED)  # topics whose readers wait for what is missing
 
@@ -90,18 +91,8 @@ class Feed:
         self._secrets = secrets
         self._budget = budget
         self._openers: dict[tuple[int, int], Opener] = {}
-        epoch = max(secrets)
-        self._note = NoteSealer(
-            secrets[epoch],
-            epoch,
-            Kind.REPORT,
-            reader.name,
-            reader.incarnation,
-            publisher,
-            topic,
-            incarnation,
-            reader.note_numbers,
-        )
+        self._announced = 0
+        self._note = self._note_sealer(max(secrets))
         self._data = Joiner(publisher, lambda epoch: self._opener(Kind.DATA, epoch), writer, budget)
         self._status = Joiner(publisher, lambda epoch: self._opener(Kind.STATUS, epoch), writer, budget)
         self.state = FeedState.NEW
@@ -130,12 +121,18 @@ class Feed:
 
     def receive(self, header: Header, frame: bytes, now_s: float) -> None:
         """Take one DATA or STATUS frame of this publisher."""
+        if header.kind == Kind.DATA and header.incarnation == self.incarnation and self._data.add_next(header, frame, now_s):
+            self._unreported_bytes += header.length
+            due_s = now_s if self._unreported_bytes >= REPORT_EVERY_BYTES else now_s + REPORT_DELAY_S
+            if due_s < self._report_at_s and self._is_reliable and self.state is FeedState.LIVE:
+                self._report_at_s = due_s
+            return
         if header.incarnation != self.incarnation:
             self._data.drops[DropReason.WRONG_INCARNATION] += 1
         elif header.kind == Kind.STATUS:
             joined = self._status.add(header, frame, now_s)
             if joined is not None:
-                self._take_status(joined, now_s)
+                self._take_status(joined, header.epoch, now_s)
         else:
             self._take_data(header, frame, now_s)
 
@@ -157,6 +154,7 @@ class Feed:
         self._unreported_bytes = 0
         if self.state is FeedState.NEW:
             self._report_at_s = now_s + ANNOUNCE_S
+            self._note = self._note_sealer(self._epoch_to_try())
             return self._note.seal(Report(ReportFlag.NEW, 0, 0, ()).to_wire())
         missing = self._missing() if self._is_reliable else ()
         self._report_at_s = now_s + (REPORT_DELAY_S if missing else REPORT_IDLE_S)
@@ -176,6 +174,32 @@ class Feed:
         for number in list(self._ready):
             self._take_ready(number)
         return self._note.seal(Report(ReportFlag.BYE, self._expected, 0, ()).to_wire())
+
+    def renew(self, secrets: Secrets) -> None:
+        """Take the topic's secrets anew; what is sealed under an epoch that is still among them opens as before."""
+        self._secrets = secrets
+        self._openers.clear()
+
+    def _note_sealer(self, epoch: int) -> NoteSealer:
+        reader = self._reader
+        return NoteSealer(
+            self._secrets[epoch],
+            epoch,
+            Kind.REPORT,
+            reader.name,
+            reader.incarnation,
+            self.publisher,
+            self._topic,
+            self.incarnation,
+            reader.note_numbers,
+        )
+
+    def _epoch_to_try(self) -> int:
+        """Return the epoch to announce under: the newest, and in turn the others, for the publisher may lag behind."""
+        epochs = sorted(self._secrets, reverse=True)
+        epoch = epochs[self._announced // ANNOUNCE_TRIES % len(epochs)]
+        self._announced += 1
+        return epoch
 
     def _opener(self, kind: Kind, epoch: int) -> Opener:
         opener = self._openers.get((kind, epoch))
@@ -251,7 +275,7 @@ class Feed:
             missing += [Missing(number, *each) for each in self._data.missing(number, room, to_end=is_announced)]
         return tuple(missing)
 
-    def _take_status(self, joined: Joined, now_s: float) -> None:
+    def _take_status(self, joined: Joined, epoch: int, now_s: float) -> None:
         try:
             status = Status.from_wire(joined.message)
         except RemoteError as error:
@@ -262,6 +286,7 @@ class Feed:
             if self._reader.name not in status.starts:
                 return
             self.state = FeedState.LIVE
+            self._note = self._note_sealer(epoch)
             self._expected = status.starts[self._reader.name]
             self.description = status.description
             for number in [n for n in self._ready if not 0 <= n - self._expected < REPLAY_WINDOW_MESSAGES]:

@@ -33,7 +33,8 @@ from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.verifier import ClaimVerifier
 
-FRAMES_AT_ONCE: Final = 64  # of one topic, before another's turn
+_FOR_FEEDS: Final = (int(Kind.DATA), int(Kind.STATUS))
+BYTES_AT_ONCE: Final = 96 << 10  # of one topic, before another's turn
 
 __all__ = ["Member", "Message", "Topic"]
 
@@ -137,6 +138,19 @@ class Member:
         delegation = topic.delegation
         self.attachment.claim(delegation.subject, Right.READ, delegation.chain, is_global=False)
 
+    def renew(self, topic: Topic) -> None:
+        """Take a topic's delegation and secrets anew, for what is published or read of it."""
+        publisher = self._publishers.get(topic.name)
+        if publisher is not None:
+            publisher.renew(topic.secrets)
+            self.attachment.renew(topic.name, Right.PUBLISH, topic.delegation.chain)
+        subscription = self._subscriptions.get(topic.name)
+        if subscription is not None:
+            subscription.topic = topic
+            for feed in subscription.feeds.values():
+                feed.renew(topic.secrets)
+            self.attachment.renew(topic.name, Right.READ, topic.delegation.chain)
+
     def subscribed(self) -> list[Topic]:
         """Return the topics that are read."""
         return [subscription.topic for subscription in self._subscriptions.values()]
@@ -157,11 +171,12 @@ class Member:
 
     def receive(self, arrivals: Sequence[Arrival], now: Instant) -> None:
         """Take frames in."""
+        fed: dict[Feed, Name] = {}
         for arrival in arrivals:
             try:
                 header = decode(arrival.frame)
-                if header.kind in (Kind.DATA, Kind.STATUS):
-                    self._take_data(header, arrival.frame, now.mono_s)
+                if header.kind in _FOR_FEEDS:
+                    self._feed(header, arrival.frame, now.mono_s, fed)
                 elif header.kind == Kind.REPORT:
                     self._take_report(header, arrival.frame, now.mono_s)
                 elif header.kind >= CONTROL_FROM:
@@ -172,6 +187,11 @@ class Member:
                     self._drops[DropReason.UNKNOWN_KIND] += 1
             except RemoteError as error:
                 self._drops[error.reason] += 1
+        for feed, topic in fed.items():
+            self._messages += [Message(topic, each, feed.description) for each in feed.take_delivered()]
+            report = feed.take_report(now.mono_s)
+            if report is not None:
+                self.attachment.send([report])
 
     def port_changed(self, port: int, up: bool, now: Instant) -> None:
         """Learn that a port's link came or went."""
@@ -192,7 +212,7 @@ class Member:
             return
         self._now_s = now_s
         for publisher in self._publishers.values():
-            frames = publisher.take(now_s, FRAMES_AT_ONCE)
+            frames = publisher.take(now_s, BYTES_AT_ONCE)
             if frames:
                 self.attachment.send(frames)
         for feed in self.feeds():
@@ -233,18 +253,15 @@ class Member:
             subscription.feeds.clear()
         self.attachment.withdraw_all()
 
-    def _take_data(self, header: Header, frame: bytes, now_s: float) -> None:
+    def _feed(self, header: Header, frame: bytes, now_s: float, fed: dict[Feed, Name]) -> None:
+        """Give a frame to the feed that it is for, and note that one."""
         subscription = self._subscriptions.get(header.destination)  # type: ignore[call-overload]
         feed = None if subscription is None else subscription.feeds.get(header.source)
         if feed is None:
             self._drops[DropReason.NOT_FOR_US] += 1
             return
         feed.receive(header, frame, now_s)
-        for delivered in feed.take_delivered():
-            self._messages.append(Message(subscription.topic.name, delivered, feed.description))
-        report = feed.take_report(now_s)
-        if report is not None:
-            self.attachment.send([report])
+        fed[feed] = subscription.topic.name
 
     def _take_report(self, header: Header, frame: bytes, now_s: float) -> None:
         if header.destination != self.name:

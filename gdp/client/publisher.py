@@ -52,7 +52,7 @@ class Source:
 
 @dataclass(slots=True)
 class _Reader:
-    opener: NoteOpener
+    incarnation: int
     heard_s: float
     start: int | None = None  # its first message; None once it has begun to confirm
     out_until_s: float = 0.0  # it may not hold the window before
@@ -122,6 +122,20 @@ class Publisher:
         """Return how many messages every reader has confirmed; of a best-effort topic, how many were sent."""
         return self._window.acknowledged if self._repairs_wanted else self.messages
 
+    def renew(self, secrets: Secrets) -> None:
+        """Take the topic's secrets anew; messages from now on are sealed under the newest epoch.
+
+        Raises:
+            LocalError: none.
+        """
+        if not secrets:
+            raise LocalError("a publisher needs a topic secret")
+        self._secrets = secrets
+        if max(secrets) != self._epoch:
+            self._epoch = max(secrets)
+            self._data = self._sealer(Kind.DATA)
+            self._status = self._sealer(Kind.STATUS)
+
     def tree_stands(self, mtu: int) -> None:
         """Learn that a tree reaches this publisher, and the smallest MTU on it (bytes after the Ethernet header)."""
         self._mtu = max(mtu, MTU_MIN_BYTES)
@@ -187,8 +201,8 @@ class Publisher:
             times.append(self._status_at_s)
         return min((time for time in times if time is not None), default=None)
 
-    def take(self, now_s: float, limit: int = _ALL) -> list[bytes]:
-        """Return frames that may go now, about ``limit`` at a time: the rest is sealed when it is asked for."""
+    def take(self, now_s: float, limit_bytes: int = _ALL) -> list[bytes]:
+        """Return frames that may go now, about ``limit_bytes`` at a time: the rest is sealed when it is asked for."""
         if self._mtu is None or not self._readers:
             return []
         while self._early:
@@ -198,7 +212,7 @@ class Publisher:
         self._waiting_bytes = 0
         if self._status_wanted and now_s >= self._status_at_s:
             frames += self._seal_status(now_s)
-        return frames + self._window.take(now_s, max(limit - len(frames), 1))
+        return frames + self._window.take(now_s, max(limit_bytes // self._mtu - len(frames), 1))
 
     def _sealer(self, kind: Kind) -> Sealer:
         source = self._source
@@ -221,16 +235,16 @@ class Publisher:
         reader = self._readers.get(name)
         if reader is None and len(self._readers) >= _READERS_MAX:
             raise EnvelopeError(DropReason.QUOTA, "readers")
-        is_current = is_known if reader is None else reader.opener is opener
+        is_current = is_known if reader is None else reader.incarnation == header.incarnation
         if not is_current and ReportFlag.NEW not in report.flags:
             raise FrameError(DropReason.UNKNOWN_SENDER, "a report of a life that never began, or is over")
         self._lives[life] = opener
         self._lives.move_to_end(life)
         if len(self._lives) > _LIVES_MAX:
             self._lives.popitem(last=False)
-        if reader is None or reader.opener is not opener:
+        if reader is None or reader.incarnation != header.incarnation:
             self._forget(name)
-            reader = self._readers[name] = _Reader(opener, now_s)
+            reader = self._readers[name] = _Reader(header.incarnation, now_s)
         reader.heard_s = now_s
         return report
 

@@ -29,6 +29,7 @@ from gdp.message.replay import ReplayWindow
 __all__ = ["ALL_PARTS", "Joined", "Joiner", "OpensParts", "VerifiesDigest"]
 
 ALL_PARTS = 0xFFFF_FFFF
+_PREPAID_BYTES = 32 << 10  # memory is taken ahead for so much of a message whose parts come in order
 _PART_OVERHEAD_BYTES = 128  # what a kept part costs beside its bytes
 _SCAN_PARTS = 4_096  # above the parts that an honest publisher has under way
 
@@ -66,6 +67,8 @@ class _Hash(Protocol):
 @dataclass(slots=True)
 class _Unfinished:
     parts: int
+    epoch: int
+    opener: OpensParts
     running: _Hash
     touched_s: float
     plain: dict[int, bytes] = field(default_factory=dict)
@@ -74,6 +77,7 @@ class _Unfinished:
     top: int = -1  # highest part held
     signature: bytes = b""
     held_bytes: int = 0
+    prepaid_bytes: int = 0  # of ``held_bytes``, not yet used
     hops: int = 0
 
 
@@ -108,6 +112,43 @@ class Joiner:
         self.highest = -1  # highest message number of which an authentic part came
         self.new_parts = 0
 
+    def add_next(self, header: Header, frame: bytes, now_s: float) -> bool:
+        """Take a part the short way: the next one, but not the last, of a message under way whose parts come in order.
+
+        Almost every part of a large message is one. False: nothing was done, ``add`` must look at it.
+        """
+        message = self._unfinished.get(header.number)
+        part = header.part
+        if (
+            message is None
+            or part != message.hashed
+            or message.early
+            or not part + 1 < header.parts == message.parts
+            or header.epoch != message.epoch
+        ):
+            return False
+        cost = header.length + _PART_OVERHEAD_BYTES
+        if message.prepaid_bytes < cost:
+            if not self._budget.reserve(self._source, _PREPAID_BYTES + cost):
+                return False
+            message.held_bytes += _PREPAID_BYTES + cost
+            message.prepaid_bytes += _PREPAID_BYTES + cost
+        try:
+            message.plain[part], sealed, _ = message.opener.open(header, frame)
+        except EnvelopeError as error:
+            self.drops[error.reason] += 1
+            return True
+        message.prepaid_bytes -= cost
+        message.running.update(sealed)
+        message.hashed = part + 1
+        message.top = part
+        message.touched_s = now_s
+        hops = HOPS_MAX - header.hops_left
+        if hops > message.hops:
+            message.hops = hops
+        self.new_parts += 1
+        return True
+
     def add(self, header: Header, frame: bytes, now_s: float) -> Joined | None:
         """Take one part; return the message it completes, if any. What is wrong with it is counted in ``drops``."""
         number = header.number
@@ -119,7 +160,8 @@ class Joiner:
             self.drops[DropReason.DUPLICATE] += 1
             return None
         try:
-            plain, sealed, signature = self._opener_of(header.epoch).open(header, frame)
+            opener = self._opener_of(header.epoch)
+            plain, sealed, signature = opener.open(header, frame)
         except EnvelopeError as error:
             self.drops[error.reason] += 1
             return None
@@ -128,7 +170,9 @@ class Joiner:
         if message is None and not self._make_room(number):
             self.drops[DropReason.MEMORY_FULL] += 1
             return None
-        return self._keep(header, plain, sealed, signature, now_s)
+        if message is None or message.parts != header.parts:
+            message = self._start(header, opener, now_s)
+        return self._keep(message, header, plain, sealed, signature, now_s)
 
     def _take_whole(self, header: Header, plain: bytes, sealed: bytes, signature: bytes) -> Joined | None:
         number = header.number
@@ -144,15 +188,17 @@ class Joiner:
         self.window.finish(number)
         return Joined(number, header.flags & ~Flag.LAST, plain, 1, max(HOPS_MAX - header.hops_left, 0))
 
-    def _keep(self, header: Header, plain: bytes, sealed: bytes, signature: bytes, now_s: float) -> Joined | None:
-        number = header.number
-        message = self._unfinished.get(number)
-        if message is not None and message.parts != header.parts:
+    def _start(self, header: Header, opener: OpensParts, now_s: float) -> _Unfinished:
+        """Return a message of which nothing is kept yet; one with another number of parts gives way."""
+        if header.number in self._unfinished:
             self.drops[DropReason.BAD_PARTS] += 1
-            self._drop(number)
-            message = None
-        if message is None:
-            message = _Unfinished(header.parts, digest_of(header), now_s)
+            self._drop(header.number)
+        return _Unfinished(header.parts, header.epoch, opener, digest_of(header), now_s)
+
+    def _keep(
+        self, message: _Unfinished, header: Header, plain: bytes, sealed: bytes, signature: bytes, now_s: float
+    ) -> Joined | None:
+        number = header.number
         in_order = header.part == message.hashed
         cost = len(plain) + _PART_OVERHEAD_BYTES + (0 if in_order else len(sealed))
         if not self._reserve(number, cost):

@@ -78,7 +78,6 @@ class Runtime:
         moment = now()
         if arrivals:
             self._machine.receive(arrivals, moment)
-            self._deadline_s = self._machine.next_timeout()
         if self._deadline_s is not None and moment.mono_s >= self._deadline_s:
             self._machine.timeout(moment)
             self._deadline_s = self._machine.next_timeout()

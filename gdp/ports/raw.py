@@ -94,7 +94,15 @@ class RawPlane(LinkedPlane):
         sizes = self._batch.take(source)
         self._counters.frames_in += len(sizes)
         slots = range(0, len(self._batch.pool), self._batch.slot_bytes)
-        self._arrivals += [self._arrival(port, slot, size) for slot, size in zip(slots, sizes, strict=False)]
+        with memoryview(self._batch.pool) as pool:
+            self._arrivals += [
+                Arrival(
+                    port,
+                    bytes(pool[slot + MAC_BYTES : slot + 2 * MAC_BYTES]),
+                    bytes(pool[slot + ETHER_BYTES : slot + ETHER_BYTES + size]),
+                )
+                for slot, size in zip(slots, sizes, strict=False)
+            ]
 
     def _arrival(self, port: int, slot: int, size: int) -> Arrival:
         with memoryview(self._batch.pool) as pool:

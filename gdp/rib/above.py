@@ -38,6 +38,7 @@ class Above:
     def __init__(self, upper: Name | None) -> None:
         self._upper = upper
         self._open: dict[Name, _Open] = {}
+        self._due_s = float("inf")  # no question is due before
 
     def want(self, name: Name, asker: Name, watch_s: float, now_s: float, *, is_known: bool) -> bool:
         """Note that somebody asks; return whether the tier above must be asked now.
@@ -57,6 +58,8 @@ class Above:
             question.is_answered, question.asked_s, question.again_s = False, now_s, now_s + RETRY_S
             question.askers = []
             is_new = True
+        if is_new:
+            self._due_s = min(self._due_s, question.again_s)
         if not question.is_answered and not is_known and asker not in question.askers:
             question.askers.append(asker)
         return is_new
@@ -84,6 +87,8 @@ class Above:
         """Return what to ask now, as (name, watch seconds), and what was given up, as (name, askers)."""
         ask: list[tuple[Name, float]] = []
         given_up: list[tuple[Name, list[Name]]] = []
+        if now_s < self._due_s:
+            return ask, given_up
         for name, question in list(self._open.items()):
             if question.again_s > now_s:
                 continue
@@ -98,8 +103,9 @@ class Above:
                 continue
             question.again_s = now_s + (WATCH_AGAIN_S if question.is_answered else RETRY_S)
             ask.append((name, self.watch_s(name)))
+        self._due_s = min((question.again_s for question in self._open.values()), default=float("inf"))
         return ask, given_up
 
     def next_due(self) -> float | None:
-        """Return the monotonic second of the next question, or None."""
-        return min((question.again_s for question in self._open.values()), default=None)
+        """Return a monotonic second that is no later than the next question, or None."""
+        return self._due_s if self._open else None

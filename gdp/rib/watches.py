@@ -23,6 +23,7 @@ class Watches:
         self._maximum = maximum
         self._by_name: dict[Name, dict[Name, float]] = {}
         self._size = 0
+        self._expire_at_s = float("inf")  # no watch ends before
 
     def __len__(self) -> int:
         return self._size
@@ -41,6 +42,7 @@ class Watches:
                 raise StatementError(DropReason.QUOTA, "watches")
             self._size += 1
         watchers[asker] = max(until_s, watchers.get(asker, until_s))
+        self._expire_at_s = min(self._expire_at_s, until_s)
 
     def watchers(self, name: Name, now_s: float) -> list[Name]:
         """Return who watches a name now."""
@@ -52,6 +54,8 @@ class Watches:
 
     def expire(self, now_s: float) -> None:
         """Forget watches that ended."""
+        if now_s < self._expire_at_s:
+            return
         for name in list(self._by_name):
             watchers = self._by_name[name]
             for asker in [asker for asker, until_s in watchers.items() if until_s <= now_s]:
@@ -59,3 +63,5 @@ class Watches:
                 self._size -= 1
             if not watchers:
                 del self._by_name[name]
+        ends = (until_s for watchers in self._by_name.values() for until_s in watchers.values())
+        self._expire_at_s = min(ends, default=float("inf"))

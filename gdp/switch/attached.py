@@ -36,6 +36,7 @@ class Attached:
 
     def __init__(self) -> None:
         self._by_name: dict[Name, dict[Name, Attachment]] = {}
+        self._next_s = float("inf")  # nothing is due before
 
     def __len__(self) -> int:
         return sum(map(len, self._by_name.values()))
@@ -55,6 +56,7 @@ class Attached:
         """Note a verified claim; it is to be relayed at once."""
         attachment = Attachment(claim, port, mac, now_s + claim.lease_s, now_s)
         self._by_name.setdefault(claim.name, {})[claim.node] = attachment
+        self._next_s = min(self._next_s, now_s)
         return attachment
 
     def remove(self, name: Name, advertiser: Name) -> Attachment | None:
@@ -85,9 +87,12 @@ class Attached:
         for claims in self._by_name.values():
             for attachment in claims.values():
                 attachment.is_settled, attachment.relay_at_s, attachment.tries = False, now_s, 0
+        self._next_s = min(self._next_s, now_s)
 
     def due(self, now_s: float) -> list[Attachment]:
         """Return the claims to relay now."""
+        if now_s < self._next_s:
+            return []
         due = []
         for claims in self._by_name.values():
             for each in claims.values():
@@ -95,20 +100,26 @@ class Attached:
                     each.tries += 1
                     each.relay_at_s = now_s + RELAY_AGAIN_S
                     due.append(each)
+        self._look_ahead()
         return due
 
     def expire(self, now_s: float) -> list[Attachment]:
         """Forget and return what was not renewed."""
+        if now_s < self._next_s:
+            return []
         late = [each for claims in self._by_name.values() for each in claims.values() if each.expires_s <= now_s]
         for each in late:
             self.remove(each.claim.name, each.claim.node)
         return late
 
     def next_event(self) -> float | None:
-        """Return the monotonic second of the next relay or lease end, or None."""
+        """Return a monotonic second that is no later than the next relay or lease end, or None."""
+        return self._next_s if self._by_name else None
+
+    def _look_ahead(self) -> None:
         times = [
             each.expires_s if each.is_settled or each.tries >= RELAY_TRIES else min(each.relay_at_s, each.expires_s)
             for claims in self._by_name.values()
             for each in claims.values()
         ]
-        return min(times, default=None)
+        self._next_s = min(times, default=float("inf"))

@@ -336,10 +336,10 @@ class Switch:
             self._refuse(neighbour, statement, error)
             raise
         at = (neighbour.port, neighbour.mac)
-        if claim.sequence < self._sequence_of(claim.name, neighbour):
-            error = StatementError(DropReason.STALE, "a claim that its maker has renewed")
-            self._refuse(neighbour, statement, error)
-            raise error
+        newest = self._sequence_of(claim.name, neighbour)
+        if claim.sequence < newest:
+            self._judge(neighbour, claim.name, DropReason.STALE, newest)
+            raise StatementError(DropReason.STALE, "a claim that its maker has renewed")
         if claim.right is Right.READ:
             if self.planter.add_reader(claim, at, self.places.of(claim.name, now.mono_s), now.mono_s):
                 self.places.want(claim.name, now.mono_s, watch=True)

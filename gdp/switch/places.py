@@ -54,6 +54,7 @@ class Places:
         self._nobody: dict[Name, float] = {}
         self._questions: dict[Name, _Question] = {}
         self._watches = 0
+        self._ask_at_s = float("inf")  # no question is due before
         self._expire_at_s = float("inf")  # no lease ends before
 
     def __len__(self) -> int:
@@ -78,9 +79,11 @@ class Places:
             if not watch and len(self._questions) - self._watches >= QUESTIONS_MAX:
                 return
             question = self._questions[name] = _Question(now_s)
+            self._ask_at_s = min(self._ask_at_s, now_s)
         if watch and not question.is_watch:
             question.is_watch = True
             question.ask_at_s = now_s
+            self._ask_at_s = min(self._ask_at_s, now_s)
             self._watches += 1
 
     def is_asked(self, name: Name) -> bool:
@@ -97,11 +100,14 @@ class Places:
         """Have every open question and every watch asked at once: there is a new RIB."""
         for question in self._questions.values():
             question.ask_at_s, question.tries = now_s, 0
+        self._ask_at_s = min(self._ask_at_s, now_s)
 
     def due(self, now_s: float) -> tuple[list[tuple[Name, bool]], list[Name]]:
         """Return the questions to send now, as (name, watch), and the names whose question was given up."""
         ask: list[tuple[Name, bool]] = []
         given_up: list[Name] = []
+        if now_s < self._ask_at_s:
+            return ask, given_up
         for name, question in list(self._questions.items()):
             if question.ask_at_s > now_s:
                 continue
@@ -112,11 +118,12 @@ class Places:
             question.tries += 1
             question.ask_at_s = now_s + (WATCH_AGAIN_S if question.is_answered else RETRY_S)
             ask.append((name, question.is_watch))
+        self._ask_at_s = min((question.ask_at_s for question in self._questions.values()), default=float("inf"))
         return ask, given_up
 
     def next_due(self) -> float | None:
-        """Return the monotonic second of the next question, or None."""
-        return min((question.ask_at_s for question in self._questions.values()), default=None)
+        """Return a monotonic second that is no later than the next question, or None."""
+        return self._ask_at_s if self._questions else None
 
     def put(self, place: Place, now_s: float) -> Place | None:
         """Note a place; return what was known of this advertiser before."""

@@ -18,7 +18,6 @@ from gdp.crypto.keys import SigningKey
 from gdp.crypto.validity import Validity
 from gdp.limits import DEAD_S, HELLO_S
 from gdp.metadata import Metadata
-from gdp.names import Name
 from gdp.rib.machine import Rib, RibSettings
 from gdp.rib.store import MemoryStore
 from gdp.switch.machine import Switch, SwitchSettings

@@ -9,7 +9,7 @@ from gdp.frame.kinds import Kind
 from gdp.testbed.topology import ring5
 from gdp.testbed.world import World
 from gdp.trust.right import Right
-from tests.journeys.flows import ROBOT, SERVER, Tap, advertise, flowing, ring
+from tests.journeys.flows import SERVER, Tap, advertise, flowing, ring
 
 SHORT = frozenset(("nuc5", "nuc1"))
 WITHOUT_BACKBONE = {"school": ("cloud",), "cloud": ("school",), "backbone": ("school", "cloud")}

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
+from gdp.crypto.statements import parse
 from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.rib.route import Route
 from gdp.testbed.world import World
 from gdp.trust.claim import ClaimBody
-from gdp.crypto.statements import parse
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 
 

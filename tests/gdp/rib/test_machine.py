@@ -24,8 +24,21 @@ from gdp.trust.claim import ClaimBody, make_claim
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
-from tests.gdp.trust.world import CAMERA, CLOUD, DAY, GATEWAY, HOUR, LATER, NOW, ROBOT, SCHOOL, STRANGER, SWITCH
-from tests.gdp.trust.world import adcert, claim
+from tests.gdp.trust.world import (
+    CAMERA,
+    CLOUD,
+    DAY,
+    GATEWAY,
+    HOUR,
+    LATER,
+    NOW,
+    ROBOT,
+    SCHOOL,
+    STRANGER,
+    SWITCH,
+    adcert,
+    claim,
+)
 
 RIB = NodeKeys.generate(Role.RIB, "rib").join(SCHOOL, DAY)
 UPPER = NodeKeys.generate(Role.RIB, "upper").join(CLOUD, DAY)

@@ -1,0 +1,126 @@
+"""A node's hold on the overlay: claims, verdicts, renewals, and which switch it holds on to."""
+
+from __future__ import annotations
+
+import pytest
+
+from gdp.client.attachment import CLAIM_LEASE_S, Claimed
+from gdp.client.member import Topic
+from gdp.crypto.subject import Subject
+from gdp.errors import DropReason
+from gdp.frame.kinds import Kind
+from gdp.metadata import Metadata
+from gdp.testbed.world import World
+from gdp.trust.right import Right
+from tests.journeys.flows import ROBOT, SERVER, Tap, advertise, ring
+
+
+def claim_without_delegation(world: World) -> None:
+    """Let the robot claim a name of an owner who gave it nothing."""
+    subject = world.owner.subject(Metadata({"kind": "topic", "name": "/not/mine"}))
+    world.members[ROBOT].attachment.claim(subject, Right.PUBLISH, (), is_global=True)
+    world.network.touch(ROBOT)
+
+
+def of(world: World, right: Right) -> Claimed:
+    return next(each for each in world.members[ROBOT].attachment.claims if each.right is right)
+
+
+def test_a_refused_claim_is_judged_and_says_why() -> None:
+    world = ring()
+    claim_without_delegation(world)
+    assert world.network.run(2, lambda: of(world, Right.PUBLISH).is_judged)
+    claimed = of(world, Right.PUBLISH)
+    assert (claimed.is_taken, claimed.refused) == (False, DropReason.NOT_DELEGATED)
+    assert world.members[ROBOT].attachment.is_attached
+
+
+@pytest.mark.parametrize("reason", list(DropReason))
+def test_every_reason_counts_as_a_judgement(reason: DropReason) -> None:
+    assert Claimed(Subject(bytes(32), b""), Right.READ, (), is_global=False, refused=reason).is_judged
+
+
+def test_a_refused_claim_is_not_made_again_at_once() -> None:
+    world = ring()
+    claim_without_delegation(world)
+    tap = Tap(ROBOT, "nuc1")
+    world.network.taps.append(tap)
+    world.network.run(CLAIM_LEASE_S / 3 - 1)
+    first = {each.number for each in tap.headers if each.kind == Kind.ADVERTISE}
+    assert len(first) <= 3
+
+
+def test_claims_are_renewed_before_their_lease_ends() -> None:
+    world = ring()
+    world.network.run(3 * CLAIM_LEASE_S)
+    assert world.switches["nuc1"].attached.get(world.members[ROBOT].name, world.members[ROBOT].name) is not None
+    assert world.ribs["school"].rib.names == 1
+
+
+def test_a_node_whose_clock_went_back_finds_its_way_past_its_earlier_life() -> None:
+    world = ring()
+    member = world.restart_member(ROBOT)
+    member.attachment._sequence = 5
+    world.network.run(3)
+    assert member.attachment.is_attached
+    assert member.attachment.refusals[DropReason.STALE] >= 1
+
+
+def test_who_leaves_is_gone_in_every_tier() -> None:
+    world = ring()
+    flow = advertise(world)
+    world.network.run(1)
+    world.members[ROBOT].leave()
+    world.network.touch(ROBOT)
+    world.network.run(1)
+    for host in world.ribs.values():
+        assert host.rib._store.routes(flow.topic.name) == []
+
+
+def test_who_falls_silent_is_gone_when_its_lease_ends() -> None:
+    world = ring()
+    world.network.stop(ROBOT)
+    world.network.run(CLAIM_LEASE_S + 1)
+    assert [host.rib.names for host in world.ribs.values()] == [0, 1, 1]
+
+
+def test_without_a_switch_what_is_sent_is_counted_as_lost() -> None:
+    world = ring()
+    attachment = world.members[ROBOT].attachment
+    world.network.set_link(world.leads[ROBOT], up=False)
+    attachment.send([b"frame"])
+    assert attachment.refusals[DropReason.PORT_DOWN] == 1
+    assert not attachment.is_attached
+
+
+def test_of_two_switches_the_cheaper_is_held() -> None:
+    world = ring()
+    world.network.connect("nuc2", ROBOT, cost=5)
+    world.network.run(2)
+    switch = world.members[ROBOT].attachment.switch
+    assert switch is not None
+    assert switch.name == world.identities["nuc2"].name
+    assert world.members[ROBOT].attachment.is_attached
+
+
+def test_the_other_switch_is_held_when_the_first_is_gone() -> None:
+    world = ring()
+    world.network.connect("nuc2", ROBOT, cost=50)
+    world.network.run(2)
+    world.network.stop("nuc1")
+    world.network.run(3)
+    switch = world.members[ROBOT].attachment.switch
+    assert switch is not None
+    assert switch.name == world.identities["nuc2"].name
+    assert world.members[ROBOT].attachment.is_attached
+
+
+def test_a_delegation_of_another_node_is_refused_with_its_reason() -> None:
+    world = ring()
+    server = world.members[SERVER]
+    topic = world.topic("/x", server, [Right.READ])
+    robot = world.members[ROBOT]
+    robot.subscribe(Topic(topic.delegation, topic.secrets))
+    world.network.touch(ROBOT)
+    world.network.run(1)
+    assert of(world, Right.READ).refused is DropReason.NOT_DELEGATED

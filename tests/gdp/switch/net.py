@@ -1,0 +1,47 @@
+"""Link states made by hand, for tests of paths."""
+
+from __future__ import annotations
+
+from gdp.control.link_state import Adjacency, LinkState, Scope
+from gdp.names import Name
+from gdp.switch.link_states import LinkStates
+from gdp.switch.paths import Paths
+
+
+def name(label: str) -> Name:
+    """Return a name that a test can read."""
+    return Name(label.encode().ljust(32, b"-"))
+
+
+HOME, AWAY, THIRD = name("home"), name("away"), name("third")
+
+
+def link(to: str, cost: int = 10, domain: Name = HOME) -> Adjacency:
+    """Return one direction of a link."""
+    return Adjacency(name(to), domain, cost, 1_500)
+
+
+def state(
+    origin: str,
+    *links: Adjacency,
+    domain: Name = HOME,
+    scope: Scope = Scope.DOMAIN,
+    sequence: int = 1,
+    inside: tuple[Adjacency, ...] = (),
+    ribs: tuple[str, ...] = (),
+) -> LinkState:
+    """Return a link state."""
+    return LinkState(name(origin), domain, scope, sequence, links, inside, tuple(name(rib) for rib in ribs))
+
+
+def known(*states: LinkState) -> LinkStates:
+    """Return what a switch of HOME knows."""
+    link_states = LinkStates(HOME)
+    for each in states:
+        link_states.put(each, b"wire of " + each.origin, 0.0)
+    return link_states
+
+
+def paths(me: str, *states: LinkState) -> Paths:
+    """Return the paths of a switch of HOME."""
+    return Paths(name(me), HOME, known(*states))

@@ -1,0 +1,116 @@
+"""Where names are: asked until answered, watched on, believed for a lease, bounded."""
+
+from __future__ import annotations
+
+from gdp.limits import NEGATIVE_LEASE_S
+from gdp.names import Name
+from gdp.switch.places import QUESTIONS_MAX, RETRY_S, TRIES_MAX, WATCH_AGAIN_S, Place, Places
+from gdp.trust.right import Right
+from tests.gdp.switch.net import HOME, name
+
+TOPIC = name("topic")
+
+
+def place(advertiser: str = "robot", expires_s: float = 30.0) -> Place:
+    return Place(TOPIC, name(advertiser), Right.PUBLISH, name("switch"), HOME, frozenset(), b"claim", expires_s)
+
+
+def asked(places: Places, now_s: float) -> list[tuple[Name, bool]]:
+    return places.due(now_s)[0]
+
+
+def test_a_question_is_asked_at_once_and_again_until_it_is_given_up() -> None:
+    places, now_s, times, given_up = Places(), 0.0, 0, []
+    places.want(TOPIC, now_s, watch=False)
+    while not given_up:
+        questions, given_up = places.due(now_s)
+        times += len(questions)
+        now_s += RETRY_S
+    assert (times, given_up) == (TRIES_MAX, [TOPIC])
+    assert places.next_due() is None
+
+
+def test_wanting_twice_asks_once() -> None:
+    places = Places()
+    places.want(TOPIC, 0.0, watch=False)
+    places.want(TOPIC, 0.0, watch=False)
+    assert asked(places, 0.0) == [(TOPIC, False)]
+    assert asked(places, 0.0) == []
+
+
+def test_an_answer_ends_a_question() -> None:
+    places = Places()
+    places.want(TOPIC, 0.0, watch=False)
+    places.put(place(), 0.0)
+    assert (places.is_asked(TOPIC), places.next_due()) == (False, None)
+
+
+def test_a_watch_goes_on_after_its_answer() -> None:
+    places = Places()
+    places.want(TOPIC, 0.0, watch=True)
+    places.put(place(), 0.0)
+    assert asked(places, 1.0) == []
+    assert asked(places, WATCH_AGAIN_S) == [(TOPIC, True)]
+
+
+def test_a_watch_is_asked_at_once_though_the_name_was_asked_for_before() -> None:
+    places = Places()
+    places.want(TOPIC, 0.0, watch=False)
+    assert asked(places, 0.0) == [(TOPIC, False)]
+    places.want(TOPIC, 0.1, watch=True)
+    assert asked(places, 0.1) == [(TOPIC, True)]
+
+
+def test_a_new_rib_is_asked_everything_at_once() -> None:
+    places = Places()
+    places.want(TOPIC, 0.0, watch=True)
+    places.put(place(), 0.0)
+    places.ask_again(1.0)
+    assert asked(places, 1.0) == [(TOPIC, True)]
+
+
+def test_what_is_watched_no_more_is_asked_no_more() -> None:
+    places = Places()
+    places.want(TOPIC, 0.0, watch=True)
+    places.unwatch(TOPIC)
+    assert (asked(places, 1.0), places.next_due()) == ([], None)
+
+
+def test_a_place_is_believed_for_its_lease() -> None:
+    places = Places()
+    places.put(place(expires_s=5.0), 0.0)
+    assert [each.advertiser for each in places.of(TOPIC, 4.9)] == [name("robot")]
+    assert places.of(TOPIC, 5.0) == []
+    places.expire(5.0)
+    assert len(places) == 0
+
+
+def test_two_advertisers_of_one_name_are_both_known() -> None:
+    places = Places()
+    places.put(place("one"), 0.0)
+    places.put(place("two"), 0.0)
+    places.remove(TOPIC, name("one"), 0.0)
+    assert [each.advertiser for each in places.of(TOPIC, 0.0)] == [name("two")]
+
+
+def test_nobody_is_believed_for_a_moment() -> None:
+    places = Places()
+    places.nobody(TOPIC, 0.0)
+    assert places.is_nowhere(TOPIC, NEGATIVE_LEASE_S - 0.1)
+    assert not places.is_nowhere(TOPIC, NEGATIVE_LEASE_S)
+
+
+def test_somebody_ends_nobody() -> None:
+    places = Places()
+    places.nobody(TOPIC, 0.0)
+    places.put(place(), 0.1)
+    assert not places.is_nowhere(TOPIC, 0.2)
+
+
+def test_open_questions_are_bounded_and_watches_stand_apart() -> None:
+    places = Places()
+    for number in range(QUESTIONS_MAX + 10):
+        places.want(name(str(number)), 0.0, watch=False)
+    places.want(TOPIC, 0.0, watch=True)
+    assert len(asked(places, 0.0)) == QUESTIONS_MAX + 1
+    assert not places.is_asked(name(str(QUESTIONS_MAX + 9)))

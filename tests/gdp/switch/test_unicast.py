@@ -1,0 +1,99 @@
+"""Ways to one name, in a running network: found when asked for, negative when there is none, never in a tree's way."""
+
+from __future__ import annotations
+
+from gdp.errors import DropReason
+from gdp.frame.codec import Header, encode
+from gdp.frame.kinds import Flag, Kind
+from gdp.limits import HOPS_MAX
+from gdp.names import Name
+from gdp.switch.table import NOWHERE
+from gdp.switch.unicast import NEGATIVE_S, _Installed
+from gdp.testbed.world import World
+from tests.journeys.flows import ROBOT, SERVER, flowing, ring
+
+ABSENT = Name(b"?" * 32)
+
+
+def send(world: World, destination: Name, source: str = ROBOT, kind: int = Kind.REPORT) -> None:
+    """Let a member send a frame to a name."""
+    member = world.members[source]
+    frame = encode(Header(kind, Flag.LAST, HOPS_MAX, 1, 0, 1, 0, 1, 9, destination, member.name))
+    member.attachment.send([frame])
+    world.network.touch(source)
+
+
+def test_a_name_that_nobody_has_is_answered_and_then_dropped_by_the_data_plane() -> None:
+    world = ring()
+    robot, nuc1 = world.members[ROBOT].name, world.switches["nuc1"]
+    send(world, ABSENT)
+    assert len(nuc1.parked) == 0
+    world.network.run(0.1)
+    send(world, ABSENT)
+    world.network.run(0.01)
+    assert nuc1.table.entries[ABSENT + robot] == NOWHERE
+    world.network.run(NEGATIVE_S + 0.5)
+    assert ABSENT + robot not in nuc1.table.entries
+
+
+def test_a_frame_waits_while_its_destination_is_asked_for() -> None:
+    world = ring()
+    send(world, ABSENT)
+    world.network.run(0.0005)
+    assert len(world.switches["nuc1"].parked) == 1
+
+
+def test_who_attaches_where_it_was_missed_is_reached_at_once() -> None:
+    world = ring()
+    nuc1 = world.switches["nuc1"]
+    late = world.add_member("nuc1/late", "nuc1")
+    for _ in range(3):
+        send(world, late.name)
+        world.network.run(0.0002)
+    world.network.run(1.0, lambda: late.attachment.is_attached)
+    send(world, late.name)
+    world.network.run(0.01)
+    assert nuc1.table.entries[late.name] != NOWHERE
+    assert late.name + world.members[ROBOT].name not in nuc1.table.entries
+
+
+def test_who_is_found_is_reached_though_it_was_missed_a_moment_ago() -> None:
+    world = ring()
+    nuc1, robot = world.switches["nuc1"], world.members[ROBOT].name
+    server = world.members[SERVER].name
+    nuc1.unicast._install_nowhere(server, robot, DropReason.NO_ROUTE, world.network.now.mono_s)
+    assert nuc1.table.entries[server + robot] == NOWHERE
+    nuc1.places.want(server, world.network.now.mono_s, watch=False)
+    world.network.touch("nuc1")
+    world.network.run(1.0)
+    send(world, server)
+    world.network.run(0.1)
+    assert nuc1.table.entries[server + robot] != NOWHERE
+
+
+def test_no_change_of_links_takes_down_a_tree_that_grew_where_nothing_was_read() -> None:
+    world = ring()
+    flow = flowing(world)
+    nuc1, robot = world.switches["nuc1"], world.members[ROBOT].name
+    key = flow.topic.name + robot
+    standing = nuc1.table.entries[key]
+    nuc1.unicast._note(key, _Installed(flow.topic.name, robot, is_negative=True))
+    nuc1.unicast.refresh(world.network.now.mono_s)
+    assert nuc1.table.entries[key] == standing
+    nuc1.unicast._note(key, _Installed(flow.topic.name, robot, is_negative=True))
+    nuc1.unicast.forget(flow.topic.name)
+    assert nuc1.table.entries[key] == standing
+
+
+def test_what_is_remembered_of_entries_goes_with_them() -> None:
+    world = ring()
+    nuc1 = world.switches["nuc1"]
+    for _ in range(2):
+        for number in range(200):
+            send(world, Name(number.to_bytes(32, "big")))
+        world.network.run(0.5)
+    assert len(nuc1.unicast._installed) > 100
+    world.network.run(10)
+    assert all(not why.is_negative for why in nuc1.unicast._installed.values())
+    assert set(nuc1.unicast._installed) == {key for keys in nuc1.unicast._keys_of.values() for key in keys}
+    assert set(nuc1.unicast._installed) <= set(nuc1.table.entries)
