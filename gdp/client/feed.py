@@ -121,7 +121,8 @@ class Feed:
 
     def receive(self, header: Header, frame: bytes, now_s: float) -> None:
         """Take one DATA or STATUS frame of this publisher."""
-        if header.kind == Kind.DATA and header.incarnation == self.incarnation and self._data.add_next(header, frame, now_s):
+        is_data = header.kind == Kind.DATA and header.incarnation == self.incarnation
+        if is_data and self._data.add_next(header, frame, now_s):
             self._unreported_bytes += header.length
             due_s = now_s if self._unreported_bytes >= REPORT_EVERY_BYTES else now_s + REPORT_DELAY_S
             if due_s < self._report_at_s and self._is_reliable and self.state is FeedState.LIVE:

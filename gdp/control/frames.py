@@ -1,8 +1,8 @@
 """A statement in frames: split where it is longer than a link carries, joined under tight bounds.
 
 Place: pure; time comes in as ``now_s`` (monotonic seconds). Statements are signed, not sealed; until one is whole
-nobody knows who wrote it, so memory is bounded per claimed source and in all, and patience is short. Where a bound is met
-the oldest unfinished statement makes room: a flood of beginnings ends its own, hardly one whose parts come together.
+nobody knows who wrote it, so memory is bounded per claimed source and in all, and patience is short. Where a bound is
+met the oldest unfinished statement makes room: a flood of beginnings ends its own, hardly one whose parts come at once.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 Place: pure; every node that has a port greets: switches, RIBs, proxies.
 
 A hello is signed by a member of a trusted domain and carries its certificate. It counts as two-way when it echoes the
-nonce of our port's present session, and is newer than all that came of its own, so a recorded hello brings nobody up: of
-sessions that ended, too, the last sequence number is remembered.
+nonce of our port's present session, and is newer than all that came of its own, so a recorded hello brings nobody up:
+of sessions that ended, too, the last sequence number is remembered.
 """
 
 from __future__ import annotations

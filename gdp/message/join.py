@@ -143,9 +143,7 @@ class Joiner:
         message.hashed = part + 1
         message.top = part
         message.touched_s = now_s
-        hops = HOPS_MAX - header.hops_left
-        if hops > message.hops:
-            message.hops = hops
+        message.hops = max(message.hops, HOPS_MAX - header.hops_left)
         self.new_parts += 1
         return True
 

@@ -102,7 +102,10 @@ class Rib:
             self.refusals[error.reason] += 1
 
     def revoke(self, wire: bytes, now: Instant) -> None:
-        """Take a certificate back: what rests on it is gone, and whoever watched is told. What does not hold is counted."""
+        """Take a certificate back: what rests on it is gone, and whoever watched is told.
+
+        What does not hold is counted.
+        """
         try:
             revocation = self._verifier.revoke(wire, now.unix_s)
         except RemoteError as error:

@@ -118,7 +118,8 @@ class MemoryStore:
 
     def resting_on(self, fingerprint: bytes) -> list[Route]:
         """Return the routes whose evidence includes a certificate; looks at all."""
-        return [each for of_name in self._routes.values() for each in of_name.values() if fingerprint in each.fingerprints]
+        every = (route for of_name in self._routes.values() for route in of_name.values())
+        return [route for route in every if fingerprint in route.fingerprints]
 
     def _take(self, name: Name, advertiser: Name) -> Route | None:
         of_name = self._routes.get(name, {})

@@ -20,7 +20,6 @@ from gdp.control.frames import ControlJoiner, ControlSplitter
 from gdp.control.greeter import Change, Greeter, LinkPort
 from gdp.control.join import Join
 from gdp.control.neighbour import Neighbour, NeighbourState
-from gdp.control.verdict import Verdict
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
@@ -31,6 +30,7 @@ from gdp.frame.kinds import CONTROL_FROM, Kind
 from gdp.limits import DEAD_S, HELLO_S, HOPS_MAX
 from gdp.names import Name
 from gdp.switch.attached import Attached
+from gdp.switch.claims import Claims
 from gdp.switch.flooding import Flooding
 from gdp.switch.inquirer import Inquirer
 from gdp.switch.outbox import Outbox
@@ -40,7 +40,6 @@ from gdp.switch.planter import Planter
 from gdp.switch.revoker import Revoker
 from gdp.switch.table import Table
 from gdp.switch.unicast import Unicast
-from gdp.trust.claim import ClaimBody
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.verifier import ClaimVerifier
@@ -108,6 +107,10 @@ class Switch:
         self._followed_s = float("-inf")
         self.inquirer = Inquirer(
             identity, policy, self._paths, self.attached, self.places, self.parked, self.planter, self.unicast,
+            self._outbox,
+        )  # fmt: skip
+        self._claims = Claims(
+            identity, self._verifier, self.attached, self.places, self.planter, self.unicast, self.inquirer,
             self._outbox,
         )  # fmt: skip
         self._drops: Counter[DropReason] = Counter()
@@ -244,9 +247,9 @@ class Switch:
                 raise StatementError(DropReason.NOT_DELEGATED, "only switches speak of links")
             self._flooding.receive(neighbour, statement, now)
         elif kind == Kind.ADVERTISE:
-            self._take_claim(neighbour, statement, now)
+            self._claims.take(neighbour, statement, now)
         elif kind == Kind.WITHDRAW:
-            self._take_withdrawal(neighbour, statement, now)
+            self._claims.withdraw(neighbour, statement, now)
         elif kind in (Kind.JOIN, Kind.LEAVE):
             self._take_join(neighbour, statement, now)
         elif kind == Kind.REVOKE:
@@ -323,71 +326,7 @@ class Switch:
     def _send_link_state(self, neighbour: Neighbour, wire: bytes) -> None:
         self._outbox.say(neighbour, Kind.LINK_STATE, wire)
 
-    # -- claims of attached nodes
-
-    def _take_claim(self, neighbour: Neighbour, statement: Statement, now: Instant) -> None:
-        if statement.signer != neighbour.name:
-            raise StatementError(DropReason.UNKNOWN_SENDER, "a claim that its maker did not bring")
-        try:
-            claim = self._verifier.verify_statement(statement, now.unix_s)
-            if claim.switch != self.name:
-                raise StatementError(DropReason.NOT_FOR_US, "the RtCert names another switch")
-        except StatementError as error:
-            self._refuse(neighbour, statement, error)
-            raise
-        at = (neighbour.port, neighbour.mac)
-        newest = self._sequence_of(claim.name, neighbour)
-        if claim.sequence < newest:
-            self._judge(neighbour, claim.name, DropReason.STALE, newest)
-            raise StatementError(DropReason.STALE, "a claim that its maker has renewed")
-        if claim.right is Right.READ:
-            if self.planter.add_reader(claim, at, self.places.of(claim.name, now.mono_s), now.mono_s):
-                self.places.want(claim.name, now.mono_s, watch=True)
-            self._judge(neighbour, claim.name, None, claim.sequence)
-            for place in self.places.of(claim.name, now.mono_s):
-                self.inquirer.tell_reader(at, place, now.mono_s)
-        else:
-            self.attached.put(claim, *at, now.mono_s)
-            self.unicast.forget(claim.name)
-            self.unicast.release(claim.name, now.mono_s)
-            for tree in self.planter.trees.of_topic(claim.name):
-                if tree.publisher == claim.node:
-                    tree.renew_at_s = now.mono_s
-        self.inquirer.ask(now.mono_s)
-
-    def _sequence_of(self, name: Name, neighbour: Neighbour) -> int:
-        """Return the highest sequence number of what an attached node claims on a name here, or -1."""
-        attachment = self.attached.get(name, neighbour.name)
-        reading = self.planter.claim_of(name, (neighbour.port, neighbour.mac))
-        known = [reading] if attachment is None else [reading, attachment.claim]
-        return max((claim.sequence for claim in known if claim is not None), default=-1)
-
-    def _refuse(self, neighbour: Neighbour, statement: Statement, error: StatementError) -> None:
-        """Tell an attached node why its claim was not taken."""
-        try:
-            body = ClaimBody.from_statement(statement)
-        except StatementError:
-            return  # not even a claim: the caller counts it
-        self._judge(neighbour, body.subject.name, error.reason, body.sequence)
-
-    def _judge(self, neighbour: Neighbour, name: Name, refused: DropReason | None, sequence: int) -> None:
-        verdict = Verdict(name, neighbour.name, refused, sequence)
-        wire = verdict.to_wire(self.name, self._identity.key, self._identity.membership)
-        self._outbox.say(neighbour, Kind.VERDICT, wire)
-
-    def _take_withdrawal(self, neighbour: Neighbour, statement: Statement, now: Instant) -> None:
-        fields = statement.expect(StatementType.WITHDRAW)
-        if statement.signer != neighbour.name:
-            raise StatementError(DropReason.UNKNOWN_SENDER, "a withdrawal that its maker did not bring")
-        statement.verify(neighbour.key)
-        name = fields.name("n")
-        if fields.uint("s") <= self._sequence_of(name, neighbour):
-            raise StatementError(DropReason.STALE, "a withdrawal of what was claimed anew")
-        if self.planter.remove_reader(name, (neighbour.port, neighbour.mac)):
-            self.places.unwatch(name)
-        if self.attached.remove(name, neighbour.name) is not None:
-            self.unicast.forget(name)
-            self.inquirer.relay(statement.wire, now.mono_s)
+    # -- trees
 
     def _take_join(self, neighbour: Neighbour, statement: Statement, now: Instant) -> None:
         join = Join.from_fields(statement.expect(StatementType.JOIN))

@@ -106,8 +106,13 @@ class Paths:
         def cost(_from: Name, to: Name, edge: dict[str, int]) -> int | None:
             return edge["weight"] if to in open_ else None  # None hides an edge
 
-        distances, routes = nx.single_source_dijkstra(self._graph, self._me, weight=cost)
-        return {to: Way(route[1], int(distances[to])) for to, route in routes.items() if len(route) > 1}
+        before, distances = nx.dijkstra_predecessor_and_distance(self._graph, self._me, weight=cost)
+        ways: dict[Name, Way] = {}
+        for to, distance in distances.items():  # the nearest first: whoever comes before ``to`` is there already
+            if to != self._me:
+                last = before[to][0]
+                ways[to] = Way(to if last == self._me else ways[last].first, int(distance))
+        return ways
 
     def _refresh(self) -> None:
         if self._version == self._link_states.version:

@@ -1,5 +1,6 @@
-"""A network in memory: the same machines that run on real sockets, joined by links with delay, loss and reordering, under
-a clock that jumps from event to event.
+"""A network in memory: the same machines that run on real sockets, joined by links with delay, loss and reordering.
+
+Its clock jumps from event to event.
 
 Place: shell, though without any I/O; deterministic for a seed.
 

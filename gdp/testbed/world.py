@@ -5,7 +5,7 @@ Place: shell, without I/O. ``namespaces`` realises the same topology with kernel
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 from gdp.client.attachment import AttachmentSettings
@@ -51,7 +51,7 @@ class World:
     hello_s: float = HELLO_S
     dead_s: float = DEAD_S
     trusts: dict[str, tuple[str, ...]] | None = None
-    transits: dict[str, tuple[str, ...]] | None = None
+    transits: Mapping[str, tuple[str, ...]] | None = None
     network: MemoryNetwork = field(init=False)
     authorities: dict[str, DomainAuthority] = field(default_factory=dict)
     identities: dict[str, Identity] = field(default_factory=dict)
@@ -66,9 +66,9 @@ class World:
     def __post_init__(self) -> None:
         self.network = MemoryNetwork(self.seed)
         self.owner = Owner(SigningKey.generate(), bytes(range(32)))
-        self._validity = Validity(int(EPOCH_UNIX_S) - _YEAR_S, int(EPOCH_UNIX_S) + _YEAR_S)
+        self.validity = Validity(int(EPOCH_UNIX_S) - _YEAR_S, int(EPOCH_UNIX_S) + _YEAR_S)
         for domain in self.topology.domains:
-            self.authorities[domain.label] = DomainAuthority.found(domain.label, SigningKey.generate(), self._validity)
+            self.authorities[domain.label] = DomainAuthority.found(domain.label, SigningKey.generate(), self.validity)
         for node in self.topology.nodes:
             self._add_switch(node, self.topology.domain_of(node).label)
         for link in self.topology.links:
@@ -82,14 +82,14 @@ class World:
         for at in self.topology.attached("proxy"):
             self.add_member(f"{at.switch}/{at.ifname}", at.switch)
 
-    _validity: Validity = field(init=False)
+    validity: Validity = field(init=False)
 
     def identity(self, role: Role, label: str, domain: str) -> Identity:
         """Return (making it the first time) the identity of a node."""
         known = self.identities.get(label)
         if known is None:
             keys = NodeKeys.generate(role, label.replace("/", "-"))
-            known = self.identities[label] = keys.join(self.authorities[domain], self._validity)
+            known = self.identities[label] = keys.join(self.authorities[domain], self.validity)
         return known
 
     def policy(self, domain: str) -> Policy:
@@ -130,7 +130,7 @@ class World:
         identity = next(each for each in self.identities.values() if each.name == member.name)
         described = Metadata({"kind": "topic", "name": name, **metadata})
         card = Card.from_wire(Card.make(identity))
-        delegation = self.owner.delegate(card, described, rights, [1], self._validity)
+        delegation = self.owner.delegate(card, described, rights, [1], self.validity)
         grants = delegation.open(identity)
         return Topic(delegation, {epoch: grant.secret for epoch, grant in grants.items()})
 

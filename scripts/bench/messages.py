@@ -1,7 +1,7 @@
 """How long a secured message takes over three raw switches: round trip of a small one, one way of an image.
 
-Real processes in namespaces: A - S1 - S2 - S3 - B, with the switches and the RIB that robots run. The two ends are members
-of the overlay without ROS: each message is encrypted, signed, verified, and reported on.
+Real processes in namespaces: A - S1 - S2 - S3 - B, with the switches and the RIB that robots run. The two ends are
+members of the overlay without ROS: each message is encrypted, signed, verified, and reported on.
 
     sudo .venv/bin/python scripts/bench/messages.py
     sudo .venv/bin/python scripts/bench/messages.py --mtu 1500 --mtu 9000 --count 300 --json out.json
@@ -140,13 +140,15 @@ def _measure(mtu: int, count: int, run: Run) -> dict[str, dict[str, list[float]]
     materials = Materials(topology, run.directory, metrics=False)
     left, right = topology.attached("proxy")
     owner = run.directory / "owner"
-    for at, rights in ((left, {"/ping": Right.PUBLISH, "/pong": Right.READ}), (right, {"/ping": Right.READ, "/pong": Right.PUBLISH})):  # fmt: skip
+    for at, publishes, reads in ((left, "/ping", "/pong"), (right, "/pong", "/ping")):
         node = run.directory / "nodes" / f"proxy-{at.switch}"
-        for topic, right_to in rights.items():
+        for topic, right_to in ((publishes, Right.PUBLISH), (reads, Right.READ)):
             given = delegate(owner, node / CARD, Metadata({"kind": "topic", "name": topic}), [right_to])
             install_delegation(node, given)
-    started = [_start(spaces, run, n, ["-m", "gdp.cli.switch", "--json", "--config", str(materials.switch(n, "raw"))]) for n in topology.nodes]  # fmt: skip
-    for process in started:
+    for process in [
+        _start(spaces, run, node, ["-m", "gdp.cli.switch", "--json", "--config", str(materials.switch(node, "raw"))])
+        for node in topology.nodes
+    ]:
         _ready(process)
     for at in topology.attached("rib"):
         _ready(_start(spaces, run, at.switch, ["-m", "gdp.cli.rib", "--json", "--config", str(materials.rib(at))]))
@@ -185,11 +187,15 @@ def _ready(process: subprocess.Popen[bytes]) -> None:
         sys.exit("a node did not come up")
 
 
+def _median_and_p99(ordered: list[float]) -> tuple[float, float]:
+    return statistics.median(ordered), ordered[int(len(ordered) * 0.99)]
+
+
 def main() -> None:
     """Run the bench, or one of its ends."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--mtu", type=int, action="append", help="bytes after the Ethernet header; may be repeated")
-    parser.add_argument("--count", type=int, default=200, help="messages of the largest size; five times that of others")
+    parser.add_argument("--count", type=int, default=200, help="messages of the largest size; others: five times that")
     parser.add_argument("--json", type=Path, help="write all figures here")
     parser.add_argument("--as", dest="end", choices=("ping", "pong"), help=argparse.SUPPRESS)
     parser.add_argument("--config", type=Path, help=argparse.SUPPRESS)
@@ -203,16 +209,16 @@ def main() -> None:
     runs = Runs()
     runs.sweep()
     table = Table(title=f"secured messages over 3 raw switches; {platform.release()}, {os.cpu_count()} cores")
-    for column in ("MTU", "bytes", "RTT median ms", "RTT p99 ms", "one way median ms", "one way p99 ms", "sender CPU ms"):
+    columns = ("MTU", "bytes", "RTT median ms", "RTT p99 ms", "one way median ms", "one way p99 ms", "sender CPU ms")
+    for column in columns:
         table.add_column(column, justify="right")
     result = {}
     for mtu in options.mtu or [1_500, 9_000]:
         figures = result[str(mtu)] = measure(mtu, options.count, runs)
         for size, figure in figures.items():
             rtt, way = sorted(figure["rtt_s"]), sorted(figure["one_way_s"])
-            cells = [statistics.median(rtt), rtt[int(len(rtt) * 0.99)], statistics.median(way), way[int(len(way) * 0.99)]]
-            cpu = statistics.median(figure["sender_cpu_s"])
-            table.add_row(str(mtu), f"{int(size):,}", *(f"{each * 1e3:.2f}" for each in [*cells, cpu]))
+            cells = [*_median_and_p99(rtt), *_median_and_p99(way), statistics.median(figure["sender_cpu_s"])]
+            table.add_row(str(mtu), f"{int(size):,}", *(f"{each * 1e3:.2f}" for each in cells))
     Console().print(table)
     if options.json is not None:
         options.json.write_text(json.dumps(result))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 from gdp.client.feed import Delivered
 from gdp.client.member import Member, Topic
@@ -49,12 +51,13 @@ class Flow:
         """Publish numbered messages from now on, at a steady rate."""
         for number in range(count):
             message = number.to_bytes(4, "big") + bytes(size)
-            self.world.network.call(number * every_s, lambda message=message: self.publish(message))
+            self.world.network.call(number * every_s, partial(self.publish, message))
 
     def collect(self) -> None:
         """Take what came to each reader."""
         for label, got in self.got.items():
-            got += [each.delivered for each in self.world.members[label].take_messages() if each.topic == self.topic.name]
+            messages = self.world.members[label].take_messages()
+            got += [each.delivered for each in messages if each.topic == self.topic.name]
 
     def numbers(self, label: str) -> list[int]:
         """Return the numbers that ``stream`` gave to the messages that a reader has."""
@@ -95,7 +98,7 @@ class Tap:
         return sum(1 for each in self.headers if each.kind == kind and destination in (None, each.destination))
 
 
-def ring(seed: int = 1, transits: dict[str, tuple[str, ...]] | None = None) -> World:
+def ring(seed: int = 1, transits: Mapping[str, tuple[str, ...]] | None = None) -> World:
     """Return the ring of five, every member attached."""
     world = World(ring5(), seed, transits=transits)
     assert world.settle()

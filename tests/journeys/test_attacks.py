@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterable
 
 import pytest
 
+from gdp.client.member import Member
+from gdp.client.rib_host import RibHost
 from gdp.control.join import Join
 from gdp.control.query import Answer
 from gdp.control.verdict import Verdict
@@ -19,6 +21,7 @@ from gdp.frame.codec import HEADER_BYTES, Header, decode, encode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import CONTROL_JOIN_BYTES, CONTROL_PATIENCE_S, HOPS_MAX
 from gdp.names import ZERO, Name
+from gdp.switch.machine import Switch
 from gdp.switch.places import QUESTIONS_MAX
 from gdp.testbed.world import World
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
@@ -30,7 +33,8 @@ NODES = ("nuc1", "nuc3", ROBOT, SERVER, "nuc2/rib")
 def counted(world: World) -> Counter[DropReason]:
     """Return everything that was dropped anywhere, by reason."""
     total = Counter(world.network.drops)
-    for machine in (*world.switches.values(), *world.ribs.values(), *world.members.values()):
+    machines: list[Switch | RibHost | Member] = [*world.switches.values(), *world.ribs.values()]
+    for machine in [*machines, *world.members.values()]:
         total += Counter(machine.drops())
     return total
 
@@ -44,13 +48,13 @@ def still_flows(flow: Flow) -> None:
     assert flow.got[SERVER][-1].message == b"after the attack"
 
 
-def attack(flow: Flow, frames: Iterable[bytes], nodes: tuple[str, ...] = NODES, mac: bytes = b"\x02evil\x00") -> Counter[DropReason]:
+def attack(flow: Flow, frames: Iterable[bytes], nodes: tuple[str, ...] = NODES) -> Counter[DropReason]:
     """Throw frames at a port of each node while the flow goes on; return what was counted more than before."""
     world = flow.world
     before = counted(world)
     for frame in frames:
         for node in nodes:
-            world.network.inject(node, 0, frame, mac)
+            world.network.inject(node, 0, frame)
     world.network.run(0.5)
     gained = counted(world)
     gained.subtract(before)
@@ -58,9 +62,9 @@ def attack(flow: Flow, frames: Iterable[bytes], nodes: tuple[str, ...] = NODES, 
     return Counter({reason: count for reason, count in gained.items() if count > 0})
 
 
-def control(kind: int, payload: bytes, *, number: int = 1, part: int = 0, parts: int = 1, source: bytes = b"e" * 32) -> bytes:
-    flags = Flag.LAST if part == parts - 1 else 0
-    return encode(Header(kind, flags, HOPS_MAX, 0, len(payload), number, part, parts, 9, ZERO, source)) + payload
+def control(kind: int, payload: bytes, *, number: int = 1, parts: int = 1, source: bytes = b"e" * 32) -> bytes:
+    flags = Flag.LAST if parts == 1 else 0
+    return encode(Header(kind, flags, HOPS_MAX, 0, len(payload), number, 0, parts, 9, ZERO, source)) + payload
 
 
 def mac_of(world: World, node: str, port: int = 0) -> bytes:

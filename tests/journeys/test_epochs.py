@@ -18,7 +18,7 @@ def topic(flow: Flow, label: str, right: Right, epochs: list[int]) -> Topic:
     metadata = flow.topic.delegation.metadata
     assert metadata is not None
     card = Card.from_wire(Card.make(identity))
-    given = world.owner.delegate(card, metadata, [right], epochs, world._validity)
+    given = world.owner.delegate(card, metadata, [right], epochs, world.validity)
     return Topic(given, {epoch: grant.secret for epoch, grant in given.open(identity).items()})
 
 

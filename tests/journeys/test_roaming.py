@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 
 from gdp.crypto.statements import parse
@@ -55,7 +57,7 @@ def test_moving_there_and_back_again_ends_where_it_began() -> None:
     network = flow.world.network
     flow.stream(400, 0.02, size=100)
     for at_s, to in enumerate(("nuc2", "nuc5", "nuc1"), start=1):
-        network.call(2.0 * at_s, lambda to=to: flow.world.roam(ROBOT, to))
+        network.call(2.0 * at_s, partial(flow.world.roam, ROBOT, to))
     assert network.run(30, lambda: flow.has(SERVER, 400))
     assert flow.numbers(SERVER) == list(range(400))
     assert flow.hops(SERVER)[-1] == 5

@@ -51,6 +51,9 @@ def at(mono_s: float, unix_s: float = NOW) -> Instant:
     return Instant(mono_s, unix_s)
 
 
+START = at(0.0)
+
+
 def rib(upper: Name | None = None, **settings: object) -> Rib:
     policy = Policy(SCHOOL.root, [CLOUD.root])
     return Rib(RIB, policy, MemoryStore(), replace(RibSettings(upper), **settings))  # type: ignore[arg-type]
@@ -60,14 +63,14 @@ def relay(statement: bytes, by: Identity = SWITCH) -> bytes:
     return Relay(statement, (SCHOOL.root.domain,), by.membership).to_wire(by.name, by.key)
 
 
-def tell(to: Rib, statement: bytes, by: Identity = SWITCH, now: Instant = at(0.0)) -> list[Letter]:
+def tell(to: Rib, statement: bytes, by: Identity = SWITCH, now: Instant = START) -> list[Letter]:
     """Relay a claim or a withdrawal; return what the RIB sends."""
     to.receive(relay(statement, by), by.name, now)
     return to.take()
 
 
-def ask(of: Rib, by: Identity = SWITCH, name: Name = NAME, watch_s: float = 0.0, now: Instant = at(0.0)) -> list[Letter]:
-    of.receive(Query(name, watch_s).to_wire(by.name, by.key, by.membership), by.name, now)
+def ask(of: Rib, by: Identity = SWITCH, watch_s: float = 0.0) -> list[Letter]:
+    of.receive(Query(NAME, watch_s).to_wire(by.name, by.key, by.membership), by.name, START)
     return of.take()
 
 
@@ -81,14 +84,14 @@ def verdicts(letters: list[Letter]) -> list[Verdict]:
     return [Verdict.from_fields(each.fields) for each in found if each.type is StatementType.VERDICT]
 
 
-def answer_from_above(to: Rib, claimed: bytes, now: Instant = at(0.0), by: Identity = UPPER) -> list[Letter]:
+def answer_from_above(to: Rib, claimed: bytes, now: Instant = START, by: Identity = UPPER) -> list[Letter]:
     node = parse(claimed).signer if claimed else ROBOT.name
     answer = Answer(NAME, node, claimed, CLOUD.root.domain, (CLOUD.root.domain,), 30.0)
     to.receive(answer.to_wire(by.name, by.key, by.membership), by.name, now)
     return to.take()
 
 
-def nobody_above(to: Rib, now: Instant = at(0.0)) -> list[Letter]:
+def nobody_above(to: Rib, now: Instant = START) -> list[Letter]:
     answer = Answer(NAME, NAME, b"", CLOUD.root.domain, (), 2.0)
     to.receive(answer.to_wire(UPPER.name, UPPER.key, UPPER.membership), UPPER.name, now)
     return to.take()

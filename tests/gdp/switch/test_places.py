@@ -20,7 +20,8 @@ def asked(places: Places, now_s: float) -> list[tuple[Name, bool]]:
 
 
 def test_a_question_is_asked_at_once_and_again_until_it_is_given_up() -> None:
-    places, now_s, times, given_up = Places(), 0.0, 0, []
+    places, now_s, times = Places(), 0.0, 0
+    given_up: list[Name] = []
     places.want(TOPIC, now_s, watch=False)
     while not given_up:
         questions, given_up = places.due(now_s)

@@ -1,0 +1,124 @@
+"""What attached nodes bring to their switch: claims and withdrawals, checked before anything is done for them.
+
+Place: pure. A reader's claim is judged here and plants trees; any other is kept, relayed, and judged by the RIB.
+"""
+
+from __future__ import annotations
+
+from gdp.control.neighbour import Neighbour
+from gdp.control.verdict import Verdict
+from gdp.crypto.identity import Identity
+from gdp.crypto.statements import Statement, StatementType
+from gdp.effects import Instant
+from gdp.errors import DropReason, StatementError
+from gdp.frame.kinds import Kind
+from gdp.names import Name
+from gdp.switch.attached import Attached
+from gdp.switch.inquirer import Inquirer
+from gdp.switch.outbox import Outbox
+from gdp.switch.places import Places
+from gdp.switch.planter import Planter
+from gdp.switch.unicast import Unicast
+from gdp.trust.claim import ClaimBody
+from gdp.trust.right import Right
+from gdp.trust.verifier import ClaimVerifier
+
+__all__ = ["Claims"]
+
+
+class Claims:
+    """Takes the claims of attached nodes."""
+
+    def __init__(
+        self,
+        identity: Identity,
+        verifier: ClaimVerifier,
+        attached: Attached,
+        places: Places,
+        planter: Planter,
+        unicast: Unicast,
+        inquirer: Inquirer,
+        outbox: Outbox,
+    ) -> None:
+        self._identity = identity
+        self._verifier = verifier
+        self._attached = attached
+        self._places = places
+        self._planter = planter
+        self._unicast = unicast
+        self._inquirer = inquirer
+        self._outbox = outbox
+
+    def take(self, neighbour: Neighbour, statement: Statement, now: Instant) -> None:
+        """Take a claim that an attached node brought; whether it is taken or refused, the node is told.
+
+        Raises:
+            StatementError: it does not hold, or is not the node's newest.
+        """
+        if statement.signer != neighbour.name:
+            raise StatementError(DropReason.UNKNOWN_SENDER, "a claim that its maker did not bring")
+        try:
+            claim = self._verifier.verify_statement(statement, now.unix_s)
+            if claim.switch != self._identity.name:
+                raise StatementError(DropReason.NOT_FOR_US, "the RtCert names another switch")
+        except StatementError as error:
+            self._refuse(neighbour, statement, error)
+            raise
+        at = (neighbour.port, neighbour.mac)
+        newest = self._sequence_of(claim.name, neighbour)
+        if claim.sequence < newest:
+            self._judge(neighbour, claim.name, DropReason.STALE, newest)
+            raise StatementError(DropReason.STALE, "a claim that its maker has renewed")
+        if claim.right is Right.READ:
+            if self._planter.add_reader(claim, at, self._places.of(claim.name, now.mono_s), now.mono_s):
+                self._places.want(claim.name, now.mono_s, watch=True)
+            self._judge(neighbour, claim.name, None, claim.sequence)
+            for place in self._places.of(claim.name, now.mono_s):
+                self._inquirer.tell_reader(at, place, now.mono_s)
+        else:
+            self._attached.put(claim, *at, now.mono_s)
+            self._unicast.forget(claim.name)
+            self._unicast.release(claim.name, now.mono_s)
+            for tree in self._planter.trees.of_topic(claim.name):
+                if tree.publisher == claim.node:
+                    tree.renew_at_s = now.mono_s
+        self._inquirer.ask(now.mono_s)
+
+    def _sequence_of(self, name: Name, neighbour: Neighbour) -> int:
+        """Return the highest sequence number of what an attached node claims on a name here, or -1."""
+        attachment = self._attached.get(name, neighbour.name)
+        reading = self._planter.claim_of(name, (neighbour.port, neighbour.mac))
+        known = [reading] if attachment is None else [reading, attachment.claim]
+        return max((claim.sequence for claim in known if claim is not None), default=-1)
+
+    def _refuse(self, neighbour: Neighbour, statement: Statement, error: StatementError) -> None:
+        """Tell an attached node why its claim was not taken."""
+        try:
+            body = ClaimBody.from_statement(statement)
+        except StatementError:
+            return  # not even a claim: the caller counts it
+        self._judge(neighbour, body.subject.name, error.reason, body.sequence)
+
+    def _judge(self, neighbour: Neighbour, name: Name, refused: DropReason | None, sequence: int) -> None:
+        verdict = Verdict(name, neighbour.name, refused, sequence)
+        wire = verdict.to_wire(self._identity.name, self._identity.key, self._identity.membership)
+        self._outbox.say(neighbour, Kind.VERDICT, wire)
+
+    def withdraw(self, neighbour: Neighbour, statement: Statement, now: Instant) -> None:
+        """Take a withdrawal.
+
+        Raises:
+            StatementError: it does not hold, or is older than what is claimed now.
+        """
+        fields = statement.expect(StatementType.WITHDRAW)
+        if statement.signer != neighbour.name:
+            raise StatementError(DropReason.UNKNOWN_SENDER, "a withdrawal that its maker did not bring")
+        statement.verify(neighbour.key)
+        name = fields.name("n")
+        if fields.uint("s") <= self._sequence_of(name, neighbour):
+            raise StatementError(DropReason.STALE, "a withdrawal of what was claimed anew")
+        if self._planter.remove_reader(name, (neighbour.port, neighbour.mac)):
+            self._places.unwatch(name)
+        if self._attached.remove(name, neighbour.name) is not None:
+            self._unicast.forget(name)
+            self._inquirer.relay(statement.wire, now.mono_s)

@@ -1,0 +1,93 @@
+"""Every statement of the control plane reads back as it was written, and refuses what it is not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gdp.control.hello import Hello
+from gdp.control.join import Join
+from gdp.control.link_state import Adjacency, LinkState, Scope
+from gdp.control.query import Answer, Query
+from gdp.control.relay import Relay
+from gdp.control.verdict import Verdict
+from gdp.crypto.statements import Fields, Statement, StatementType, parse, sign
+from gdp.errors import DropReason, StatementError
+from gdp.names import Name
+from tests.gdp.control.members import node
+
+NODE = node("n")
+A, B, C = Name(b"a" * 32), Name(b"b" * 32), Name(b"c" * 32)
+HELLO = Hello(b"n" * 8, 7, (b"h" * 8,), 1_500, b"d" * 8, b"cert")
+JOIN = Join(A, B, C, A, frozenset({A, B}), 1_400, 7.0, b"evidence", b"s" * 8, 99)
+STATE = LinkState(NODE.name, A, Scope.BORDER, 5, (Adjacency(B, A, 10, 1_500),), (Adjacency(C, A, 3, 1),), (C,))
+ANSWER = Answer(A, B, b"claim", C, (A, B), 30.0)
+
+Read = Callable[[Fields], object]
+BODIES: dict[str, tuple[bytes, object, Read]] = {
+    "hello": (HELLO.to_wire(NODE.name, NODE.key), HELLO, Hello.from_fields),
+    "join": (JOIN.to_wire(NODE.name, NODE.key), JOIN, Join.from_fields),
+    "link state": (STATE.to_wire(NODE.key, b"cert"), STATE, lambda fields: LinkState.from_fields(fields, NODE.name, A)),
+    "query": (Query(A, 20.0).to_wire(NODE.name, NODE.key, b"cert"), Query(A, 20.0), Query.from_fields),
+    "answer": (ANSWER.to_wire(NODE.name, NODE.key, b"cert"), ANSWER, Answer.from_fields),
+    "relay": (
+        Relay(b"claim", (A,), b"cert").to_wire(NODE.name, NODE.key),
+        Relay(b"claim", (A,), b"cert"),
+        Relay.from_fields,
+    ),
+    "verdict": (
+        Verdict(A, B, DropReason.STALE, 3).to_wire(NODE.name, NODE.key, b"cert"),
+        Verdict(A, B, DropReason.STALE, 3),
+        Verdict.from_fields,
+    ),
+}
+
+
+def body_of(which: str) -> Statement:
+    return parse(BODIES[which][0])
+
+
+@pytest.mark.parametrize("which", BODIES)
+def test_what_was_written_is_read(which: str) -> None:
+    wire, value, read = BODIES[which]
+    statement = parse(wire)
+    statement.verify(NODE.key.public)
+    assert read(statement.fields) == value
+
+
+@pytest.mark.parametrize("which", BODIES)
+@given(value=st.sampled_from([None, True, -1, 1 << 63, 0.5, b"", b"x" * 33, "text", [], {}, [[b"", b"", 0, 0]]]))
+def test_a_field_of_another_type_is_malformed_or_means_something(which: str, value: object) -> None:
+    statement, read = body_of(which), BODIES[which][2]
+    for key in statement.fields:
+        changed = parse(sign(statement.type, {**statement.fields, key: value}, NODE.name, NODE.key))
+        try:
+            read(changed.fields)
+        except StatementError as error:
+            assert error.reason is DropReason.MALFORMED  # noqa: PT017
+
+
+@pytest.mark.parametrize("which", BODIES)
+def test_an_empty_body_is_malformed(which: str) -> None:
+    with pytest.raises(StatementError) as caught:
+        BODIES[which][2](parse(sign(StatementType.HELLO, {}, NODE.name, NODE.key)).fields)
+    assert caught.value.reason is DropReason.MALFORMED
+
+
+def test_a_reason_of_a_later_version_is_a_refusal_all_the_same() -> None:
+    fields = {**body_of("verdict").fields, "r": 200}
+    verdict = Verdict.from_fields(parse(sign(StatementType.VERDICT, fields, NODE.name, NODE.key)).fields)
+    assert verdict.refused is DropReason.MALFORMED
+
+
+def test_what_is_taken_has_no_reason() -> None:
+    taken = Verdict(A, B, None, 3)
+    assert Verdict.from_fields(parse(taken.to_wire(NODE.name, NODE.key, b"")).fields) == taken
+
+
+def test_an_answer_that_names_the_name_itself_without_a_claim_is_nobody() -> None:
+    assert Answer(A, A, b"", C, (), 2.0).is_nobody
+    assert not Answer(A, B, b"", C, (), 0.0).is_nobody

@@ -1,0 +1,90 @@
+"""Link states between switches: they reach who should have them and nobody else."""
+
+from __future__ import annotations
+
+from gdp.control.link_state import LinkState, Scope
+from gdp.errors import DropReason
+from gdp.frame.codec import HEADER_BYTES, Header, encode
+from gdp.frame.kinds import Flag, Kind
+from gdp.limits import HOPS_MAX, LINK_STATE_LEASE_S, LINK_STATE_REFRESH_S
+from gdp.names import ZERO
+from gdp.testbed.world import World
+from tests.journeys.flows import ring
+
+
+def say(world: World, state: LinkState, by: str, to: str, port: int = 0) -> None:
+    """Let a neighbour of ``to`` pass on a link state that ``by`` signed."""
+    identity = world.identities[by]
+    wire = state.to_wire(identity.key, identity.membership)
+    header = Header(Kind.LINK_STATE, Flag.LAST, HOPS_MAX, 0, len(wire), 1 << 40, 0, 1, 9, ZERO, identity.name)
+    mac = world.network._nodes[to].ports[port][2].mac
+    assert len(encode(header)) == HEADER_BYTES
+    world.network.inject(to, port, encode(header) + wire, mac)
+    world.network.run(0.2)
+
+
+def origins(world: World, label: str, scope: Scope) -> set[bytes]:
+    return {bytes(each.origin) for each in world.switches[label]._flooding.link_states.states(scope)}
+
+
+def test_the_inside_of_a_domain_is_known_in_it_alone() -> None:
+    world = ring()
+    world.network.run(1)
+    assert origins(world, "nuc1", Scope.DOMAIN) == {world.identities[each].name for each in ("nuc1", "nuc2")}
+    assert origins(world, "nuc3", Scope.DOMAIN) == {world.identities["nuc3"].name}
+
+
+def test_borders_are_known_everywhere() -> None:
+    world = ring()
+    world.network.run(1)
+    everyone = {bytes(world.identities[each].name) for each in world.topology.nodes}
+    assert all(origins(world, each, Scope.BORDER) == everyone for each in world.switches)
+
+
+def test_an_inside_state_that_leaves_its_domain_is_refused() -> None:
+    world = ring()
+    nuc2 = world.identities["nuc2"]
+    state = LinkState(nuc2.name, nuc2.root.domain, Scope.DOMAIN, 1 << 60, (), (), ())
+    say(world, state, "nuc2", "nuc3")
+    assert world.switches["nuc3"].drops()[DropReason.WRONG_DOMAIN] == 1
+    assert bytes(nuc2.name) not in origins(world, "nuc3", Scope.DOMAIN)
+
+
+def test_ones_own_state_of_an_earlier_life_is_outdone() -> None:
+    world = ring()
+    nuc1 = world.identities["nuc1"]
+    ahead = 1 << 50
+    say(world, LinkState(nuc1.name, nuc1.root.domain, Scope.DOMAIN, ahead, (), (), ()), "nuc1", "nuc1")
+    known = world.switches["nuc2"]._flooding.link_states
+    assert known.sequence_of(nuc1.name, Scope.DOMAIN) > ahead
+    assert any(each.links for each in known.states(Scope.DOMAIN) if each.origin == nuc1.name)
+
+
+def test_a_state_played_back_changes_nothing_and_goes_no_further() -> None:
+    world = ring()
+    nuc2 = world.identities["nuc2"]
+    before = world.switches["nuc1"]._flooding.link_states.version
+    say(world, LinkState(nuc2.name, nuc2.root.domain, Scope.DOMAIN, 1, (), (), ()), "nuc2", "nuc1")
+    assert world.switches["nuc1"]._flooding.link_states.version == before
+
+
+def test_a_switch_that_is_gone_is_forgotten_and_the_others_are_not() -> None:
+    world = ring()
+    world.network.stop("nuc3")
+    world.network.run(LINK_STATE_LEASE_S + LINK_STATE_REFRESH_S + 1)
+    gone = bytes(world.identities["nuc3"].name)
+    assert gone not in origins(world, "nuc1", Scope.BORDER)
+    assert len(origins(world, "nuc1", Scope.BORDER)) == 4
+
+
+def test_neighbours_that_missed_a_flood_catch_up_by_their_digests() -> None:
+    world = ring()
+    cable = world.cables[frozenset(("nuc1", "nuc2"))]
+    world.network.run(1)
+    cable.loss = 1.0
+    world.network.set_link(world.cables[frozenset(("nuc3", "nuc4"))], up=False)
+    world.network.run(0.4)
+    cable.loss = 0.0
+    world.network.run(3)
+    one, two = (world.switches[each]._flooding.link_states for each in ("nuc1", "nuc2"))
+    assert one.digest(one._domain) == two.digest(two._domain)
