@@ -3,9 +3,9 @@
 Place: pure; time comes in as ``now_s`` (monotonic seconds).
 
 A revocation proves itself, so it is passed to every neighbour of every domain, once; a neighbour that comes up is told
-all that is known. What a revoked certificate had opened ends at once: attachments, readers, and, unless the switch below
-shows another reader within ``GRACE_S``, the branches that rested on it. A revoked neighbour's next hello is refused, so
-that it is gone when it has been silent for long enough.
+all that is known. What a revoked certificate had opened ends at once: attachments, readers, and, unless the switch
+below shows another reader within ``GRACE_S``, the branches that rested on it. A revoked neighbour's next hello is
+refused, so that it is gone when it has been silent for long enough.
 """
 
 from __future__ import annotations
