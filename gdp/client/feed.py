@@ -99,7 +99,7 @@ class Feed:
         self.description = b""
         self._is_reliable: bool | None = None
         self._expected = 0  # next number to deliver, once LIVE
-        self._known_next = 0  # the publisher has numbered everything below this
+        self._sent = (0, 0)  # the publisher has sent everything before this (number, part)
         self._ready: dict[int, Joined] = {}  # whole, behind a gap
         self._out = deque[Delivered]()
         self._report_at_s = now_s
@@ -267,13 +267,16 @@ class Feed:
     def _missing(self) -> tuple[Missing, ...]:
         """Return what is known to be lacking: gaps below the newest part, and all that a status announced."""
         missing: list[Missing] = []
-        end = max(self._data.highest + 1, self._known_next)
+        sent_number, sent_part = self._sent
+        end = max(self._data.highest + 1, sent_number + (sent_part > 0))
         for number in self._data.window.unfinished(self._expected, end):
             room = NACKS_PER_REPORT - len(missing)
             if room <= 0:
                 break
-            is_announced = number < self._known_next
-            missing += [Missing(number, *each) for each in self._data.missing(number, room, to_end=is_announced)]
+            ranges = self._data.missing(number, room, to_end=number < sent_number)
+            if not ranges and number == sent_number:
+                ranges = _below(self._data.missing(number, room, to_end=True), sent_part)
+            missing += [Missing(number, *each) for each in ranges]
         return tuple(missing)
 
     def _take_status(self, joined: Joined, epoch: int, now_s: float) -> None:
@@ -293,7 +296,7 @@ class Feed:
             for number in [n for n in self._ready if not 0 <= n - self._expected < REPLAY_WINDOW_MESSAGES]:
                 self._take_ready(number)
             self._data.begin(self._expected, self._ready)
-        self._known_next = max(self._known_next, status.next_number)
+        self._sent = max(self._sent, (status.sent_number, status.sent_part))
         if status.oldest > self._expected:
             self._skip_to(status.oldest)
         self._report_at_s = now_s
@@ -325,3 +328,8 @@ class Feed:
     def _hand_out(self, joined: Joined) -> None:
         self.delivered += 1
         self._out.append(Delivered(self.publisher, joined.number, joined.message, joined.parts, joined.hops))
+
+
+def _below(ranges: list[tuple[int, int]], end: int) -> list[tuple[int, int]]:
+    """Return inclusive ranges as far as they lie below ``end``."""
+    return [(first, min(last, end - 1)) for first, last in ranges if first < end]

@@ -291,7 +291,8 @@ class Publisher:
         assert self._mtu is not None
         oldest = self._window.oldest
         about = self._description if self._starts else b""
-        status = Status(self._next_number if oldest is None else oldest, self._next_number, dict(self._starts), about)
+        sent = self._window.sent if self._repairs_wanted else (self._next_number, 0)
+        status = Status(sent[0] if oldest is None else oldest, *sent, dict(self._starts), about)
         self._starts.clear()
         self._status_wanted = False
         self._status_number += 1

@@ -40,6 +40,9 @@ class OpensParts(Protocol):
     def open(self, header: Header, frame: bytes) -> tuple[bytes, bytes, bytes]:
         """Return plaintext, signed payload, signature; or raise ``EnvelopeError``."""
 
+    def open_inner(self, header: Header, frame: bytes) -> tuple[bytes, bytes]:
+        """Return plaintext and signed payload of a part that is not the last; or raise ``EnvelopeError``."""
+
 
 class VerifiesDigest(Protocol):
     """A writer's public key."""
@@ -134,7 +137,7 @@ class Joiner:
             message.held_bytes += _PREPAID_BYTES + cost
             message.prepaid_bytes += _PREPAID_BYTES + cost
         try:
-            message.plain[part], sealed, _ = message.opener.open(header, frame)
+            message.plain[part], sealed = message.opener.open_inner(header, frame)
         except EnvelopeError as error:
             self.drops[error.reason] += 1
             return True

@@ -1,7 +1,8 @@
 """What a publisher tells its readers about its topic: what it still holds, where each begins, what the messages are.
 
-Place: pure. It travels as a sealed and signed message. Wire form, big-endian: ``oldest (8) | next (8) | starts (2)``,
-for each start ``reader (32) | number (8)``, then the description, empty when this status brings none.
+Place: pure. It travels as a sealed and signed message. Wire form, big-endian: ``oldest (8) | sent number (8) | sent
+part (4) | starts (2)``, for each start ``reader (32) | number (8)``, then the description, empty when this status
+brings none.
 """
 
 from __future__ import annotations
@@ -14,21 +15,25 @@ from gdp.errors import DropReason, FrameError
 __all__ = ["STARTS_MAX", "Status"]
 
 STARTS_MAX: Final = 64  # readers that one status tells where to begin; more get the next one
-_HEAD: Final = struct.Struct("!QQH")
+_HEAD: Final = struct.Struct("!QQIH")
 _START: Final = struct.Struct("!32sQ")
 
 
 class Status(NamedTuple):
-    """Messages from ``oldest`` (still repairable) up to, but not including, ``next_number`` exist."""
+    """Messages from ``oldest`` on can be repaired; everything before (sent_number, sent_part) has been sent.
+
+    What has not been sent is not announced: it would be taken for lost.
+    """
 
     oldest: int
-    next_number: int
+    sent_number: int
+    sent_part: int
     starts: dict[bytes, int]  # new reader -> the first message that is its
     description: bytes
 
     def to_wire(self) -> bytes:
         """Return the wire form."""
-        head = _HEAD.pack(self.oldest, self.next_number, len(self.starts))
+        head = _HEAD.pack(self.oldest, self.sent_number, self.sent_part, len(self.starts))
         return head + b"".join(_START.pack(*each) for each in self.starts.items()) + self.description
 
     @classmethod
@@ -40,8 +45,8 @@ class Status(NamedTuple):
         """
         if len(wire) < _HEAD.size:
             raise FrameError(DropReason.TRUNCATED, "status")
-        oldest, next_number, count = _HEAD.unpack_from(wire)
+        oldest, sent_number, sent_part, count = _HEAD.unpack_from(wire)
         end = _HEAD.size + count * _START.size
-        if count > STARTS_MAX or len(wire) < end or oldest > next_number:
+        if count > STARTS_MAX or len(wire) < end or oldest > sent_number:
             raise FrameError(DropReason.MALFORMED, "status")
-        return cls(oldest, next_number, dict(_START.iter_unpack(wire[_HEAD.size : end])), wire[end:])
+        return cls(oldest, sent_number, sent_part, dict(_START.iter_unpack(wire[_HEAD.size : end])), wire[end:])

@@ -36,6 +36,7 @@ from gdp.message.report import Missing, Report
 __all__ = ["SendWindow"]
 
 _SCAN_PARTS: Final = 8_192  # parts looked at for one report; a flight of small frames has fewer
+_GROWTH_BYTES: Final = 16 << 10  # of the flight in a round trip, above the threshold: these links are not narrow
 _ROUND_MIN_S: Final = PROBE_MIN_S / 3
 
 
@@ -129,6 +130,11 @@ class SendWindow:
     def is_acknowledged(self) -> bool:
         """Return whether every reader has everything."""
         return self._acked_at() == self._end_at
+
+    @property
+    def sent(self) -> tuple[int, int]:
+        """Return the message number and the part before which everything has been sent."""
+        return self._next[0] if self._next else (self._newest + 1, 0)
 
     @property
     def acknowledged(self) -> int:
@@ -272,7 +278,7 @@ class SendWindow:
         if self._flight_bytes < self._threshold_bytes:
             self._flight_bytes += acknowledged_bytes
         else:
-            self._flight_bytes += acknowledged_bytes * 1500 // self._flight_bytes
+            self._flight_bytes += acknowledged_bytes * _GROWTH_BYTES // self._flight_bytes
         self._flight_bytes = min(self._flight_bytes, FLIGHT_MAX_BYTES)
         if self._sample is not None and self._acked_at() >= self._sample[0]:
             self._learn_rtt(now_s - self._sample[1])

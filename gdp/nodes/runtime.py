@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from types import FrameType
 
 from gdp.effects import Instant, Machine
+from gdp.nodes.allocator import settle_memory
 from gdp.ports.plane import Plane
 
 __all__ = ["Runtime", "now"]
@@ -115,6 +116,7 @@ class Runtime:
                     if signal.SIGHUP in numbers and reload is not None:
                         reload()
 
+        settle_memory()
         before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
         before[signal.SIGHUP] = signal.signal(signal.SIGHUP, hang_up)
         woken_before = signal.set_wakeup_fd(writing.fileno(), warn_on_full_buffer=False)

@@ -5,6 +5,9 @@ members of the overlay without ROS: each message is encrypted, signed, verified,
 
     sudo .venv/bin/python scripts/bench/messages.py
     sudo .venv/bin/python scripts/bench/messages.py --mtu 1500 --mtu 9000 --count 300 --json out.json
+    sudo .venv/bin/python scripts/bench/messages.py --realtime     # all processes under SCHED_FIFO
+
+Each round lays a new chain. The figures are the medians of the rounds; behind them in brackets their lowest and highest.
 """
 
 from __future__ import annotations
@@ -28,6 +31,7 @@ from gdp.client.attachment import AttachmentSettings
 from gdp.client.member import Member, Topic
 from gdp.crypto.certificates import Role
 from gdp.metadata import Metadata
+from gdp.nodes.allocator import settle_memory
 from gdp.nodes.config import RibConfig
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.nodes.runtime import Runtime
@@ -41,6 +45,7 @@ from gdp.trust.right import Right
 from proxy.ring.materials import Materials
 
 SIZES = (100, 10_000, 921_600)
+COLUMNS = ("RTT median ms", "RTT p99 ms", "one way median ms", "one way p99 ms", "sender CPU ms")
 STAMP = struct.Struct("!Qd")
 PATIENCE_S = 20.0
 
@@ -99,6 +104,7 @@ def pong(config: Path) -> None:
 def ping(config: Path, count: int) -> None:
     """Send, wait for the answer, send the next; print figures in seconds as JSON."""
     end = End(config, "/ping", "/pong")
+    settle_memory()
     end.wait_for_reader()
     figures: dict[str, dict[str, list[float]]] = {}
     for size in SIZES:
@@ -160,7 +166,8 @@ def _measure(mtu: int, count: int, run: Run) -> dict[str, dict[str, list[float]]
     if pinger.returncode:
         sys.exit(f"the measurement failed: {output.decode()}")
     answer = json.loads(output)
-    print(f"mtu {mtu}: {answer['repairs']} repairs", file=sys.stderr)
+    if answer["repairs"]:
+        print(f"mtu {mtu}: {answer['repairs']} parts were sent again", file=sys.stderr)
     figures: dict[str, dict[str, list[float]]] = answer["figures"]
     return figures
 
@@ -196,6 +203,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--mtu", type=int, action="append", help="bytes after the Ethernet header; may be repeated")
     parser.add_argument("--count", type=int, default=200, help="messages of the largest size; others: five times that")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--realtime", action="store_true", help="run under SCHED_FIFO: what else runs does not disturb")
     parser.add_argument("--json", type=Path, help="write all figures here")
     parser.add_argument("--as", dest="end", choices=("ping", "pong"), help=argparse.SUPPRESS)
     parser.add_argument("--config", type=Path, help=argparse.SUPPRESS)
@@ -206,22 +215,35 @@ def main() -> None:
     if options.end == "pong":
         pong(options.config)
         return
+    if options.realtime:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     runs = Runs()
     runs.sweep()
-    table = Table(title=f"secured messages over 3 raw switches; {platform.release()}, {os.cpu_count()} cores")
-    columns = ("MTU", "bytes", "RTT median ms", "RTT p99 ms", "one way median ms", "one way p99 ms", "sender CPU ms")
-    for column in columns:
+    scheduler = "SCHED_FIFO" if options.realtime else "ordinary scheduler"
+    table = Table(title=f"secured messages over 3 raw switches; {platform.release()}, {os.cpu_count()} cores, {scheduler}")
+    for column in ("MTU", "bytes", *COLUMNS):
         table.add_column(column, justify="right")
-    result = {}
+    result: dict[str, dict[str, dict[str, list[float]]]] = {}
     for mtu in options.mtu or [1_500, 9_000]:
-        figures = result[str(mtu)] = measure(mtu, options.count, runs)
-        for size, figure in figures.items():
-            rtt, way = sorted(figure["rtt_s"]), sorted(figure["one_way_s"])
-            cells = [*_median_and_p99(rtt), *_median_and_p99(way), statistics.median(figure["sender_cpu_s"])]
-            table.add_row(str(mtu), f"{int(size):,}", *(f"{each * 1e3:.2f}" for each in cells))
-    Console().print(table)
+        rounds = [_summary(measure(mtu, options.count, runs)) for _ in range(options.rounds)]
+        for size in rounds[0]:
+            columns = {name: sorted(each[size][name] for each in rounds) for name in COLUMNS}
+            result.setdefault(str(mtu), {})[size] = columns
+            cells = [f"{statistics.median(c):.2f} ({c[0]:.2f}-{c[-1]:.2f})" for c in columns.values()]
+            table.add_row(str(mtu), f"{int(size):,}", *cells)
+    Console(width=140).print(table)
     if options.json is not None:
-        options.json.write_text(json.dumps(result))
+        options.json.write_text(json.dumps({"scheduler": scheduler, "rounds": result}, indent=2) + "\n")
+
+
+def _summary(figures: dict[str, dict[str, list[float]]]) -> dict[str, dict[str, float]]:
+    """Return the columns of the table in milliseconds, by message size."""
+    summary = {}
+    for size, figure in figures.items():
+        rtt, way = sorted(figure["rtt_s"]), sorted(figure["one_way_s"])
+        values = [*_median_and_p99(rtt), *_median_and_p99(way), statistics.median(figure["sender_cpu_s"])]
+        summary[size] = dict(zip(COLUMNS, (value * 1e3 for value in values), strict=True))
+    return summary
 
 
 if __name__ == "__main__":

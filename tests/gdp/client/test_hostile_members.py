@@ -107,7 +107,7 @@ def test_messages_behind_a_gap_that_is_never_filled_are_kept_within_bounds() -> 
 
 def test_a_status_of_giant_numbers_costs_a_report_of_the_usual_size() -> None:
     pipe, end = live()
-    status = Status(0, (1 << 64) - 1, {}, b"").to_wire()
+    status = Status(0, (1 << 64) - 1, 0, {}, b"").to_wire()
     give(pipe, end, forge(500, status, kind=Kind.STATUS, signer=WRITER))
     report = end.feed.take_report(pipe.now_s)
     assert report is not None
@@ -118,7 +118,7 @@ def test_a_status_of_giant_numbers_costs_a_report_of_the_usual_size() -> None:
 
 def test_a_status_whose_oldest_is_giant_ends_its_own_feed_and_no_more() -> None:
     pipe, end = live()
-    status = Status((1 << 64) - 2, (1 << 64) - 1, {}, b"").to_wire()
+    status = Status((1 << 64) - 2, (1 << 64) - 1, 0, {}, b"").to_wire()
     give(pipe, end, forge(500, status, kind=Kind.STATUS, signer=WRITER))
     pipe.publish([b"x"])
     pipe.run(2.0)
