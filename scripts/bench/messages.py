@@ -7,7 +7,7 @@ members of the overlay without ROS: each message is encrypted, signed, verified,
     sudo .venv/bin/python scripts/bench/messages.py --mtu 1500 --mtu 9000 --count 300 --json out.json
     sudo .venv/bin/python scripts/bench/messages.py --realtime     # all processes under SCHED_FIFO
 
-Each round lays a new chain. The figures are the medians of the rounds; behind them in brackets their lowest and highest.
+Each round lays a new chain. The figures are the medians of the rounds, with their lowest and highest in brackets.
 """
 
 from __future__ import annotations
@@ -220,7 +220,8 @@ def main() -> None:
     runs = Runs()
     runs.sweep()
     scheduler = "SCHED_FIFO" if options.realtime else "ordinary scheduler"
-    table = Table(title=f"secured messages over 3 raw switches; {platform.release()}, {os.cpu_count()} cores, {scheduler}")
+    machine = f"{platform.release()}, {os.cpu_count()} cores, {scheduler}"
+    table = Table(title=f"secured messages over 3 raw switches; {machine}")
     for column in ("MTU", "bytes", *COLUMNS):
         table.add_column(column, justify="right")
     result: dict[str, dict[str, dict[str, list[float]]]] = {}

@@ -1,0 +1,52 @@
+"""The veth pairs that a switch makes for nodes on its own host."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+
+import pytest
+
+from gdp.errors import LocalError
+from gdp.names import Name
+from gdp.nodes.pairs import attach_pairs
+from gdp.ports.link import LinkWatch
+from netns_tests.spaces import Space
+
+pytestmark = [pytest.mark.netns, pytest.mark.usefixtures("space")]
+
+ONE, OTHER = (Name(hashlib.sha256(text).digest()) for text in (b"one", b"other"))
+PAIR = {"rib0", "rib0-s"}
+
+
+def devices() -> dict[str, int]:
+    """Return the MTU of every device but the loopback."""
+    with contextlib.closing(LinkWatch()) as links:
+        return {link.ifname: link.mtu for link in links.all() if link.ifname != "lo"}
+
+
+def test_a_pair_has_the_wanted_mtu_and_goes_with_its_switch() -> None:
+    with attach_pairs(["rib0"], ONE, 9_000):
+        assert devices() == dict.fromkeys(PAIR, 9_000)
+    assert devices() == {}
+
+
+def test_a_pair_that_a_killed_run_left_is_replaced() -> None:
+    left = attach_pairs(["rib0"], ONE, 1_500)
+    left.__enter__()  # and never left
+    with attach_pairs(["rib0"], ONE, 1_400):
+        assert devices() == dict.fromkeys(PAIR, 1_400)
+
+
+def test_the_pair_of_another_switch_is_left_alone() -> None:
+    with attach_pairs(["rib0"], ONE, 1_500):
+        with pytest.raises(LocalError, match="not ours"), attach_pairs(["rib0"], OTHER, 1_500):
+            pass
+        assert devices().keys() == PAIR
+
+
+def test_somebody_elses_device_is_refused_and_what_was_made_before_it_is_gone(space: Space) -> None:
+    space.ip("add", "rib0-s", "type", "bridge")
+    with pytest.raises(LocalError, match="rib0-s exists"), attach_pairs(["px0", "rib0"], ONE, 1_500):
+        pass
+    assert devices().keys() == {"rib0-s"}

@@ -1,0 +1,25 @@
+"""What a receiver measures."""
+
+from __future__ import annotations
+
+from proxy.tally import Tally, percentile
+
+
+def test_a_tally_tells_the_usual_way_and_all_ways_that_were_seen() -> None:
+    tally = Tally("/t", "std_msgs/msg/String")
+    for hops in (5, 5, 2, 5):
+        tally.add(1.0, 3, hops)
+    fields = tally.to_fields()
+    assert (fields["hops"], fields["hops_seen"], fields["received"], fields["parts"]) == (5, [2, 5], 4, 3)
+
+
+def test_without_a_message_there_is_no_latency_and_no_way() -> None:
+    fields = Tally("/t", "std_msgs/msg/String").to_fields()
+    assert fields["latency_ms"] == {"median": None, "p99": None, "max": None}
+    assert (fields["hops"], fields["hops_seen"]) == (0, [])
+
+
+def test_percentiles_are_values_that_were_measured() -> None:
+    ordered = [float(value) for value in range(1, 101)]
+    assert (percentile(ordered, 0.5), percentile(ordered, 0.99), percentile(ordered, 1)) == (51.0, 100.0, 100.0)
+    assert percentile([7.0], 0.99) == 7.0
