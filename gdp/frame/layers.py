@@ -119,17 +119,20 @@ class GDP(Packet):
         return conf.raw_layer
 
     def hashret(self) -> bytes:
-        """Return what a question and its answer share."""
+        """Return what a question and its answer share: an echo its number, too."""
         asked = _ANSWER_TO.get(self.kind, self.kind)
-        number = int(self.number).to_bytes(8, "big")
+        number = int(self.number).to_bytes(8, "big") if asked == Kind.ECHO_REQUEST else b""
         return bytes([asked]) + number + bytes(strxor(self.destination, self.source))
 
     def answers(self, other: Packet) -> bool:
-        """An answer has the number of its question, and its names the other way round."""
+        """An answer has the names of its question the other way round; an echo has its number, too.
+
+        A RIB numbers its answers itself, since one question may have several.
+        """
         return (
             isinstance(other, GDP)
             and _ANSWER_TO.get(self.kind) == other.kind
-            and self.number == other.number
+            and (self.kind != Kind.ECHO_REPLY or self.number == other.number)
             and self.destination == other.source
             and self.source == other.destination
         )
