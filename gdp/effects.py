@@ -28,6 +28,11 @@ class Arrival(NamedTuple):
     mac: bytes  # the sender's, 6 bytes
     frame: bytes  # from the header on, without the Ethernet header; may end in padding
 
+    @property
+    def via(self) -> bytes:
+        """Return port and sender's address as one key."""
+        return self.port.to_bytes(4, "big") + self.mac
+
 
 class Transmit(NamedTuple):
     """Frames to one neighbour, in order."""

@@ -17,6 +17,7 @@ from typing import Final
 
 from gdp.control.frames import ControlJoiner, ControlSplitter
 from gdp.control.greeter import Greeter
+from gdp.control.join import Join
 from gdp.control.neighbour import Neighbour
 from gdp.control.verdict import Verdict
 from gdp.crypto.certificates import Role
@@ -147,7 +148,7 @@ class Attachment:
         Raises:
             RemoteError: it does not hold.
         """
-        wire = self.joiner.add(header, arrival.frame, now.mono_s)
+        wire = self.joiner.add(header, arrival.frame, now.mono_s, arrival.via)
         if wire is None:
             return None
         statement = parse(wire)
@@ -161,7 +162,9 @@ class Attachment:
         if header.kind == Kind.VERDICT:
             return self._take_verdict(statement, switch, now)
         if header.kind in (Kind.JOIN, Kind.LEAVE):
+            join = Join.from_fields(statement.expect(StatementType.JOIN))
             statement.verify(switch.key)
+            self.greeter.ports[switch.port].take_join(join, switch.name)
             return statement
         if header.kind == Kind.REVOKE:
             return statement  # it proves itself

@@ -101,8 +101,8 @@ class Publisher:
 
     @property
     def readers(self) -> int:
-        """Return how many readers have introduced themselves and are alive."""
-        return len(self._readers)
+        """Return how many readers have introduced themselves and are alive; none before a tree stands."""
+        return 0 if self._mtu is None else len(self._readers)
 
     @property
     def repairs(self) -> int:

@@ -87,7 +87,7 @@ class RibHost:
             raise FrameError(DropReason.NOT_FOR_US)
         if header.kind not in (Kind.RIB_REQUEST, Kind.RIB_ANSWER):
             raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
-        wire = self._joiner.add(header, arrival.frame, now.mono_s)
+        wire = self._joiner.add(header, arrival.frame, now.mono_s, arrival.via)
         if wire is not None:
             self.rib.receive(wire, Name(header.source), now)
 

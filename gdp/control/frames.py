@@ -31,7 +31,7 @@ __all__ = ["ControlJoiner", "ControlSplitter"]
 _COST_BYTES: Final = 200  # what an unfinished statement costs beside its bytes
 _FAR_MTU: Final = 1_400  # behind the first link there may be a tunnel
 
-_Key = tuple[bytes, int, int, int]  # source, kind, incarnation, number
+_Key = tuple[bytes, int, int, int]  # origin, kind, incarnation, number
 
 
 class ControlSplitter:
@@ -87,7 +87,7 @@ class ControlJoiner:
 
     @property
     def unfinished(self) -> Mapping[_Key, object]:
-        """Return what waits for parts, keyed by (source, kind, incarnation, number)."""
+        """Return what waits for parts, keyed by (origin, kind, incarnation, number)."""
         return self._unfinished
 
     @property
@@ -95,8 +95,12 @@ class ControlJoiner:
         """Return how much memory unfinished statements hold."""
         return self._budget.held_bytes
 
-    def add(self, header: Header, frame: bytes, now_s: float) -> bytes | None:
+    def add(self, header: Header, frame: bytes, now_s: float, via: bytes = b"") -> bytes | None:
         """Take a part; return the statement when it is whole.
+
+        Args:
+            via: whom it came from on which port. With the source it makes the origin, which has its own memory, and
+                whose parts alone are put together: a stranger on the link cannot spoil a neighbour's statement.
 
         Raises:
             FrameError: it cannot be a part of a statement.
@@ -107,12 +111,13 @@ class ControlJoiner:
         if header.parts > CONTROL_PARTS_MAX:
             raise FrameError(DropReason.BAD_PARTS, f"a statement in {header.parts} parts")
         self.expire(now_s)
-        key = (header.source, header.kind, header.incarnation, header.number)
+        origin = header.source + via
+        key = (origin, header.kind, header.incarnation, header.number)
         waiting = self._unfinished.get(key)
         if waiting is None:
-            self._reserve(header.source, _COST_BYTES)
+            self._reserve(origin, _COST_BYTES)
             waiting = self._unfinished[key] = _Unfinished(header.parts, now_s)
-            self._by_source.setdefault(header.source, {})[key] = None
+            self._by_source.setdefault(origin, {})[key] = None
         if waiting.parts != header.parts:
             raise FrameError(DropReason.BAD_PARTS, "the number of parts changed")
         if header.part in waiting.chunks:
@@ -120,9 +125,9 @@ class ControlJoiner:
         if waiting.held_bytes + len(payload) > CONTROL_MAX_BYTES + _COST_BYTES:
             self._drop(key)
             raise FrameError(DropReason.TOO_BIG, "statement")
-        self._reserve(header.source, len(payload))
+        self._reserve(origin, len(payload))
         if key not in self._unfinished:  # it was the oldest itself
-            self._budget.release(header.source, len(payload))
+            self._budget.release(origin, len(payload))
             raise FrameError(DropReason.MEMORY_FULL, "statements")
         waiting.held_bytes += len(payload)
         waiting.chunks[header.part] = payload

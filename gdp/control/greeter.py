@@ -15,6 +15,7 @@ from typing import Final
 
 from gdp.control.frames import ControlSplitter
 from gdp.control.hello import DIGEST_BYTES, NONCE_BYTES, Hello
+from gdp.control.join import Join
 from gdp.control.neighbour import TRANSITIONS, Neighbour, NeighbourEvent, NeighbourState
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType
@@ -66,17 +67,22 @@ class LinkPort:
             if len(self.ended) > _ENDED_MAX:
                 del self.ended[next(iter(self.ended))]
 
-    def take_join(self, name: Name, sequence: int) -> bool:
-        """Note a verified join or leave of a neighbour; False when it came before, or is too old to tell."""
+    def take_join(self, join: Join, name: Name) -> None:
+        """Note a verified join or leave of a neighbour.
+
+        Raises:
+            StatementError: REPLAYED: it is of another session of this port, came before, or is too old to tell.
+        """
+        if join.session != self.nonce:
+            raise StatementError(DropReason.REPLAYED, "a join of another session")
         window = self.joins.get(name)
         if window is None:
             if len(self.joins) >= _ENDED_MAX:
                 del self.joins[next(iter(self.joins))]
             window = self.joins[name] = ReplayWindow(_JOINS_WINDOW)
-        if window.is_finished(sequence):
-            return False
-        window.finish(sequence)
-        return True
+        if window.is_finished(join.sequence):
+            raise StatementError(DropReason.REPLAYED, "join")
+        window.finish(join.sequence)
 
 
 class Greeter:

@@ -35,11 +35,7 @@ class StatementType(str, Enum):
     WITHDRAW = "withdraw"
     QUERY = "query"
     ANSWER = "answer"
-    WATCH = "watch"
-    UNWATCH = "unwatch"
-    NOTICE = "notice"  # what changed under a watch
     JOIN = "join"
-    LEAVE = "leave"
     LINK_STATE = "link-state"
     HELLO = "hello"
     ADCERT = "adcert"  # owner to node: may do this with the name
@@ -48,7 +44,6 @@ class StatementType(str, Enum):
     GRANT = "grant"  # owner to node: a topic secret, sealed
     RELAY = "relay"  # a claim passed on by a switch or a RIB
     REVOKE = "revoke"
-    REFUSAL = "refusal"
     VERDICT = "verdict"
 
 

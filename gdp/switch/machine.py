@@ -223,13 +223,14 @@ class Switch:
                 joiner = self._hellos
             else:
                 self._sender(arrival)  # for strangers no state is kept
-            wire = joiner.add(header, arrival.frame, now.mono_s)
+            wire = joiner.add(header, arrival.frame, now.mono_s, arrival.via)
             if wire is not None:
                 self._take_control(arrival, header.kind, parse(wire), now)
-        elif header.destination == self.name:
-            self._take_own(header, arrival.frame, now)
+            return
+        self._sender(arrival)  # nor is anything answered or looked for in their name
+        if header.destination == self.name:
+            self._take_own(header, arrival, now)
         else:
-            self._sender(arrival)  # nor is anything looked for in their name
             self.unicast.miss(header, arrival.frame[: HEADER_BYTES + header.length], now.mono_s)
 
     def _take_control(self, arrival: Arrival, kind: int, statement: Statement, now: Instant) -> None:
@@ -269,9 +270,9 @@ class Switch:
                 return neighbour
         raise FrameError(DropReason.UNKNOWN_SENDER)
 
-    def _take_own(self, header: Header, frame: bytes, now: Instant) -> None:
+    def _take_own(self, header: Header, arrival: Arrival, now: Instant) -> None:
         if header.kind == Kind.RIB_ANSWER:
-            wire = self._joiner.add(header, frame, now.mono_s)
+            wire = self._joiner.add(header, arrival.frame, now.mono_s, arrival.via)
             if wire is not None:
                 self.inquirer.receive(parse(wire), now)
         elif header.kind == Kind.ECHO_REQUEST:
@@ -279,7 +280,7 @@ class Switch:
                 kind=Kind.ECHO_REPLY, hops_left=HOPS_MAX, destination=header.source, source=self.name,
                 incarnation=self._incarnation,
             )  # fmt: skip
-            reply = encode(back) + frame[HEADER_BYTES : HEADER_BYTES + header.length]
+            reply = encode(back) + arrival.frame[HEADER_BYTES : HEADER_BYTES + header.length]
             self.unicast.send([reply], Name(header.source), self.name, now.mono_s)
         else:
             raise FrameError(DropReason.NOT_FOR_US, str(header.kind))
@@ -292,6 +293,7 @@ class Switch:
             self._flooding.neighbour_changed(now_s)
         if neighbour.state is NeighbourState.UP:
             self._revoker.tell_all(neighbour)
+            self.planter.neighbour_up((neighbour.port, neighbour.mac), now_s)
             if neighbour.role is Role.SWITCH:
                 self._flooding.sync(neighbour, now_s)
         elif before is NeighbourState.UP:
@@ -333,9 +335,7 @@ class Switch:
         if neighbour.role is not Role.SWITCH or statement.signer != neighbour.name:
             raise StatementError(DropReason.UNKNOWN_SENDER, "a join is from a neighbouring switch")
         statement.verify(neighbour.key)
-        port = self.greeter.ports[neighbour.port]
-        if join.session != port.nonce or not port.take_join(neighbour.name, join.sequence):
-            raise StatementError(DropReason.REPLAYED, "join")
+        self.greeter.ports[neighbour.port].take_join(join, neighbour.name)
         if join.lease_s > 0:
             claim = self._verifier.verify(join.evidence, now.unix_s)
             if claim.right is not Right.READ or claim.name != join.topic:

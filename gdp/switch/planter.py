@@ -145,6 +145,12 @@ class Planter:
         if not self._follow(tree, now_s) and not (is_known and is_same_place):
             self._ask_above(tree, now_s)
 
+    def neighbour_up(self, at: At, now_s: float) -> None:
+        """Ask a neighbour again for what it was asked before its present session, of which it knows nothing."""
+        for tree in self.trees.all():
+            if tree.above == at:
+                self._ask_above(tree, now_s)
+
     def neighbour_lost(self, at: At) -> None:
         """Cut every branch to a neighbour that is gone."""
         for topic in [topic for topic, readers in self._readers.items() if at in readers]:

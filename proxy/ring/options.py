@@ -86,6 +86,10 @@ class Options:
         for file in (self.json, self.pcap):
             if file is not None and not file.parent.is_dir():
                 raise LocalError(f"no such directory: {file.parent}")
+            if file is not None and file.is_dir():
+                raise LocalError(f"a directory, where a file was expected: {file}")
+        if self.out is not None and self.out.exists() and not self.out.is_dir():
+            raise LocalError(f"a file, where a directory was expected: {self.out}")
         topology = self.topology()
         for cut in self.cuts:
             topology.link(cut.a, cut.b)

@@ -349,8 +349,9 @@ def test_an_answer_from_no_rib_of_ones_own_is_not_believed(role: Role, domain: s
     name = flow.topic.name
     answer = Answer(name, name, b"", liar.root.domain, (), 2.0).to_wire(liar.name, liar.key, liar.membership)
     header = Header(Kind.RIB_ANSWER, Flag.LAST, HOPS_MAX, 0, len(answer), 1, 0, 1, 9, nuc1.name, liar.name)
-    found = attack(flow, [encode(header) + answer], ("nuc1",))
-    assert found[DropReason.WRONG_DOMAIN] == 1
+    world.network.inject("nuc1", 0, encode(header) + answer, mac_of(world, "nuc1"))
+    assert nuc1.drops()[DropReason.WRONG_DOMAIN] == 1
+    assert attack(flow, [encode(header) + answer], ("nuc1",))[DropReason.UNKNOWN_SENDER] == 1
 
 
 def test_a_statement_of_no_known_type_is_malformed() -> None:

@@ -155,3 +155,12 @@ def test_padding_behind_the_payload_is_cut_off() -> None:
     frame = splitter().split(Kind.HELLO, b"short", 1_500)[0]
     assert len(frame) == HEADER_BYTES + 5
     assert ControlJoiner().add(decode(frame), frame + bytes(20), 0.0) == b"short"
+
+
+def test_parts_from_another_address_do_not_spoil_a_statement() -> None:
+    to = ControlJoiner()
+    first, second = ControlSplitter(b"s" * 32, 1).split(Kind.HELLO, b"x" * 700, 576)
+    spoilt = first[:HEADER_BYTES] + bytes(len(first) - HEADER_BYTES)
+    assert to.add(decode(spoilt), spoilt, 0.0, b"stranger") is None
+    assert to.add(decode(first), first, 0.0, b"neighbour") is None
+    assert to.add(decode(second), second, 0.0, b"neighbour") == b"x" * 700

@@ -6,8 +6,9 @@ from itertools import product
 
 import pytest
 
-from gdp.control.greeter import NEIGHBOURS_PER_PORT, Change, Greeter
-from gdp.control.hello import Hello
+from gdp.control.greeter import NEIGHBOURS_PER_PORT, Change, Greeter, LinkPort
+from gdp.control.hello import NONCE_BYTES, Hello
+from gdp.control.join import Join
 from gdp.control.neighbour import TRANSITIONS, NeighbourEvent, NeighbourState
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
@@ -17,6 +18,7 @@ from gdp.effects import Arrival
 from gdp.errors import DropReason, StatementError
 from gdp.frame.codec import HEADER_BYTES
 from gdp.limits import DEAD_S, HELLO_S
+from gdp.names import ZERO, Name
 from gdp.trust.domain import Policy
 from tests.gdp.control.members import CLOUD, ELSEWHERE, SCHOOL, UNIX_S, YEAR, at, greeter, node
 
@@ -238,11 +240,26 @@ def test_a_greeter_never_wants_to_be_called_in_the_past() -> None:
         assert due_s > now_s
 
 
+def is_taken(port: LinkPort, session: bytes, name: Name, sequence: int) -> bool:
+    join = Join(ZERO, ZERO, ZERO, ZERO, frozenset(), 1_500, 1.0, b"", session, sequence)
+    try:
+        port.take_join(join, name)
+    except StatementError as error:
+        return error.reason is not DropReason.REPLAYED
+    return True
+
+
 def test_a_join_counts_once() -> None:
     port = greeter(A, 1).ports[0]
-    assert [port.take_join(B.name, sequence) for sequence in (5, 4, 5, 6, 4)] == [True, True, False, True, False]
+    taken = [is_taken(port, port.nonce, B.name, sequence) for sequence in (5, 4, 5, 6, 4)]
+    assert taken == [True, True, False, True, False]
+
+
+def test_a_join_of_another_session_is_refused() -> None:
+    port = greeter(A, 1).ports[0]
+    assert not is_taken(port, bytes(NONCE_BYTES), B.name, 1)
 
 
 def test_joins_of_two_neighbours_do_not_hinder_each_other() -> None:
     port = greeter(A, 1).ports[0]
-    assert [port.take_join(name, 1) for name in (A.name, B.name)] == [True, True]
+    assert [is_taken(port, port.nonce, name, 1) for name in (A.name, B.name)] == [True, True]
