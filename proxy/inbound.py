@@ -96,7 +96,9 @@ class Inbound:
         if handle is not None and self._sink is not None:
             self._sink.write(handle, stamp_ns, raw)
         latency_ms = (stamp_ns - parcel.stamp_ns) / 1e6
-        tally.add(latency_ms, message.delivered.parts, message.delivered.hops)
+        delivered = message.delivered
+        tally.count_number(delivered.publisher, delivered.incarnation, delivered.number)
+        tally.add(latency_ms, delivered.parts, delivered.hops)
         self._node.latency.observe(latency_ms / 1e3)
         self._node.messages_in += 1
         self._node.bytes_in += len(message.delivered.message)

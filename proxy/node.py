@@ -12,8 +12,8 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from gdp.client.attachment import AttachmentSettings
 from gdp.client.member import Member, Topic
+from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import GdpError, LocalError
@@ -73,7 +73,7 @@ def run_node(config: ProxyConfig) -> Iterator[ProxyNode]:
     """
     identity, policy = load_member(config.identity, config.domain, Role.PROXY)
     topics = open_topics(config, identity)
-    settings = AttachmentSettings(incarnation(), wall_clock_ms(), secrets.token_bytes)
+    settings = NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes)
     member = Member(identity, policy, settings)
     with contextlib.ExitStack() as stack:
         plane = RawPlane([config.iface])

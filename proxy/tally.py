@@ -27,6 +27,13 @@ class Tally:
     parts: int = 0  # of the message that had most
     hops: Counter[int] = field(default_factory=Counter)
     latencies_ms: deque[float] = field(default_factory=lambda: deque(maxlen=SAMPLES_MAX))
+    newest: dict[tuple[bytes, int], int] = field(default_factory=dict)  # publisher, incarnation -> message number
+
+    def count_number(self, publisher: bytes, incarnation: int, number: int) -> None:
+        """Count a message that came again: numbers rise within an incarnation."""
+        life = (publisher, incarnation)
+        self.duplicated += number <= self.newest.get(life, -1)
+        self.newest[life] = max(number, self.newest.get(life, -1))
 
     def add(self, latency_ms: float, parts: int, hops: int) -> None:
         """Count one message."""

@@ -11,7 +11,6 @@ Place: pure. Whoever publishes, reads or serves builds on this; so does a RIB.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -19,6 +18,7 @@ from gdp.control.frames import ControlJoiner, ControlSplitter
 from gdp.control.greeter import Greeter
 from gdp.control.join import Join
 from gdp.control.neighbour import Neighbour
+from gdp.control.settings import NodeSettings
 from gdp.control.verdict import Verdict
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
@@ -29,29 +29,17 @@ from gdp.effects import Arrival, Instant, Transmit
 from gdp.errors import DropReason, FrameError, StatementError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Kind
-from gdp.limits import DEAD_S, HELLO_S
 from gdp.names import Name
 from gdp.trust.claim import make_claim
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
 
-__all__ = ["Attachment", "AttachmentSettings", "Claimed"]
+__all__ = ["Attachment", "Claimed"]
 
 CLAIM_LEASE_S: Final = 24.0
 _CLAIM_AGAIN_S: Final = 0.5  # until it is judged
 _RTCERT_S: Final = 600
-
-
-@dataclass(frozen=True, slots=True)
-class AttachmentSettings:
-    """``incarnation`` is random at each start; ``first_sequence`` is wall-clock milliseconds."""
-
-    incarnation: int
-    first_sequence: int
-    random_bytes: Callable[[int], bytes]
-    hello_s: float = HELLO_S
-    dead_s: float = DEAD_S
 
 
 @dataclass(slots=True)
@@ -75,7 +63,7 @@ class Claimed:
 class Attachment:
     """One node's hold on the overlay."""
 
-    def __init__(self, identity: Identity, policy: Policy, settings: AttachmentSettings) -> None:
+    def __init__(self, identity: Identity, policy: Policy, settings: NodeSettings) -> None:
         self._identity = identity
         self._policy = policy
         self._incarnation = settings.incarnation

@@ -64,6 +64,7 @@ class Delivered:
     """One message, opened, verified and in its place."""
 
     publisher: bytes
+    incarnation: int  # of the publisher, within which numbers rise
     number: int
     message: bytes
     parts: int
@@ -113,11 +114,6 @@ class Feed:
     def drops(self) -> Counter[DropReason]:
         """Return what was dropped, by reason."""
         return self._data.drops + self._status.drops
-
-    @property
-    def duplicates(self) -> int:
-        """Return how many parts came a second time and were dropped."""
-        return self._data.drops[DropReason.DUPLICATE] + self._data.drops[DropReason.LATE]
 
     def receive(self, header: Header, frame: bytes, now_s: float) -> None:
         """Take one DATA or STATUS frame of this publisher."""
@@ -327,7 +323,8 @@ class Feed:
 
     def _hand_out(self, joined: Joined) -> None:
         self.delivered += 1
-        self._out.append(Delivered(self.publisher, joined.number, joined.message, joined.parts, joined.hops))
+        about = joined.number, joined.message, joined.parts, joined.hops
+        self._out.append(Delivered(self.publisher, self.incarnation, *about))
 
 
 def _below(ranges: list[tuple[int, int]], end: int) -> list[tuple[int, int]]:

@@ -14,11 +14,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-from gdp.client.attachment import Attachment, AttachmentSettings
+from gdp.client.attachment import Attachment
 from gdp.client.feed import Delivered, Feed, Reader
 from gdp.client.publisher import Publisher, Secrets, Source
 from gdp.control.join import Join
 from gdp.control.query import Answer
+from gdp.control.settings import NodeSettings
 from gdp.crypto.identity import Identity
 from gdp.crypto.note import topic_of
 from gdp.crypto.statements import Statement, StatementType
@@ -69,7 +70,7 @@ class _Subscription:
 class Member:
     """The machine of one member."""
 
-    def __init__(self, identity: Identity, policy: Policy, settings: AttachmentSettings) -> None:
+    def __init__(self, identity: Identity, policy: Policy, settings: NodeSettings) -> None:
         self._identity = identity
         self._incarnation = settings.incarnation
         self._reader = Reader(identity.name, settings.incarnation)  # one: its feeds share the numbers of their notes

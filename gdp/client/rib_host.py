@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-from gdp.client.attachment import Attachment, AttachmentSettings
+from gdp.client.attachment import Attachment
 from gdp.control.frames import ControlJoiner
+from gdp.control.settings import NodeSettings
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import StatementType
 from gdp.effects import Arrival, Instant, Transmit
@@ -27,7 +28,7 @@ __all__ = ["RibHost"]
 class RibHost:
     """The machine of a RIB node."""
 
-    def __init__(self, identity: Identity, policy: Policy, rib: Rib, settings: AttachmentSettings) -> None:
+    def __init__(self, identity: Identity, policy: Policy, rib: Rib, settings: NodeSettings) -> None:
         self._identity = identity
         self._joiner = ControlJoiner()
         self._drops: Counter[DropReason] = Counter()

@@ -10,8 +10,8 @@ import logging
 import secrets
 from collections.abc import Callable
 
-from gdp.client.attachment import AttachmentSettings
 from gdp.client.rib_host import RibHost
+from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.names import Name
 from gdp.nodes.config import RibConfig
@@ -44,7 +44,7 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None]) -> None:
         config.upper, config.allow_unowned, quotas.names_per_sender, quotas.watches, quotas.lease_max_s
     )
     rib = Rib(identity, policy, MemoryStore(), settings)
-    attachment = AttachmentSettings(incarnation(), wall_clock_ms(), secrets.token_bytes)
+    attachment = NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes)
     host = RibHost(identity, policy, rib, attachment)
     with contextlib.ExitStack() as stack:
         plane = RawPlane([config.iface])

@@ -11,6 +11,7 @@ import secrets
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.names import Name
@@ -21,7 +22,7 @@ from gdp.nodes.runtime import Runtime, now
 from gdp.ports.link import LinkWatch
 from gdp.ports.plane import Plane
 from gdp.ports.raw import RawPlane
-from gdp.switch.machine import Switch, SwitchSettings
+from gdp.switch.machine import Switch
 from gdp.switch.table import Table
 from gdp.telemetry.metrics import Metrics, Sources
 
@@ -45,7 +46,7 @@ def run_switch(config: SwitchConfig, ready: Callable[[Name, str], None]) -> None
     if not config.ports and not config.attach:
         raise LocalError("a switch needs at least one port: --iface, or ports in the configuration")
     table = Table()
-    settings = SwitchSettings(
+    settings = NodeSettings(
         incarnation(), wall_clock_ms(), secrets.token_bytes, config.hello_s, config.dead_s
     )
     switch = Switch(identity, policy, table, settings)

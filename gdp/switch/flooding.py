@@ -52,7 +52,6 @@ class Flooding:
         self.link_states = LinkStates(self._domain)
         self.paths = Paths(identity.name, self._domain, self.link_states)
         self._said: dict[Scope, tuple[object, ...]] = {}
-        self._inside_version = -1
         self._refresh_at_s = 0.0
         self._synced_s: dict[tuple[int, Name], float] = {}
 

@@ -12,14 +12,14 @@ The walk of a frame that was handed up::
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from gdp.control.frames import ControlJoiner, ControlSplitter
 from gdp.control.greeter import Change, Greeter, LinkPort
 from gdp.control.join import Join
 from gdp.control.neighbour import Neighbour, NeighbourState
+from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
@@ -27,7 +27,7 @@ from gdp.effects import Arrival, Instant, Transmit
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
 from gdp.frame.codec import HEADER_BYTES, Header, decode, encode
 from gdp.frame.kinds import CONTROL_FROM, Kind
-from gdp.limits import DEAD_S, HELLO_S, HOPS_MAX
+from gdp.limits import HOPS_MAX
 from gdp.names import Name
 from gdp.switch.attached import Attached
 from gdp.switch.claims import Claims
@@ -44,22 +44,11 @@ from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.verifier import ClaimVerifier
 
-__all__ = ["Switch", "SwitchSettings"]
+__all__ = ["Switch"]
 
 _FOLLOW_S: Final = 0.005  # from the first news of links to new paths
 _FOLLOW_AGAIN_S: Final = 0.1  # ... and where news keep coming
 _CONTROL = frozenset(kind.value for kind in Kind if kind >= CONTROL_FROM)
-
-
-@dataclass(frozen=True, slots=True)
-class SwitchSettings:
-    """What an operator may choose. ``incarnation`` is random at each start; ``first_sequence`` is wall-clock ms."""
-
-    incarnation: int
-    first_sequence: int
-    random_bytes: Callable[[int], bytes]
-    hello_s: float = HELLO_S
-    dead_s: float = DEAD_S
 
 
 class Switch:
@@ -69,7 +58,7 @@ class Switch:
         table: the forwarding table that the data plane reads.
     """
 
-    def __init__(self, identity: Identity, policy: Policy, table: Table, settings: SwitchSettings) -> None:
+    def __init__(self, identity: Identity, policy: Policy, table: Table, settings: NodeSettings) -> None:
         self._identity = identity
         self._policy = policy
         self.table = table

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
-from gdp.client.attachment import AttachmentSettings
 from gdp.client.member import Member, Topic
 from gdp.client.rib_host import RibHost
+from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.issuing import DomainAuthority
@@ -20,7 +20,7 @@ from gdp.limits import DEAD_S, HELLO_S
 from gdp.metadata import Metadata
 from gdp.rib.machine import Rib, RibSettings
 from gdp.rib.store import MemoryStore
-from gdp.switch.machine import Switch, SwitchSettings
+from gdp.switch.machine import Switch
 from gdp.switch.table import Table
 from gdp.testbed.memory import EPOCH_UNIX_S, Cable, MemoryNetwork
 from gdp.testbed.topology import Attachment, Topology
@@ -105,7 +105,7 @@ class World:
     def add_member(self, label: str, switch: str, domain: str | None = None) -> Member:
         """Attach a member to a switch; its domain is the switch's unless given."""
         domain = domain or self.topology.domain_of(switch).label
-        member = Member(self.identity(Role.PROXY, label, domain), self.policy(domain), self._attachment_settings())
+        member = Member(self.identity(Role.PROXY, label, domain), self.policy(domain), self._settings())
         self.members[label] = member
         self.network.add(label, member)
         self.leads[label] = self.network.connect(switch, label, Cable(0.0001))
@@ -116,7 +116,7 @@ class World:
         before = self.members[label]
         identity = next(each for each in self.identities.values() if each.name == before.name)
         domain = next(domain for domain, each in self.authorities.items() if each.root.domain == identity.root.domain)
-        member = self.members[label] = Member(identity, self.policy(domain), self._attachment_settings())
+        member = self.members[label] = Member(identity, self.policy(domain), self._settings())
         self.network.replace(label, member)
         return member
 
@@ -157,15 +157,7 @@ class World:
 
     def _switch(self, name: str, domain: str) -> tuple[Switch, Table]:
         table = Table()
-        self._incarnation += 1
-        settings = SwitchSettings(
-            self._incarnation,
-            int(self.network.now.unix_s * 1000),
-            self.network.random_bytes,
-            self.hello_s,
-            self.dead_s,
-        )
-        switch = self.switches[name] = Switch(self.identities[name], self.policy(domain), table, settings)
+        switch = self.switches[name] = Switch(self.identities[name], self.policy(domain), table, self._settings())
         return switch, table
 
     def _ribs_of(self, domain: str) -> list[Attachment]:
@@ -181,12 +173,12 @@ class World:
         identity = self.identities[f"rib:{domain.label}"]
         policy = self.policy(domain.label)
         rib = Rib(identity, policy, MemoryStore(), RibSettings(upper))
-        host = self.ribs[domain.label] = RibHost(identity, policy, rib, self._attachment_settings())
+        host = self.ribs[domain.label] = RibHost(identity, policy, rib, self._settings())
         return host
 
-    def _attachment_settings(self) -> AttachmentSettings:
+    def _settings(self) -> NodeSettings:
         self._incarnation += 1
-        return AttachmentSettings(
+        return NodeSettings(
             self._incarnation,
             int(self.network.now.unix_s * 1000),
             self.network.random_bytes,

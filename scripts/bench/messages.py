@@ -27,8 +27,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from gdp.client.attachment import AttachmentSettings
 from gdp.client.member import Member, Topic
+from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.metadata import Metadata
 from gdp.nodes.allocator import settle_memory
@@ -57,7 +57,7 @@ class End:
         settings = RibConfig.load(config)  # identity, domain and iface are all that an end needs
         identity, policy = load_member(settings.identity, settings.domain, Role.PROXY)
         self.member = Member(
-            identity, policy, AttachmentSettings(incarnation(), wall_clock_ms(), secrets.token_bytes)
+            identity, policy, NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes)
         )
         self.plane = RawPlane([settings.iface])
         self.runtime = Runtime(self.member, self.plane)

@@ -23,3 +23,10 @@ def test_percentiles_are_values_that_were_measured() -> None:
     ordered = [float(value) for value in range(1, 101)]
     assert (percentile(ordered, 0.5), percentile(ordered, 0.99), percentile(ordered, 1)) == (51.0, 100.0, 100.0)
     assert percentile([7.0], 0.99) == 7.0
+
+
+def test_a_message_that_comes_again_is_counted_and_a_restarted_publisher_is_not() -> None:
+    tally = Tally("/t", "std_msgs/msg/String")
+    for incarnation, number in ((1, 1), (1, 2), (1, 2), (1, 1), (2, 1), (1, 3)):
+        tally.count_number(b"p" * 32, incarnation, number)
+    assert tally.to_fields()["duplicated"] == 2
