@@ -66,6 +66,7 @@ class Rule(Section):
     encoding: Encoding = "json"
     reliable: bool = True
     latched: bool = False
+    priority: Literal["normal", "urgent"] = "normal"
     max_bytes: int = Field(default=MESSAGE_MAX_BYTES, ge=1, le=MESSAGE_MAX_BYTES)
     is_global: bool = Field(default=True, alias="global")
 

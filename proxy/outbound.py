@@ -91,6 +91,7 @@ class Outbound:
             reliable=rule.reliable,
             depth=depth,
             is_global=rule.is_global,
+            urgent=rule.priority == "urgent",
         )
         self.publishers[rule.name] = publisher
         for number, at in enumerate(indexes):

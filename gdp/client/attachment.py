@@ -53,6 +53,7 @@ class Claimed:
     claim_at_s: float = 0.0
     is_taken: bool = False
     refused: DropReason | None = None
+    join_sequence: int = -1  # of the newest join for it that came from this switch
 
     @property
     def is_judged(self) -> bool:
@@ -153,6 +154,7 @@ class Attachment:
             join = Join.from_fields(statement.expect(StatementType.JOIN))
             statement.verify(switch.key)
             self.greeter.ports[switch.port].take_join(join, switch.name)
+            self._note_newest(join)
             return statement
         if header.kind == Kind.REVOKE:
             return statement  # it proves itself
@@ -198,7 +200,7 @@ class Attachment:
         if best is not None and not is_same:
             self._rtcert = b""
             for each in self._claims.values():
-                each.claim_at_s, each.is_taken, each.refused = now_s, False, None
+                each.claim_at_s, each.is_taken, each.refused, each.join_sequence = now_s, False, None, -1
 
     def _claim_wire(self, each: Claimed, now: Instant) -> bytes:
         assert self._switch is not None
@@ -217,6 +219,18 @@ class Attachment:
             is_global=each.is_global,
             chain=each.chain,
         )
+
+    def _note_newest(self, join: Join) -> None:
+        """Note how new a join is.
+
+        Raises:
+            StatementError: REPLAYED: a newer one overtook it, and what it says of the tree is no longer so.
+        """
+        claimed = self._claims.get((join.topic, Right.PUBLISH))
+        if claimed is not None:
+            if join.sequence < claimed.join_sequence:
+                raise StatementError(DropReason.REPLAYED, "a newer join overtook it")
+            claimed.join_sequence = join.sequence
 
     def _take_verdict(self, statement: Statement, switch: Neighbour, now: Instant) -> Statement | None:
         """Take what became of a claim, or pass a publisher's place on."""

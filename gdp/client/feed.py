@@ -9,7 +9,7 @@ delivers: a reliable topic in order and complete, a best-effort one in order and
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from itertools import count
@@ -18,6 +18,7 @@ from typing import Final
 from gdp.client.publisher import Secrets
 from gdp.crypto.envelope import Opener
 from gdp.crypto.note import NoteSealer
+from gdp.effects import Arrival
 from gdp.errors import DropReason, EnvelopeError, RemoteError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Flag, Kind
@@ -117,13 +118,6 @@ class Feed:
 
     def receive(self, header: Header, frame: bytes, now_s: float) -> None:
         """Take one DATA or STATUS frame of this publisher."""
-        is_data = header.kind == Kind.DATA and header.incarnation == self.incarnation
-        if is_data and self._data.add_next(header, frame, now_s):
-            self._unreported_bytes += header.length
-            due_s = now_s if self._unreported_bytes >= REPORT_EVERY_BYTES else now_s + REPORT_DELAY_S
-            if due_s < self._report_at_s and self._is_reliable and self.state is FeedState.LIVE:
-                self._report_at_s = due_s
-            return
         if header.incarnation != self.incarnation:
             self._data.drops[DropReason.WRONG_INCARNATION] += 1
         elif header.kind == Kind.STATUS:
@@ -132,6 +126,16 @@ class Feed:
                 self._take_status(joined, header.epoch, now_s)
         else:
             self._take_data(header, frame, now_s)
+
+    def receive_run(self, arrivals: Sequence[Arrival], at: int, now_s: float) -> int:
+        """Take the frames of ``arrivals[at:]`` that carry on with the message under way; return how many."""
+        taken = self._data.add_run(arrivals, at, now_s)
+        if taken:
+            self._unreported_bytes += sum(len(arrival.frame) for arrival in arrivals[at : at + taken])
+            due_s = now_s if self._unreported_bytes >= REPORT_EVERY_BYTES else now_s + REPORT_DELAY_S
+            if due_s < self._report_at_s and self._is_reliable and self.state is FeedState.LIVE:
+                self._report_at_s = due_s
+        return taken
 
     def timeout(self, now_s: float) -> None:
         """Give back what waited too long for its parts (best effort), and let a due report go."""

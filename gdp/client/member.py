@@ -9,7 +9,7 @@ the switch hands on and this member verifies itself.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
@@ -35,7 +35,7 @@ from gdp.trust.right import Right
 from gdp.trust.verifier import ClaimVerifier
 
 _FOR_FEEDS: Final = (int(Kind.DATA), int(Kind.STATUS))
-BYTES_AT_ONCE: Final = 96 << 10  # of one topic, before another's turn
+BYTES_AT_ONCE: Final = 96 << 10  # of what is not urgent, before anything else has its turn
 
 __all__ = ["Member", "Message", "Topic"]
 
@@ -77,8 +77,11 @@ class Member:
         self._verifier = ClaimVerifier(policy)
         self._budget = Budget()
         self._publishers: dict[Name, Publisher] = {}
+        self._urgent: list[Publisher] = []
+        self._ordinary = deque[Publisher]()  # the one whose turn it is comes first
         self._subscriptions: dict[Name, _Subscription] = {}
         self._messages: list[Message] = []
+        self._under_way: tuple[Feed, Name] | None = None  # whose next part is expected
         self._now_s = 0.0
         self._drops: Counter[DropReason] = Counter()
         self._closed_drops: Counter[DropReason] = Counter()
@@ -109,7 +112,14 @@ class Member:
         self.attachment.greeter.add_port(index, mac, mtu, cost, now.mono_s)
 
     def advertise(
-        self, topic: Topic, description: bytes, *, reliable: bool, depth: int = 0, is_global: bool = True
+        self,
+        topic: Topic,
+        description: bytes,
+        *,
+        reliable: bool,
+        depth: int = 0,
+        is_global: bool = True,
+        urgent: bool = False,
     ) -> Publisher:
         """Publish a topic from now on.
 
@@ -121,8 +131,11 @@ class Member:
         if topic.name in self._publishers:  # a second one would count, and make nonces, from 1 again
             raise LocalError(f"{topic.name.short} is published already")
         source = Source(self.name, self._incarnation, self._identity.key)
-        publisher = Publisher(topic.name, source, topic.secrets, description, reliable=reliable, depth=depth)
+        publisher = Publisher(
+            topic.name, source, topic.secrets, description, reliable=reliable, depth=depth, urgent=urgent
+        )
         self._publishers[topic.name] = publisher
+        (self._urgent if urgent else self._ordinary).append(publisher)
         delegation = topic.delegation
         self.attachment.claim(delegation.subject, Right.PUBLISH, delegation.chain, is_global=is_global)
         return publisher
@@ -173,26 +186,38 @@ class Member:
     def receive(self, arrivals: Sequence[Arrival], now: Instant) -> None:
         """Take frames in."""
         fed: dict[Feed, Name] = {}
-        for arrival in arrivals:
-            try:
-                header = decode(arrival.frame)
-                if header.kind in _FOR_FEEDS:
-                    self._feed(header, arrival.frame, now.mono_s, fed)
-                elif header.kind == Kind.REPORT:
-                    self._take_report(header, arrival.frame, now.mono_s)
-                elif header.kind >= CONTROL_FROM:
-                    statement = self.attachment.receive_control(arrival, header, now)
-                    if statement is not None:
-                        self._take_statement(statement, now)
-                else:
-                    self._drops[DropReason.UNKNOWN_KIND] += 1
-            except RemoteError as error:
-                self._drops[error.reason] += 1
+        at = 0
+        while at < len(arrivals):
+            if self._under_way is not None:
+                feed, topic = self._under_way
+                taken = feed.receive_run(arrivals, at, now.mono_s)
+                if taken:
+                    fed[feed] = topic
+                    at += taken
+                    continue
+            self._receive_one(arrivals[at], now, fed)
+            at += 1
         for feed, topic in fed.items():
             self._messages += [Message(topic, each, feed.description) for each in feed.take_delivered()]
             report = feed.take_report(now.mono_s)
             if report is not None:
                 self.attachment.send([report])
+
+    def _receive_one(self, arrival: Arrival, now: Instant, fed: dict[Feed, Name]) -> None:
+        try:
+            header = decode(arrival.frame)
+            if header.kind in _FOR_FEEDS:
+                self._feed(header, arrival.frame, now.mono_s, fed)
+            elif header.kind == Kind.REPORT:
+                self._take_report(header, arrival.frame, now.mono_s)
+            elif header.kind >= CONTROL_FROM:
+                statement = self.attachment.receive_control(arrival, header, now)
+                if statement is not None:
+                    self._take_statement(statement, now)
+            else:
+                self._drops[DropReason.UNKNOWN_KIND] += 1
+        except RemoteError as error:
+            self._drops[error.reason] += 1
 
     def port_changed(self, port: int, up: bool, now: Instant) -> None:
         """Learn that a port's link came or went."""
@@ -212,10 +237,17 @@ class Member:
         if self.attachment.switch is None:
             return
         self._now_s = now_s
-        for publisher in self._publishers.values():
-            frames = publisher.take(now_s, BYTES_AT_ONCE)
-            if frames:
+        for publisher in self._urgent:
+            if frames := publisher.take(now_s, BYTES_AT_ONCE):
                 self.attachment.send(frames)
+        left = BYTES_AT_ONCE
+        for _ in range(len(self._ordinary)):
+            if frames := self._ordinary[0].take(now_s, left):
+                self.attachment.send(frames)
+                left -= sum(map(len, frames))
+            self._ordinary.rotate(-1)
+            if left < BYTES_AT_ONCE // 2:
+                break
         for feed in self.feeds():
             report = feed.take_report(now_s)
             if report is not None:
@@ -233,7 +265,7 @@ class Member:
         """Return, once, what is to be sent; more comes at the next call, until nothing does.
 
         So the first frames of a large message are on their way while the next ones are being sealed, and the topics
-        take turns.
+        take turns; urgent ones go first each time.
         """
         out = self.attachment.take()
         if not out:
@@ -252,6 +284,7 @@ class Member:
             for feed in subscription.feeds.values():
                 self.attachment.send([feed.close()])
             subscription.feeds.clear()
+        self._under_way = None
         self.attachment.withdraw_all()
 
     def _feed(self, header: Header, frame: bytes, now_s: float, fed: dict[Feed, Name]) -> None:
@@ -263,6 +296,8 @@ class Member:
             return
         feed.receive(header, frame, now_s)
         fed[feed] = subscription.topic.name
+        if header.parts > 1:
+            self._under_way = feed, subscription.topic.name
 
     def _take_report(self, header: Header, frame: bytes, now_s: float) -> None:
         if header.destination != self.name:
@@ -331,5 +366,6 @@ class Member:
 
     def _close(self, subscription: _Subscription, feed: Feed) -> None:
         self.attachment.send([feed.close()])
+        self._under_way = None
         self._closed_drops += feed.drops
         del subscription.feeds[feed.publisher]

@@ -66,10 +66,19 @@ class Publisher:
         secrets: topic secrets by epoch; the newest seals.
         description: what a reader must know to understand the messages; travels sealed.
         depth: how many messages late joiners get (0: none).
+        urgent: its frames go before those of other topics, wherever they queue.
     """
 
     def __init__(
-        self, topic: Name, source: Source, secrets: Secrets, description: bytes, *, reliable: bool, depth: int = 0
+        self,
+        topic: Name,
+        source: Source,
+        secrets: Secrets,
+        description: bytes,
+        *,
+        reliable: bool,
+        depth: int = 0,
+        urgent: bool = False,
     ) -> None:
         if not secrets:
             raise LocalError("a publisher needs a topic secret")
@@ -78,7 +87,9 @@ class Publisher:
         self._secrets = secrets
         self._description = description
         self._repairs_wanted = reliable or depth > 0
-        self._flags = (Flag.RELIABLE if reliable else 0) | (Flag.LATCHED if depth else 0)
+        self.is_urgent = urgent
+        wanted = (reliable, Flag.RELIABLE), (depth, Flag.LATCHED), (urgent, Flag.URGENT)
+        self._flags = sum(int(flag) for is_set, flag in wanted if is_set)
         self._window = SendWindow(depth)
         self._depth = depth
         self._epoch = max(secrets)

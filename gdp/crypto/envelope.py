@@ -18,6 +18,7 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections.abc import Sequence
+from itertools import islice
 from typing import Final, Protocol, overload
 
 from cryptography.exceptions import InvalidTag
@@ -25,8 +26,10 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
+from gdp.crypto.heads import NONCE_BYTES, Heads
+from gdp.effects import Arrival
 from gdp.errors import DropReason, EnvelopeError, LocalError
-from gdp.frame.codec import HEADER_BYTES, HOPS_AT, Header, authenticated
+from gdp.frame.codec import AAD_BYTES, HEADER_BYTES, HOPS_AT, Header, authenticated
 from gdp.frame.kinds import VERSION, Flag
 from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, PARTS_MAX
 
@@ -39,7 +42,6 @@ _NONCE: Final = struct.Struct("!QI")
 _AAD: Final = struct.Struct("!BBBHHQIIQ32s32s")
 _COMMON: Final = struct.Struct("!BBBHQIQ32s32s")
 _HOPS: Final = bytes([HOPS_MAX])
-_BEHIND_HOPS: Final = HOPS_AT + 1
 _LAST: Final = int(Flag.LAST)  # a plain number: an IntFlag's operators cost a microsecond each
 
 
@@ -183,22 +185,37 @@ class Opener:
     def __init__(self, secret: bytes, kind: int, source: bytes, incarnation: int, destination: bytes) -> None:
         self._decrypt = AESGCM(seal_key(secret, kind, source, incarnation, destination)).decrypt
 
-    def open_inner(self, header: Header, frame: bytes) -> tuple[bytes, bytes]:
-        """Return plaintext and payload of a part that is not the last, by the shortest way; ``open`` takes any.
+    def open_run(
+        self, heads: Heads, first: int, length: int, arrivals: Sequence[Arrival], at: int
+    ) -> tuple[list[bytes], list[bytes]]:
+        """Open the parts from ``first`` on, as far as ``arrivals[at:]`` brings them in order; the shortest way.
 
-        Raises:
-            EnvelopeError: too short, flagged as the last, or altered; the part is worth nothing.
+        A frame that is not, to the bit, the one that ``heads`` foretell ends the run, as does one that was altered:
+        ``open`` must look at it.
+
+        Args:
+            length: payload bytes of each part; ``heads`` are of parts that are not the last.
+
+        Returns:
+            plaintexts and payloads.
         """
-        sealed = frame[HEADER_BYTES : HEADER_BYTES + header.length]
-        if header.flags & _LAST or len(sealed) < TAG_BYTES:
-            raise EnvelopeError(DropReason.BAD_PARTS, "too short, or wrongly flagged as the last")
-        try:
-            plain = self._decrypt(
-                _NONCE.pack(header.number, header.part), sealed, frame[:HOPS_AT] + frame[_BEHIND_HOPS:HEADER_BYTES]
-            )
-        except InvalidTag:
-            raise EnvelopeError(DropReason.BAD_TAG) from None
-        return plain, sealed
+        plains: list[bytes] = []
+        payloads: list[bytes] = []
+        decrypt, end = self._decrypt, HEADER_BYTES + length
+        headers, additional, nonces = heads.headers, heads.additional, heads.nonces
+        skip = first - heads.first
+        for k, arrival in zip(range(skip, heads.count), islice(arrivals, at, None), strict=False):
+            frame = arrival.frame
+            if not frame.startswith(headers[k * HEADER_BYTES : (k + 1) * HEADER_BYTES]):
+                break
+            sealed = frame[HEADER_BYTES:end]
+            nonce = nonces[k * NONCE_BYTES : (k + 1) * NONCE_BYTES]
+            try:
+                plains.append(decrypt(nonce, sealed, additional[k * AAD_BYTES : (k + 1) * AAD_BYTES]))
+            except InvalidTag:
+                break
+            payloads.append(sealed)
+        return plains, payloads
 
     def open(self, header: Header, frame: bytes) -> tuple[bytes, bytes, bytes]:
         """Return plaintext, payload as the signature covers it, and signature (empty but for the last part).

@@ -20,6 +20,7 @@ __all__ = [
     "AAD_BYTES",
     "DESTINATION_AT",
     "ETHER_BYTES",
+    "FLAGS_AT",
     "HEADER_BYTES",
     "HOPS_AT",
     "KIND_AT",
@@ -36,6 +37,7 @@ ETHER_BYTES: Final = 14
 HEADER_BYTES: Final = 96
 OVERHEAD_BYTES: Final = ETHER_BYTES + HEADER_BYTES
 KIND_AT: Final = 1
+FLAGS_AT: Final = 2
 HOPS_AT: Final = 3
 DESTINATION_AT: Final = 32
 SOURCE_AT: Final = 64

@@ -45,3 +45,4 @@ class Flag(IntFlag):
     BUNDLE = 0x04  # several messages under one seal
     ALL_REPLICAS = 0x08
     LATCHED = 0x10  # late joiners want it too
+    URGENT = 0x20  # goes before all that is not, wherever frames queue

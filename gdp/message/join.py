@@ -14,11 +14,13 @@ holds; and when there are too many unfinished messages, the one that is needed l
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
 from gdp.crypto.envelope import digest_of
+from gdp.crypto.heads import Heads
+from gdp.effects import Arrival
 from gdp.errors import DropReason, EnvelopeError, RemoteError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Flag
@@ -31,6 +33,7 @@ __all__ = ["ALL_PARTS", "Joined", "Joiner", "OpensParts", "VerifiesDigest"]
 ALL_PARTS = 0xFFFF_FFFF
 _PREPAID_BYTES = 32 << 10  # memory is taken ahead for so much of a message whose parts come in order
 _PART_OVERHEAD_BYTES = 128  # what a kept part costs beside its bytes
+_AHEAD_PARTS = 64  # heads made at once
 _SCAN_PARTS = 4_096  # above the parts that an honest publisher has under way
 
 
@@ -40,8 +43,10 @@ class OpensParts(Protocol):
     def open(self, header: Header, frame: bytes) -> tuple[bytes, bytes, bytes]:
         """Return plaintext, signed payload, signature; or raise ``EnvelopeError``."""
 
-    def open_inner(self, header: Header, frame: bytes) -> tuple[bytes, bytes]:
-        """Return plaintext and signed payload of a part that is not the last; or raise ``EnvelopeError``."""
+    def open_run(
+        self, heads: Heads, first: int, length: int, arrivals: Sequence[Arrival], at: int
+    ) -> tuple[list[bytes], list[bytes]]:
+        """Return plaintexts and payloads of the inner parts that follow each other from ``first`` on."""
 
 
 class VerifiesDigest(Protocol):
@@ -74,6 +79,8 @@ class _Unfinished:
     opener: OpensParts
     running: _Hash
     touched_s: float
+    header: Header  # of the newest part that came in order
+    heads: Heads | None = None  # of the parts expected next
     plain: dict[int, bytes] = field(default_factory=dict)
     early: dict[int, bytes] = field(default_factory=dict)  # ciphertext ahead of the hash
     hashed: int = 0  # parts the hash has taken
@@ -114,41 +121,48 @@ class Joiner:
         self.drops: Counter[DropReason] = Counter()
         self.highest = -1  # highest message number of which an authentic part came
         self.new_parts = 0
+        self._under_way = -1  # number of the message whose next parts are expected
 
-    def add_next(self, header: Header, frame: bytes, now_s: float) -> bool:
-        """Take a part the short way: the next one, but not the last, of a message under way whose parts come in order.
+    def add_run(self, arrivals: Sequence[Arrival], at: int, now_s: float) -> int:
+        """Take what ``arrivals[at:]`` brings of the message under way, as long as its inner parts come in order.
 
-        Almost every part of a large message is one. False: nothing was done, ``add`` must look at it.
+        Almost every part of a large message comes so, and goes this short way. What ends the run is for ``add``.
+
+        Returns:
+            how many were taken.
         """
-        message = self._unfinished.get(header.number)
-        part = header.part
-        if (
-            message is None
-            or part != message.hashed
-            or message.early
-            or not part + 1 < header.parts == message.parts
-            or header.epoch != message.epoch
-        ):
-            return False
-        cost = header.length + _PART_OVERHEAD_BYTES
-        if message.prepaid_bytes < cost:
-            if not self._budget.reserve(self._source, _PREPAID_BYTES + cost):
-                return False
-            message.held_bytes += _PREPAID_BYTES + cost
-            message.prepaid_bytes += _PREPAID_BYTES + cost
-        try:
-            message.plain[part], sealed = message.opener.open_inner(header, frame)
-        except EnvelopeError as error:
-            self.drops[error.reason] += 1
-            return True
-        message.prepaid_bytes -= cost
-        message.running.update(sealed)
-        message.hashed = part + 1
-        message.top = part
-        message.touched_s = now_s
-        message.hops = max(message.hops, HOPS_MAX - header.hops_left)
-        self.new_parts += 1
-        return True
+        message = self._unfinished.get(self._under_way)
+        if message is None or message.early:
+            return 0
+        taken, first = 0, message.hashed
+        while at + taken < len(arrivals):
+            part, heads = message.hashed, message.heads
+            if heads is None or not 0 <= part - heads.first < heads.count:
+                count = min(_AHEAD_PARTS, message.parts - 1 - part)
+                if count <= 0:
+                    break
+                heads = message.heads = Heads(message.header, part, count)
+            wanted = min(len(arrivals) - at - taken, heads.count - part + heads.first)
+            cost = message.header.length + _PART_OVERHEAD_BYTES
+            if message.prepaid_bytes < wanted * cost:
+                if not self._budget.reserve(self._source, _PREPAID_BYTES + wanted * cost):
+                    break
+                message.held_bytes += _PREPAID_BYTES + wanted * cost
+                message.prepaid_bytes += _PREPAID_BYTES + wanted * cost
+            plains, payloads = message.opener.open_run(heads, part, message.header.length, arrivals, at + taken)
+            message.plain.update(enumerate(plains, part))
+            for payload in payloads:
+                message.running.update(payload)
+            message.prepaid_bytes -= len(plains) * cost
+            message.hashed += len(plains)
+            taken += len(plains)
+            if len(plains) < wanted:
+                break
+        if taken:
+            message.top = first + taken - 1
+            message.touched_s = now_s
+            self.new_parts += taken
+        return taken
 
     def add(self, header: Header, frame: bytes, now_s: float) -> Joined | None:
         """Take one part; return the message it completes, if any. What is wrong with it is counted in ``drops``."""
@@ -194,7 +208,7 @@ class Joiner:
         if header.number in self._unfinished:
             self.drops[DropReason.BAD_PARTS] += 1
             self._drop(header.number)
-        return _Unfinished(header.parts, header.epoch, opener, digest_of(header), now_s)
+        return _Unfinished(header.parts, header.epoch, opener, digest_of(header), now_s, header)
 
     def _keep(
         self, message: _Unfinished, header: Header, plain: bytes, sealed: bytes, signature: bytes, now_s: float
@@ -216,6 +230,8 @@ class Joiner:
         if signature:
             message.signature = signature
         if in_order:
+            message.header, message.heads = header, None
+            self._under_way = number
             self._hash(message, sealed)
         else:
             message.early[header.part] = sealed

@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import signal
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
 from types import FrameType
 
-from gdp.effects import Instant, Machine
+from gdp.effects import Arrival, Instant, Machine
 from gdp.nodes.allocator import settle_memory
+from gdp.nodes.spin import Spin
 from gdp.ports.plane import Plane
 
 __all__ = ["Runtime", "now"]
@@ -35,12 +37,16 @@ class Runtime:
 
     Args:
         costs: of ports by device name; others cost ``COST_DEFAULT``.
+        spin_s: for how long to look again before going to sleep, where frames follow each other closely; 0: never.
     """
 
-    def __init__(self, machine: Machine, plane: Plane, costs: Mapping[str, int] | None = None) -> None:
+    def __init__(
+        self, machine: Machine, plane: Plane, costs: Mapping[str, int] | None = None, *, spin_s: float = 0.0
+    ) -> None:
         self._machine = machine
         self._plane = plane
         self._costs = dict(costs or {})
+        self._spin = Spin(spin_s)
         self._is_stopped = False
         self._deadline_s: float | None = None
         moment = now()
@@ -71,11 +77,17 @@ class Runtime:
         return until is None
 
     def step(self, latest_s: float | None = None) -> None:
-        """Wait for something to do, no longer than a monotonic second, and do it."""
-        self.flush()
-        times = [each for each in (self._deadline_s, latest_s) if each is not None]
-        timeout_s = max(min(times) - time.monotonic(), 0.0) if times else None
-        arrivals = self._plane.poll(timeout_s)
+        """Wait for something to do, no longer than a monotonic second, and do it.
+
+        While the machine has more to say, nothing is waited for, but what came meanwhile is heard: a large message on
+        its way out holds up nobody.
+        """
+        if self.send():
+            arrivals = self._plane.poll(0.0)
+        else:
+            self._deadline_s = self._machine.next_timeout()
+            times = [each for each in (self._deadline_s, latest_s) if each is not None]
+            arrivals = self._wait(max(min(times) - time.monotonic(), 0.0) if times else None)
         moment = now()
         if arrivals:
             self._machine.receive(arrivals, moment)
@@ -83,12 +95,30 @@ class Runtime:
             self._machine.timeout(moment)
             self._deadline_s = self._machine.next_timeout()
 
-    def flush(self) -> None:
-        """Send what the machine has to say, and ask when it wants to be called next."""
-        while transmits := self._machine.take():
-            for port, mac, frames in transmits:
-                self._plane.transmit(port, mac, frames)
-        self._deadline_s = self._machine.next_timeout()
+    def _wait(self, timeout_s: float | None) -> list[Arrival]:
+        """Wait for frames; where they follow each other closely, look again for a moment before going to sleep."""
+        begun_s = time.monotonic()
+        if self._spin.pays:
+            spin_s = self._spin.longest_s if timeout_s is None else min(self._spin.longest_s, timeout_s)
+            while (waited_s := time.monotonic() - begun_s) < spin_s:
+                arrivals = self._plane.poll(0.0)
+                if arrivals:
+                    self._spin.waited(waited_s)
+                    return arrivals
+                os.sched_yield()  # whoever else wants this core goes first
+            if timeout_s is not None:
+                timeout_s = max(timeout_s - waited_s, 0.0)
+        arrivals = self._plane.poll(timeout_s)
+        if arrivals:
+            self._spin.waited(time.monotonic() - begun_s)
+        return arrivals
+
+    def send(self) -> bool:
+        """Send what the machine has to say next; return whether there may be more."""
+        transmits = self._machine.take()
+        for port, mac, frames in transmits:
+            self._plane.transmit(port, mac, frames)
+        return bool(transmits)
 
     @contextlib.contextmanager
     def signals(self, reload: Callable[[], None] | None = None) -> Iterator[None]:
@@ -140,9 +170,10 @@ class Runtime:
 
     def _link_changed(self, index: int, up: bool) -> None:
         moment = now()
-        log.info("link port=%d up=%s", index, up)
-        if up and index in self._plane.ports:
-            self._add(index, moment)  # it may have come back with another address or MTU
+        port = self._plane.ports.get(index)
+        log.info("link port=%d up=%s mtu=%d", index, up, 0 if port is None else port.mtu)
+        if up and port is not None:
+            self._add(index, moment)  # it may have come back with another address, or only its MTU has changed
         else:
             self._machine.port_changed(index, up, moment)
         self._deadline_s = moment.mono_s

@@ -3,7 +3,7 @@
 Place: I/O; no Scapy, and the struct codec's offsets only.
 Source: DESIGN section 7. What is ordinary is decided here, in one pass over the batch; whatever is not goes to
 ``gdp.switch.forwarder.decide``, and fixtures hold the two together. Neighbouring frames of a batch that go the same way
-leave in one call, a *run*::
+leave in one call, a *run*; what is urgent has sockets of its own, and goes first::
 
     take  | A A A A B B A |      decide      runs: A A A A | B B | A      put, put, put
 """
@@ -13,17 +13,18 @@ from __future__ import annotations
 import socket
 import struct
 from collections.abc import Mapping, Sequence
-from functools import partial
+from functools import lru_cache, partial
+from itertools import chain
 from typing import Final
 
 from gdp.errors import DropReason
-from gdp.frame.codec import ETHER_BYTES, HEADER_BYTES, HOPS_AT, OVERHEAD_BYTES
-from gdp.frame.kinds import CONTROL_FROM, VERSION
+from gdp.frame.codec import ETHER_BYTES, FLAGS_AT, HEADER_BYTES, HOPS_AT, KIND_AT, OVERHEAD_BYTES
+from gdp.frame.kinds import CONTROL_FROM, VERSION, Flag
 from gdp.names import NAME_BYTES
-from gdp.ports.batch import SLOTS, Batch, make_batch
+from gdp.ports.batch import SLOTS, Batch, make_batch, put_one
 from gdp.ports.linked import LinkedPlane
 from gdp.ports.plane import MAC_BYTES, Arrival, Port
-from gdp.ports.sockets import kernel_drops, open_port
+from gdp.ports.sockets import Lane, kernel_drops, open_port
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.table import NOWHERE, Hops, Table
 
@@ -33,6 +34,13 @@ __all__ = ["RawPlane"]
 _GLANCE: Final = struct.Struct("!HxBxxH24x64s")
 _FIRST: Final = VERSION << 8
 _FIRST_CONTROL: Final = _FIRST | CONTROL_FROM
+_URGENT: Final = int(Flag.URGENT)
+
+
+@lru_cache(maxsize=4_096)  # more than the sizes that come often
+def _shape(size: int) -> struct.Struct:
+    """Return what takes the sender's address and a frame of ``size`` bytes out of a slot, in one call."""
+    return struct.Struct(f"{MAC_BYTES}x{MAC_BYTES}s{ETHER_BYTES - 2 * MAC_BYTES}x{size}s")
 
 
 class RawPlane(LinkedPlane):
@@ -52,28 +60,33 @@ class RawPlane(LinkedPlane):
     ) -> None:
         self._bypass_qdisc = bypass_qdisc
         self._sockets: dict[int, socket.socket] = {}
+        self._urgent: dict[int, socket.socket] = {}  # of the same ports: what goes first
         self._batch: Batch = make_batch(OVERHEAD_BYTES)
         super().__init__(ifnames, table)
 
     def _open(self, port: Port) -> None:
-        opened = open_port(port.ifname, bypass_qdisc=self._bypass_qdisc)
         if port.mtu + ETHER_BYTES > self._batch.slot_bytes:
             self._batch = make_batch(port.mtu + ETHER_BYTES)
-        self._sockets[port.index] = opened
-        take = self._hand_up_all if self._entries is None else partial(self._forward_all, self._entries)
-        self.watch(opened, partial(take, port.index, opened))
+        for lane, sockets in (Lane.URGENT, self._urgent), (Lane.ORDINARY, self._sockets):
+            opened = sockets[port.index] = open_port(port.ifname, lane, bypass_qdisc=self._bypass_qdisc)
+            if self._entries is None:
+                ready = partial(self._hand_up_all, port.index, opened)
+            else:
+                ready = partial(self._forward_all, self._entries, port.index, opened, sockets)
+            self.watch(opened, ready, is_urgent=lane is Lane.URGENT)
 
     def _shut(self, index: int) -> None:
-        opened = self._sockets.pop(index, None)
-        if opened is not None:
-            self.unwatch(opened)
-            opened.close()
+        for sockets in self._urgent, self._sockets:
+            opened = sockets.pop(index, None)
+            if opened is not None:
+                self.unwatch(opened)
+                opened.close()
 
     def _is_open(self, index: int) -> bool:
         return index in self._sockets
 
     def _kernel_drops(self) -> int:
-        return sum(map(kernel_drops, self._sockets.values()))
+        return sum(map(kernel_drops, chain(self._urgent.values(), self._sockets.values())))
 
     def transmit(self, port: int, destination_mac: bytes, frames: Sequence[bytes]) -> int:
         counters, facts, batch = self._counters, self._ports.get(port), self._batch
@@ -82,7 +95,15 @@ class RawPlane(LinkedPlane):
             return 0
         fitting = [frame for frame in frames if len(frame) <= facts.mtu]
         counters.drops[DropReason.TOO_BIG] += len(frames) - len(fitting)
-        macs, sink, left = destination_mac + facts.mac, self._sockets[port], 0
+        if not fitting:
+            return 0
+        is_urgent = fitting[0][FLAGS_AT] & _URGENT or fitting[0][KIND_AT] >= CONTROL_FROM
+        sink = (self._urgent if is_urgent else self._sockets)[port]
+        macs, left = destination_mac + facts.mac, 0
+        if len(fitting) == 1:
+            left = put_one(sink, fitting[0], macs, counters.drops)
+            counters.frames_out += left
+            return left
         for at in range(0, len(fitting), SLOTS):
             chunk = fitting[at : at + SLOTS]
             batch.fill(chunk)
@@ -91,26 +112,21 @@ class RawPlane(LinkedPlane):
         return left
 
     def _hand_up_all(self, port: int, source: socket.socket) -> None:
-        sizes = self._batch.take(source)
+        batch = self._batch
+        sizes = batch.take(source)
         self._counters.frames_in += len(sizes)
-        slots = range(0, len(self._batch.pool), self._batch.slot_bytes)
-        with memoryview(self._batch.pool) as pool:
-            self._arrivals += [
-                Arrival(
-                    port,
-                    bytes(pool[slot + MAC_BYTES : slot + 2 * MAC_BYTES]),
-                    bytes(pool[slot + ETHER_BYTES : slot + ETHER_BYTES + size]),
-                )
-                for slot, size in zip(slots, sizes, strict=False)
-            ]
+        pool, arrivals = batch.pool, self._arrivals
+        for slot, size in zip(range(0, len(pool), batch.slot_bytes), sizes, strict=False):
+            mac, frame = _shape(size).unpack_from(pool, slot)
+            arrivals.append(Arrival(port, mac, frame))
 
     def _arrival(self, port: int, slot: int, size: int) -> Arrival:
-        with memoryview(self._batch.pool) as pool:
-            mac = bytes(pool[slot + MAC_BYTES : slot + 2 * MAC_BYTES])
-            return Arrival(port, mac, bytes(pool[slot + ETHER_BYTES : slot + ETHER_BYTES + size]))
+        return Arrival(port, *_shape(size).unpack_from(self._batch.pool, slot))
 
-    def _forward_all(self, entries: Mapping[bytes, Hops], port: int, source: socket.socket) -> None:
-        """Take one batch from a port and forward it, handing up what is for the node."""
+    def _forward_all(
+        self, entries: Mapping[bytes, Hops], port: int, source: socket.socket, sinks: Mapping[int, socket.socket]
+    ) -> None:
+        """Take one batch from a port and forward it by ``sinks``, handing up what is for the node."""
         batch, get = self._batch, entries.get
         pool, step, glance = batch.pool, batch.slot_bytes, _GLANCE.unpack_from
         sizes = batch.take(source)
@@ -120,7 +136,7 @@ class RawPlane(LinkedPlane):
             first, hops_left, length, key = glance(pool, at)
             if key != run_key:
                 slot = at // step
-                self._send(run_hops, run_start, slot - run_start)
+                self._send(sinks, run_hops, run_start, slot - run_start)
                 hops = get(key)
                 if hops is None:
                     hops = get(key[:NAME_BYTES])
@@ -130,16 +146,18 @@ class RawPlane(LinkedPlane):
                 pool[at + HOPS_AT] = hops_left - 1
             else:
                 slot = at // step
-                self._send(run_hops, run_start, slot - run_start)
+                self._send(sinks, run_hops, run_start, slot - run_start)
                 run_start = slot + 1
-                self._consider(entries, port, slot, size)
-        self._send(run_hops, run_start, len(sizes) - run_start)
+                self._consider(entries, port, sinks, slot, size)
+        self._send(sinks, run_hops, run_start, len(sizes) - run_start)
 
     def _narrowest(self, hops: Hops) -> int:
         """Return the size that every hop's link takes; 0 where one is down or there is none."""
         return min((self._mtus.get(port, 0) for port, _ in hops), default=0)
 
-    def _consider(self, entries: Mapping[bytes, Hops], port: int, slot: int, size: int) -> None:
+    def _consider(
+        self, entries: Mapping[bytes, Hops], port: int, sinks: Mapping[int, socket.socket], slot: int, size: int
+    ) -> None:
         """Decide on the one frame in a slot by the reference, and do what it says."""
         batch, drops = self._batch, self._counters.drops
         at = slot * batch.slot_bytes
@@ -150,16 +168,16 @@ class RawPlane(LinkedPlane):
             for reason in verdict.lost:
                 drops[reason] += 1
             batch.pool[at + ETHER_BYTES + HOPS_AT] -= 1
-            self._send(verdict.hops, slot, 1)
+            self._send(sinks, verdict.hops, slot, 1)
         else:
             self._arrivals.append(self._arrival(port, at, size))
 
-    def _send(self, hops: Hops, first: int, count: int) -> None:
+    def _send(self, sinks: Mapping[int, socket.socket], hops: Hops, first: int, count: int) -> None:
         """Send a run of slots to every hop."""
         if not count:
             return
         counters = self._counters
         for port, macs in hops:
-            left = self._batch.put(self._sockets[port], first, count, macs, counters.drops)
+            left = self._batch.put(sinks[port], first, count, macs, counters.drops)
             counters.forwarded += left
             counters.frames_out += left

@@ -3,11 +3,15 @@
 Place: I/O; opens and asks sockets, keeps nothing.
 Source: packet(7), socket(7), ``linux/filter.h`` (classic BPF, which needs no privilege beyond the raw socket itself).
 
-What a port lets in is settled in the kernel, by four loads and compares, so that no frame that is someone else's costs
+What a port lets in is settled in the kernel, by a few loads and compares, so that no frame that is someone else's costs
 Python anything: frames to the port's own address, and broadcast frames whose kind is for the neighbour itself. A frame
 to another station (``PACKET_OTHERHOST``, seen on a shared or promiscuous link), a multicast, an echo of our own
 sending, and a data frame that was broadcast (which every switch on a shared link would forward once more) are none of
 our business: neither forwarded nor counted.
+
+A port may have two sockets, so that what is urgent never waits in a queue behind what is not: one for frames flagged
+urgent and for what neighbours say to each other, one for all the rest. What leaves by the urgent one carries a priority
+that every queueing discipline with bands honours (``pfifo_fast``, ``prio``, and the access categories of Wi-Fi).
 """
 
 from __future__ import annotations
@@ -16,13 +20,14 @@ import errno
 import socket
 import struct
 from array import array
+from enum import Enum
 from typing import Final
 
 from gdp.errors import LocalError
-from gdp.frame.codec import ETHER_BYTES, KIND_AT
-from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE
+from gdp.frame.codec import ETHER_BYTES, FLAGS_AT, KIND_AT
+from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, Flag
 
-__all__ = ["NO_RAW_SOCKETS", "kernel_drops", "large_buffers", "only_ours", "open_port"]
+__all__ = ["NO_RAW_SOCKETS", "Lane", "kernel_drops", "large_buffers", "only_ours", "open_port"]
 
 NO_RAW_SOCKETS: Final = "raw sockets need root or CAP_NET_RAW (or a user namespace with its own network)"
 
@@ -41,22 +46,55 @@ _JUMP_GREATER_EQUAL: Final = 0x35  # BPF_JMP | BPF_JGE | BPF_K
 _RETURN: Final = 0x06  # BPF_RET | BPF_K
 _PACKET_TYPE: Final = 0xFFFFF004  # SKF_AD_OFF + SKF_AD_PKTTYPE
 _WHOLE: Final = 0xFFFFFFFF
-_OURS: Final = (
-    # code, jump if true, jump if false, value
-    (_LOAD_BYTE, 0, 0, _PACKET_TYPE),
-    (_JUMP_EQUAL, 3, 0, socket.PACKET_HOST),
-    (_JUMP_EQUAL, 0, 3, socket.PACKET_BROADCAST),
-    (_LOAD_BYTE, 0, 0, ETHER_BYTES + KIND_AT),
-    (_JUMP_GREATER_EQUAL, 0, 1, CONTROL_FROM),
-    (_RETURN, 0, 0, _WHOLE),
-    (_RETURN, 0, 0, 0),
-)
+_JUMP_SET: Final = 0x45  # BPF_JMP | BPF_JSET | BPF_K
+_PRIORITY: Final = 6  # TC_PRIO_INTERACTIVE: the first band; 7 would need CAP_NET_ADMIN
+_KIND: Final = (_LOAD_BYTE, 0, 0, ETHER_BYTES + KIND_AT)
+_FLAGS: Final = (_LOAD_BYTE, 0, 0, ETHER_BYTES + FLAGS_AT)
+_TYPE: Final = (_LOAD_BYTE, 0, 0, _PACKET_TYPE)
+_TAKE: Final = (_RETURN, 0, 0, _WHOLE)
+_LEAVE: Final = (_RETURN, 0, 0, 0)
 
 
-def open_port(ifname: str, *, bypass_qdisc: bool = False) -> socket.socket:
+class Lane(Enum):
+    """Which of our frames a socket sees: steps of (code, jump if true, jump if false, value)."""
+
+    ALL = (
+        _TYPE,
+        (_JUMP_EQUAL, 3, 0, socket.PACKET_HOST),
+        (_JUMP_EQUAL, 0, 3, socket.PACKET_BROADCAST),
+        _KIND,
+        (_JUMP_GREATER_EQUAL, 0, 1, CONTROL_FROM),
+        _TAKE,
+        _LEAVE,
+    )
+    URGENT = (
+        _TYPE,
+        (_JUMP_EQUAL, 1, 0, socket.PACKET_HOST),
+        (_JUMP_EQUAL, 2, 5, socket.PACKET_BROADCAST),
+        _FLAGS,
+        (_JUMP_SET, 2, 0, Flag.URGENT),
+        _KIND,
+        (_JUMP_GREATER_EQUAL, 0, 1, CONTROL_FROM),
+        _TAKE,
+        _LEAVE,
+    )
+    ORDINARY = (
+        _TYPE,
+        (_JUMP_EQUAL, 0, 5, socket.PACKET_HOST),
+        _KIND,
+        (_JUMP_GREATER_EQUAL, 3, 0, CONTROL_FROM),
+        _FLAGS,
+        (_JUMP_SET, 1, 0, Flag.URGENT),
+        _TAKE,
+        _LEAVE,
+    )
+
+
+def open_port(ifname: str, lane: Lane = Lane.ALL, *, bypass_qdisc: bool = False) -> socket.socket:
     """Open a non-blocking socket for our EtherType on one device.
 
     Args:
+        lane: which of our frames it sees.
         bypass_qdisc: hand frames to the driver past traffic control; quicker, but shaping (tc) is skipped too.
 
     Raises:
@@ -67,7 +105,9 @@ def open_port(ifname: str, *, bypass_qdisc: bool = False) -> socket.socket:
     except PermissionError as error:
         raise LocalError(NO_RAW_SOCKETS) from error
     try:
-        only_ours(opened)
+        only_ours(opened, lane)
+        if lane is Lane.URGENT:
+            opened.setsockopt(socket.SOL_SOCKET, socket.SO_PRIORITY, _PRIORITY)
         if bypass_qdisc:
             opened.setsockopt(_SOL_PACKET, _PACKET_QDISC_BYPASS, 1)
         large_buffers(opened)
@@ -79,14 +119,14 @@ def open_port(ifname: str, *, bypass_qdisc: bool = False) -> socket.socket:
     return opened
 
 
-def only_ours(opened: socket.socket) -> None:
-    """Let in what the head of this module says.
+def only_ours(opened: socket.socket, lane: Lane = Lane.ALL) -> None:
+    """Let in what the head of this module says, as far as it belongs on this lane.
 
     Raises:
         OSError: not a packet socket.
     """
-    program = array("B", b"".join(struct.pack("=HBBI", *step) for step in _OURS))
-    opened.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", len(_OURS), program.buffer_info()[0]))
+    program = array("B", b"".join(struct.pack("=HBBI", *step) for step in lane.value))
+    opened.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", len(lane.value), program.buffer_info()[0]))
     try:
         opened.setsockopt(_SOL_PACKET, _PACKET_IGNORE_OUTGOING, 1)
     except OSError as error:

@@ -113,11 +113,12 @@ def advertise(
     reliable: bool = True,
     depth: int = 0,
     is_global: bool = True,
+    urgent: bool = False,
 ) -> Flow:
     """Return a topic that a member publishes from now on."""
     member = world.members[source]
     topic = world.topic(name, member, [Right.PUBLISH])
-    publisher = member.advertise(topic, b"described", reliable=reliable, depth=depth, is_global=is_global)
+    publisher = member.advertise(topic, b"described", reliable=reliable, depth=depth, is_global=is_global, urgent=urgent)
     world.network.touch(source)
     return Flow(world, name, source, topic, publisher)
 

@@ -1,0 +1,85 @@
+"""Parts that come in order take a short way; it must lead where the long way leads."""
+
+from __future__ import annotations
+
+from random import Random
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gdp.effects import Arrival
+from gdp.errors import DropReason, FrameError
+from gdp.frame.codec import HEADER_BYTES, HOPS_AT, decode
+from gdp.message.join import Joined, Joiner
+from gdp.message.memory import Budget
+from tests.gdp.message.sealed import add_all, joiner, seal
+
+LONG = bytes(range(256)) * 64
+
+
+def take(to: Joiner, frames: list[bytes], at_once: int = 64) -> tuple[list[Joined], int]:
+    """Give frames in batches, the short way where it is open; return what was joined, and how many went that way."""
+    joined: list[Joined] = []
+    short = 0
+    for begin in range(0, len(frames), at_once):
+        arrivals = [Arrival(0, bytes(6), frame) for frame in frames[begin : begin + at_once]]
+        at = 0
+        while at < len(arrivals):
+            taken = to.add_run(arrivals, at, 0.0)
+            short += taken
+            at += taken
+            if not taken:
+                frame = arrivals[at].frame
+                whole = to.add(decode(frame), frame, 0.0)
+                joined += [whole] if whole is not None else []
+                at += 1
+    return joined, short
+
+
+def test_all_inner_parts_but_the_first_go_the_short_way() -> None:
+    frames = seal(1, LONG)
+    joined, short = take(joiner(), frames)
+    assert [each.message for each in joined] == [LONG]
+    assert short >= len(frames) - 3
+
+
+@given(st.integers(0, 1 << 32), st.integers(1, 40), st.floats(0, 0.2), st.floats(0, 0.2))
+def test_both_ways_join_the_same(seed: int, at_once: int, doubled: float, swapped: float) -> None:
+    random = Random(seed)
+    sizes = [random.randrange(0, 9_000) for _ in range(3)]
+    frames = [frame for number, size in enumerate(sizes, 1) for frame in seal(number, random.randbytes(size))]
+    frames = [frame for each in frames for frame in [each] * (1 + (random.random() < doubled))]
+    for at in range(1, len(frames)):
+        if random.random() < swapped:
+            frames[at - 1], frames[at] = frames[at], frames[at - 1]
+    budget = Budget()
+    by_both, _ = take(joiner(budget), frames, at_once)
+    by_one = add_all(joiner(), frames)
+    assert by_both == by_one
+    assert [len(each.message) for each in sorted(by_both, key=lambda each: each.number)] == sizes
+    assert budget.held_bytes == 0
+
+
+@given(st.integers(1, 60), st.integers(0, HEADER_BYTES + 150), st.integers(0, 7))
+def test_an_altered_part_dies_alone(part: int, at: int, bit: int) -> None:
+    frames = seal(1, LONG)
+    bad = bytearray(frames[part])
+    bad[at] ^= 1 << bit
+    to = joiner()
+    try:
+        decode(bytes(bad))
+    except FrameError:  # never reaches the joiner
+        return
+    joined, _ = take(to, [*frames[:part], bytes(bad), *frames[part:]])
+    assert [each.message for each in joined] == [LONG]
+    if at != HOPS_AT:
+        assert sum(to.drops.values()) == 1
+
+
+def test_memory_is_charged_before_a_run_is_opened() -> None:
+    budget = Budget(total_bytes=12_000, source_bytes=12_000)
+    to = joiner(budget)
+    joined, _ = take(to, seal(1, LONG))
+    assert joined == []
+    assert to.drops[DropReason.MEMORY_FULL] > 0
+    assert budget.held_bytes <= 12_000

@@ -1,0 +1,43 @@
+"""What is urgent goes first, and one slow reader costs only itself."""
+
+from __future__ import annotations
+
+from gdp.frame.codec import decode
+from gdp.frame.kinds import Flag, Kind
+from tests.journeys.flows import ROBOT, SERVER, advertise, flowing, ring
+
+IMAGE = bytes(921_600)
+
+
+def test_an_urgent_message_leaves_before_what_waits_of_others() -> None:
+    world = ring()
+    images = flowing(world, "/image")
+    urgent = advertise(world, "/cmd_vel", urgent=True)
+    urgent.read_by(SERVER)
+    assert world.network.run(5, lambda: urgent.is_read_by(1))
+    member, now_s = world.members[ROBOT], world.network.now.mono_s
+    for _ in range(3):
+        images.publisher.publish(IMAGE)
+    member.flush(now_s)
+    sent_before = [frame for each in member.take() for frame in each.frames]
+    urgent.publisher.publish(b"stop")
+    headers = [decode(frame) for each in member.take() for frame in each.frames]
+    assert len(sent_before) * 1_500 < len(IMAGE)  # most of the images still wait
+    assert [header.destination for header in headers if header.kind == Kind.DATA][0] == urgent.topic.name
+    assert headers[0].flags & Flag.URGENT
+
+
+def test_topics_that_are_not_urgent_take_turns() -> None:
+    world = ring()
+    flows = [flowing(world, name) for name in ("/left", "/right")]
+    member, now_s = world.members[ROBOT], world.network.now.mono_s
+    for flow in flows:
+        flow.publisher.publish(IMAGE)
+    member.flush(now_s)
+    turns = []
+    for _ in range(4):
+        headers = [decode(frame) for each in member.take() for frame in each.frames]
+        turns.append({header.destination for header in headers if header.kind == Kind.DATA})
+    names = {flow.topic.name for flow in flows}
+    assert set().union(*turns) == names
+    assert turns[0] != turns[1]
