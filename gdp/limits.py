@@ -23,18 +23,20 @@ REPLAY_WINDOW_MESSAGES: Final = 16_384
 
 # Repair
 WINDOW_BYTES: Final = 32 << 20  # what a reliable publisher keeps for repairs
-FLIGHT_MIN_BYTES: Final = 192 << 10  # above twice REPORT_EVERY_BYTES, so that a window never waits for a timer
+FLIGHT_MIN_BYTES: Final = 192 << 10  # above twice REPORT_EVERY_BYTES, so that a window rarely waits for a timer
 FLIGHT_START_BYTES: Final = 256 << 10
 FLIGHT_MAX_BYTES: Final = 4 << 20
 FLIGHT_MESSAGES_MAX: Final = 8_192  # below REPLAY_WINDOW_MESSAGES
 REPORT_EVERY_BYTES: Final = 80 << 10  # a reader reports after this much that is new
+REPORT_EVERY_MAX_BYTES: Final = 384 << 10  # ... or, while nothing is missing, a quarter of what came since, up to this
 REPORT_DELAY_S: Final = 0.02  # ... or this long after the first part it has not reported
+REPORT_PAUSE_S: Final = 0.004  # ... within a message: its publisher may be waiting for a report
 REPORT_GAP_S: Final = 0.002  # ... or this long after it saw a gap: frames may overtake each other
 PROBE_MIN_S: Final = 0.03
 PROBE_MAX_S: Final = 0.25
 REPORT_IDLE_S: Final = 1.0  # a live reader reports at least this often
 READER_LEASE_S: Final = 6.0  # a reader that does not report for this long no longer holds its publisher
-NACKS_PER_REPORT: Final = 128  # ranges
+NACKS_PER_REPORT: Final = 24  # ranges: a report, sealed and alone in its frame, fits the smallest link there may be
 
 # Control plane
 CONTROL_MAX_BYTES: Final = 16 << 10  # one statement with its evidence

@@ -19,7 +19,8 @@ IN_MAC, WIDE_MAC, NARROW_MAC = (bytes([2, 0, 0, 0, port, 1]) for port in (IN, WI
 PEER_MACS = {port: bytes([2, 0, 0, 0, port, 2]) for port in (IN, WIDE, NARROW)}
 
 SOURCE, OTHER_SOURCE = bytes([0x50]) * 32, bytes([0x51]) * 32
-ONE, BOTH, SPLIT, GONE, HALF, NOBODY, DEAD = (bytes([0xD0 + n]) * 32 for n in range(7))
+ONE, BOTH, SPLIT, GONE, HALF, NOBODY, DEAD, ANYBODY = (bytes([0xD0 + n]) * 32 for n in range(8))
+NO_SOURCE = bytes(32)
 
 TO_WIDE = (WIDE, PEER_MACS[WIDE] + WIDE_MAC)
 TO_NARROW = (NARROW, PEER_MACS[NARROW] + NARROW_MAC)
@@ -33,6 +34,8 @@ ENTRIES: dict[bytes, Hops] = {
     GONE + OTHER_SOURCE: NOWHERE,
     HALF: (TO_ABSENT, TO_WIDE),
     DEAD: (TO_ABSENT,),
+    ANYBODY: (TO_WIDE,),
+    ANYBODY + NO_SOURCE: (TO_NARROW,),
 }
 
 
@@ -98,6 +101,10 @@ CASES = [
     Case("the only port is down", frame(DEAD), drops=(DropReason.PORT_DOWN,)),
     Case("a negative entry", frame(GONE, source=OTHER_SOURCE), drops=(DropReason.NO_ROUTE,)),
     _forwarded("a negative entry is of one source", frame(GONE), WIDE),
+    _forwarded("no source", frame(ONE, source=NO_SOURCE), WIDE),
+    _forwarded("an entry for no source", frame(ANYBODY, source=NO_SOURCE), NARROW),
+    _forwarded("an entry for no source is for that alone", frame(ANYBODY), WIDE),
+    _forwarded("urgent", frame(ONE, flags=Flag.LAST | Flag.URGENT), WIDE),
     Case("a miss", frame(NOBODY), handed_up=True),
     Case("a neighbour's word", frame(ONE, kind=Kind.HELLO), handed_up=True),
     Case("a neighbour's unknown word", frame(ONE, kind=0xFF, hops_left=0), handed_up=True),

@@ -28,7 +28,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 def switch(
     config: Config,
     iface: Annotated[list[str] | None, typer.Option(help="A port; once for each. Adds to the file's.")] = None,
-    data_plane: Annotated[str | None, typer.Option(help="auto, raw or scapy; instead of the file's.")] = None,
+    data_plane: Annotated[str | None, typer.Option(help="auto, kernel, raw or scapy; instead of the file's.")] = None,
     check: Check = False,
     json: Json = False,
     verbose: Verbose = False,
@@ -43,11 +43,11 @@ def switch(
             identity, _ = load_member(settings.identity, settings.domain, Role.SWITCH)
             _report_check(identity.name, len(settings.ports), json=json)
             return
-        run_switch(settings, lambda name, plane: _report_ready(name, plane, json=json))
+        run_switch(settings, lambda name, plane, reason: _report_ready(name, plane, reason, json=json))
 
 
 def _data_plane(text: str) -> DataPlane:
-    known: dict[str, DataPlane] = {"auto": "auto", "raw": "raw", "scapy": "scapy"}
+    known: dict[str, DataPlane] = {"auto": "auto", "kernel": "kernel", "raw": "raw", "scapy": "scapy"}
     if text not in known:
         raise LocalError(f"--data-plane is {', '.join(known)}, not {text}")
     return known[text]
@@ -60,11 +60,13 @@ def _report_check(name: Name, ports: int, *, json: bool) -> None:
         typer.echo(f"configuration good: switch {name.short}, {ports} ports")
 
 
-def _report_ready(name: Name, plane: str, *, json: bool) -> None:
+def _report_ready(name: Name, plane: str, reason: str, *, json: bool) -> None:
     if json:
-        emit("ready", name=name.to_text(), data_plane=plane)
-    else:
-        typer.echo(f"switch {name.short} is up, data plane {plane}; Ctrl-C ends it")
+        emit("ready", name=name.to_text(), data_plane=plane, reason=reason)
+        return
+    typer.echo(f"switch {name.short} is up, data plane {plane}; Ctrl-C ends it")
+    if reason:
+        typer.echo(f"not the kernel data plane: {reason}")
 
 
 def main() -> None:

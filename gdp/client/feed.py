@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from itertools import count
 from typing import Final
@@ -27,11 +27,14 @@ from gdp.limits import (
     REPLAY_WINDOW_MESSAGES,
     REPORT_DELAY_S,
     REPORT_EVERY_BYTES,
+    REPORT_EVERY_MAX_BYTES,
     REPORT_GAP_S,
     REPORT_IDLE_S,
+    REPORT_PAUSE_S,
 )
 from gdp.message.join import Joined, Joiner, VerifiesDigest
 from gdp.message.memory import Budget
+from gdp.message.move import Move
 from gdp.message.report import Missing, Report, ReportFlag
 from gdp.message.status import Status
 from gdp.names import Name
@@ -106,6 +109,7 @@ class Feed:
         self._out = deque[Delivered]()
         self._report_at_s = now_s
         self._unreported_bytes = 0
+        self._clean_bytes = 0  # reported since something was last missing
         self.claim = b""  # of the publisher, the newest
         self.claim_sequence = 0
         self.lost = 0
@@ -131,10 +135,9 @@ class Feed:
         """Take the frames of ``arrivals[at:]`` that carry on with the message under way; return how many."""
         taken = self._data.add_run(arrivals, at, now_s)
         if taken:
-            self._unreported_bytes += sum(len(arrival.frame) for arrival in arrivals[at : at + taken])
-            due_s = now_s if self._unreported_bytes >= REPORT_EVERY_BYTES else now_s + REPORT_DELAY_S
-            if due_s < self._report_at_s and self._is_reliable and self.state is FeedState.LIVE:
-                self._report_at_s = due_s
+            self._unreported_bytes += taken * len(arrivals[at].frame)
+            if self.state is FeedState.LIVE and self._is_reliable:
+                self._report_at_s = min(self._report_at_s, now_s if self._owes_report() else now_s + REPORT_PAUSE_S)
         return taken
 
     def timeout(self, now_s: float) -> None:
@@ -152,12 +155,15 @@ class Feed:
         """Return the frame of the report that is due, or None."""
         if now_s < self._report_at_s:
             return None
+        self._clean_bytes += self._unreported_bytes
         self._unreported_bytes = 0
         if self.state is FeedState.NEW:
             self._report_at_s = now_s + ANNOUNCE_S
             self._note = self._note_sealer(self._epoch_to_try())
             return self._note.seal(Report(ReportFlag.NEW, 0, 0, ()).to_wire())
         missing = self._missing() if self._is_reliable else ()
+        if missing:
+            self._clean_bytes = 0
         self._report_at_s = now_s + (REPORT_DELAY_S if missing else REPORT_IDLE_S)
         part = self._data.progress(self._expected)
         return self._note.seal(Report(ReportFlag.NONE, self._expected, part, missing).to_wire())
@@ -255,11 +261,21 @@ class Feed:
         is_in_order = is_next and (
             self._data.is_finished(header.number) or header.part == self._data.progress(header.number) - 1
         )
-        if self._unreported_bytes >= REPORT_EVERY_BYTES:
+        if self._owes_report():
             due_s = now_s
+        elif not is_in_order:
+            due_s = now_s + REPORT_GAP_S
         else:
-            due_s = now_s + (REPORT_DELAY_S if is_in_order else REPORT_GAP_S)
+            due_s = now_s + (REPORT_DELAY_S if self._data.is_finished(header.number) else REPORT_PAUSE_S)
         self._report_at_s = min(self._report_at_s, due_s)
+
+    def _owes_report(self) -> bool:
+        """Return whether a report is due for how much has come; the longer all is well, the more that takes.
+
+        A publisher's flight has grown by what was reported since the last loss, and should never run dry.
+        """
+        every_bytes = max(REPORT_EVERY_BYTES, min(self._clean_bytes // 4, REPORT_EVERY_MAX_BYTES))
+        return self._unreported_bytes >= every_bytes
 
     def _is_whole(self, number: int) -> bool:
         return number < self._expected or self._data.is_finished(number)
@@ -297,10 +313,28 @@ class Feed:
                 self._take_ready(number)
             self._data.begin(self._expected, self._ready)
         self._sent = max(self._sent, (status.sent_number, status.sent_part))
+        for move in status.moves:
+            if move.is_before(self._expected):
+                self._follow(move)
         if status.oldest > self._expected:
             self._skip_to(status.oldest)
         self._report_at_s = now_s
         self._deliver()
+
+    def _follow(self, move: Move) -> None:
+        """Go on under new numbers: what is here of the old ones waits, under theirs, for what lacks."""
+        if self._expected < move.first:
+            self._skip_to(move.first)
+        self._expected = move.of(self._expected)
+        early = {number: self._take_ready(number) for number in list(self._ready) if move.is_before(number)}
+        for number in [number for number in self._ready if number < self._expected]:
+            self._take_ready(number)  # it was handed out under its old number
+        self._data.forget(self._expected)
+        for old, joined in early.items():
+            number, size = move.of(old), len(joined.message) + _READY_OVERHEAD_BYTES
+            if number not in self._ready and self._budget.reserve(self.publisher, size):
+                self._ready[number] = replace(joined, number=number)
+                self._data.skip(number)
 
     def _skip_to(self, number: int) -> None:
         """Accept that what lies before ``number`` and is not here will not come."""

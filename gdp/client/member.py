@@ -83,6 +83,7 @@ class Member:
         self._messages: list[Message] = []
         self._under_way: tuple[Feed, Name] | None = None  # whose next part is expected
         self._now_s = 0.0
+        self._may_send = True  # a look at what publishers and feeds have ready may be worth it
         self._drops: Counter[DropReason] = Counter()
         self._closed_drops: Counter[DropReason] = Counter()
         self.attachment = Attachment(identity, policy, settings)
@@ -237,13 +238,16 @@ class Member:
         if self.attachment.switch is None:
             return
         self._now_s = now_s
+        self._may_send = False
         for publisher in self._urgent:
             if frames := publisher.take(now_s, BYTES_AT_ONCE):
                 self.attachment.send(frames)
+                self._may_send = True
         left = BYTES_AT_ONCE
         for _ in range(len(self._ordinary)):
             if frames := self._ordinary[0].take(now_s, left):
                 self.attachment.send(frames)
+                self._may_send = True
                 left -= sum(map(len, frames))
             self._ordinary.rotate(-1)
             if left < BYTES_AT_ONCE // 2:
@@ -268,7 +272,7 @@ class Member:
         take turns; urgent ones go first each time.
         """
         out = self.attachment.take()
-        if not out:
+        if not out and (self._may_send or any(publisher.has_new for publisher in self._publishers.values())):
             self.flush(self._now_s)
             out = self.attachment.take()
         return out
@@ -306,9 +310,11 @@ class Member:
         if publisher is None:
             raise StatementError(DropReason.NOT_FOR_US)
         self._now_s = now_s
+        self._may_send = True
         publisher.receive_report(header, frame, now_s)
 
     def _take_statement(self, statement: Statement, now: Instant) -> None:
+        self._may_send = True
         if statement.type is StatementType.JOIN:
             join = Join.from_fields(statement.fields)
             publisher = self._publishers.get(join.topic)

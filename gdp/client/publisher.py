@@ -2,8 +2,9 @@
 
 Place: pure; time comes in as ``now_s`` (monotonic seconds). Frames come out of ``take`` and go to the switch.
 
-A message is sealed once. Without a reader nothing is sealed; the last ``depth`` messages of a latched topic wait for
-late joiners.
+A message is sealed once. Where the path has become too narrow for what is kept, that is split anew, and all that is
+kept moves to new numbers; statuses say which (``gdp/message/move.py``). Without a reader nothing is sealed; the last
+``depth`` messages of a latched topic wait for late joiners.
 
 A reader is known by its notes. One that falls silent is forgotten; one that stands still, or lags while others are
 through, holds the window no longer: it gets what is sent, and is told to skip what is gone, until after a penance it
@@ -23,6 +24,7 @@ from gdp.errors import DropReason, EnvelopeError, FrameError, LocalError, Remote
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import MTU_MIN_BYTES, READER_LEASE_S, WINDOW_BYTES
+from gdp.message.move import MOVES_MAX, Move
 from gdp.message.report import Report, ReportFlag
 from gdp.message.status import STARTS_MAX, Status
 from gdp.message.window import SendWindow
@@ -87,7 +89,7 @@ class Publisher:
         self._secrets = secrets
         self._description = description
         self._repairs_wanted = reliable or depth > 0
-        self.is_urgent = urgent
+        self.has_new = False  # something was published since ``take`` was last asked
         wanted = (reliable, Flag.RELIABLE), (depth, Flag.LATCHED), (urgent, Flag.URGENT)
         self._flags = sum(int(flag) for is_set, flag in wanted if is_set)
         self._window = SendWindow(depth)
@@ -103,6 +105,8 @@ class Publisher:
         self._starts: dict[bytes, int] = {}
         self._status_wanted = False
         self._status_at_s = float("-inf")  # when the next one may go
+        self._moves: deque[Move] = deque(maxlen=MOVES_MAX)
+        self._skipped = 0  # numbers that moves left behind
         self._waiting = deque[Sealed]()  # best-effort messages
         self._waiting_bytes = 0
         self._early = deque[bytes](maxlen=depth or None)  # latched messages from before the first reader
@@ -131,7 +135,7 @@ class Publisher:
     @property
     def acknowledged(self) -> int:
         """Return how many messages every reader has confirmed; of a best-effort topic, how many were sent."""
-        return self._window.acknowledged if self._repairs_wanted else self.messages
+        return self._window.acknowledged - self._skipped if self._repairs_wanted else self.messages
 
     def renew(self, secrets: Secrets) -> None:
         """Take the topic's secrets anew; messages from now on are sealed under the newest epoch.
@@ -150,6 +154,7 @@ class Publisher:
     def tree_stands(self, mtu: int) -> None:
         """Learn that a tree reaches this publisher, and the smallest MTU on it (bytes after the Ethernet header)."""
         self._mtu = max(mtu, MTU_MIN_BYTES)
+        self._split_anew(self._mtu)
 
     def publish(self, message: bytes) -> int | None:
         """Seal and queue a message; return its number, or None when nobody is there to read it.
@@ -157,6 +162,7 @@ class Publisher:
         Raises:
             LocalError: above the limits.
         """
+        self.has_new = True
         if self._mtu is None or not self._readers:
             if self._depth:
                 self._early.append(message)
@@ -164,8 +170,7 @@ class Publisher:
                 self.drops[DropReason.NO_READER] += 1
             return None
         number = self._next_number
-        self._next_number += 1
-        frames = self._data.seal(number, self._flags, message, self._mtu)
+        frames = self._seal(message, self._mtu)
         self.messages += 1
         self.payload_bytes += len(message)
         if self._repairs_wanted:
@@ -189,7 +194,7 @@ class Publisher:
         else:
             self._readers[name].start = None
             if self._repairs_wanted:
-                self._take_report(name, report, now_s)
+                self._take_report(name, self._follow_moves(report), now_s)
 
     def timeout(self, now_s: float) -> None:
         """Let silent readers go, let laggards hold nothing, and ask those that owe a report."""
@@ -214,6 +219,7 @@ class Publisher:
 
     def take(self, now_s: float, limit_bytes: int = _ALL) -> list[bytes]:
         """Return frames that may go now, about ``limit_bytes`` at a time: the rest is sealed when it is asked for."""
+        self.has_new = False
         if self._mtu is None or not self._readers:
             return []
         while self._early:
@@ -224,6 +230,46 @@ class Publisher:
         if self._status_wanted and now_s >= self._status_at_s:
             frames += self._seal_status(now_s)
         return frames + self._window.take(now_s, max(limit_bytes // self._mtu - len(frames), 1))
+
+    def _seal(self, message: bytes, mtu: int) -> Sealed:
+        number = self._next_number
+        self._next_number += 1
+        return self._data.seal(number, self._flags, message, mtu)
+
+    def _split_anew(self, mtu: int) -> None:
+        """Seal anew what has become too large for its path."""
+        if any(each.largest > mtu for each in self._waiting):
+            waiting = [each.message() for each in self._waiting]
+            self._waiting.clear()
+            self._waiting_bytes = 0
+            for message in waiting:
+                self._wait(self._seal(message, mtu))
+        kept = [(number, each) for number, each in self._window.kept() if isinstance(each, Sealed)]
+        if not any(each.largest > mtu for _, each in kept):
+            return
+        first, end = kept[0][0], self._next_number
+        move = Move(first, end - first, end + 1)
+        moved = [
+            (move.of(number), self._data.seal(move.of(number), self._flags, each.message(), mtu))
+            for number, each in kept
+        ]
+        self._next_number = move.of(end)
+        self._skipped += move.to - first
+        self._moves.append(move)
+        self._window.move(move, [(number, each, each.size_bytes) for number, each in moved])
+        self._starts = {name: move.of(start) for name, start in self._starts.items()}
+        for reader in self._readers.values():
+            if reader.start is not None:
+                reader.start = move.of(reader.start)
+        self._status_wanted = True
+
+    def _follow_moves(self, report: Report) -> Report:
+        """Return a report as it would be under the present numbers; a reader that does not know them is told."""
+        for move in self._moves:
+            if move.is_before(report.next_number):
+                report = Report(report.flags, move.of(report.next_number), 0, ())
+                self._status_wanted = True
+        return report
 
     def _sealer(self, kind: Kind) -> Sealer:
         source = self._source
@@ -303,7 +349,8 @@ class Publisher:
         oldest = self._window.oldest
         about = self._description if self._starts else b""
         sent = self._window.sent if self._repairs_wanted else (self._next_number, 0)
-        status = Status(sent[0] if oldest is None else oldest, *sent, dict(self._starts), about)
+        first = sent[0] if oldest is None else oldest
+        status = Status(first, *sent, dict(self._starts), about, tuple(self._moves))
         self._starts.clear()
         self._status_wanted = False
         self._status_number += 1

@@ -22,6 +22,7 @@ from gdp.limits import (
     CONTROL_PARTS_MAX,
     CONTROL_PATIENCE_S,
     HOPS_MAX,
+    MTU_MIN_BYTES,
 )
 from gdp.message.memory import Budget
 from gdp.names import ZERO
@@ -29,7 +30,7 @@ from gdp.names import ZERO
 __all__ = ["ControlJoiner", "ControlSplitter"]
 
 _COST_BYTES: Final = 200  # what an unfinished statement costs beside its bytes
-_FAR_MTU: Final = 1_400  # behind the first link there may be a tunnel
+_FAR_MTU: Final = MTU_MIN_BYTES  # behind the first link there may be a tunnel, or any link there may be
 
 _Key = tuple[bytes, int, int, int]  # origin, kind, incarnation, number
 

@@ -5,6 +5,8 @@ Place: pure; every node that has a port greets: switches, RIBs, proxies.
 A hello is signed by a member of a trusted domain and carries its certificate. It counts as two-way when it echoes the
 nonce of our port's present session, and is newer than all that came of its own, so a recorded hello brings nobody up:
 of sessions that ended, too, the last sequence number is remembered.
+
+Hellos also say what each end takes: a link is as wide as its narrowest end. Where an end changes, both know at once.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ _ENDED_MAX: Final = 1_024  # sessions of the far ends, remembered for one sessio
 _JOINS_WINDOW: Final = 1_024  # how far joins may overtake each other
 _ANSWER_S: Final = 0.02  # a stranger's hello is answered at once, but not more often than this
 
-Change = tuple[Neighbour, NeighbourState]  # a neighbour after the change, and its state before
+# A neighbour after the change, and its state before; the same state where only the link to it changed, MTU or cost.
+Change = tuple[Neighbour, NeighbourState]
 
 
 @dataclass(slots=True)
@@ -43,7 +46,7 @@ class LinkPort:
 
     index: int
     mac: bytes
-    mtu: int  # bytes after the Ethernet header
+    own_mtu: int  # what our end takes, in bytes after the Ethernet header
     cost: int
     nonce: bytes
     is_up: bool = True
@@ -53,6 +56,18 @@ class LinkPort:
     neighbours: dict[Name, Neighbour] = field(default_factory=dict)
     ended: dict[bytes, int] = field(default_factory=dict)  # nonce of a session to its last sequence number
     joins: dict[Name, ReplayWindow] = field(default_factory=dict)  # which joins were taken in this session
+    said_mtus: dict[Name, int] = field(default_factory=dict)  # what each neighbour's end takes
+
+    @property
+    def mtu(self) -> int:
+        """Return what our end and those of all neighbours that are up take, in bytes after the Ethernet header."""
+        up = [n.mtu for n in self.neighbours.values() if n.state is NeighbourState.UP]
+        return min([self.own_mtu, *up])
+
+    @property
+    def hello_mtu(self) -> int:
+        """Return what everybody takes who was heard at all: a neighbour behind a narrow end must hear us to be up."""
+        return min([self.own_mtu, *self.said_mtus.values()])
 
     def last_of(self, name: Name, nonce: bytes) -> int:
         """Return the last sequence number that came of a neighbour's session, or -1."""
@@ -113,10 +128,24 @@ class Greeter:
         self._digest_for = digest_for
         self.ports: dict[int, LinkPort] = {}
 
-    def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now_s: float) -> None:
-        """Begin to greet on a port."""
-        nonce = self._random_bytes(NONCE_BYTES)
-        self.ports[index] = LinkPort(index, mac, max(mtu, MTU_MIN_BYTES), cost, nonce, hello_at_s=now_s)
+    def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now_s: float) -> list[Change]:
+        """Begin to greet on a port, or learn that the MTU or cost of one that is up has changed.
+
+        Returns the neighbours to which the link has changed, and those that another address of ours takes away.
+        """
+        port, own_mtu = self.ports.get(index), max(mtu, MTU_MIN_BYTES)
+        if port is None or not port.is_up or port.mac != mac:
+            lost = [] if port is None else self._lose(port, list(port.neighbours.values()), NeighbourEvent.LINK_LOST)
+            nonce = self._random_bytes(NONCE_BYTES)
+            self.ports[index] = LinkPort(index, mac, own_mtu, cost, nonce, hello_at_s=now_s)
+            return lost
+        if (port.own_mtu, port.cost) == (own_mtu, cost):
+            return []
+        port.own_mtu, port.cost = own_mtu, cost
+        port.hello_at_s = now_s  # the other ends must know
+        for neighbour in port.neighbours.values():
+            neighbour.mtu = min(port.said_mtus[neighbour.name], own_mtu)
+        return [(each, each.state) for each in port.neighbours.values() if each.state is NeighbourState.UP]
 
     def neighbour(self, port: int, name: Name) -> Neighbour | None:
         """Return the neighbour of that name that is up on a port, or None."""
@@ -162,11 +191,16 @@ class Greeter:
             return None
         if is_new_session:
             port.end(known)
-        known.mac, known.mtu, known.nonce, known.candidate = arrival.mac, min(hello.mtu, port.mtu), hello.nonce, b""
+        said_mtu = port.said_mtus[known.name] = max(hello.mtu, MTU_MIN_BYTES)
+        mtu = min(said_mtu, port.own_mtu)
+        is_resized = known.mtu != mtu
+        known.mac, known.mtu, known.nonce, known.candidate = arrival.mac, mtu, hello.nonce, b""
         known.sequence, known.digest, known.heard_s = hello.sequence, hello.digest, now.mono_s
         change = self._step(known, NeighbourEvent.TWO_WAY if is_two_way else NeighbourEvent.ONE_WAY)
         if change is None and is_new_session and is_two_way:
             return known, NeighbourState.GONE  # it restarted, and has forgotten what we told it
+        if change is None and is_resized and known.state is NeighbourState.UP:
+            return known, known.state
         return change
 
     def port_changed(self, index: int, up: bool, now_s: float) -> list[Change]:
@@ -209,12 +243,12 @@ class Greeter:
         port.hello_at_s = now_s + self._hello_s
         heard = tuple(n for each in port.neighbours.values() for n in (each.nonce, each.candidate) if n)
         identity = self._identity
-        hello = Hello(port.nonce, port.sequence, heard, port.mtu, self._digest_for(port), identity.membership)
-        return self._splitter.split(Kind.HELLO, hello.to_wire(identity.name, identity.key), port.mtu)
+        hello = Hello(port.nonce, port.sequence, heard, port.own_mtu, self._digest_for(port), identity.membership)
+        return self._splitter.split(Kind.HELLO, hello.to_wire(identity.name, identity.key), port.hello_mtu)
 
     def _lose(self, port: LinkPort, lost: list[Neighbour], event: NeighbourEvent) -> list[Change]:
         for neighbour in lost:
-            del port.neighbours[neighbour.name]
+            del port.neighbours[neighbour.name], port.said_mtus[neighbour.name]
             port.end(neighbour)
         return [change for neighbour in lost if (change := self._step(neighbour, event)) is not None]
 

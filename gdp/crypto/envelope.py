@@ -26,10 +26,10 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
-from gdp.crypto.heads import NONCE_BYTES, Heads
+from gdp.crypto.heads import Heads
 from gdp.effects import Arrival
 from gdp.errors import DropReason, EnvelopeError, LocalError
-from gdp.frame.codec import AAD_BYTES, HEADER_BYTES, HOPS_AT, Header, authenticated
+from gdp.frame.codec import HEADER_BYTES, Header, authenticated, encode
 from gdp.frame.kinds import VERSION, Flag
 from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, PARTS_MAX
 
@@ -39,9 +39,7 @@ TAG_BYTES: Final = 16
 SIGNATURE_BYTES: Final = 64
 SECRET_BYTES: Final = 32
 _NONCE: Final = struct.Struct("!QI")
-_AAD: Final = struct.Struct("!BBBHHQIIQ32s32s")
 _COMMON: Final = struct.Struct("!BBBHQIQ32s32s")
-_HOPS: Final = bytes([HOPS_MAX])
 _LAST: Final = int(Flag.LAST)  # a plain number: an IntFlag's operators cost a microsecond each
 
 
@@ -133,6 +131,7 @@ class Sealed(Sequence[bytes]):
     """The frames of one message, sealed in order and as far as they have been asked for; always the same bytes."""
 
     def __init__(self, aead: AESGCM, signer: Signer, header: Header, message: bytes, room: int) -> None:
+        self._aead = aead
         self._encrypt = aead.encrypt
         self._signer = signer
         self._header = header
@@ -158,25 +157,58 @@ class Sealed(Sequence[bytes]):
             self._seal_until(end)
         return self._frames[at]
 
+    @property
+    def largest(self) -> int:
+        """Return the bytes of the largest frame, sealed or not."""
+        return self.size_bytes if self._header.parts == 1 else self._room + HEADER_BYTES + TAG_BYTES
+
+    def message(self) -> bytes:
+        """Return what was sealed, to be sealed anew under another number."""
+        if len(self._frames) < self._header.parts:
+            return bytes(self._message)
+        last, number, decrypt = self._header.parts - 1, self._header.number, self._aead.decrypt
+        plains = [
+            decrypt(
+                _NONCE.pack(number, part),
+                frame[HEADER_BYTES : -SIGNATURE_BYTES if part == last else None],
+                authenticated(frame),
+            )
+            for part, frame in enumerate(self._frames)
+        ]
+        return b"".join(plains)
+
     def _seal_until(self, end: int) -> None:
-        kind, flags, _, epoch, _, number, _, parts, incarnation, destination, source = self._header
-        room, message, encrypt, update = self._room, self._message, self._encrypt, self._running.update
-        pack, pack_nonce = _AAD.pack, _NONCE.pack
+        full_end = min(end, self._header.parts - 2)  # the last two may be shorter
+        if len(self._frames) < full_end:
+            self._seal_full(full_end)
         for part in range(len(self._frames), end):
-            plain = message[part * room : (part + 1) * room]
-            length = len(plain) + TAG_BYTES
-            is_last = part == parts - 1
-            if is_last:
-                flags |= _LAST
-                length += SIGNATURE_BYTES
-            aad = pack(VERSION, kind, flags, epoch, length, number, part, parts, incarnation, destination, source)
-            sealed = encrypt(pack_nonce(number, part), plain, aad)
+            self._seal_one(part)
+
+    def _seal_full(self, end: int) -> None:
+        """Seal the parts before ``end``, all of full length, by the shortest way."""
+        first, room, message = len(self._frames), self._room, self._message
+        encrypt, update, append = self._encrypt, self._running.update, self._frames.append
+        heads = Heads(self._header._replace(length=room + TAG_BYTES), first, end - first)
+        begins = range(first * room, end * room, room)
+        for begin, (header,), (additional,), (nonce,) in zip(begins, *heads.each(), strict=True):
+            sealed = encrypt(nonce, message[begin : begin + room], additional)
             update(sealed)
-            frame = aad[:HOPS_AT] + _HOPS + aad[HOPS_AT:] + sealed
-            if is_last:
-                frame += self._signer.sign_digest(self._running.digest())
-                self._message = message[:0]  # the frames hold all of it now
-            self._frames.append(frame)
+            append(header + sealed)
+
+    def _seal_one(self, part: int) -> None:
+        header, room = self._header, self._room
+        plain = self._message[part * room : (part + 1) * room]
+        is_last = part == header.parts - 1
+        length = len(plain) + TAG_BYTES + (SIGNATURE_BYTES if is_last else 0)
+        flags = header.flags | _LAST if is_last else header.flags
+        head = encode(header._replace(part=part, length=length, flags=flags))
+        sealed = self._encrypt(_NONCE.pack(header.number, part), plain, authenticated(head))
+        self._running.update(sealed)
+        frame = head + sealed
+        if is_last:
+            frame += self._signer.sign_digest(self._running.digest())
+            self._message = self._message[:0]  # the frames hold all of it now
+        self._frames.append(frame)
 
 
 class Opener:
@@ -202,16 +234,14 @@ class Opener:
         plains: list[bytes] = []
         payloads: list[bytes] = []
         decrypt, end = self._decrypt, HEADER_BYTES + length
-        headers, additional, nonces = heads.headers, heads.additional, heads.nonces
-        skip = first - heads.first
-        for k, arrival in zip(range(skip, heads.count), islice(arrivals, at, None), strict=False):
+        expected = islice(zip(*heads.each(), strict=True), first - heads.first, None)
+        for ((header,), (additional,), (nonce,)), arrival in zip(expected, islice(arrivals, at, None), strict=False):
             frame = arrival.frame
-            if not frame.startswith(headers[k * HEADER_BYTES : (k + 1) * HEADER_BYTES]):
+            if not frame.startswith(header):
                 break
             sealed = frame[HEADER_BYTES:end]
-            nonce = nonces[k * NONCE_BYTES : (k + 1) * NONCE_BYTES]
             try:
-                plains.append(decrypt(nonce, sealed, additional[k * AAD_BYTES : (k + 1) * AAD_BYTES]))
+                plains.append(decrypt(nonce, sealed, additional))
             except InvalidTag:
                 break
             payloads.append(sealed)

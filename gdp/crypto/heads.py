@@ -14,6 +14,7 @@ from __future__ import annotations
 import struct
 import sys
 from array import array
+from collections.abc import Iterator
 from typing import Final
 
 from gdp.frame.codec import AAD_BYTES, HEADER_BYTES, Header, authenticated, encode
@@ -22,6 +23,9 @@ __all__ = ["NONCE_BYTES", "Heads"]
 
 NONCE_BYTES: Final = 12
 _NONCE: Final = struct.Struct("!QI")
+_NONCE_WHOLE: Final = struct.Struct(f"{NONCE_BYTES}s")
+_HEADER: Final = struct.Struct(f"{HEADER_BYTES}s")
+_ADDITIONAL: Final = struct.Struct(f"{AAD_BYTES}s")
 _PART_AT: Final = 16
 _PART_BYTES: Final = 4
 _PART_IN_NONCE: Final = 8
@@ -58,3 +62,8 @@ class Heads:
         self.headers = bytes(headers)
         self.additional = bytes(additional)
         self.nonces = bytes(nonces)
+
+    def each(self) -> tuple[Iterator[tuple[bytes]], Iterator[tuple[bytes]], Iterator[tuple[bytes]]]:
+        """Return header, additional data and nonce of each part, in order, by three iterators."""
+        headers, additional = _HEADER.iter_unpack(self.headers), _ADDITIONAL.iter_unpack(self.additional)
+        return headers, additional, _NONCE_WHOLE.iter_unpack(self.nonces)

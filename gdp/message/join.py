@@ -299,6 +299,12 @@ class Joiner:
             self.window.finish(number)
         self.highest = max([first - 1, *finished, *self._unfinished])
 
+    def skip(self, number: int) -> None:
+        """Take a message as finished: it is here under another number."""
+        if number in self._unfinished:
+            self._drop(number)
+        self.window.finish(number)
+
     def forget(self, below: int) -> int:
         """Give up every message numbered under ``below``; return how many unfinished ones that ended."""
         ended = 0

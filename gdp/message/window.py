@@ -31,6 +31,7 @@ from gdp.limits import (
     READER_LEASE_S,
     WINDOW_BYTES,
 )
+from gdp.message.move import Move
 from gdp.message.report import Missing, Report
 
 __all__ = ["SendWindow"]
@@ -151,6 +152,31 @@ class SendWindow:
         self._kept_bytes += size
         self._end_at += size
         self._next.append((number, 0))
+
+    def kept(self) -> list[tuple[int, Sequence[bytes]]]:
+        """Return what is kept, oldest first."""
+        return [(number, kept.frames) for number, kept in self._kept.items()]
+
+    def move(self, move: Move, frames: Sequence[tuple[int, Sequence[bytes], int]]) -> None:
+        """Put what is kept anew, under new numbers, in place of the old; what all readers have does not go again.
+
+        Args:
+            frames: number, frames and their size; as in ``add``.
+        """
+        for number in list(self._kept):
+            self._release(number)
+        self._repairs.clear()
+        self._sample = None
+        for number, each, size in frames:
+            self.add(number, each, size)
+        for reader in self._readers.values():
+            reader.next_number = move.of(reader.next_number)
+        least = self._least_number() if self._readers else 0
+        while self._next and self._next[0][0] < least:
+            self._sent_at = self._kept[self._next.popleft()[0]].end_at
+        for reader in self._readers.values():
+            reader.acked_at = reader.mark_at = self._sent_at
+        self._release_acknowledged()
 
     def add_reader(self, reader: bytes, first_number: int, now_s: float) -> None:
         """Let a reader hold the window from a message on."""

@@ -11,12 +11,13 @@ from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from gdp.limits import DEAD_S, HELLO_S, LEASE_MAX_S, LEASE_MIN_S, RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX
+from gdp.limits import DEAD_S, HELLO_S, LEASE_MAX_S, LEASE_MIN_S, RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX, TABLE_MAX
 from gdp.nodes.schema import Directory, Domain, Ifname, Metrics, NameText, Section, Unique, load
+from gdp.ports.kernel.shapes import ENTRIES_DEFAULT
 
 __all__ = ["DataPlane", "PortConfig", "Quotas", "RibConfig", "SwitchConfig"]
 
-DataPlane = Literal["auto", "raw", "scapy"]
+DataPlane = Literal["auto", "kernel", "raw", "scapy"]
 
 COST_DEFAULT: Final = 10
 _ATTACH_MAX: Final = 13  # leaves room for the "-s" of the switch's end
@@ -40,7 +41,8 @@ class PortConfig(Section):
 
 class SwitchConfig(Section):
     """``switch.yaml``. For each ``NAME`` of ``attach`` the command makes a veth pair ``NAME``/``NAME-s``; a RIB or
-    proxy on this host takes ``NAME`` as its device. Files in ``revocations`` are read at start and on SIGHUP.
+    proxy on this host takes ``NAME`` as its device. Files in ``revocations`` are read at start and on SIGHUP. The
+    kernel plane holds ``table_max`` entries, and the process forwards by the others.
     """
 
     identity: Directory
@@ -48,6 +50,7 @@ class SwitchConfig(Section):
     ports: tuple[PortConfig, ...] = ()
     attach: Annotated[tuple[AttachName, ...], Unique] = ()
     data_plane: DataPlane = "auto"
+    table_max: int = Field(default=ENTRIES_DEFAULT, ge=1, le=TABLE_MAX)
     revocations: Directory | None = None
     metrics: Metrics | None = None
     hello_s: float = Field(default=HELLO_S, ge=0.01, le=60.0)

@@ -25,6 +25,7 @@ __all__ = ["Runtime", "now"]
 log = logging.getLogger(__name__)
 
 COST_DEFAULT = 10
+_STREAK_MAX = 8
 
 
 def now() -> Instant:
@@ -48,6 +49,7 @@ class Runtime:
         self._costs = dict(costs or {})
         self._spin = Spin(spin_s)
         self._is_stopped = False
+        self._streak = 0  # steps in a row that brought frames, without a look at the timers
         self._deadline_s: float | None = None
         moment = now()
         for port in list(plane.ports.values()):
@@ -82,12 +84,14 @@ class Runtime:
         While the machine has more to say, nothing is waited for, but what came meanwhile is heard: a large message on
         its way out holds up nobody.
         """
-        if self.send():
+        is_sending, arrivals = self.send(), list[Arrival]()
+        if is_sending or self._streak:
             arrivals = self._plane.poll(0.0)
-        else:
+        if not is_sending and not arrivals:
             self._deadline_s = self._machine.next_timeout()
             times = [each for each in (self._deadline_s, latest_s) if each is not None]
             arrivals = self._wait(max(min(times) - time.monotonic(), 0.0) if times else None)
+        self._streak = self._streak + 1 if arrivals and self._streak < _STREAK_MAX else 0
         moment = now()
         if arrivals:
             self._machine.receive(arrivals, moment)

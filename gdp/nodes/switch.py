@@ -16,12 +16,11 @@ from gdp.crypto.certificates import Role
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.names import Name
 from gdp.nodes.config import SwitchConfig
+from gdp.nodes.data_plane import Chosen, choose_plane
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.nodes.pairs import attach_pairs, switch_end
 from gdp.nodes.runtime import Runtime, now
 from gdp.ports.link import LinkWatch
-from gdp.ports.plane import Plane
-from gdp.ports.raw import RawPlane
 from gdp.switch.machine import Switch
 from gdp.switch.table import Table
 from gdp.telemetry.metrics import Metrics, Sources
@@ -33,11 +32,11 @@ log = logging.getLogger(__name__)
 _MTU_FALLBACK = 1_500
 
 
-def run_switch(config: SwitchConfig, ready: Callable[[Name, str], None]) -> None:
+def run_switch(config: SwitchConfig, ready: Callable[[Name, str, str], None]) -> None:
     """Run a switch until it is told to stop.
 
     Args:
-        ready: called once with the switch's name and its data plane, when it has begun.
+        ready: called once when it has begun, with the switch's name, its data plane, and why it is not a better one.
 
     Raises:
         LocalError: keys, devices or ports are not as the configuration says.
@@ -53,18 +52,21 @@ def run_switch(config: SwitchConfig, ready: Callable[[Name, str], None]) -> None
     ifaces = [port.iface for port in config.ports]
     with contextlib.ExitStack() as stack:
         stack.enter_context(attach_pairs(config.attach, identity.name, _widest(ifaces)))
-        plane = _open_plane(config.data_plane, [*ifaces, *map(switch_end, config.attach)], table)
+        devices = [*ifaces, *map(switch_end, config.attach)]
+        chosen = choose_plane(config.data_plane, devices, table, config.table_max)
+        plane = chosen.plane
         stack.callback(plane.close)
         runtime = Runtime(switch, plane, {port.iface: port.cost for port in config.ports})
         stack.enter_context(runtime.signals(lambda: _revoke(switch, config.revocations)))
         _revoke(switch, config.revocations)
         if config.metrics is not None:
-            metrics = Metrics(_sources(switch, plane))
+            metrics = Metrics(_sources(switch, chosen))
             metrics.serve(config.metrics.port)
             stack.callback(metrics.close)
-        plane_name = "scapy" if config.data_plane == "scapy" else "raw"
-        log.info("switch up name=%s plane=%s ports=%d", identity.name.short, plane_name, len(plane.ports))
-        ready(identity.name, plane_name)
+        log.info("switch up name=%s plane=%s ports=%d", identity.name.short, chosen.name, len(plane.ports))
+        if chosen.reason:
+            log.warning("not the best data plane plane=%s reason=%s", chosen.name, chosen.reason)
+        ready(identity.name, chosen.name, chosen.reason)
         runtime.run()
 
 
@@ -89,24 +91,17 @@ def _widest(ifaces: Sequence[str]) -> int:
     return max(mtus, default=_MTU_FALLBACK)
 
 
-def _open_plane(kind: str, ifaces: Sequence[str], table: Table) -> Plane:
-    if kind == "scapy":
-        from gdp.ports.scapy_plane import ScapyPlane
+def _sources(switch: Switch, chosen: Chosen) -> Sources:
+    plane = chosen.plane
 
-        return ScapyPlane(ifaces, table)
-    return RawPlane(ifaces, table)
+    def frames() -> dict[str, int]:
+        now = plane.counters
+        return {"in": now.frames_in, "out": now.frames_out, "forwarded": now.forwarded, "handed-up": now.handed_up}
 
-
-def _sources(switch: Switch, plane: Plane) -> Sources:
-    counters = plane.counters
     return Sources(
-        frames=lambda: {
-            "in": counters.frames_in,
-            "out": counters.frames_out,
-            "forwarded": counters.forwarded,
-            "handed-up": counters.handed_up,
-        },
-        drops=[lambda: counters.drops, lambda: count_list(switch.drops())],
+        frames=frames,
+        drops=[lambda: plane.counters.drops, lambda: count_list(switch.drops())],
         table_entries=lambda: len(switch.table),
+        entries=chosen.entry_counts,
         parked_frames=lambda: len(switch.parked),
     )

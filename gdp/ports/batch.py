@@ -8,7 +8,7 @@ Source: recvmmsg(2), sendmmsg(2), through ctypes; where the C library cannot be 
     on leaving  [ head 14 ] + [ frame ... ]            put() gathers a new Ethernet header and the frame in its slot
 
 So a frame that is forwarded is never copied here: its hops left is changed in the slot, and one head serves a whole run
-of frames to the same neighbour.
+of frames to the same neighbour. Nor is a frame of our own: ``send`` points at the bytes where they lie.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import ctypes
 import errno
 import socket
 from array import array
+from collections.abc import Sequence
 from typing import Final, Protocol
 
 from gdp.errors import DropReason
@@ -58,6 +59,12 @@ class Batch(Protocol):
 
     def fill(self, frames: list[bytes]) -> None:
         """Put frames (from the GDP header on, at most ``SLOTS``, each fitting a slot) into the slots."""
+
+    def send(self, sink: socket.socket, frames: Sequence[bytes], macs: bytes, drops: list[int]) -> int:
+        """Send frames (from the GDP header on, at most ``SLOTS``), from where they lie.
+
+        Returns how many left; the others are counted in ``drops``.
+        """
 
     def put(self, sink: socket.socket, first: int, count: int, macs: bytes, drops: list[int]) -> int:
         """Send the slots ``first`` to ``first + count``, last filled by ``take`` or ``fill``, under new addresses.
@@ -120,6 +127,16 @@ class MmsgBatch:
             for messages, vectors, each in (self._in, self._in_vectors, 1), (self._out, self._out_vectors, 2):
                 messages[slot].header.vectors = ctypes.addressof(vectors) + each * slot * ctypes.sizeof(_IoVec)
                 messages[slot].header.vector_count = each
+        self._own_vectors, self._own = (_IoVec * (2 * SLOTS))(), (_MmsgHdr * SLOTS)()
+        for slot in range(SLOTS):
+            self._own_vectors[2 * slot] = _IoVec(head, ETHER_BYTES)
+            self._own[slot].header.vectors = ctypes.addressof(self._own_vectors) + 2 * slot * ctypes.sizeof(_IoVec)
+            self._own[slot].header.vector_count = 2
+        self._own_at = ctypes.addressof(self._own)
+        self._pointers = (ctypes.c_char_p * SLOTS)()
+        self._addresses = memoryview(self._pointers).cast("B").cast("L")
+        own_words = memoryview(self._own_vectors).cast("B").cast("L")
+        self._own_addresses, self._own_sizes = own_words[2::4], own_words[3::4]
         self._in_at, self._out_at = ctypes.addressof(self._in), ctypes.addressof(self._out)
 
         # One slice reads all received lengths, one assignment sets all lengths to send.
@@ -141,11 +158,22 @@ class MmsgBatch:
             pool[at : at + len(frame)] = frame
         self._sizes[: len(frames)] = memoryview(array("L", map(len, frames)))
 
+    def send(self, sink: socket.socket, frames: Sequence[bytes], macs: bytes, drops: list[int]) -> int:
+        count = len(frames)
+        self._pointers[:count] = list(frames)
+        self._own_addresses[:count] = self._addresses[:count]
+        self._own_sizes[:count] = memoryview(array("L", map(len, frames)))
+        return self._submit(sink, self._own_at, 0, count, macs, drops)
+
     def put(self, sink: socket.socket, first: int, count: int, macs: bytes, drops: list[int]) -> int:
+        return self._submit(sink, self._out_at, first, count, macs, drops)
+
+    def _submit(self, sink: socket.socket, table: int, first: int, count: int, macs: bytes, drops: list[int]) -> int:
+        """Send ``count`` messages of the table of messages at an address."""
         self._head[: len(macs)] = macs
         at, end, left = first, first + count, 0
         while at < end:
-            sent = self._send(sink.fileno(), self._out_at + at * ctypes.sizeof(_MmsgHdr), end - at, _DONTWAIT)
+            sent = self._send(sink.fileno(), table + at * ctypes.sizeof(_MmsgHdr), end - at, _DONTWAIT)
             if sent > 0:
                 left += sent
                 at += sent
@@ -183,16 +211,25 @@ class PlainBatch:
             slot[ETHER_BYTES : ETHER_BYTES + len(frame)] = frame
         self._sizes = [len(frame) for frame in frames]
 
+    def send(self, sink: socket.socket, frames: Sequence[bytes], macs: bytes, drops: list[int]) -> int:
+        return self._submit(sink, frames, macs, drops)
+
     def put(self, sink: socket.socket, first: int, count: int, macs: bytes, drops: list[int]) -> int:
+        slots = [self._slots[at][ETHER_BYTES : ETHER_BYTES + self._sizes[at]] for at in range(first, first + count)]
+        return self._submit(sink, slots, macs, drops)
+
+    def _submit(
+        self, sink: socket.socket, frames: Sequence[bytes | memoryview], macs: bytes, drops: list[int]
+    ) -> int:
         self._head[: len(macs)] = macs
         left = 0
-        for at in range(first, first + count):
+        for at, frame in enumerate(frames):
             try:
-                sink.sendmsg((self._head, self._slots[at][ETHER_BYTES : ETHER_BYTES + self._sizes[at]]))
+                sink.sendmsg((self._head, frame))
             except OSError as error:
                 reason, goes_on = send_failure(error.errno or 0)
                 if not goes_on:
-                    drops[reason] += first + count - at
+                    drops[reason] += len(frames) - at
                     break
                 drops[reason] += 1
             else:

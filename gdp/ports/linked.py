@@ -51,6 +51,7 @@ class LinkedPlane(ABC):
         self._next_index = 0
         self._epoll = select.epoll()
         self._ready: dict[int, Callable[[], None]] = {}
+        self._urgent_fds: set[int] = set()  # served first
         self._arrivals: list[Arrival] = []
         self._on_link: list[LinkCallback] = []
         self._links = LinkWatch()
@@ -79,6 +80,15 @@ class LinkedPlane(ABC):
     @abstractmethod
     def _is_open(self, index: int) -> bool: ...
 
+    def _widen(self, port: Port) -> None:
+        """Make room for the larger frames of an open device; to open it anew loses what waits at its socket.
+
+        Raises:
+            LocalError: it cannot be opened.
+        """
+        self._close_device(port.index)
+        self._open(port)
+
     @abstractmethod
     def _kernel_drops(self) -> int:
         """Return the frames that the kernel dropped at open ports since last asked."""
@@ -101,6 +111,8 @@ class LinkedPlane(ABC):
         self._polls += 1
         if not events or not self._polls % _AUDIT_POLLS:
             self._audit()
+        if len(events) > 1:
+            events.sort(key=lambda event: event[0] not in self._urgent_fds)
         for fd, _ in events:
             ready = self._ready.get(fd)
             if ready is not None:  # an earlier one of this round may have closed it
@@ -109,14 +121,17 @@ class LinkedPlane(ABC):
         self._counters.handed_up += len(arrivals)
         return arrivals
 
-    def watch(self, source: HasFileno, ready: Callable[[], None]) -> None:
+    def watch(self, source: HasFileno, ready: Callable[[], None], *, is_urgent: bool = False) -> None:
         fd = source.fileno()
         self._epoll.register(fd, select.EPOLLIN)
         self._ready[fd] = ready
+        if is_urgent:
+            self._urgent_fds.add(fd)
 
     def unwatch(self, source: HasFileno) -> None:
         fd = source.fileno()
         if self._ready.pop(fd, None) is not None:
+            self._urgent_fds.discard(fd)
             self._epoll.unregister(fd)
 
     def add_port(self, ifname: str) -> int:
@@ -166,16 +181,19 @@ class LinkedPlane(ABC):
         self._counters.drops[DropReason.PORT_FULL] += self._kernel_drops()
 
     def _know(self, port: Port) -> None:
-        """Remember a port as it now is, and tell if it went up or down."""
+        """Remember a port as it now is, and tell if it went up or down, or came to be another while up."""
         before = self._ports.get(port.index)
         self._ports[port.index] = port
         if port.up:
             self._mtus[port.index] = port.mtu
         else:
             self._mtus.pop(port.index, None)
-        if before is not None and before.up != port.up:
+        if before is None or before == port or not (before.up or port.up):
+            return
+        is_moved = before.up and port.up and before.mac != port.mac
+        for up in (False, True) if is_moved else (port.up,):
             for callback in self._on_link:
-                callback(port.index, port.up)
+                callback(port.index, up)
 
     def _hear(self) -> None:
         for link in self._links.news():
@@ -199,12 +217,12 @@ class LinkedPlane(ABC):
         self._know(after)
 
     def _reopen_if_needed(self, before: Port, after: Port) -> Port:
-        """Open a device that is new, or whose frames no longer fit what was made for the old MTU."""
-        if self._is_open(before.index) and before.mtu == after.mtu:
+        """Open a device that is new, and make room where its frames have become larger."""
+        is_open = self._is_open(before.index)
+        if is_open and after.mtu <= before.mtu:
             return after
-        self._close_device(before.index)
         try:
-            self._open(after)
+            self._widen(after) if is_open else self._open(after)
         except LocalError:  # gone again, or not ready: its next news tries once more
             return replace(after, up=False)
         return after

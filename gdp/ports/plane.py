@@ -114,7 +114,11 @@ class Plane(Protocol):
         """Say whether the port exists, is up and has a carrier."""
 
     def on_link(self, callback: LinkCallback) -> None:
-        """Call ``callback(port, up)`` from within ``poll`` each time a port goes up or down."""
+        """Call ``callback(port, up)`` from within ``poll`` each time a port goes up or down.
+
+        It is called with ``up`` again where only the MTU changed, and with down and up where the address did: to its
+        neighbours that is another port. ``ports`` has the new facts.
+        """
 
     def close(self) -> None:
         """Close every socket; the plane is of no use afterwards."""

@@ -65,8 +65,7 @@ class RawPlane(LinkedPlane):
         super().__init__(ifnames, table)
 
     def _open(self, port: Port) -> None:
-        if port.mtu + ETHER_BYTES > self._batch.slot_bytes:
-            self._batch = make_batch(port.mtu + ETHER_BYTES)
+        self._widen(port)
         for lane, sockets in (Lane.URGENT, self._urgent), (Lane.ORDINARY, self._sockets):
             opened = sockets[port.index] = open_port(port.ifname, lane, bypass_qdisc=self._bypass_qdisc)
             if self._entries is None:
@@ -74,6 +73,10 @@ class RawPlane(LinkedPlane):
             else:
                 ready = partial(self._forward_all, self._entries, port.index, opened, sockets)
             self.watch(opened, ready, is_urgent=lane is Lane.URGENT)
+
+    def _widen(self, port: Port) -> None:
+        if port.mtu + ETHER_BYTES > self._batch.slot_bytes:
+            self._batch = make_batch(port.mtu + ETHER_BYTES)
 
     def _shut(self, index: int) -> None:
         for sockets in self._urgent, self._sockets:
@@ -105,9 +108,7 @@ class RawPlane(LinkedPlane):
             counters.frames_out += left
             return left
         for at in range(0, len(fitting), SLOTS):
-            chunk = fitting[at : at + SLOTS]
-            batch.fill(chunk)
-            left += batch.put(sink, 0, len(chunk), macs, counters.drops)
+            left += batch.send(sink, fitting[at : at + SLOTS], macs, counters.drops)
         counters.frames_out += left
         return left
 

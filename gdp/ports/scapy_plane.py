@@ -63,6 +63,9 @@ class ScapyPlane(LinkedPlane):
         self._sockets[port.index] = opened, opened.fileno()
         self.watch(opened, partial(self._sniff, port.index))
 
+    def _widen(self, port: Port) -> None:
+        """Do nothing: Scapy's sockets take frames of any size."""
+
     def _shut(self, index: int) -> None:
         opened, fd = self._sockets.pop(index, (None, -1))
         if opened is None:

@@ -125,8 +125,12 @@ class Switch:
         return self._drops + joiners + self.parked.drops + self.planter.drops + self.unicast.drops
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Instant) -> None:
-        """Begin to use a port."""
-        self.greeter.add_port(index, mac, mtu, cost, now.mono_s)
+        """Begin to use a port, or learn that the MTU or cost of one that is up has changed."""
+        changes = self.greeter.add_port(index, mac, mtu, cost, now.mono_s)
+        for change in changes:
+            self._neighbour_changed(change, now.mono_s)
+        if changes:
+            self._follow_links(now.mono_s)
 
     def port_changed(self, port: int, up: bool, now: Instant) -> None:
         """Learn that a port's link came or went."""
@@ -280,9 +284,17 @@ class Switch:
         neighbour, before = change
         if NeighbourState.UP in (neighbour.state, before):
             self._flooding.neighbour_changed(now_s)
+        if neighbour.state is not before:
+            self._neighbour_moved(change, now_s)
+        self.planter.link_resized(neighbour.port)
+
+    def _neighbour_moved(self, change: Change, now_s: float) -> None:
+        """Greet who came up, and let go of who is gone."""
+        neighbour, before = change
         if neighbour.state is NeighbourState.UP:
             self._revoker.tell_all(neighbour)
             self.planter.neighbour_up((neighbour.port, neighbour.mac), now_s)
+            self._seen_version = -1  # it may have another address now: what leads to it is computed anew
             if neighbour.role is Role.SWITCH:
                 self._flooding.sync(neighbour, now_s)
         elif before is NeighbourState.UP:

@@ -3,7 +3,8 @@
 Place: pure; time comes in as ``now_s`` (monotonic seconds).
 
 A reader's claim and each known publisher of its topic make a tree. A switch asks the next switch towards the publisher,
-again and again while a branch stands, and asks another one at once when the way changes.
+again and again while a branch stands, and asks another one at once when the way changes. A join says the smallest MTU
+below, so it is said anew at once when that changes: a reader came or left, or a link got narrower or wider.
 """
 
 from __future__ import annotations
@@ -129,21 +130,27 @@ class Planter:
         at = (neighbour.port, neighbour.mac)
         if join.lease_s == 0:
             tree = self.trees.get(join.topic, join.publisher)
-            if tree is not None:
+            if tree is not None and at in tree.branches and tree.branches[at].sequence < join.sequence:
                 self._cut(tree, at)
             return
         if self._policy.own not in join.allowed or neighbour.domain not in join.allowed:
             raise StatementError(DropReason.WRONG_DOMAIN, "a tree that must not pass here")
         tree = self._tree(join.topic, join.publisher, join.allowed)
-        is_known = at in tree.branches
+        before = tree.branches.get(at)
+        if before is not None and join.sequence < before.sequence:
+            return  # a newer one overtook it
         is_same_place = (tree.switch, tree.domain) == (join.switch, join.domain)
         tree.switch, tree.domain, tree.allowed = join.switch, join.domain, join.allowed
-        mtu = min(join.mtu, neighbour.mtu)
-        is_known = is_known and tree.branches[at].mtu == mtu
-        tree.branches[at] = Branch(now_s + min(join.lease_s, JOIN_LEASE_S), mtu, join.evidence)
+        branch = Branch(now_s + min(join.lease_s, JOIN_LEASE_S), join.mtu, join.evidence, join.mtu, join.sequence)
+        branch.fit(self._outbox.mtu_of(neighbour.port))
+        tree.branches[at] = branch
         self._plant(tree)
-        if not self._follow(tree, now_s) and not (is_known and is_same_place):
+        if self._follow(tree, now_s):
+            return
+        if before is None or not is_same_place:
             self._ask_above(tree, now_s)
+        else:
+            self._resize(tree)
 
     def neighbour_up(self, at: At, now_s: float) -> None:
         """Ask a neighbour again for what it was asked before its present session, of which it knows nothing."""
@@ -157,6 +164,14 @@ class Planter:
             self.remove_reader(topic, at)
         for tree in self.trees.all():
             self._cut(tree, at)
+
+    def link_resized(self, port: int) -> None:
+        """Tell the ones above of every tree to which the link on a port made a difference."""
+        for tree in self.trees.all():
+            for (its, _), branch in tree.branches.items():
+                if its == port:
+                    branch.fit(self._outbox.mtu_of(port))
+            self._resize(tree)
 
     def claims(self) -> list[tuple[Name, At, Claim]]:
         """Return the claims of all readers attached here, with their topic and place."""
@@ -219,6 +234,7 @@ class Planter:
     def _after_cut(self, tree: Tree) -> None:
         if tree.branches:
             self._plant(tree)
+            self._resize(tree)
             return
         self._table.remove(tree.key)
         self._leave(tree)
@@ -251,8 +267,17 @@ class Planter:
         if above is None:
             return
         tree.above, tree.above_name = above[:2], above[2]
-        mtu = min(tree.mtu, self._outbox.mtu_of(above[0]))
-        self._say(tree, mtu, JOIN_LEASE_S, tree.evidence)
+        tree.asked_mtu = min(tree.mtu, self._outbox.mtu_of(above[0]))
+        self._say(tree, tree.asked_mtu, JOIN_LEASE_S, tree.evidence)
+
+    def _resize(self, tree: Tree) -> None:
+        """Say at once, to the one above, that what fits its tree has changed."""
+        if tree.above is None:
+            return
+        mtu = min(tree.mtu, self._outbox.mtu_of(tree.above[0]))
+        if mtu != tree.asked_mtu:
+            tree.asked_mtu = mtu
+            self._say(tree, mtu, JOIN_LEASE_S, tree.evidence)
 
     def _leave(self, tree: Tree) -> None:
         if tree.above is not None:

@@ -9,18 +9,21 @@ Leases stand beside the entries, so that the hot dictionary holds nothing that f
 for every entry at least one item that is no later than the end of its lease; renewing a lease leaves the item alone,
 and it is put right when it comes to the top. So no operation looks at all entries, except a rebuild that as many
 changes have paid for.
+
+A data plane that keeps a copy elsewhere is told of every change before the call returns (``Observer``).
 """
 
 from __future__ import annotations
 
 import heapq
-from typing import Final
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final, Protocol
 
 from gdp.errors import LocalError
 from gdp.limits import TABLE_MAX
 from gdp.names import NAME_BYTES
 
-__all__ = ["MACS_BYTES", "NOWHERE", "Hop", "Hops", "Table"]
+__all__ = ["MACS_BYTES", "NOWHERE", "Hop", "Hops", "Observer", "Table"]
 
 MACS_BYTES: Final = 12  # destination MAC, source MAC: the first bytes of the frame that goes out
 
@@ -29,8 +32,20 @@ Hops = tuple[Hop, ...]
 
 NOWHERE: Final[Hops] = ()
 
+_KEY_SIZES: Final = (NAME_BYTES, 2 * NAME_BYTES)
+_UNSEEN: Final[tuple[Hops, Hops | None]] = (NOWHERE, None)
 _SHARED_MAX: Final = 4_096  # hop tuples remembered for sharing; a switch has far fewer different ones
 _SLACK: Final = 1_024  # stale heap items that are not yet worth a rebuild
+
+
+class Observer(Protocol):
+    """Whoever keeps a copy of the entries. It may not change the table, and has nowhere to refuse to."""
+
+    def put(self, items: Mapping[bytes, Hops]) -> None:
+        """Take entries that are new, or whose hops changed; a renewed lease alone is no news."""
+
+    def remove(self, keys: Sequence[bytes]) -> None:
+        """Take entries out."""
 
 
 class Table:
@@ -43,17 +58,25 @@ class Table:
         entries: key to hops. Data planes hold this very dictionary; it is never replaced.
     """
 
-    __slots__ = ("_ends", "_heap", "_max", "_shared", "entries")
+    __slots__ = ("_ends", "_heap", "_latest_s", "_max", "_observer", "_shared", "entries")
 
     def __init__(self, max_entries: int = TABLE_MAX) -> None:
         self.entries: dict[bytes, Hops] = {}
         self._ends: dict[bytes, float] = {}
         self._heap: list[tuple[float, bytes]] = []
+        self._latest_s = float("-inf")  # no end in the heap is later
         self._shared: dict[Hops, Hops] = {}
         self._max = max_entries
+        self._observer: Observer | None = None
 
     def __len__(self) -> int:
         return len(self.entries)
+
+    def observe(self, observer: Observer | None) -> None:
+        """Tell one observer of all entries there are, and from now on of each change; None: nobody."""
+        self._observer = observer
+        if observer is not None and self.entries:
+            observer.put(self.entries)
 
     def install(self, key: bytes, hops: Hops, expires_s: float) -> bool:
         """Put or replace an entry and its lease; False when the table is full and the key is new.
@@ -66,21 +89,63 @@ class Table:
         Raises:
             LocalError: a key or an address of another length.
         """
-        if len(key) not in (NAME_BYTES, 2 * NAME_BYTES):
-            raise LocalError(f"a table key has {NAME_BYTES} or {2 * NAME_BYTES} bytes, not {len(key)}")
-        if any(len(macs) != MACS_BYTES for _, macs in hops):
-            raise LocalError(f"a hop has {MACS_BYTES} bytes of addresses: destination MAC, source MAC")
+        _check(key, hops)
         known = self._ends.get(key)
         if known is None:
             if len(self.entries) >= self._max:
                 return False
             key = bytes(key)  # a plain one: looked up faster than a subclass
-        self.entries[key] = self._share(hops)
+        hops = self._share(hops)
+        is_news = self._observer is not None and self.entries.get(key) != hops
+        self.entries[key] = hops
         self._ends[key] = expires_s
+        self._latest_s = max(self._latest_s, expires_s)
         if known is None or expires_s < known:
             heapq.heappush(self._heap, (expires_s, key))
             self._rebuild_if_stale()
+        if self._observer is not None and is_news:
+            self._observer.put({key: hops})
         return True
+
+    def install_many(self, items: Iterable[tuple[bytes, Hops]], expires_s: float) -> int:
+        """Put or replace entries under one lease; return how many were taken: all, unless the table is full.
+
+        Raises:
+            LocalError: as ``install``; the items before the wrong one are in.
+        """
+        entries, ends = self.entries, self._ends
+        news: dict[bytes, Hops] = {}
+        sooner: list[bytes] = []
+        seen: dict[int, tuple[Hops, Hops]] = {}  # by identity, which costs less than a hash; holding them keeps it true
+        taken = 0
+        try:
+            for key, hops in items:
+                _, shared = seen.get(id(hops), _UNSEEN)
+                if shared is None or len(key) not in _KEY_SIZES:
+                    _check(key, hops)
+                    shared = self._share(hops)
+                    seen[id(hops)] = hops, shared
+                known = ends.get(key)
+                if known is None:
+                    if len(entries) >= self._max:
+                        continue
+                    key = bytes(key)  # noqa: PLW2901  (as in install)
+                    sooner.append(key)
+                    news[key] = shared
+                    entries[key] = shared
+                else:
+                    if expires_s < known:
+                        sooner.append(key)
+                    if entries[key] != shared:
+                        news[key] = shared
+                        entries[key] = shared
+                ends[key] = expires_s
+                taken += 1
+        finally:
+            self._expect(sooner, expires_s)
+            if self._observer is not None and news:
+                self._observer.put(news)
+        return taken
 
     def remove(self, key: bytes) -> bool:
         """Take an entry out; False when there was none."""
@@ -88,6 +153,8 @@ class Table:
             return False
         del self._ends[key]
         self._rebuild_if_stale()
+        if self._observer is not None:
+            self._observer.remove((key,))
         return True
 
     def expire(self, now_s: float) -> list[bytes]:
@@ -98,6 +165,8 @@ class Table:
             del self._ends[key]
             del self.entries[key]
             gone.append(key)
+        if self._observer is not None and gone:
+            self._observer.remove(gone)
         return gone
 
     def next_expiry(self) -> float | None:
@@ -118,6 +187,16 @@ class Table:
                 return True
         return False
 
+    def _expect(self, keys: list[bytes], expires_s: float) -> None:
+        """Take in the end of one lease, and the entries that it is sooner for than what the heap says."""
+        if expires_s >= self._latest_s:  # none in the heap is later, so they may stand behind it
+            self._latest_s = expires_s
+            self._heap += [(expires_s, key) for key in keys]
+        else:
+            for key in keys:
+                heapq.heappush(self._heap, (expires_s, key))
+        self._rebuild_if_stale()
+
     def _share(self, hops: Hops) -> Hops:
         """Return the one remembered tuple that equals ``hops``."""
         if len(self._shared) >= _SHARED_MAX:
@@ -128,3 +207,10 @@ class Table:
         if len(self._heap) > 2 * len(self.entries) + _SLACK:
             self._heap = [(end, key) for key, end in self._ends.items()]
             heapq.heapify(self._heap)
+
+
+def _check(key: bytes, hops: Hops) -> None:
+    if len(key) not in _KEY_SIZES:
+        raise LocalError(f"a table key has {NAME_BYTES} or {2 * NAME_BYTES} bytes, not {len(key)}")
+    if any(len(macs) != MACS_BYTES for _, macs in hops):
+        raise LocalError(f"a hop has {MACS_BYTES} bytes of addresses: destination MAC, source MAC")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from gdp.limits import FRAME_MAX_BYTES
 from gdp.names import Name
 from gdp.switch.table import Hops
 
@@ -21,8 +22,14 @@ class Branch:
     """One neighbour below that wants a copy."""
 
     expires_s: float
-    mtu: int  # smallest on the way down
+    mtu: int  # smallest on the way down, the link to that neighbour included
     evidence: bytes  # the signed claim of a reader down there
+    said_mtu: int = FRAME_MAX_BYTES  # what the neighbour said of the way; a reader says nothing
+    sequence: int = 0  # of its last join
+
+    def fit(self, link_mtu: int) -> None:
+        """Take in what the link to the neighbour takes now."""
+        self.mtu = min(self.said_mtu, link_mtu)
 
 
 @dataclass(slots=True)
@@ -38,6 +45,7 @@ class Tree:
     above: At | None = None  # whom the last join went to
     above_name: Name | None = None
     renew_at_s: float = 0.0
+    asked_mtu: int = 0  # what the last join said
 
     @property
     def key(self) -> bytes:

@@ -20,11 +20,13 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.registry import Collector
 
 from gdp.errors import DropReason, LocalError
+from gdp.names import NAME_BYTES, Name
 
 __all__ = ["LATENCY_BOUNDS_S", "Histogram", "Metrics", "Sources"]
 
 LATENCY_BOUNDS_S: Final = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 _LOOPBACK: Final = "127.0.0.1"
+_ANY: Final = "any"  # an entry for every source
 
 
 class Histogram:
@@ -50,6 +52,7 @@ class Histogram:
 
 Counts = Callable[[], Mapping[str, int]]  # label value to count
 Gauge = Callable[[], float]
+EntryCounts = Callable[[], Mapping[bytes, tuple[int, int]]]  # table key to frames and bytes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,6 +63,7 @@ class Sources:
         frames: by direction: in, out, forwarded, handed-up.
         drops: lists of counts by ``DropReason``, added up.
         table_entries: entries of the forwarding table.
+        entries: frames and bytes forwarded by the busiest entries, by the table's key.
         parked_frames: frames that wait for an answer.
         rib_answers: a RIB's answers by what they said.
         rib_refusals: a RIB's refusals by reason.
@@ -72,6 +76,7 @@ class Sources:
     frames: Counts | None = None
     drops: Sequence[Callable[[], Sequence[int]]] = ()
     table_entries: Gauge | None = None
+    entries: EntryCounts | None = None
     parked_frames: Gauge | None = None
     rib_answers: Counts | None = None
     rib_refusals: Counts | None = None
@@ -101,6 +106,7 @@ class Metrics(Collector):
         if of.drops:
             yield from _counter("gdp_drops", "What went no further, by reason", "reason", self._drops)
         yield from _gauge("gdp_table_entries", "Entries of the forwarding table", of.table_entries)
+        yield from _entries(of.entries)
         yield from _gauge("gdp_parked_frames", "Frames waiting for an answer", of.parked_frames)
         yield from _counter("gdp_rib_answers", "Answers by what they said", "answer", of.rib_answers)
         yield from _counter("gdp_rib_refusals", "Refusals by reason", "reason", of.rib_refusals)
@@ -149,6 +155,25 @@ def _counter(name: str, text: str, label: str, source: Counts | None) -> Iterato
         for value, count in list(source().items()):  # at once: the node goes on counting
             family.add_metric([value], count)
         yield family
+
+
+def _entries(source: EntryCounts | None) -> Iterator[Metric]:
+    """Tell of entries by short names: a whole one would let whoever reads a graph ask for the topic."""
+    if source is None:
+        return
+    labels = ["destination", "source"]
+    frames = CounterMetricFamily("gdp_entry_frames", "Frames forwarded by the busiest entries", labels=labels)
+    sizes = CounterMetricFamily("gdp_entry_bytes", "Their bytes", labels=labels)
+    sums: dict[tuple[str, str], tuple[int, int]] = {}
+    for key, (count, size) in source().items():
+        names = Name(key[:NAME_BYTES]).short, Name(key[NAME_BYTES:]).short if len(key) > NAME_BYTES else _ANY
+        before = sums.get(names, (0, 0))
+        sums[names] = before[0] + count, before[1] + size
+    for names, (count, size) in sums.items():
+        frames.add_metric(names, count)
+        sizes.add_metric(names, size)
+    yield frames
+    yield sizes
 
 
 def _gauge(name: str, text: str, source: Gauge | None) -> Iterator[Metric]:

@@ -116,11 +116,21 @@ class MemoryNetwork:
     def set_link(self, cable: Cable, up: bool) -> None:
         """Pull a cable or put it back; both ends notice at once, as they do on a real port."""
         cable.is_up = up
-        for name, node in self._nodes.items():
-            for port, (its, _, _) in node.ports.items():
-                if its is cable:
-                    node.machine.port_changed(port, up, self.now)
-                    self._settle(name)
+        self._tell(cable)
+
+    def set_mtu(self, cable: Cable, mtu: int) -> None:
+        """Let a cable take other sizes, in bytes after the Ethernet header; both ends notice at once.
+
+        What is under way on it still arrives.
+        """
+        cable.mtu = mtu
+        self._tell(cable)
+
+    def set_cost(self, cable: Cable, cost: int) -> None:
+        """Make a cable dearer or cheaper at both ends."""
+        for node in self._nodes.values():
+            node.costs |= {port: cost for port, (its, _, _) in node.ports.items() if its is cable}
+        self._tell(cable)
 
     def stop(self, name: str) -> None:
         """Kill a node: it says no goodbye."""
@@ -166,6 +176,18 @@ class MemoryNetwork:
         """Let a frame (from its header on) come in at a node's port, as if a stranger on the link had sent it."""
         _, own, _ = self._nodes[name].ports[port]
         self._deliver(own, ethernet(BROADCAST, mac) + frame)
+
+    def _tell(self, cable: Cable) -> None:
+        """Tell both ends of a cable how it now is, as a node's shell does."""
+        for name, node in self._nodes.items():
+            for port, (its, own, _) in node.ports.items():
+                if its is not cable or not node.is_alive:
+                    continue
+                if cable.is_up:
+                    node.machine.add_port(port, own.mac, cable.mtu, node.costs[port], self.now)
+                else:
+                    node.machine.port_changed(port, False, self.now)
+                self._settle(name)
 
     def _mac(self) -> bytes:
         self._count += 1

@@ -43,11 +43,13 @@ class World:
         trusts: for each domain label, the labels it trusts; None: everyone trusts everyone.
         transits: for a domain label, the labels through which its traffic may pass; all trusted ones if not given.
         delay_s: of every link between switches.
+        lead_mtu: of the links to members and RIBs, in bytes after the Ethernet header.
     """
 
     topology: Topology
     seed: int = 1
     delay_s: float = 0.0005
+    lead_mtu: int = 1_500
     hello_s: float = HELLO_S
     dead_s: float = DEAD_S
     trusts: dict[str, tuple[str, ...]] | None = None
@@ -108,7 +110,7 @@ class World:
         member = Member(self.identity(Role.PROXY, label, domain), self.policy(domain), self._settings())
         self.members[label] = member
         self.network.add(label, member)
-        self.leads[label] = self.network.connect(switch, label, Cable(0.0001))
+        self.leads[label] = self.network.connect(switch, label, Cable(0.0001, mtu=self.lead_mtu))
         return member
 
     def restart_member(self, label: str) -> Member:
@@ -123,7 +125,7 @@ class World:
     def roam(self, label: str, switch: str) -> None:
         """Pull a member's cable and put one in at another switch."""
         self.network.set_link(self.leads[label], up=False)
-        self.leads[label] = self.network.connect(switch, label, Cable(0.0001))
+        self.leads[label] = self.network.connect(switch, label, Cable(0.0001, mtu=self.lead_mtu))
 
     def topic(self, name: str, member: Member, rights: Collection[Right], **metadata: str) -> Topic:
         """Return a topic of the owner's, delegated to a member."""
@@ -165,7 +167,7 @@ class World:
 
     def _add_rib(self, label: str, switch: str) -> None:
         self.network.add(label, self._rib(self.topology.domain_of(switch).label))
-        self.leads[label] = self.network.connect(switch, label, Cable(0.0001))
+        self.leads[label] = self.network.connect(switch, label, Cable(0.0001, mtu=self.lead_mtu))
 
     def _rib(self, label: str) -> RibHost:
         domain = next(each for each in self.topology.domains if each.label == label)

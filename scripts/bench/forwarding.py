@@ -1,244 +1,228 @@
-"""How many frames a second pass three switches, and how long a round trip takes: raw and scapy, side by side.
+"""How many frames a second one and three switches carry, how long a round trip takes, what a frame costs.
 
-    sudo .venv/bin/python scripts/bench/forwarding.py [--json FILE] [--frame-bytes 1400] [--mtu 1500] [--plane raw ...]
+    sudo .venv/bin/python scripts/bench/forwarding.py                      minutes; JSON and plot to docs/benchmarks
+    sudo .venv/bin/python scripts/bench/forwarding.py --quick --no-save    a few seconds, to see that all works
+    sudo .venv/bin/python scripts/bench/forwarding.py --only kernel --only bridge --rounds 5
 
-Five namespaces in a chain (A - S1 - S2 - S3 - B) joined by veth pairs, one process in each: a source, three switches
-with a static table, a sink. The figure is the highest rate at which the sink gets all but 0.5 % of the frames *and* the
-last one comes within 0.1 s of the last sending: a rate that only fills queues does not count. A rate that fails is
-tried once more, because whatever else a machine does can spoil a single try. Round trips are then taken of single
-frames of 100 bytes payload, by ends that sleep in epoll as real ones do (with fewer cores than processes, ends that
-spin would take the switches' time). Everything made is removed, whatever happens.
+Our planes (scapy, raw, kernel with and without redirect_peer), the Linux bridge and the kernel's IPv4 forwarding stand
+in the same chain of namespaces, one after the other, and so again each round. Per size of frame and length of chain:
+
+frames/s            highest rate at which less than 0.1 % is lost and the last frame comes at once (``search.py``)
+RTT, polling ends   of single frames, by ends that ask their socket again and again: the path alone; not measured for
+                    planes that are processes where these would share the ends' cores
+RTT, sleeping ends  by ends that wait in epoll, as nodes do
+CPU µs/frame        at that rate: the source, soft interrupts (forwarding in the kernel is done by the sender's own, so
+                    it shows as the source's time) and switch processes; the sink is left out
+forwarding's part, forwarding's share: round trip and CPU, less what the ends side by side take in the same round
+
+All frames leave through AF_PACKET, IPv4 ones too, so that the source costs the same for all, and no offload takes part.
+Everything made is removed, whatever happens.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import platform
 import signal
 import statistics
-import subprocess
 import sys
+from collections.abc import Sequence
 from contextlib import ExitStack
-from itertools import pairwise
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Final
 
-from pyroute2 import NetNS, netns
+from chains import Chain
+from contenders import Bridge, Contender, Direct, IPv4, Plane
+from machine import machine_state, offload_text
+from plot import panel_of, require_plot, save_bars
+from report import Goal, Rounds, percentile, progress, show, write_json
+from search import LOSS_MAX, highest
 
-NODES = ("a", "s1", "s2", "s3", "b")
-LOSS_MAX = 0.005
-LATE_MAX_S = 0.1
-OVERHEAD_BYTES = 110
+from gdp.errors import LocalError
+from gdp.testbed.runs import Runs
+
+SIZES: Final = {1_500: (128, 1_400), 9_000: (8_900,)}
+LENGTHS: Final = (1, 3)
+OURS: Final = ("kernel", "kernel, redirect", "raw", "scapy")
+OTHERS: Final = ("bridge", "IPv4")
+GUESSES: Final = {"raw": 80_000.0, "scapy": 1_500.0}
+RATE, LOSS, SINK_LOSS = "frames/s", "loss %", "of it at the sink %"
+CPU, SHARE = "CPU µs/frame", "forwarding's share, µs"
+POLLED, POLLED_P99, PART = "RTT µs, polling ends: median", "p99, polling", "forwarding's part, µs"
+SLEPT, SLEPT_P99 = "RTT µs, sleeping ends: median", "p99, sleeping"
+OUTPUT: Final = Path(__file__).parents[2] / "docs" / "benchmarks"
 
 
-def mac(node: int, side: str) -> str:
-    return f"02:00:00:00:{node:02x}:{1 if side == 'left' else 2:02x}"
+class Bench:
+    """The rounds of one run: what is known so far, and how to measure one contender in one chain."""
 
+    def __init__(self, seconds: float, pings: int) -> None:
+        self.over = Rounds()
+        self._seconds = seconds
+        self._pings = pings
+        self._guesses: dict[tuple[str, str], float] = {}
+        self._ends_cpu: dict[int, float] = {}
+        self._ends_trip: dict[int, float] = {}
 
-class Chain:
-    """The five namespaces; a context manager."""
+    def measure(self, contender: Contender, chain: Chain, sizes: Sequence[int], lengths: Sequence[int]) -> None:
+        """Set a contender up, measure each size, take it down; say why if it cannot be had.
 
-    def __init__(self, mtu: int) -> None:
-        self.names = [f"gdp-bench-{os.getpid()}-{node}" for node in NODES]
-        self.mtu = mtu
-
-    def __enter__(self) -> Chain:
+        Args:
+            contender: who.
+            chain: where.
+            sizes: of frames, bytes.
+            lengths: the chains whose tables the figures stand in.
+        """
+        if contender.name in self.over.reasons:
+            return
         try:
-            for name in self.names:
-                netns.create(name)
-            for at, (name, beyond) in enumerate(pairwise(self.names)):
-                peer = {"ifname": "left", "net_ns_fd": beyond, "address": mac(at + 1, "left"), "mtu": self.mtu}
-                with NetNS(name) as here:
-                    here.link("add", ifname="right", kind="veth", address=mac(at, "right"), mtu=self.mtu, peer=peer)
-            for name in self.names:
-                with NetNS(name) as here:
-                    for link in here.get_links():
-                        here.link("set", index=link["index"], state="up")
-        except BaseException:
-            self.__exit__()
-            raise
-        return self
+            standing = contender.stand(chain)
+        except LocalError as error:
+            self.over.absent(contender.name, str(error))
+            return
+        with standing:
+            for size in sizes:
+                figures = self._figures(contender, chain, size)
+                for length in lengths:
+                    for column, value in figures.items():
+                        self.over.add(contender.name, case_of(size, length), column, value)
 
-    def __exit__(self, *_: object) -> None:
-        for name in self.names:
-            if Path("/run/netns", name).exists():
-                netns.remove(name)
-
-
-class Process:
-    """One role in one namespace, asked by lines; a context manager that ends it."""
-
-    def __init__(self, chain: Chain, node: int, role: str, **settings: Any) -> None:
-        macs = {"left": mac(node - 1, "right"), "right": mac(node + 1, "left")}  # the neighbours' addresses
-        macs = {side: text.replace(":", "") for side, text in macs.items() if 0 <= node + (1, -1)[side == "left"] < 5}
-        arguments = {"namespace": chain.names[node], "role": role, "macs": macs, **settings}
-        self._process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).with_name("roles.py")), json.dumps(arguments)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-
-    def __enter__(self) -> Process:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._process.kill()
-        self._process.communicate()
-
-    def read(self) -> dict[str, Any]:
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if not line:
-            raise SystemExit("a process of the benchmark ended early; see above")
-        return dict(json.loads(line))
-
-    def ask(self, **values: Any) -> dict[str, Any]:
-        assert self._process.stdin is not None
-        self._process.stdin.write(json.dumps(values) + "\n")
-        self._process.stdin.flush()
-        return self.read()
+    def _figures(self, contender: Contender, chain: Chain, size: int) -> dict[str, float | None]:
+        wire, workers = contender.wire(chain, size), contender.workers()
+        pings = min(self._pings, 50) if contender.name == "scapy" else self._pings
+        slept = chain.round_trips(wire, pings, poll=False)
+        apart = not contender.processes or len(os.sched_getaffinity(0)) >= 2 + len(workers)
+        polled = chain.round_trips(wire, pings, poll=True) if apart else []
+        trip = statistics.median(polled) if polled else None
+        if trip is not None and not chain.switches:
+            self._ends_trip[size] = trip
+        asked = contender.name, case_of(size, chain.switches)
+        guess = self._guesses.get(asked, GUESSES.get(contender.name)) if contender.processes else None
+        best = highest(lambda rate: chain.attempt(wire, workers, rate, self._seconds), guess)
+        cpu = share = None
+        if best is not None:
+            self._guesses[asked] = best.rate
+            cpu = best.cpu_s / best.got * 1e6
+            if not chain.switches:
+                self._ends_cpu[size] = cpu
+            share = cpu - self._ends_cpu[size] if chain.switches and size in self._ends_cpu else None
+        return {
+            RATE: best.rate if best else None,
+            LOSS: best.loss * 100 if best else None,
+            SINK_LOSS: best.sink_drops / best.sent * 100 if best else None,
+            POLLED: trip,
+            POLLED_P99: percentile(polled, 0.99) if polled else None,
+            PART: trip - self._ends_trip[size] if trip and chain.switches and size in self._ends_trip else None,
+            SLEPT: statistics.median(slept) if slept else None,
+            SLEPT_P99: percentile(slept, 0.99) if slept else None,
+            CPU: cpu,
+            SHARE: share,
+        }
 
 
-def attempt(source: Process, sink: Process, rate: float, seconds: float) -> dict[str, float]:
-    """Send at one rate, again if it does not hold; return what came of it."""
-    tried = once(source, sink, rate, seconds)
-    return tried if holds(tried, rate) else once(source, sink, rate, seconds)
+def case_of(size: int, switches: int) -> str:
+    """Return what a table is headed with."""
+    return f"{size:,} B, {switches} switch{'es' if switches > 1 else ''}"
 
 
-def once(source: Process, sink: Process, rate: float, seconds: float) -> dict[str, float]:
-    sink.ask(silence_s=0.05)
-    sent = source.ask(do="send", rate=rate, seconds=seconds)
-    got = sink.ask(silence_s=0.5)
-    span = sent["end_s"] - sent["start_s"]
-    return {
-        "rate": sent["sent"] / span,
-        "loss": 1 - got["got"] / sent["sent"],
-        "late_s": got["last_s"] - sent["end_s"],
-        "sink_drops": got["kernel_drops"],
-    }
+def contenders_of(only: Sequence[str]) -> list[Contender]:
+    """Return the contenders asked for, all without a wish; those that are compared follow each other closely."""
+    quick: list[Contender] = [*(Plane(name, processes=False) for name in OURS if name not in GUESSES), Bridge(), IPv4()]
+    known = [*quick, *(Plane(name, processes=True) for name in OURS if name in GUESSES)]
+    return [each for each in known if not only or each.name in only]
 
 
-def holds(tried: dict[str, float], rate: float) -> bool:
-    return tried["loss"] < LOSS_MAX and tried["late_s"] < LATE_MAX_S and tried["rate"] > 0.95 * rate
-
-
-def highest(source: Process, sink: Process, guess: float, seconds: float, steps: int) -> dict[str, float]:
-    """Find the highest rate that holds: step up or down to bracket it, then bisect."""
-    low, high, best = 0.0, 0.0, {"rate": 0.0, "loss": 1.0, "late_s": 0.0, "sink_drops": 0.0}
-    rate = guess
-    for _ in range(12):
-        tried = attempt(source, sink, rate, seconds)
-        if holds(tried, rate):
-            low, best = rate, tried
-            if high:
-                break
-            rate *= 1.6
-        else:
-            high = rate
-            if low:
-                break
-            rate /= 1.6
-    for _ in range(steps):
-        rate = (low + high) / 2
-        tried = attempt(source, sink, rate, seconds)
-        if holds(tried, rate):
-            low, best = rate, tried
-        else:
-            high = rate
-    return best
-
-
-def measure(chain: Chain, plane: str, options: argparse.Namespace) -> dict[str, Any]:
-    payload = options.frame_bytes - OVERHEAD_BYTES
-    guess, pings = (80_000.0, 2_000) if plane == "raw" else (1_500.0, 200)
-    with ExitStack() as stack:
-        switches = [stack.enter_context(Process(chain, node, "switch", plane_kind=plane)) for node in (1, 2, 3)]
-        source = stack.enter_context(Process(chain, 0, "source", payload_bytes=payload))
-        with Process(chain, 4, "sink") as sink:
-            for process in (*switches, source, sink):
-                process.read()
-            best = highest(source, sink, guess, options.seconds, options.steps)
-            before = switches[1].ask()
-            again = attempt(source, sink, best["rate"] * 0.9, options.seconds)
-            after = switches[1].ask()
-        with Process(chain, 4, "echo") as echo:
-            echo.read()
-            times = sorted(source.ask(do="ping", count=pings, payload_bytes=100)["rtt_us"])
-    frames = after["forwarded"] - before["forwarded"]
-    return {
-        "plane": plane,
-        "frames_per_s": round(best["rate"]),
-        "loss": round(max(0.0, best["loss"]), 5),
-        "gbit_per_s": round(best["rate"] * options.frame_bytes * 8 / 1e9, 3),
-        "loss_at_90_percent": round(max(0.0, again["loss"]), 5),
-        "switch_cpu_us_per_frame": round((after["cpu_s"] - before["cpu_s"]) / max(frames, 1) * 1e6, 2),
-        "switch_rss_mib": round(after["rss_mib"], 1),
-        "rtt_us": {
-            "median": round(statistics.median(times), 1) if times else None,
-            "p99": round(times[int(len(times) * 0.99)], 1) if times else None,
-            "answered": len(times),
-            "asked": pings,
-        },
-    }
-
-
-def offloads(chain: Chain) -> str:
-    shown = subprocess.run(
-        ["ip", "-n", chain.names[0], "-d", "link", "show", "right"], capture_output=True, text=True, check=False
-    ).stdout
-    words = shown.split()
-    return " ".join(f"{key}={words[words.index(key) + 1]}" for key in ("gso_max_size", "gro_max_size") if key in words)
+def goals_of(over: Rounds) -> list[Goal]:
+    """Return the figures that the kernel plane is to reach, all in the longer chain."""
+    case, plain = case_of(1_400, 3), "kernel, redirect"
+    return [
+        over.ratio(f"{case}: kernel by plain redirect / bridge, frames/s", plain, "bridge", case, RATE, 1.3),
+        over.ratio(f"{case}: kernel / bridge, frames/s", "kernel", "bridge", case, RATE, 1.7),
+        over.ratio(
+            f"{case}: kernel / IPv4, RTT median by polling ends", "kernel", "IPv4", case, POLLED, 0.7, at_most=True
+        ),
+        over.ratio(
+            f"{case}: kernel / IPv4, RTT median by sleeping ends", "kernel", "IPv4", case, SLEPT, None, at_most=True
+        ),
+        over.ratio(f"{case}: kernel / IPv4, forwarding's part of the RTT", "kernel", "IPv4", case, PART, None),
+        over.ratio(f"{case}: kernel / bridge, forwarding's share of the CPU", "kernel", "bridge", case, SHARE, None),
+    ]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--json", type=Path, help="also write the result to this file")
-    parser.add_argument("--plane", choices=("raw", "scapy"), action="append", help="only this plane (default: both)")
-    parser.add_argument("--frame-bytes", type=int, default=1400, help="whole frame, Ethernet header included")
-    parser.add_argument("--mtu", type=int, default=1500)
-    parser.add_argument("--seconds", type=float, default=2.0, help="length of one try")
-    parser.add_argument("--steps", type=int, default=5, help="bisections")
+    """Run the bench."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=0.3, help="length of one try")
+    parser.add_argument("--only", action="append", choices=[*OURS, *OTHERS], default=[], help="may be repeated")
+    parser.add_argument("--realtime", action="store_true", help="SCHED_FIFO for every process alike")
+    parser.add_argument("--quick", action="store_true", help="one short round of 1,400 bytes: does everything work?")
+    parser.add_argument("--json", type=Path, default=OUTPUT / "forwarding.json")
+    parser.add_argument("--plot", type=Path, default=OUTPUT / "forwarding.png")
+    parser.add_argument("--no-plot", action="store_true")
+    parser.add_argument("--no-save", action="store_true", help="print only")
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
-    planes = options.plane or ["raw", "scapy"]
-    with Chain(options.mtu) as chain:
-        result: dict[str, Any] = {
-            "kernel": platform.release(),
-            "python": platform.python_version(),
-            "cores": len(os.sched_getaffinity(0)),
-            "mtu": options.mtu,
-            "frame_bytes": options.frame_bytes,
-            "offloads": offloads(chain),
-            "load_before": os.getloadavg()[0],
-            "planes": [measure(chain, plane, options) for plane in planes],
-        }
-    rates = {one["plane"]: one["frames_per_s"] for one in result["planes"]}
-    if len(rates) == 2:
-        result["raw_over_scapy"] = round(rates["raw"] / max(rates["scapy"], 1), 1)
-    show(result)
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=2) + "\n")
+    state = machine_state()
+    if not (options.no_plot or options.no_save):
+        require_plot()
+    if options.realtime:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    sizes = {1_500: (1_400,)} if options.quick else SIZES
+    rounds, seconds, pings = (1, 0.15, 200) if options.quick else (options.rounds, options.seconds, 1_000)
+    bench, runs = Bench(seconds, pings), Runs()
+    runs.sweep()
+    try:
+        with ExitStack() as undo:
+            chains = {length: undo.enter_context(Chain(runs, length, 1_500)) for length in (0, *LENGTHS)}
+            found = offload_text(chains[LENGTHS[-1]].offloads())
+            for number in range(rounds):
+                for mtu, bytes_each in sizes.items():
+                    for chain in chains.values():
+                        chain.set_mtu(mtu)
+                    progress(f"round {number + 1} of {rounds}, MTU {mtu}: ends alone")
+                    bench.measure(Direct(), chains[0], bytes_each, LENGTHS)
+                    for length in LENGTHS:
+                        for contender in contenders_of(options.only):
+                            progress(
+                                f"round {number + 1} of {rounds}, MTU {mtu}, {length} in the middle: {contender.name}"
+                            )
+                            bench.measure(contender, chains[length], bytes_each, [length])
+    except KeyboardInterrupt:
+        sys.exit("stopped; everything that was made is gone")
+    except LocalError as error:
+        sys.exit(str(error))
+    settings = {
+        "rounds": rounds,
+        "seconds a try": seconds,
+        "pings": pings,
+        "loss below": LOSS_MAX,
+        "MTU": list(sizes),
+        "cores": "source 0, sink 1, switches anywhere",
+        "scheduler": "SCHED_FIFO" if options.realtime else "ordinary",
+        "offloads of the devices (none touches AF_PACKET frames)": found,
+    }
+    goals = goals_of(bench.over)
+    show("Forwarding", state, settings, bench.over, goals)
+    if options.no_save:
+        return
+    write_json(options.json, "forwarding", state, settings, bench.over, goals)
+    if not options.no_plot:
+        draw(options.plot, str(state), bench.over)
 
 
-def show(result: dict[str, Any]) -> None:
-    print(
-        f"kernel {result['kernel']}, Python {result['python']}, {result['cores']} cores,"
-        f" load {result['load_before']:.2f}, MTU {result['mtu']}, frames of {result['frame_bytes']} bytes,"
-        f" veth {result['offloads']}"
-    )
-    heads = f"{'plane':8}{'frames/s':>10}{'Gbit/s':>8}{'loss':>8}{'RTT µs':>9}{'p99':>8}"
-    print(f"{heads}{'CPU µs/frame':>14}{'RSS MiB':>9}")
-    for one in result["planes"]:
-        rtt = one["rtt_us"]
-        print(
-            f"{one['plane']:8}{one['frames_per_s']:>10}{one['gbit_per_s']:>8}{one['loss']:>8.3%}{rtt['median']!s:>9}"
-            f"{rtt['p99']!s:>8}{one['switch_cpu_us_per_frame']:>14}{one['switch_rss_mib']:>9}"
-        )
-    if "raw_over_scapy" in result:
-        print(f"raw carries {result['raw_over_scapy']} times what scapy carries")
+def draw(path: Path, footer: str, over: Rounds) -> None:
+    """Draw rates of each size, round trips and costs, in the longer chain."""
+    everyone = (*OURS, *OTHERS, "ends alone")
+    panel = partial(panel_of, over, ours=OURS)
+    case = case_of(1_400, LENGTHS[-1])
+    rates = [panel(each, RATE, everyone) for each in over.cases() if each.endswith(f"{LENGTHS[-1]} switches")]
+    trips = [
+        panel(case, POLLED, everyone, p99=POLLED_P99, log=True),
+        panel(case, SLEPT, everyone, p99=SLEPT_P99, log=True),
+    ]
+    save_bars(path, "Forwarding", footer, [*rates, panel(case, SHARE, everyone, log=True), *trips])
 
 
 if __name__ == "__main__":

@@ -1,190 +1,130 @@
-"""The processes of the forwarding benchmark, each in a namespace of its own: switch, source, sink, echo.
+"""The processes of the forwarding and scale benches, each in a namespace of its own: ``switch`` and ``end``.
 
-Started by ``forwarding.py``. Each reads commands as JSON lines on stdin and answers every one with a JSON line.
+Started by ``worker.py``. Each reads commands as JSON lines on stdin and answers every one with a JSON line.
 """
 
 from __future__ import annotations
 
-import ctypes
+import gc
 import json
 import os
-import resource
-import select
-import struct
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
-from gdp.frame.codec import ETHER_BYTES, HEADER_BYTES, Header, encode
-from gdp.frame.kinds import Kind
-from gdp.limits import HOPS_MAX
+from ends import answer_pings, count_frames, ping, send, spread_frames
+from fill import ENTRY_LEASE_S, fill, resident_bytes
+from frames import NAME_AT, SINK, SOURCE, spread_names
+from worker import answer, command, command_waits, integer
 
-CLONE_NEWNET = 0x40000000
-SINK, SOURCE = bytes([0xB0]) * 32, bytes([0xA0]) * 32
-ECHO = bytes([0xE0]) * 32
-NUMBER = struct.Struct("!Q")
-NUMBER_AT = ETHER_BYTES + 8
-
-
-def enter(namespace: str) -> None:
-    """Move this process into a named network namespace."""
-    fd = os.open(f"/run/netns/{namespace}", os.O_RDONLY)
-    library = ctypes.CDLL(None, use_errno=True)
-    if library.setns(fd, CLONE_NEWNET):
-        raise OSError(ctypes.get_errno(), f"setns {namespace}")
-    os.close(fd)
+from gdp.errors import DropReason, LocalError
+from gdp.ports.linked import LinkedPlane
+from gdp.switch.table import Table
 
 
-def answer(**values: Any) -> None:
-    print(json.dumps(values), flush=True)
+def make_plane(kind: str, ifnames: list[str], table: Table, entries_max: int) -> LinkedPlane:
+    """Return a plane by its name in the benches.
 
-
-def command() -> dict[str, Any]:
-    line = sys.stdin.readline()
-    if not line:
-        sys.exit(0)
-    return dict(json.loads(line))
-
-
-def resident_mib() -> float:
-    """Return what this process holds now; its recorded maximum would include the parent's, from before exec."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / (1 << 20)
-
-
-def make_plane(kind: str, ifnames: list[str], table: Any) -> Any:
+    Raises:
+        LocalError: it is not to be had here; says why.
+    """
     if kind == "scapy":
         from gdp.ports.scapy_plane import ScapyPlane
 
         return ScapyPlane(ifnames, table)
-    from gdp.ports.raw import RawPlane
+    if kind == "raw":
+        from gdp.ports.raw import RawPlane
 
-    return RawPlane(ifnames, table)
+        return RawPlane(ifnames, table)
+    from gdp.ports.kernel.plane import KernelPlane
+
+    return KernelPlane(ifnames, table, entries_max=entries_max, peer=kind == "kernel")
 
 
-def switch(plane_kind: str, macs: dict[str, str], **_: Any) -> None:
-    """Forward between two ports by a static table, until stdin closes."""
-    from gdp.switch.table import Table
+def switch(plane: str, ways: dict[str, str], names: int = 0, **_: Any) -> None:
+    """Forward by a static table until stdin closes.
 
-    table = Table()
-    plane = make_plane(plane_kind, ["left", "right"], table)
-    own = {port.ifname: port for port in plane.ports.values()}
-    for name, ifname in ((SINK, "right"), (ECHO, "right"), (SOURCE, "left")):
-        table.install(name, ((own[ifname].index, bytes.fromhex(macs[ifname]) + own[ifname].mac),), float("inf"))
+    Args:
+        plane: which one.
+        ways: the devices towards the source ("left") and the sink ("right"), each "device neighbour's-MAC" in hex.
+        names: entries beside those two; all lead to the right.
+    """
+    left, right = (ways[side].split() for side in ("left", "right"))
+    entries_max = max(names + 2, 1_024)
+    table = Table(entries_max)
+    try:
+        made = make_plane(plane, [left[0], right[0]], table, entries_max)
+    except LocalError as error:
+        answer({"refused_because": str(error)})
+        return
+    own = {port.ifname: port for port in made.ports.values()}
+    hops = {
+        name: ((own[ifname].index, bytes.fromhex(mac) + own[ifname].mac),)
+        for name, (ifname, mac) in ((SINK, right), (SOURCE, left))
+    }
+    for name, hop in hops.items():
+        table.install(name, hop, ENTRY_LEASE_S)
 
     def asked() -> None:
-        command()
-        counters, used = plane.counters, resource.getrusage(resource.RUSAGE_SELF)
+        if not (line := sys.stdin.readline()):
+            made.close()
+            sys.exit(0)
+        if json.loads(line).get("do") == "fill":
+            answer(fill(table, names, hops[SINK]))
+            return
+        drops = made.counters.drops
         answer(
-            frames_in=counters.frames_in,
-            forwarded=counters.forwarded,
-            drops=sum(counters.drops),
-            cpu_s=used.ru_utime + used.ru_stime,
-            rss_mib=resident_mib(),
+            {
+                "drops": {reason.name: lost for reason in DropReason if (lost := drops[reason])},
+                "cpu_s": time.process_time(),
+                "rss_mib": resident_bytes() / (1 << 20),
+            }
         )
 
-    plane.watch(sys.stdin, asked)
-    answer(event="ready")
+    made.watch(sys.stdin, asked)
+    gc.collect()
+    gc.freeze()
+    answer({"event": "ready"})
     while True:
-        plane.poll(None)
+        made.poll(None)
 
 
-def source(payload_bytes: int, macs: dict[str, str], **_: Any) -> None:
-    """Send numbered frames at a given rate, or measure round trips one frame at a time."""
-    from gdp.ports.batch import SLOTS, make_batch
-    from gdp.ports.raw import RawPlane
-    from gdp.ports.sockets import open_port
-
-    header = Header(Kind.DATA, 0, HOPS_MAX, 1, payload_bytes, 0, 0, 1, 1, SINK, SOURCE)
-    plane = RawPlane(["right"])
-    own, hop_mac = plane.ports[0], bytes.fromhex(macs["right"])
-    answer(event="ready")
+def end(ifname: str, **_: Any) -> None:
+    """Send, count, ping or answer on one device, as told."""
+    answer({"event": "ready"})
+    gc.freeze()
+    gc.disable()
     while True:
-        asked = command()
-        if asked["do"] == "ping":
-            answer(rtt_us=ping(plane, hop_mac, asked["count"], asked["payload_bytes"]))
-            continue
-        sock, batch = open_port("right"), make_batch(own.mtu + ETHER_BYTES)
-        rate, seconds = asked["rate"], asked["seconds"]
-        batch.fill([encode(header) + os.urandom(payload_bytes)] * SLOTS)
-        burst, total = max(1, min(SLOTS, int(rate / 1000))), int(rate * seconds)
-        drops, step, sent = [0] * 64, batch.slot_bytes, 0
-        start = time.monotonic()
-        while sent < total:
-            behind = (time.monotonic() - start) * rate - sent
-            if behind < burst:
-                time.sleep((burst - behind) / rate)
-                continue
-            for slot in range(burst):
-                NUMBER.pack_into(batch.pool, slot * step + NUMBER_AT, sent + slot)
-            batch.put(sock, 0, burst, hop_mac + own.mac, drops)
-            sent += burst
-        answer(sent=sent, refused=sum(drops), start_s=start, end_s=time.monotonic())
-        sock.close()
+        told: dict[str, Any] = command()
+        ethertype = told.get("ethertype", 0)
+        frame = bytes.fromhex(told.get("frame", ""))
+        if told["do"] == "send":
+            names = spread_names(told["names"], told["of"]) if told["names"] else []
+            frames = spread_frames(frame, NAME_AT, names) if names else [frame]
+            answer(send(ifname, frames, told["rate"], told["seconds"])._asdict())
+        elif told["do"] == "count":
+            seen = count_frames(ifname, ethertype, ready, expected)
+            answer(seen._asdict())
+        elif told["do"] == "ping":
+            answer({"rtt_us": ping(ifname, ethertype, frame, told["pings"], poll=told["poll"])})
+        elif told["do"] == "answer":
+            answer({"answered": answer_pings(ifname, ethertype, frame, told["pings"], ready, poll=told["poll"])})
 
 
-def ping(plane: Any, hop_mac: bytes, count: int, payload_bytes: int) -> list[float]:
-    """Return round-trip times in microseconds of frames sent one at a time."""
-    times = []
-    for number in range(count + 20):
-        header = Header(Kind.ECHO_REQUEST, 0, HOPS_MAX, 0, payload_bytes, number, 0, 1, 1, ECHO, SOURCE)
-        frame = encode(header) + bytes(payload_bytes)
-        start = time.perf_counter()
-        plane.transmit(0, hop_mac, [frame])
-        if plane.poll(1.0) and number >= 20:  # the first ones only warm up
-            times.append((time.perf_counter() - start) * 1e6)
-    return times
+def expected() -> int | None:
+    """Return how many frames the source has sent, once that has been told."""
+    return integer(command()["expected"]) if command_waits() else None
 
 
-def sink(**_: Any) -> None:
-    """Count what arrives; on command, wait for silence and tell how many, and when the last one came."""
-    from gdp.ports.batch import make_batch
-    from gdp.ports.sockets import kernel_drops, open_port
-
-    sock = open_port("left")
-    batch = make_batch(1 << 16)
-    epoll = select.epoll()
-    epoll.register(sock, select.EPOLLIN)
-    epoll.register(sys.stdin, select.EPOLLIN)
-    answer(event="ready")
-    got, last = 0, 0.0
-    while True:
-        for fd, _events in epoll.poll():
-            if fd == sock.fileno():
-                got += len(batch.take(sock))
-                last = time.monotonic()
-                continue
-            silence_s = command()["silence_s"]
-            quiet = select.epoll()
-            quiet.register(sock, select.EPOLLIN)
-            while quiet.poll(silence_s):
-                got += len(batch.take(sock))
-                last = time.monotonic()
-            quiet.close()
-            answer(got=got, last_s=last, kernel_drops=kernel_drops(sock))
-            got = 0
-
-
-def echo(macs: dict[str, str], **_: Any) -> None:
-    """Send every echo request back."""
-    from gdp.frame.codec import decode
-    from gdp.ports.raw import RawPlane
-
-    plane = RawPlane(["left"])
-    plane.watch(sys.stdin, command)
-    answer(event="ready")
-    while True:
-        for arrival in plane.poll(None):
-            header = decode(arrival.frame)
-            back = encode(
-                header._replace(
-                    kind=Kind.ECHO_REPLY, hops_left=HOPS_MAX, destination=header.source, source=header.destination
-                )
-            )
-            plane.transmit(0, bytes.fromhex(macs["left"]), [back + arrival.frame[HEADER_BYTES:]])
+def ready() -> None:
+    answer({"event": "ready"})
 
 
 if __name__ == "__main__":
     settings = json.loads(sys.argv[1])
-    enter(settings.pop("namespace"))
-    {"switch": switch, "source": source, "sink": sink, "echo": echo}[settings.pop("role")](**settings)
+    if (cpu := settings.pop("cpu")) is not None:
+        os.sched_setaffinity(0, {cpu})
+    if settings.pop("role") == "switch":
+        switch(**settings)
+    else:
+        end(**settings)

@@ -39,6 +39,7 @@ class End:
     feed: Feed
     budget: Budget
     loss: float = 0.0
+    mtu: int = 65_535  # what the link to it takes
     deaf: bool = False  # hears nothing
     mute: bool = False  # says nothing
     delivered: list[Delivered] = field(default_factory=list)
@@ -111,7 +112,7 @@ class Pipe:
         for frame in self.publisher.take(self.now_s):
             self.seen.append(frame)
             for end in self.ends.values():
-                if not end.deaf:
+                if not end.deaf and len(frame) <= end.mtu:
                     self._send(frame, end, self._to_reader(end, frame))
         for end in self.ends.values():
             report = end.feed.take_report(self.now_s)

@@ -215,9 +215,85 @@ def test_a_port_has_so_many_neighbours_and_no_more() -> None:
 
 def test_a_neighbours_mtu_is_the_smaller_of_both_ends() -> None:
     one, two = greeter(A, 1), greeter(B, 2)
-    two.ports[0].mtu = 1_000
+    two.ports[0].own_mtu = 1_000
     greet(one, two, 0.0)
     assert [n.mtu for n in one.all_up()] == [1_000]
+
+
+def resize(one: Greeter, mtu: int, now_s: float, cost: int = 10) -> list[Change]:
+    return one.add_port(0, one.ports[0].mac, mtu, cost, now_s)
+
+
+def test_a_port_that_changes_keeps_its_session_and_tells_what_it_changed() -> None:
+    one, _, _ = pair()
+    nonce = one.ports[0].nonce
+    changes = resize(one, 1_200, 2.0)
+    assert [(n.name, n.mtu, n.state, before) for n, before in changes] == [(B.name, 1_200, UP, UP)]
+    assert (one.ports[0].nonce, one.ports[0].mtu) == (nonce, 1_200)
+    assert len(resize(one, 1_200, 2.1, cost=20)) == 1
+    assert resize(one, 1_200, 2.2, cost=20) == []
+
+
+def test_a_port_that_changed_says_so_at_once_and_the_far_end_tells() -> None:
+    one, two, _ = pair()
+    resize(one, 1_200, 1.0)
+    changes = [hear(two, hello, 1.0) for hello in hellos(one, 1.0)]
+    assert [(each[0].mtu, each[0].state, each[1]) for each in changes if each is not None] == [(1_200, UP, UP)]
+    assert two.ports[0].mtu == 1_200
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_link_grows_when_both_ends_have_whichever_is_first(first: int) -> None:
+    one, two, _ = pair()
+    ends = [one, two]
+    seen = []
+    for end in (ends[first], ends[1 - first]):
+        resize(end, 9_000, 1.0)
+        greet(one, two, 1.0, rounds=1)
+        seen.append([n.mtu for each in ends for n in each.all_up()])
+    assert seen == [[1_500, 1_500], [9_000, 9_000]]
+
+
+def test_hellos_fit_the_narrowest_end_that_was_heard() -> None:
+    one = greeter(A, 1)
+    resize(one, 65_000, 0.0)
+    hello = Hello(b"n" * 8, 1, (), 576, bytes(8), B.membership)
+    hear(one, hello.to_wire(B.name, B.key), 0.0)
+    frames = [frame for transmit in one.take(0.1) for frame in transmit.frames]
+    assert len(frames) > 1
+    assert max(map(len, frames)) <= 576
+
+
+def test_a_neighbour_that_claims_to_take_nothing_is_taken_for_the_narrowest_there_may_be() -> None:
+    one = greeter(A, 1)
+    hello = Hello(b"n" * 8, 1, (one.ports[0].nonce,), 0, bytes(8), B.membership)
+    hear(one, hello.to_wire(B.name, B.key), 0.0)
+    assert one.ports[0].mtu == 576
+
+
+def test_who_was_only_heard_makes_no_link_narrow() -> None:
+    one = greeter(A, 1)
+    hello = Hello(b"n" * 8, 1, (), 576, bytes(8), B.membership)
+    hear(one, hello.to_wire(B.name, B.key), 0.0)
+    assert one.ports[0].mtu == 1_500
+
+
+def test_a_narrow_neighbour_that_is_gone_leaves_the_link_as_wide_as_before() -> None:
+    one, two, _ = pair()
+    resize(two, 1_000, 1.0)
+    greet(one, two, 1.0)
+    before = one.ports[0].mtu
+    one.expire(10.0)
+    assert (before, one.ports[0].mtu) == (1_000, 1_500)
+
+
+def test_another_address_takes_the_neighbours_away_and_begins_anew() -> None:
+    one, _, _ = pair()
+    nonce = one.ports[0].nonce
+    changes = one.add_port(0, b"\x02new\x00\x00", 1_500, 10, 2.0)
+    assert [(n.name, n.state, before) for n, before in changes] == [(B.name, NeighbourState.GONE, UP)]
+    assert one.all_up() == []
+    assert one.ports[0].nonce != nonce
 
 
 def test_who_is_new_is_answered_before_the_next_hello_is_due() -> None:

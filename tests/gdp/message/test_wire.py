@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from gdp.errors import FrameError
 from gdp.limits import NACKS_PER_REPORT
+from gdp.message.move import MOVES_MAX, Move
 from gdp.message.report import Missing, Report, ReportFlag
 from gdp.message.status import STARTS_MAX, Status
 
@@ -14,6 +16,10 @@ U64 = st.integers(0, (1 << 64) - 1)
 U32 = st.integers(0, (1 << 32) - 1)
 MISSING = st.lists(st.builds(Missing, U64, U32, U32), max_size=NACKS_PER_REPORT).map(tuple)
 REPORTS = st.builds(Report, st.sampled_from([ReportFlag.NONE, ReportFlag.NEW, ReportFlag.BYE]), U64, U32, MISSING)
+MOVES = st.lists(
+    st.builds(lambda first, span, gap: Move(first, span, first + span + gap), *[st.integers(1, 1 << 60)] * 3),
+    max_size=MOVES_MAX,
+).map(tuple)
 STARTS = st.dictionaries(st.binary(min_size=32, max_size=32), U64, max_size=STARTS_MAX)
 
 
@@ -22,10 +28,17 @@ def test_a_report_comes_back_as_it_was(report: Report) -> None:
     assert Report.from_wire(report.to_wire()) == report
 
 
-@given(U64, U64, STARTS, st.binary(max_size=100))
-def test_a_status_comes_back_as_it_was(one: int, other: int, starts: dict[bytes, int], description: bytes) -> None:
-    status = Status(min(one, other), max(one, other), one % (1 << 32), starts, description)
+@given(U64, U64, STARTS, st.binary(max_size=100), MOVES)
+def test_a_status_comes_back_as_it_was(
+    one: int, other: int, starts: dict[bytes, int], description: bytes, moves: tuple[Move, ...]
+) -> None:
+    status = Status(min(one, other), max(one, other), one % (1 << 32), starts, description, moves)
     assert Status.from_wire(status.to_wire()) == status
+
+
+def test_a_move_that_leads_back_is_malformed() -> None:
+    with pytest.raises(FrameError):
+        Status.from_wire(Status(5, 5, 0, {}, b"", (Move(3, 2, 5),)).to_wire())
 
 
 @given(st.binary(max_size=200))

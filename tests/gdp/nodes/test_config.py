@@ -85,7 +85,7 @@ def test_a_missing_key_is_told_at_what_should_hold_it(place: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "complaint"),
     [
-        ("data_plane: xdp", "data_plane: expected 'auto', 'raw' or 'scapy', not 'xdp'"),
+        ("data_plane: xdp", "data_plane: expected 'auto', 'kernel', 'raw' or 'scapy', not 'xdp'"),
         ("ports: [{iface: a/b}]", "ports[0].iface: a device's name has 1 to 15 characters without '/', ':' or blanks"),
         ("ports: [{iface: a, cost: true}]", "ports[0].cost: expected a whole number, not True"),
         ("ports: [{iface: a, cost: 0}]", "ports[0].cost: expected greater than or equal to 1, not 0"),

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -117,12 +119,61 @@ def test_what_was_taken_back_leaves_no_lasting_trace(changes: list[tuple[bool, f
     assert len(table._heap) <= 2 * len(table) + 1_024 + 1
 
 
+class Copy:
+    """An observer that keeps a copy, and refuses news that is none."""
+
+    def __init__(self) -> None:
+        self.entries: dict[bytes, Hops] = {}
+
+    def put(self, items: Mapping[bytes, Hops]) -> None:
+        for each, hops in items.items():
+            assert self.entries.get(each) != hops
+            self.entries[each] = hops
+
+    def remove(self, keys: Sequence[bytes]) -> None:
+        for each in keys:
+            del self.entries[each]
+
+
+def test_an_observer_hears_of_what_was_there_before_it() -> None:
+    table, copy = Table(), Copy()
+    table.install(key(1), HOPS, 1.0)
+    table.observe(copy)
+    assert copy.entries == {key(1): HOPS}
+
+
+def test_an_observer_that_was_sent_away_hears_no_more() -> None:
+    table, copy = Table(), Copy()
+    table.observe(copy)
+    table.observe(None)
+    table.install(key(1), HOPS, 1.0)
+    assert copy.entries == {}
+
+
+def test_many_at_once_are_taken_until_the_table_is_full() -> None:
+    table = Table(max_entries=3)
+    table.install(key(9), HOPS, 5.0)
+    assert table.install_many([(key(n), HOPS) for n in (1, 9, 2, 3, 4)], 2.0) == 3
+    assert table.entries.keys() == {key(9), key(1), key(2)}
+    assert set(table.expire(2.0)) == {key(9), key(1), key(2)}
+
+
+def test_a_wrong_one_among_many_leaves_those_before_it() -> None:
+    table, copy = Table(), Copy()
+    table.observe(copy)
+    with pytest.raises(LocalError):
+        table.install_many([(key(1), HOPS), (key(2, 31), HOPS)], 1.0)
+    assert copy.entries == table.entries == {key(1): HOPS}
+    assert table.next_expiry() == 1.0
+
+
 class TableAgainstPlainDict(RuleBasedStateMachine):
     """The table does what a dictionary with a scan would."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.table, self.model = Table(max_entries=6), dict[bytes, float]()
+        self.table, self.model, self.copy = Table(max_entries=6), dict[bytes, float](), Copy()
+        self.table.observe(self.copy)
         self.now_s = 0.0
 
     @rule(number=st.integers(0, 8), lease_s=st.integers(0, 20))
@@ -131,6 +182,15 @@ class TableAgainstPlainDict(RuleBasedStateMachine):
         assert taken == (key(number) in self.model or len(self.model) < 6)
         if taken:
             self.model[key(number)] = self.now_s + lease_s
+
+    @rule(numbers=st.lists(st.integers(0, 8)), lease_s=st.integers(0, 20), to=st.sampled_from([HOPS, NOWHERE]))
+    def install_many(self, numbers: list[int], lease_s: int, to: Hops) -> None:
+        taken = 0
+        for number in numbers:
+            if key(number) in self.model or len(self.model) < 6:
+                taken += 1
+                self.model[key(number)] = self.now_s + lease_s
+        assert self.table.install_many([(key(number), to) for number in numbers], self.now_s + lease_s) == taken
 
     @rule(number=st.integers(0, 8))
     def remove(self, number: int) -> None:
@@ -147,6 +207,7 @@ class TableAgainstPlainDict(RuleBasedStateMachine):
     @invariant()
     def same(self) -> None:
         assert self.table.entries.keys() == self.model.keys()
+        assert self.table.entries == self.copy.entries
         assert self.table.next_expiry() == min(self.model.values(), default=None)
 
 

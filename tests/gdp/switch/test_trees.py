@@ -46,3 +46,12 @@ def test_trees_of_one_topic_are_found_by_it() -> None:
     assert {each.publisher for each in trees.of_topic(name("topic"))} == {name("robot"), name("second")}
     trees.remove(tree())
     assert (len(trees), trees.get(name("topic"), name("robot"))) == (2, None)
+
+
+def test_a_branch_is_as_narrow_as_its_link_or_the_way_behind_it() -> None:
+    branch = Branch(9.0, 1_400, b"claim", said_mtu=1_400)
+    seen = []
+    for link_mtu in (9_000, 1_000, 1_500):
+        branch.fit(link_mtu)
+        seen.append(branch.mtu)
+    assert seen == [1_400, 1_000, 1_400]

@@ -7,6 +7,7 @@ from urllib.request import urlopen
 import pytest
 
 from gdp.errors import DropReason, LocalError
+from gdp.names import Name
 from gdp.telemetry.metrics import Histogram, Metrics, Sources
 
 
@@ -123,3 +124,13 @@ def test_serving_twice_is_our_own_fault(metrics: Metrics) -> None:
     metrics.serve(0)
     with pytest.raises(LocalError):
         metrics.serve(0)
+
+
+def test_entries_are_told_by_short_names_and_those_that_look_alike_together() -> None:
+    one, other = bytes(range(32)), bytes(range(16)) + b"x" * 14 + bytes([30, 31])
+    assert Name(one).short == Name(other).short
+    text = Metrics(Sources(entries=lambda: {one: (3, 300), other: (1, 50), one + other: (2, 200)})).text()
+    short = Name(one).short
+    assert f'gdp_entry_frames_total{{destination="{short}",source="any"}} 4.0' in text
+    assert f'gdp_entry_bytes_total{{destination="{short}",source="{short}"}} 200.0' in text
+    assert one.hex() not in text

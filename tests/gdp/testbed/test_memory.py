@@ -19,11 +19,12 @@ class Talker:
         self.out: list[Transmit] = []
         self.got: list[tuple[float, bytes]] = []
         self.links: list[bool] = []
+        self.facts: list[tuple[int, int]] = []  # MTU and cost of its port, as told
         self.due_s: float | None = None
         self.called_s: list[float] = []
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Instant) -> None:
-        self.cost = cost
+        self.facts.append((mtu, cost))
 
     def receive(self, arrivals: Sequence[Arrival], now: Instant) -> None:
         self.got += [(now.mono_s, each.frame) for each in arrivals]
@@ -127,6 +128,27 @@ def test_a_pulled_cable_carries_nothing_and_both_ends_know() -> None:
     assert network.drops == {DropReason.PORT_DOWN: 1}
 
 
+def test_a_cable_that_changes_tells_both_ends_and_carries_what_it_now_takes() -> None:
+    cable = Cable()
+    network, a, b = two(cable)
+    network.set_mtu(cable, 100)
+    network.set_cost(cable, 9)
+    assert a.facts == b.facts == [(1_500, 7), (100, 7), (100, 9)]
+    send(network, a, bytes(101), bytes(100))
+    network.run(1)
+    assert (len(b.got), network.drops) == (1, {DropReason.TOO_BIG: 1})
+
+
+def test_a_cable_that_changes_while_pulled_is_told_of_when_it_is_back() -> None:
+    cable = Cable()
+    network, a, _ = two(cable)
+    network.set_link(cable, up=False)
+    network.set_mtu(cable, 100)
+    assert a.facts == [(1_500, 7)]
+    network.set_link(cable, up=True)
+    assert a.facts == [(1_500, 7), (100, 7)]
+
+
 def test_a_timer_comes_at_its_second_and_no_sooner() -> None:
     network, a, _ = two(Cable())
     due_s = network.now.mono_s + 3.0
@@ -164,7 +186,7 @@ def test_who_starts_anew_has_its_ports_as_they_are() -> None:
     network.set_link(cable, up=False)
     again = Talker(network)
     network.replace("b", again)
-    assert (again.cost, again.links) == (7, [False])
+    assert (again.facts, again.links) == ([(1_500, 7)], [False])
 
 
 def test_time_goes_on_to_the_end_though_nothing_happens() -> None:

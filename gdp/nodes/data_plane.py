@@ -1,0 +1,67 @@
+"""Which data plane a switch takes, and why not a better one.
+
+Place: shell. From the best on: ``kernel``, ``raw``; ``scapy`` only when asked for.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from gdp.errors import LocalError
+from gdp.ports.linked import LinkedPlane
+from gdp.ports.raw import RawPlane
+from gdp.switch.table import Table
+
+__all__ = ["Chosen", "choose_plane"]
+
+log = logging.getLogger(__name__)
+
+_BEST: Final = "kernel"
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """A data plane that is open.
+
+    Attributes:
+        name: ``kernel``, ``raw`` or ``scapy``.
+        reason: one line: why it is not the best one; empty when it is, or when another was asked for.
+        entry_counts: frames and bytes by the busiest entries, where the plane counts them.
+    """
+
+    plane: LinkedPlane
+    name: str
+    reason: str = ""
+    entry_counts: Callable[[], Mapping[bytes, tuple[int, int]]] | None = None
+
+
+def choose_plane(wanted: str, ifnames: Sequence[str], table: Table, entries_max: int) -> Chosen:
+    """Open the data plane that was asked for; for ``auto``, the best one that this machine allows.
+
+    Args:
+        wanted: ``auto``, ``kernel``, ``raw`` or ``scapy``.
+        entries_max: most entries that the kernel is to hold.
+
+    Raises:
+        LocalError: a port cannot be opened, or what was asked for by name is refused, and why.
+    """
+    if wanted == "scapy":
+        from gdp.ports.scapy_plane import ScapyPlane
+
+        return Chosen(ScapyPlane(ifnames, table), "scapy")
+    if wanted == "raw":
+        return Chosen(RawPlane(ifnames, table), "raw")
+    from gdp.ports.kernel.plane import KernelPlane
+
+    try:
+        best = KernelPlane(ifnames, table, entries_max=entries_max)
+        return Chosen(best, _BEST, entry_counts=best.entry_counts)
+    except LocalError as refused:
+        if wanted == _BEST:
+            raise LocalError(f"data plane kernel: {refused}") from refused
+        log.debug("kernel plane refused: %s", refused)
+        plane = RawPlane(ifnames, table)  # says itself where the ports are what is wrong
+        return Chosen(plane, "raw", str(refused).partition("\n")[0])

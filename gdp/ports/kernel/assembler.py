@@ -1,0 +1,152 @@
+"""A small assembler for eBPF: named registers, named labels, one method an instruction.
+
+Place: pure; numbers in, bytes out.
+Source: RFC 9669 (BPF Instruction Set Architecture). One instruction is 8 bytes, and a jump counts instructions from the
+one behind it::
+
+    opcode (1)  source and destination register (1)  offset (2, signed)  immediate (4, signed)
+"""
+
+from __future__ import annotations
+
+import struct
+import sys
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+from gdp.errors import LocalError
+
+__all__ = ["Assembler", "Reg"]
+
+
+class Reg(IntEnum):
+    """R0: results; R1 to R5: arguments, lost in a call; R6 to R9: kept; R10: the top of the stack, read only."""
+
+    R0 = 0
+    R1 = 1
+    R2 = 2
+    R3 = 3
+    R4 = 4
+    R5 = 5
+    R6 = 6
+    R7 = 7
+    R8 = 8
+    R9 = 9
+    R10 = 10
+
+
+_SIZES: Final = {1: 0x10, 2: 0x08, 4: 0x00, 8: 0x18}
+_LOAD, _STORE_VALUE, _STORE, _IN_MEMORY = 0x01, 0x02, 0x03, 0x60
+_ALU64, _JUMP, _FROM_REGISTER = 0x07, 0x05, 0x08
+_ADD, _SUBTRACT, _SHIFT_LEFT, _MOVE = 0x00, 0x10, 0x60, 0xB0
+_CONDITIONS: Final = {"==": 0x10, ">": 0x20, ">=": 0x30, "&": 0x40, "!=": 0x50, "<": 0xA0, "<=": 0xB0}
+_CALL, _EXIT, _WIDE, _BIG_ENDIAN = 0x85, 0x95, 0x18, 0xDC
+_MAP: Final = 1  # BPF_PSEUDO_MAP_FD
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    opcode: int
+    destination: int = 0
+    source: int = 0
+    offset: int = 0
+    value: int = 0
+    label: str = ""
+
+
+class Assembler:
+    """Steps in the order in which they are written. Values are signed 32-bit, comparisons unsigned 64-bit."""
+
+    def __init__(self) -> None:
+        self._steps: list[_Step] = []
+        self._labels: dict[str, int] = {}
+
+    def label(self, name: str) -> None:
+        """Name the next instruction.
+
+        Raises:
+            LocalError: the name is taken.
+        """
+        if name in self._labels:
+            raise LocalError(f"label {name} stands twice")
+        self._labels[name] = len(self._steps)
+
+    def move(self, to: Reg, value: Reg | int) -> None:
+        self._compute(_MOVE, to, value)
+
+    def add(self, to: Reg, value: Reg | int) -> None:
+        self._compute(_ADD, to, value)
+
+    def subtract(self, to: Reg, value: Reg | int) -> None:
+        self._compute(_SUBTRACT, to, value)
+
+    def shift_left(self, to: Reg, bits: int) -> None:
+        self._compute(_SHIFT_LEFT, to, bits)
+
+    def from_big_endian(self, to: Reg, bits: int) -> None:
+        """Turn what was loaded from a frame into a number."""
+        self._steps.append(_Step(_BIG_ENDIAN, to, value=bits))
+
+    def load(self, to: Reg, base: Reg, offset: int, size: int) -> None:
+        """Read ``size`` bytes at ``base + offset``."""
+        self._steps.append(_Step(_LOAD | _IN_MEMORY | _SIZES[size], to, base, offset))
+
+    def store(self, base: Reg, offset: int, value: Reg | int, size: int) -> None:
+        """Write ``size`` bytes at ``base + offset``."""
+        if isinstance(value, Reg):
+            self._steps.append(_Step(_STORE | _IN_MEMORY | _SIZES[size], base, value, offset))
+        else:
+            self._steps.append(_Step(_STORE_VALUE | _IN_MEMORY | _SIZES[size], base, 0, offset, value))
+
+    def load_map(self, to: Reg, descriptor: int) -> None:
+        """Name a map to the next call."""
+        self._steps += [_Step(_WIDE, to, _MAP, value=descriptor), _Step(0)]
+
+    def jump(self, label: str) -> None:
+        self._steps.append(_Step(_JUMP, label=label))
+
+    def jump_if(self, left: Reg, condition: str, right: Reg | int, label: str) -> None:
+        """Jump where ``left condition right``; ``&`` asks for a common bit."""
+        opcode = _JUMP | _CONDITIONS[condition]
+        if isinstance(right, Reg):
+            self._steps.append(_Step(opcode | _FROM_REGISTER, left, right, label=label))
+        else:
+            self._steps.append(_Step(opcode, left, value=right, label=label))
+
+    def call(self, helper: int) -> None:
+        """Call a helper of the kernel; R1 to R5 are lost."""
+        self._steps.append(_Step(_CALL, value=helper))
+
+    def leave(self, result: int | None = None) -> None:
+        """End the program with a result, or with what is in R0."""
+        if result is not None:
+            self.move(Reg.R0, result)
+        self._steps.append(_Step(_EXIT))
+
+    def assemble(self) -> bytes:
+        """Return the program in this machine's byte order.
+
+        Raises:
+            LocalError: a jump to nowhere, or a number that does not fit.
+        """
+        return b"".join(self._encoded(at, step) for at, step in enumerate(self._steps))
+
+    def _compute(self, operation: int, to: Reg, value: Reg | int) -> None:
+        if isinstance(value, Reg):
+            self._steps.append(_Step(_ALU64 | operation | _FROM_REGISTER, to, value))
+        else:
+            self._steps.append(_Step(_ALU64 | operation, to, value=value))
+
+    def _encoded(self, at: int, step: _Step) -> bytes:
+        offset = step.offset
+        if step.label:
+            if step.label not in self._labels:
+                raise LocalError(f"no label {step.label}")
+            offset = self._labels[step.label] - at - 1
+        little = sys.byteorder == "little"
+        registers = step.destination | step.source << 4 if little else step.destination << 4 | step.source
+        try:
+            return struct.pack("=BBhi", step.opcode, registers, offset, step.value)
+        except struct.error as error:
+            raise LocalError(f"instruction {at}: {error}") from error

@@ -1,0 +1,103 @@
+"""What stands between a port's device and its far end: whether frames may pass it by, and how many it refused.
+
+Place: I/O. ``bpf_redirect_peer`` passes by everything on the way out of the device and into the other end: so it is
+right only where nothing stands there. The device must be one end of a veth pair whose other end is in another
+namespace (the kernel drops the frame otherwise), without a queue, and without programs or filters on its way out.
+Source: Linux, net/core/filter.c, ``skb_do_redirect``; if_link.h, ``rtnl_link_stats64``; gen_stats.h.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable
+from typing import Final
+
+from gdp.ports.kernel.netlink import CLSACT_EGRESS, ROOT, LinkAttribute, filters, link, listen, nested, queues
+from gdp.ports.kernel.syscall import BpfError, attached
+
+__all__ = ["QueueWatch", "Refusals", "has_free_peer"]
+
+_INFO_KIND: Final = 1  # IFLA_INFO_KIND
+_TCX_EGRESS: Final = 47
+_STATS2, _STATS_QUEUE = 7, 3  # TCA_STATS2, TCA_STATS_QUEUE
+_QUEUE_DROPS_AT: Final = 8
+_TX_DROPPED_AT: Final = 7 * 8
+_READ_BYTES: Final = 1 << 16
+
+
+def has_free_peer(ifindex: int) -> bool:
+    """Say whether nothing stands between this device and the other end of its pair, in another namespace."""
+    facts = link(ifindex)
+    kind = nested(facts.get(LinkAttribute.LINKINFO, b"")).get(_INFO_KIND, b"")
+    return (
+        kind.rstrip(b"\0") == b"veth"
+        and LinkAttribute.LINK_NETNSID in facts
+        and facts.get(LinkAttribute.QDISC, b"").rstrip(b"\0") == b"noqueue"
+        and not _has_programs(ifindex)
+        and not filters(ifindex, CLSACT_EGRESS)
+    )
+
+
+def _has_programs(ifindex: int) -> bool:
+    try:
+        return attached(ifindex, _TCX_EGRESS) > 0
+    except BpfError:  # before Linux 6.6 there are none
+        return False
+
+
+class QueueWatch:
+    """Becomes readable when queues or filters of this namespace's devices change."""
+
+    def __init__(self) -> None:
+        self._socket = listen()
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def drain(self) -> None:
+        """Forget the news; what is now is asked anew."""
+        while True:
+            try:
+                self._socket.recv(_READ_BYTES)
+            except BlockingIOError:
+                return
+            except OSError:  # ENOBUFS: more news than fits, which is news all the same
+                continue
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+class Refusals:
+    """Frames that devices and their queues would not send, which nobody tells a program that redirects.
+
+    A device counts what anybody sends: where others use it too, theirs are among them.
+    """
+
+    def __init__(self) -> None:
+        self._last: dict[int, int] = {}  # by ifindex
+        self._total = 0
+
+    @property
+    def total(self) -> int:
+        """Frames refused since each device was first looked at."""
+        return self._total
+
+    def look(self, ifindexes: Iterable[int]) -> None:
+        """Ask about these devices, and forget the others."""
+        now = {ifindex: _dropped(ifindex) for ifindex in ifindexes}
+        for ifindex, parent, facts in queues() if now else ():
+            if ifindex in now and parent == ROOT:
+                now[ifindex] += _queue_drops(facts)
+        self._total += sum(max(count - self._last.get(ifindex, count), 0) for ifindex, count in now.items())
+        self._last = now
+
+
+def _dropped(ifindex: int) -> int:
+    stats = link(ifindex).get(LinkAttribute.STATS64, b"")
+    return int(struct.unpack_from("=Q", stats, _TX_DROPPED_AT)[0]) if stats else 0
+
+
+def _queue_drops(facts: dict[int, bytes]) -> int:
+    queue = nested(facts.get(_STATS2, b"")).get(_STATS_QUEUE, b"")
+    return int(struct.unpack_from("=I", queue, _QUEUE_DROPS_AT)[0]) if queue else 0

@@ -1,0 +1,171 @@
+"""Maps of the kernel, as bytes to bytes.
+
+Place: I/O; one file descriptor each.
+Source: bpf(2); Linux, Documentation/bpf/map_hash.rst and map_array.rst. A per-CPU value is as many values as there may
+be CPUs, each padded to 8 bytes.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import struct
+import sys
+from collections.abc import Sequence
+from enum import IntEnum
+from pathlib import Path
+from typing import Final
+
+from gdp.ports.kernel.syscall import NAME_MAX, BpfError, Command, address, bpf
+
+__all__ = ["KernelMap", "MapKind", "possible_cpus"]
+
+_NO_PREALLOC: Final = 1  # BPF_F_NO_PREALLOC: an entry costs memory when it is there
+_POSSIBLE: Final = Path("/sys/devices/system/cpu/possible")
+_BATCH: Final = struct.Struct("=QQQQIIQQ")
+_STOPPED: Final = (errno.E2BIG, errno.ENOENT)
+_NO_BATCH: Final = (errno.EINVAL, 524)  # ENOTSUPP: arrays, before Linux 5.13
+_CHUNK: Final = 1 << 14  # entries a call: the kernel holds a copy of each only while it works on it
+
+
+class MapKind(IntEnum):
+    """``enum bpf_map_type``, as far as it is used."""
+
+    HASH = 1
+    ARRAY = 2
+    PERCPU_ARRAY = 6
+
+
+def possible_cpus() -> int:
+    """Return how many CPUs this kernel is ready for, there or not."""
+    ranges = (part.partition("-") for part in _POSSIBLE.read_text(encoding="ascii").strip().split(","))
+    return sum(int(last or first) - int(first) + 1 for first, _, last in ranges)
+
+
+class KernelMap:
+    """One map.
+
+    Args:
+        kind: a hash is empty at first and takes memory as it grows; arrays are all zero, and whole, at once.
+        key_bytes: of one key.
+        value_bytes: of one value; on one CPU, where there is one for each.
+        name: shown by diagnostic tools.
+
+    Raises:
+        BpfError: refused.
+    """
+
+    def __init__(self, kind: MapKind, key_bytes: int, value_bytes: int, max_entries: int, name: str) -> None:
+        self.max_entries = max_entries
+        self.name = name
+        self._key_bytes = key_bytes
+        each = -(-value_bytes // 8) * 8
+        self._value_bytes = each * possible_cpus() if kind is MapKind.PERCPU_ARRAY else value_bytes
+        flags = _NO_PREALLOC if kind is MapKind.HASH else 0
+        shape = struct.pack("=5I", kind, key_bytes, value_bytes, max_entries, flags)
+        attributes = bytearray(shape + struct.pack("=2I16s", 0, 0, name.encode()[:NAME_MAX]))
+        self.fd = _create(attributes, f"make the map {name} of {max_entries} entries")
+        self._key, self._value = bytearray(key_bytes), bytearray(self._value_bytes)
+        self._one = bytearray(struct.pack("=IxxxxQQQ", self.fd, address(self._key), address(self._value), 0))
+        self._one_key = self._one[:16]  # what takes no value may be given none
+        self._tried = f"map {name}"
+
+    @property
+    def value_bytes(self) -> int:
+        """Bytes of one value as user space sees it: of all CPUs."""
+        return self._value_bytes
+
+    def close(self) -> None:
+        """Let go of it; a program that uses it keeps it."""
+        if self.fd >= 0:
+            os.close(self.fd)
+            self.fd = -1
+
+    def put(self, key: bytes, value: bytes) -> None:
+        """Put or replace one entry.
+
+        Raises:
+            BpfError: E2BIG when it is full.
+        """
+        self._key[:], self._value[:] = key, value
+        bpf(Command.MAP_UPDATE_ELEM, self._one, self._tried)
+
+    def get(self, key: bytes) -> bytes | None:
+        """Return one entry's value, None where there is none. Safe in any thread."""
+        given, value = bytearray(key), bytearray(self._value_bytes)
+        try:
+            attributes = bytearray(struct.pack("=IxxxxQQQ", self.fd, address(given), address(value), 0))
+            bpf(Command.MAP_LOOKUP_ELEM, attributes, self._tried)
+        except BpfError as error:
+            if error.number == errno.ENOENT:
+                return None
+            raise
+        return bytes(value)
+
+    def remove(self, key: bytes) -> bool:
+        """Take one entry out; False when there was none."""
+        self._key[:] = key
+        try:
+            bpf(Command.MAP_DELETE_ELEM, self._one_key, self._tried)
+        except BpfError as error:
+            if error.number == errno.ENOENT:
+                return False
+            raise
+        return True
+
+    def put_many(self, keys: Sequence[bytes], values: Sequence[bytes]) -> int:
+        """Put entries in order until one is refused; return how many are in."""
+        for at in range(0, len(keys), _CHUNK):
+            some, theirs = keys[at : at + _CHUNK], values[at : at + _CHUNK]
+            done = self._batch(Command.MAP_UPDATE_BATCH, b"".join(some), b"".join(theirs), len(some))
+            while done < len(some):
+                try:  # what a batch refuses, and what it is too old for
+                    self.put(some[done], theirs[done])
+                except BpfError:
+                    return at + done
+                done += 1
+        return len(keys)
+
+    def remove_many(self, keys: Sequence[bytes]) -> None:
+        """Take entries out; some may not be there."""
+        for at in range(0, len(keys), _CHUNK):
+            some = keys[at : at + _CHUNK]
+            for key in some[self._batch(Command.MAP_DELETE_BATCH, b"".join(some), b"", len(some)) :]:
+                self.remove(key)
+
+    def read_array(self, count: int) -> bytes:
+        """Return the first ``count`` values of an array, one behind the other. Safe in any thread."""
+        keys, values, following = bytearray(4 * count), bytearray(self._value_bytes * count), bytearray(8)
+        places = (0, address(following), address(keys), address(values), count, self.fd, 0, 0)
+        try:
+            if count:
+                bpf(Command.MAP_LOOKUP_BATCH, bytearray(_BATCH.pack(*places)), self._tried)
+        except BpfError as error:
+            if error.number in _NO_BATCH:
+                return b"".join(self.get(index.to_bytes(4, sys.byteorder)) or b"" for index in range(count))
+            if error.number != errno.ENOENT:  # which only says that this was the end
+                raise
+        return bytes(values)
+
+    def _batch(self, command: Command, keys: bytes, values: bytes, count: int) -> int:
+        """Return for how many, from the first on, it is done; the kernel says so only where one of them was refused."""
+        attributes = bytearray(_BATCH.pack(0, 0, address(keys), address(values), count, self.fd, 0, 0))
+        try:
+            bpf(command, attributes, self._tried)
+        except BpfError as error:
+            return int(_BATCH.unpack(attributes)[4]) if error.number in _STOPPED else 0
+        return count
+
+
+def _create(attributes: bytearray, tried: str) -> int:
+    try:
+        return bpf(Command.MAP_CREATE, attributes, tried)
+    except BpfError as error:
+        if error.number != errno.EPERM:
+            raise
+        try:  # before Linux 5.11 maps count as locked memory
+            resource.setrlimit(resource.RLIMIT_MEMLOCK, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+        except (OSError, ValueError):
+            raise error from None
+        return bpf(Command.MAP_CREATE, attributes, tried)

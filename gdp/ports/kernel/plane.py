@@ -1,0 +1,175 @@
+"""The data plane whose decision is a program in the kernel; what that is unsure of comes up to the raw plane's code.
+
+Place: I/O; the raw plane beneath, with the same table, so that nothing is lost that the kernel cannot take.
+Source: DESIGN section 7. A frame that the kernel takes wakes nobody; one that comes up costs what it costs the raw
+plane::
+
+    device -> program -> redirected | dropped and counted
+                 `-> up: packet socket -> decide() -> sent | dropped and counted | handed up
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Sequence
+from typing import Final
+
+from gdp.errors import DropReason, LocalError
+from gdp.ports.kernel.attach import Attachment, FilterAttachment, LinkAttachment, has_links
+from gdp.ports.kernel.device import QueueWatch, Refusals, has_free_peer
+from gdp.ports.kernel.loaded import Loaded
+from gdp.ports.kernel.mirror import EntryCounts, Mirror
+from gdp.ports.kernel.shapes import ENTRIES_DEFAULT, PortFlag
+from gdp.ports.plane import Arrival, Counters, Port
+from gdp.ports.raw import RawPlane
+from gdp.switch.table import Table
+
+__all__ = ["KernelPlane"]
+
+_LEASE_S: Final = 3.0  # how long a dead process's filter goes on forwarding
+_UPKEEP_S: Final = 1.0
+_COUNTED_MAX: Final = 100
+
+
+class KernelPlane(RawPlane):
+    """``Plane`` by a program on the ingress of every port.
+
+    Args:
+        ifnames: devices to open at once.
+        table: what to forward by; None hands every frame up.
+        entries_max: most entries that the kernel holds; Python forwards by the others.
+        peer: go straight to the other end of a veth pair where that is right.
+        clsact: attach by filters even where there are links.
+        bypass_qdisc: send what is sent from here past traffic control.
+
+    Raises:
+        LocalError: as ``add_port``; or the kernel does not take the program, and why.
+    """
+
+    def __init__(
+        self,
+        ifnames: Sequence[str] = (),
+        table: Table | None = None,
+        *,
+        entries_max: int = ENTRIES_DEFAULT,
+        peer: bool = True,
+        clsact: bool = False,
+        bypass_qdisc: bool = False,
+    ) -> None:
+        self._peer = peer
+        self._attachments: dict[int, Attachment] = {}
+        self._queues: QueueWatch | None = None
+        self._table = table
+        self._next_upkeep_s = 0.0
+        self._refusals = Refusals()
+        self._unread = 0  # frames that came up to a full socket
+        self._loaded = Loaded(entries_max, leased=clsact or not has_links())
+        self._mirror = Mirror({} if table is None else table.entries, *self._loaded.of_entries)
+        super().__init__(ifnames, table, bypass_qdisc=bypass_qdisc)
+        self._queues = QueueWatch()
+        self.watch(self._queues, self._review_queues)
+        if table is not None:
+            table.observe(self._mirror)
+        self._keep_up()
+
+    @property
+    def counters(self) -> Counters:
+        """The counts of the kernel and of this process together, as they are now.
+
+        A device tells nobody when it refuses what the kernel sent on: such a frame counts as forwarded, and as
+        ``PORT_FULL`` from the next idle ``poll`` on.
+        """
+        here, there = self._counters, self._loaded.counters()
+        drops = [a + b for a, b in zip(here.drops, there.drops, strict=True)]
+        told = drops[DropReason.PORT_FULL] - self._unread
+        drops[DropReason.PORT_FULL] += max(self._refusals.total - told, 0)
+        return Counters(
+            here.frames_in + there.frames_in,
+            here.frames_out + there.frames_out,
+            here.forwarded + there.forwarded,
+            here.handed_up,
+            drops,
+        )
+
+    @property
+    def left_out(self) -> int:
+        """How many of the table's entries are forwarded by Python alone."""
+        return self._mirror.left_out
+
+    def entry_counts(self, most: int = _COUNTED_MAX) -> EntryCounts:
+        """Return frames and bytes that the kernel forwarded by the busiest entries. Safe in any thread."""
+        return self._mirror.counts(most)
+
+    def poll(self, timeout_s: float | None) -> list[Arrival]:
+        if self._loaded.is_leased:
+            timeout_s = _UPKEEP_S if timeout_s is None else min(timeout_s, _UPKEEP_S)
+        if time.monotonic() >= self._next_upkeep_s:
+            self._keep_up()
+        return super().poll(timeout_s)
+
+    def close(self) -> None:
+        if self._table is not None:
+            self._table.observe(None)
+        super().close()
+        if self._queues is not None:
+            self._queues.close()
+        self._loaded.close()
+
+    # ports
+
+    def _open(self, port: Port) -> None:
+        super()._open(port)
+        try:
+            ifindex = _ifindex(port.ifname)
+            attach = FilterAttachment if self._loaded.is_leased else LinkAttachment
+            self._attachments[port.index] = attach(self._loaded.program, ifindex)
+        except LocalError as error:
+            self._shut(port.index)
+            raise LocalError(f"port {port.ifname}: {error}") from error
+
+    def _shut(self, index: int) -> None:
+        self._loaded.set_port(index, 0, 0, 0)
+        attachment = self._attachments.pop(index, None)
+        if attachment is not None:
+            attachment.close()
+        super()._shut(index)
+
+    def _know(self, port: Port) -> None:
+        self._tell_kernel(port)
+        self._refusals.look(self._devices)  # from now on, not only from the next idle poll
+        super()._know(port)
+
+    def _kernel_drops(self) -> int:
+        unread = super()._kernel_drops()
+        self._unread += unread
+        self._refusals.look(self._devices)
+        return unread
+
+    def _tell_kernel(self, port: Port) -> None:
+        ifindex = next((ifindex for ifindex, index in self._devices.items() if index == port.index), 0)
+        if port.up and ifindex:
+            is_free = self._peer and has_free_peer(ifindex)
+            self._loaded.set_port(port.index, ifindex, port.mtu, PortFlag.PEER if is_free else 0)
+        else:
+            self._loaded.set_port(port.index, 0, 0, 0)
+
+    def _review_queues(self) -> None:
+        """See anew where frames may pass by what stands on the way out."""
+        if self._queues is not None:
+            self._queues.drain()
+        for port in self._ports.values():
+            self._tell_kernel(port)
+
+    def _keep_up(self) -> None:
+        """Do what nobody gives news of: the lease, and programs that came to stand on a port's way out."""
+        self._loaded.renew(_LEASE_S)
+        self._review_queues()
+        self._next_upkeep_s = time.monotonic() + _UPKEEP_S / 2
+
+
+def _ifindex(ifname: str) -> int:
+    try:
+        return socket.if_nametoindex(ifname)
+    except OSError as error:
+        raise LocalError("no such device") from error

@@ -1,0 +1,333 @@
+"""The forwarding decision as an eBPF program on the ingress of every port, written as a story.
+
+Place: pure; map descriptors in, instructions out.
+Source: ``gdp.switch.forwarder.decide``, which it must never differ from; Linux, include/uapi/linux/bpf.h, for the
+helpers and ``struct __sk_buff``; linux/pkt_sched.h for the priority. The header's offsets are read from the Scapy
+layer, so that the normative format is the source of this program too.
+
+A frame is taken (forwarded, or dropped and counted) where the program is sure; any other goes *up*: it continues to
+the port's packet socket, where Python decides by the same table and counts. So the program needs no word for what is
+rare::
+
+    to our station? -> whole header? -> version, kind, hops, length good? -> known? -> nowhere | one hop | a group
+          no: up            no: up                no: up                     no: up
+"""
+
+from __future__ import annotations
+
+import socket
+from dataclasses import dataclass
+from typing import Final
+
+from gdp.errors import DropReason
+from gdp.frame.codec import ETHER_BYTES, OVERHEAD_BYTES
+from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION, Flag
+from gdp.frame.layers import layout
+from gdp.names import NAME_BYTES
+from gdp.ports.kernel.assembler import Assembler, Reg
+from gdp.ports.kernel.shapes import (
+    BRANCH_BYTES,
+    BRANCHES_MAX,
+    GROUP,
+    GROUP_HEAD_BYTES,
+    INDEX_BYTES,
+    NOWHERE_PORT,
+    EntryAt,
+    PortAt,
+    PortFlag,
+    Total,
+)
+from gdp.switch.table import MACS_BYTES
+
+__all__ = ["DROP", "LICENCE", "REDIRECT", "UP", "Descriptors", "forwarder"]
+
+LICENCE: Final = b"Apache-2.0"  # no helper used here asks for another
+UP: Final = -1  # TC_ACT_UNSPEC, TCX_NEXT: whoever else stands at this hook sees it next
+DROP: Final = 2  # TC_ACT_SHOT, TCX_DROP
+REDIRECT: Final = 7  # TC_ACT_REDIRECT, TCX_REDIRECT
+
+_SKB: Final = Reg.R6
+_FRAME, _BRANCH = Reg.R7, Reg.R7  # a frame's bytes may not be kept over what a group does
+_TOTALS: Final = Reg.R8
+_ENTRY, _TURN = Reg.R9, Reg.R9
+
+# struct __sk_buff
+_LEN, _PKT_TYPE, _PROTOCOL, _VLAN_PRESENT, _PRIORITY, _DATA, _DATA_END = 0, 4, 16, 20, 32, 76, 80
+# enum bpf_func_id
+_LOOKUP, _KTIME_NS, _STORE_BYTES, _CLONE_REDIRECT, _REDIRECT, _PULL, _REDIRECT_PEER = 1, 5, 9, 13, 23, 39, 155
+
+_URGENT_PRIORITY: Final = 6  # TC_PRIO_INTERACTIVE: the first band of pfifo_fast and prio
+_CONGESTION_NOTED: Final = 2  # NET_XMIT_CN: sent, though the queue is getting full
+
+_KEY: Final = -2 * NAME_BYTES
+_INDEX: Final = _KEY - 8
+_GROUP: Final = _INDEX - 8
+_IFINDEX: Final = _GROUP - 8
+
+
+@dataclass(frozen=True, slots=True)
+class Descriptors:
+    """The maps that the program reads, by file descriptor; without ``lease`` it forwards for as long as it is there."""
+
+    entries: int
+    ports: int
+    groups: int
+    totals: int
+    counts: int
+    lease: int | None = None
+
+
+class _Story(Assembler):
+    """The program, one method a step."""
+
+    def __init__(self, maps: Descriptors) -> None:
+        super().__init__()
+        self._maps = maps
+        places = layout()
+        self._at = {name: ETHER_BYTES + offset for name, (offset, _) in places.items()}
+
+    def tell(self) -> bytes:
+        self._only_ours()
+        if self._maps.lease is not None:
+            self._only_while_valid(self._maps.lease)
+        self._whole_header()
+        self._good_header()
+        self._look_up()
+        self._urgency()
+        self._where()
+        self._one_hop()
+        self._group()
+        self._ends()
+        return self.assemble()
+
+    def _only_ours(self) -> None:
+        """To this station, by our EtherType, and in no VLAN."""
+        self.move(_SKB, Reg.R1)
+        self.load(Reg.R2, _SKB, _PROTOCOL, 4)
+        self.jump_if(Reg.R2, "!=", socket.htons(ETHERTYPE), "up")
+        self.load(Reg.R2, _SKB, _PKT_TYPE, 4)
+        self.jump_if(Reg.R2, "!=", socket.PACKET_HOST, "up")
+        self.load(Reg.R2, _SKB, _VLAN_PRESENT, 4)
+        self.jump_if(Reg.R2, "!=", 0, "up")
+
+    def _only_while_valid(self, lease: int) -> None:
+        """A program that may outlive its switch forwards only while that says so."""
+        self._find(lease, 0)
+        self.jump_if(Reg.R0, "==", 0, "up")
+        self.load(Reg.R7, Reg.R0, 0, 8)
+        self.call(_KTIME_NS)
+        self.jump_if(Reg.R0, ">", Reg.R7, "up")
+
+    def _whole_header(self) -> None:
+        """Make the header readable, then prove it to the verifier."""
+        self.load(Reg.R2, _SKB, _DATA, 4)
+        self.load(Reg.R3, _SKB, _DATA_END, 4)
+        self.add(Reg.R2, OVERHEAD_BYTES)
+        self.jump_if(Reg.R2, "<=", Reg.R3, "in one piece")
+        self.move(Reg.R1, _SKB)
+        self.move(Reg.R2, OVERHEAD_BYTES)
+        self.call(_PULL)
+        self.jump_if(Reg.R0, "!=", 0, "up")
+        self.label("in one piece")
+        self.load(_FRAME, _SKB, _DATA, 4)
+        self.load(Reg.R3, _SKB, _DATA_END, 4)
+        self.move(Reg.R2, _FRAME)
+        self.add(Reg.R2, OVERHEAD_BYTES)
+        self.jump_if(Reg.R2, ">", Reg.R3, "up")
+
+    def _good_header(self) -> None:
+        self.load(Reg.R2, _FRAME, self._at["version"], 1)
+        self.jump_if(Reg.R2, "!=", VERSION, "up")
+        self.load(Reg.R2, _FRAME, self._at["kind"], 1)
+        self.jump_if(Reg.R2, ">=", CONTROL_FROM, "up")
+        self.load(Reg.R2, _FRAME, self._at["hops_left"], 1)
+        self.jump_if(Reg.R2, "<=", 1, "up")
+        self.load(Reg.R2, _FRAME, self._at["length"], 2)
+        self.from_big_endian(Reg.R2, 16)
+        self.load(Reg.R3, _SKB, _LEN, 4)
+        self.subtract(Reg.R3, OVERHEAD_BYTES)
+        self.jump_if(Reg.R2, ">", Reg.R3, "up")
+
+    def _look_up(self) -> None:
+        """By destination and source, which stand in the frame as they do in a key; then by destination alone."""
+        self.load_map(Reg.R1, self._maps.entries)
+        self.move(Reg.R2, _FRAME)
+        self.add(Reg.R2, self._at["destination"])
+        self.call(_LOOKUP)
+        self.jump_if(Reg.R0, "!=", 0, "known")
+        for at in range(0, NAME_BYTES, 8):
+            self.load(Reg.R2, _FRAME, self._at["destination"] + at, 8)
+            self.store(Reg.R10, _KEY + at, Reg.R2, 8)
+            self.store(Reg.R10, _KEY + NAME_BYTES + at, 0, 8)
+        self.load_map(Reg.R1, self._maps.entries)
+        self.move(Reg.R2, Reg.R10)
+        self.add(Reg.R2, _KEY)
+        self.call(_LOOKUP)
+        self.jump_if(Reg.R0, "==", 0, "up")
+        self.label("known")
+        self.move(_ENTRY, Reg.R0)
+        self._find(self._maps.totals, 0)
+        self.jump_if(Reg.R0, "==", 0, "up")
+        self.move(_TOTALS, Reg.R0)
+
+    def _urgency(self) -> None:
+        """Where a device queues, urgent frames go first."""
+        self.load(Reg.R2, _FRAME, self._at["flags"], 1)
+        self.jump_if(Reg.R2, "&", Flag.URGENT, "urgent")
+        self.label("any urgency")
+
+    def _where(self) -> None:
+        self.load(Reg.R2, _ENTRY, EntryAt.PORT, 4)
+        self.jump_if(Reg.R2, "==", GROUP, "group")
+        self.jump_if(Reg.R2, "==", NOWHERE_PORT, "nowhere")
+
+    def _one_hop(self) -> None:
+        """R2: the port."""
+        self._find(self._maps.ports, Reg.R2)
+        self.jump_if(Reg.R0, "==", 0, "up")
+        self.load(Reg.R2, Reg.R0, PortAt.IFINDEX, 4)
+        self.jump_if(Reg.R2, "==", 0, "down")
+        self._frame_bytes(Reg.R2)
+        self.load(Reg.R3, Reg.R0, PortAt.MTU, 4)
+        self.jump_if(Reg.R2, ">", Reg.R3, "up")
+        self._one_hop_fewer()
+        for at in range(0, MACS_BYTES, 4):
+            self.load(Reg.R2, _ENTRY, EntryAt.MACS + at, 4)
+            self.store(_FRAME, at, Reg.R2, 4)
+        self.move(Reg.R7, Reg.R0)  # the port; the frame is done with
+        self._count(Total.TAKEN)
+        self._count_copy()
+        self._count_entry("one hop")
+        self.load(Reg.R1, Reg.R7, PortAt.IFINDEX, 4)
+        self.load(Reg.R3, Reg.R7, PortAt.FLAGS, 4)
+        self.move(Reg.R2, 0)
+        self.jump_if(Reg.R3, "&", PortFlag.PEER, "to the peer")
+        self.call(_REDIRECT)
+        self.leave()
+        self.label("to the peer")
+        self.call(_REDIRECT_PEER)
+        self.leave()
+
+    def _group(self) -> None:
+        """A copy to every branch that can take it; from the first copy on nothing may go up."""
+        self.label("group")
+        self.load(Reg.R2, _ENTRY, EntryAt.GROUP, 4)
+        self._find(self._maps.groups, Reg.R2)
+        self.jump_if(Reg.R0, "==", 0, "up")
+        self.store(Reg.R10, _GROUP, Reg.R0, 8)
+        self._one_hop_fewer()
+        self._count(Total.TAKEN)
+        self._count_entry("group")
+        self.move(_TURN, 0)
+        self.label("branch")
+        self.jump_if(_TURN, ">=", BRANCHES_MAX, "drop")
+        self.load(Reg.R1, Reg.R10, _GROUP, 8)
+        self.load(Reg.R2, Reg.R1, 0, 4)
+        self.jump_if(_TURN, ">=", Reg.R2, "drop")
+        self.move(_BRANCH, _TURN)
+        self.shift_left(_BRANCH, BRANCH_BYTES.bit_length() - 1)
+        self.add(_BRANCH, Reg.R1)
+        self.load(Reg.R2, _BRANCH, GROUP_HEAD_BYTES, 4)
+        self._find(self._maps.ports, Reg.R2)
+        self.jump_if(Reg.R0, "==", 0, "branch down")
+        self.load(Reg.R2, Reg.R0, PortAt.IFINDEX, 4)
+        self.jump_if(Reg.R2, "==", 0, "branch down")
+        self.store(Reg.R10, _IFINDEX, Reg.R2, 8)
+        self._frame_bytes(Reg.R2)
+        self.load(Reg.R3, Reg.R0, PortAt.MTU, 4)
+        self.jump_if(Reg.R2, ">", Reg.R3, "branch too narrow")
+        self._send_copy()
+        self.jump_if(Reg.R0, "==", 0, "branch sent")
+        self.jump_if(Reg.R0, "!=", _CONGESTION_NOTED, "branch full")
+        self.label("branch sent")
+        self._count_copy()
+        self.label("next branch")
+        self.add(_TURN, 1)
+        self.jump("branch")
+        for label, reason in (
+            ("branch down", DropReason.PORT_DOWN),
+            ("branch too narrow", DropReason.TOO_BIG),
+            ("branch full", DropReason.PORT_FULL),
+        ):
+            self.label(label)
+            self._count(reason)
+            self.jump("next branch")
+
+    def _send_copy(self) -> None:
+        """Put the branch's addresses into the frame and send a clone; R0: 0, or why not."""
+        self.move(Reg.R1, _SKB)
+        self.move(Reg.R2, 0)
+        self.move(Reg.R3, _BRANCH)
+        self.add(Reg.R3, GROUP_HEAD_BYTES + INDEX_BYTES)
+        self.move(Reg.R4, MACS_BYTES)
+        self.move(Reg.R5, 0)
+        self.call(_STORE_BYTES)
+        self.jump_if(Reg.R0, "!=", 0, "branch full")
+        self.move(Reg.R1, _SKB)
+        self.load(Reg.R2, Reg.R10, _IFINDEX, 8)
+        self.move(Reg.R3, 0)
+        self.call(_CLONE_REDIRECT)
+
+    def _ends(self) -> None:
+        self.label("nowhere")
+        self._count(Total.TAKEN)
+        self._count(DropReason.NO_ROUTE)
+        self.jump("drop")
+        self.label("down")
+        self._count(Total.TAKEN)
+        self._count(DropReason.PORT_DOWN)
+        self.label("drop")
+        self.leave(DROP)
+        self.label("urgent")
+        self.move(Reg.R2, _URGENT_PRIORITY)
+        self.store(_SKB, _PRIORITY, Reg.R2, 4)
+        self.jump("any urgency")
+        self.label("up")
+        self.leave(UP)
+
+    # phrases
+
+    def _find(self, descriptor: int, index: Reg | int) -> None:
+        """R0: the value at an index of a map, or 0."""
+        self.store(Reg.R10, _INDEX, index, 4)
+        self.load_map(Reg.R1, descriptor)
+        self.move(Reg.R2, Reg.R10)
+        self.add(Reg.R2, _INDEX)
+        self.call(_LOOKUP)
+
+    def _frame_bytes(self, to: Reg) -> None:
+        """What counts against an MTU: all behind the Ethernet header, padding too."""
+        self.load(to, _SKB, _LEN, 4)
+        self.subtract(to, ETHER_BYTES)
+
+    def _one_hop_fewer(self) -> None:
+        self.load(Reg.R2, _FRAME, self._at["hops_left"], 1)
+        self.subtract(Reg.R2, 1)
+        self.store(_FRAME, self._at["hops_left"], Reg.R2, 1)
+
+    def _count(self, index: int, amount: Reg | int = 1) -> None:
+        """Not atomically: on one CPU, receiving is never interrupted by receiving."""
+        self.load(Reg.R1, _TOTALS, 8 * index, 8)
+        self.add(Reg.R1, amount)
+        self.store(_TOTALS, 8 * index, Reg.R1, 8)
+
+    def _count_copy(self) -> None:
+        self._count(Total.COPIES)
+        self.load(Reg.R2, _SKB, _LEN, 4)
+        self._count(Total.BYTES, Reg.R2)
+
+    def _count_entry(self, where: str) -> None:
+        self.load(Reg.R2, _ENTRY, EntryAt.COUNTER, 4)
+        self._find(self._maps.counts, Reg.R2)
+        self.jump_if(Reg.R0, "==", 0, f"{where} not counted")
+        self.load(Reg.R2, _SKB, _LEN, 4)
+        for at, amount in ((0, 1), (8, Reg.R2)):
+            self.load(Reg.R1, Reg.R0, at, 8)
+            self.add(Reg.R1, amount)
+            self.store(Reg.R0, at, Reg.R1, 8)
+        self.label(f"{where} not counted")
+
+
+def forwarder(maps: Descriptors) -> bytes:
+    """Return the program's instructions."""
+    return _Story(maps).tell()

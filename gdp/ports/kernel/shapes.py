@@ -1,0 +1,119 @@
+"""What the kernel program and its control plane must agree on: the bytes of keys, values and counters.
+
+Place: pure; numbers only. In this machine's byte order, but for names and addresses, which are bytes as in a frame::
+
+    key      destination (32)  source, or zero for every source (32)
+    entry    port, or GROUP or NOWHERE (4)  addresses (12)  group (4)  counter (4)
+    port     ifindex, 0 when it is down (4)  MTU (4)  flags (4)  unused (4)
+    group    number of branches (4)  unused (4)  64 times: port (4)  addresses (12)
+    count    frames (8)  bytes (8), on each CPU
+    totals   drops by reason (8 each), then the rest of ``Total`` (8 each), on each CPU
+"""
+
+from __future__ import annotations
+
+import struct
+from enum import IntEnum
+from typing import Final
+
+from gdp.errors import DropReason
+from gdp.names import NAME_BYTES
+from gdp.switch.table import MACS_BYTES
+
+__all__ = [
+    "BRANCHES_MAX",
+    "BRANCH_BYTES",
+    "COUNT_BYTES",
+    "ENTRIES_DEFAULT",
+    "ENTRY_BYTES",
+    "EVERY_SOURCE",
+    "GROUP",
+    "GROUPS_MAX",
+    "GROUP_BYTES",
+    "GROUP_HEAD_BYTES",
+    "INDEX_BYTES",
+    "KEY_BYTES",
+    "NOWHERE_PORT",
+    "PORTS_MAX",
+    "PORT_BYTES",
+    "TOTALS_BYTES",
+    "EntryAt",
+    "PortAt",
+    "PortFlag",
+    "Total",
+    "entry_head",
+    "group",
+    "port",
+]
+
+INDEX_BYTES: Final = 4
+KEY_BYTES: Final = 2 * NAME_BYTES
+EVERY_SOURCE: Final = bytes(NAME_BYTES)
+ENTRIES_DEFAULT: Final = 1 << 17  # 2 MiB of counters on every CPU
+PORTS_MAX: Final = 1_024  # a port above that is served by Python alone
+GROUPS_MAX: Final = 4_096  # different sets of branches; entries with equal hops share one
+BRANCHES_MAX: Final = 64
+
+GROUP: Final = 0x7FFF_FFFE
+NOWHERE_PORT: Final = 0x7FFF_FFFF
+
+
+class EntryAt(IntEnum):
+    """Offsets in an entry."""
+
+    PORT = 0
+    MACS = 4
+    GROUP = 4 + MACS_BYTES
+    COUNTER = 8 + MACS_BYTES
+
+
+class PortAt(IntEnum):
+    """Offsets in a port."""
+
+    IFINDEX = 0
+    MTU = 4
+    FLAGS = 8
+
+
+class PortFlag(IntEnum):
+    """How a port is served."""
+
+    PEER = 1  # straight to the other end of a veth pair
+
+
+class Total(IntEnum):
+    """Indices of the counters behind those of the drop reasons."""
+
+    TAKEN = len(DropReason)  # frames that were not handed up
+    COPIES = TAKEN + 1  # forwarded
+    BYTES = TAKEN + 2  # of those copies, Ethernet header included
+
+
+_HEAD: Final = struct.Struct(f"=I{MACS_BYTES}sI")
+_PORT: Final = struct.Struct("=IIII")
+_GROUP_HEAD: Final = struct.Struct("=II")
+_BRANCH: Final = struct.Struct(f"=I{MACS_BYTES}s")
+
+ENTRY_BYTES: Final = _HEAD.size + INDEX_BYTES
+PORT_BYTES: Final = _PORT.size
+GROUP_HEAD_BYTES: Final = _GROUP_HEAD.size
+BRANCH_BYTES: Final = _BRANCH.size
+GROUP_BYTES: Final = GROUP_HEAD_BYTES + BRANCHES_MAX * BRANCH_BYTES
+COUNT_BYTES: Final = 16
+TOTALS_BYTES: Final = 8 * (max(Total) + 1)
+
+
+def entry_head(port: int, macs: bytes = bytes(MACS_BYTES), group: int = 0) -> bytes:
+    """Return an entry up to its counter."""
+    return _HEAD.pack(port, macs, group)
+
+
+def port(ifindex: int, mtu: int, flags: int) -> bytes:
+    """Return a port; ``ifindex`` 0 is one that is down."""
+    return _PORT.pack(ifindex, mtu, flags, 0)
+
+
+def group(branches: tuple[tuple[int, bytes], ...]) -> bytes:
+    """Return a group of at most ``BRANCHES_MAX`` branches."""
+    body = b"".join(_BRANCH.pack(*branch) for branch in branches)
+    return (_GROUP_HEAD.pack(len(branches), 0) + body).ljust(GROUP_BYTES, b"\0")

@@ -1,0 +1,21 @@
+"""A kernel plane in a process of its own, for tests that end it badly; it names its program and polls until killed.
+
+python -m netns_tests.kernel_child link|filter p0 p1 ...
+"""
+
+from __future__ import annotations
+
+import sys
+
+from gdp.ports.kernel.plane import KernelPlane
+from gdp.ports.kernel.syscall import program_id
+from gdp.switch.table import Table
+from tests.fixtures_forwarding import ENTRIES
+
+if __name__ == "__main__":
+    table = Table()
+    table.install_many(ENTRIES.items(), float("inf"))
+    plane = KernelPlane(sys.argv[2:], table, clsact=sys.argv[1] == "filter")
+    print(program_id(plane._loaded.program), flush=True)
+    while True:
+        plane.poll(None)

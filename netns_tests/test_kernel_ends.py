@@ -1,0 +1,222 @@
+"""What the kernel plane leaves behind, however it ends, and what it says where it is not allowed."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from pyroute2 import IPRoute
+
+from gdp.errors import LocalError
+from gdp.ports.kernel.assembler import Assembler
+from gdp.ports.kernel.loaded import PROGRAM
+from gdp.ports.kernel.plane import KernelPlane
+from gdp.ports.kernel.syscall import (
+    Command,
+    attached,
+    create_link,
+    link_program,
+    load_program,
+    objects,
+    program_id,
+    program_name,
+)
+from gdp.switch.table import Table
+from netns_tests.spaces import Space
+from netns_tests.test_planes import PORT_MACS, far_end
+from tests.fixtures_forwarding import ENTRIES, MTUS, ONE, PEER_MACS, WIDE, frame, leaves
+
+pytestmark = pytest.mark.netns
+
+TCX_INGRESS = 46
+PATIENCE_S = 20.0
+PROJECT = Path(__file__).parents[1]
+WHERE = os.environ | {"PYTHONPATH": os.pathsep.join([str(PROJECT), *filter(None, sys.path)])}
+
+
+@pytest.fixture
+def ports(space: Space) -> list[str]:
+    for port, mac in PORT_MACS.items():
+        space.veth(f"p{port}", f"q{port}", mac, PEER_MACS[port], MTUS[port])
+    try:
+        KernelPlane().close()
+    except LocalError as error:
+        pytest.skip(str(error).partition("\n")[0])
+    return [f"p{port}" for port in PORT_MACS]
+
+
+@contextlib.contextmanager
+def running(mode: str, ports: list[str]) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """A process with a kernel plane, and its program; killed at the end, whatever happens."""
+    argv = [sys.executable, "-m", "netns_tests.kernel_child", mode, *ports]
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, env=WHERE, cwd=PROJECT) as child:
+        try:
+            assert child.stdout is not None
+            yield child, int(child.stdout.readline())
+        finally:
+            child.kill()
+
+
+def loaded() -> dict[int, str]:
+    """Return the names of all programs in the kernel; others on this machine may have loaded theirs."""
+    found = objects(Command.PROG_GET_NEXT_ID, Command.PROG_GET_FD_BY_ID)
+    return {program_id(opened): program_name(opened) for opened in found}
+
+
+def links_of(program: int) -> int:
+    return [link_program(each) for each in objects(Command.LINK_GET_NEXT_ID, Command.LINK_GET_FD_BY_ID)].count(program)
+
+
+def gone(program: int) -> bool:
+    """Wait until a program is no more: the kernel frees it a moment after its last user."""
+    deadline_s = time.monotonic() + PATIENCE_S
+    while program in loaded():
+        if time.monotonic() > deadline_s:
+            return False
+        os.sched_yield()
+    return True
+
+
+def filters(ifname: str) -> list[str]:
+    with IPRoute() as ask:
+        found = ask.get_filters(index=socket.if_nametoindex(ifname), parent=0xFFFFFFF2)
+        return [each.get_nested("TCA_OPTIONS", "TCA_BPF_NAME") or "" for each in found if each["handle"]]
+
+
+def has_clsact(ifname: str) -> bool:
+    with IPRoute() as ask:
+        found = ask.get_qdiscs(index=socket.if_nametoindex(ifname))
+        return any(each.get_attr("TCA_KIND") == "clsact" for each in found)
+
+
+def table() -> Table:
+    made = Table()
+    made.install_many(ENTRIES.items(), float("inf"))
+    return made
+
+
+def crosses(patience_s: float) -> bool:
+    """Whether a frame that enters at ``p0`` leaves at ``p1`` within this time, with nobody in Python to help."""
+    sender, receiver = far_end("q0"), far_end("q1")
+    with sender, receiver:
+        receiver.settimeout(patience_s)
+        sender.send(frame(ONE))
+        try:
+            return receiver.recv(1 << 16) == leaves(frame(ONE), WIDE)[WIDE]
+        except TimeoutError:
+            return False
+
+
+@pytest.mark.parametrize("clsact", [False, True], ids=["link", "filter"])
+def test_opening_and_closing_again_and_again_leaves_nothing(ports: list[str], clsact: bool) -> None:
+    descriptors = os.listdir("/proc/self/fd")
+    for _ in range(3):
+        plane = KernelPlane(ports, table(), clsact=clsact)
+        mine = program_id(plane._loaded.program)
+        assert loaded()[mine] == PROGRAM
+        assert links_of(mine) == (0 if clsact else len(ports))
+        plane.close()
+        assert gone(mine)
+        assert links_of(mine) == 0
+    assert len(os.listdir("/proc/self/fd")) == len(descriptors)
+    assert not any(map(has_clsact, ports))
+
+
+def test_a_killed_switch_leaves_no_program_and_no_link(ports: list[str]) -> None:
+    with running("link", ports) as (child, mine):
+        assert links_of(mine) == len(ports)
+        assert crosses(PATIENCE_S)
+        child.send_signal(signal.SIGKILL)
+        child.wait()
+    assert gone(mine)
+    assert not crosses(0.1)
+    assert attached(socket.if_nametoindex(ports[0]), TCX_INGRESS) == 0
+
+
+def test_the_filter_of_a_killed_switch_forwards_no_more_and_the_next_run_replaces_it(ports: list[str]) -> None:
+    with running("filter", ports) as (child, mine):
+        assert crosses(PATIENCE_S)
+        child.send_signal(signal.SIGKILL)
+        child.wait()
+    assert [name.startswith(f"{PROGRAM}:{child.pid}:") for name in filters(ports[0])] == [True]
+    deadline_s = time.monotonic() + PATIENCE_S
+    while crosses(0.1):  # until its lease ends
+        assert time.monotonic() < deadline_s
+    plane = KernelPlane(ports, table(), clsact=True)
+    assert gone(mine)
+    assert [name.split(":")[1] for name in filters(ports[0])] == [str(os.getpid())]
+    assert crosses(PATIENCE_S)
+    plane.close()
+    assert not any(map(has_clsact, ports))
+
+
+def test_a_device_that_a_live_switch_has_by_a_filter_is_refused(ports: list[str]) -> None:
+    with running("filter", ports) as (child, _):
+        with pytest.raises(LocalError, match=f"live process {child.pid}"):
+            KernelPlane(ports, table(), clsact=True)
+        assert crosses(PATIENCE_S)
+
+
+@pytest.mark.parametrize("clsact", [False, True], ids=["link", "filter"])
+def test_somebody_elses_program_on_the_same_hook_stays(ports: list[str], clsact: bool) -> None:
+    passing = Assembler()
+    passing.leave(-1)
+    theirs = load_program(passing.assemble(), "theirs", b"Apache-2.0")
+    ifindex = socket.if_nametoindex(ports[0])
+    with IPRoute() as ask:
+        ask.tc("add", "clsact", ifindex)
+        place = {"parent": 0xFFFFFFF2, "fd": theirs, "name": "theirs", "direct_action": True}
+        ask.tc("add-filter", "bpf", ifindex, **place)
+    link = create_link(theirs, ifindex, TCX_INGRESS)
+    plane = KernelPlane(ports, table(), clsact=clsact)
+    assert crosses(PATIENCE_S)
+    plane.close()
+    assert filters(ports[0]) == ["theirs"]
+    assert attached(ifindex, TCX_INGRESS) == 1
+    os.close(link)
+    os.close(theirs)
+
+
+CHOOSE = """
+import sys
+from gdp.errors import LocalError
+from gdp.nodes.data_plane import choose_plane
+from gdp.switch.table import Table
+try:
+    chosen = choose_plane(sys.argv[1], ["p0"], Table(), 100)
+except LocalError as error:
+    sys.exit(str(error))
+print(chosen.name, chosen.reason, sep="|")
+chosen.plane.close()
+"""
+
+
+@pytest.mark.parametrize("lacks", ["bpf,-sys_admin", "net_admin,-sys_admin"])
+def test_without_the_capability_it_says_so_and_takes_the_next_best(ports: list[str], lacks: str) -> None:
+    drop = [f"--bounding-set=-{lacks}", f"--inh-caps=-{lacks}"]
+    with_less = ["setpriv", *drop, "--", sys.executable, "-c", CHOOSE]
+    run = {"capture_output": True, "text": True, "env": WHERE, "cwd": PROJECT}
+    auto = subprocess.run([*with_less, "auto"], check=False, **run)  # type: ignore[call-overload]
+    assert auto.returncode == 0, auto.stderr
+    name, reason = auto.stdout.strip().split("|")
+    assert name == "raw"
+    assert "EPERM" in reason
+    assert "CAP_BPF" in reason
+    kernel = subprocess.run([*with_less, "kernel"], check=False, **run)  # type: ignore[call-overload]
+    assert kernel.returncode == 1
+    assert "data plane kernel:" in kernel.stderr
+    assert "EPERM" in kernel.stderr
+
+
+def test_where_it_is_allowed_it_is_what_auto_takes(ports: list[str]) -> None:
+    argv = [sys.executable, "-c", CHOOSE, "auto"]
+    ended = subprocess.run(argv, check=True, capture_output=True, text=True, env=WHERE, cwd=PROJECT)
+    assert ended.stdout == "kernel|\n"

@@ -1,0 +1,162 @@
+"""A chain of namespaces for the forwarding and scale benches: a source, some switches, a sink, each in its own.
+
+Place: I/O; ``gdp.testbed`` makes and removes the namespaces. What the switches are is ``contenders.py``'s.
+::
+
+    s1 (source) -- s2 -- ... -- s(n+1) -- s(n+2) (sink)        devices are called like the neighbour they lead to
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from functools import partial
+from typing import TypeVar
+
+from frames import Wire
+from machine import offloads, soft_interrupts_s, thread_s
+from pyroute2 import IPRoute
+from search import Try
+from worker import Worker, floats, integer, number
+
+from gdp.testbed import netns_files
+from gdp.testbed.namespaces import Namespaces
+from gdp.testbed.runs import Runs
+from gdp.testbed.topology import chain
+
+__all__ = ["Chain"]
+
+_SOURCE_CPU, _SINK_CPU = 0, 1
+
+T = TypeVar("T")
+
+
+class Chain:
+    """A chain with so many ``switches``, none of which runs yet; a context manager that removes all of it.
+
+    Args:
+        runs: where the record of what is made is kept.
+        switches: 0 joins the source and the sink directly.
+        mtu: bytes after the Ethernet header.
+        pin: the source on one core, the sink on another; without it the scheduler chooses.
+
+    Raises:
+        LocalError: the kernel refuses.
+    """
+
+    def __init__(self, runs: Runs, switches: int, mtu: int, *, pin: bool = True) -> None:
+        self.switches = switches
+        self._undo = ExitStack()
+        with ExitStack() as undo:
+            run = runs.start()
+            undo.callback(run.end)
+            self.spaces = Namespaces(chain(switches + 2, mtu), run)
+            self.nodes = self.spaces.topology.nodes
+            self._macs = {node: self.inside(node, partial(_addresses, self.devices(node))) for node in self.nodes}
+            cpus = (_SOURCE_CPU, _SINK_CPU) if pin else (None, None)
+            self._source, self._sink = (
+                undo.enter_context(Worker(self.spaces, node, "end", cpu=cpu, ifname=self.devices(node)[0]))
+                for node, cpu in zip((self.nodes[0], self.nodes[-1]), cpus, strict=True)
+            )
+            self._source.read()
+            self._sink.read()
+            self._undo = undo.pop_all()
+
+    def __enter__(self) -> Chain:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._undo.close()
+
+    @property
+    def middles(self) -> Sequence[str]:
+        """The nodes between the source and the sink."""
+        return self.nodes[1:-1]
+
+    def devices(self, node: str) -> list[str]:
+        """Return a node's devices, from left to right."""
+        at = self.nodes.index(node)
+        return [*self.nodes[max(0, at - 1) : at], *self.nodes[at + 1 : at + 2]]
+
+    def mac(self, node: str, towards: str) -> bytes:
+        """Return the address of a node's device towards a neighbour."""
+        return self._macs[node][towards]
+
+    def inside(self, node: str, work: Callable[[], T]) -> T:
+        """Do ``work`` in a node's namespace."""
+        return netns_files.inside(self.spaces.path(node), work)
+
+    def set_mtu(self, mtu: int) -> None:
+        """Give every device another MTU."""
+        for node in self.nodes:
+            self.inside(node, partial(_set_mtus, self.devices(node), mtu))
+
+    def offloads(self) -> list[dict[str, bool]]:
+        """Return the offloads of every device."""
+        return [one for node in self.nodes for one in self.inside(node, partial(_all_offloads, self.devices(node)))]
+
+    def attempt(
+        self,
+        wire: Wire,
+        switches: Sequence[Worker],
+        rate: float | None,
+        seconds: float,
+        spread: tuple[int, int] = (0, 0),
+    ) -> Try:
+        """Send for a while, at ``rate`` frames/s or flat out, and count.
+
+        Args:
+            wire: what to send.
+            switches: the processes whose time counts.
+            rate: None for flat out.
+            seconds: for how long.
+            spread: send to so many names, out of so many of a large table; (0, 0) sends to the sink's own.
+
+        Raises:
+            LocalError: a process of the bench ended.
+        """
+        self._sink.ask(do="count", ethertype=wire.ethertype)
+        spent_s = soft_interrupts_s() + sum(thread_s(each.pid) for each in switches)
+        sent = self._source.ask(
+            do="send", frame=wire.out.hex(), rate=rate, seconds=seconds, names=spread[0], of=spread[1]
+        )
+        got = self._sink.ask(expected=sent["sent"])
+        spent_s = soft_interrupts_s() + sum(thread_s(each.pid) for each in switches) - spent_s
+        ended_s = number(sent["end_s"])
+        return Try(
+            asked=rate,
+            sent=integer(sent["sent"]),
+            got=integer(got["got"]),
+            sink_drops=integer(got["drops"]),
+            send_s=ended_s - number(sent["start_s"]),
+            late_s=number(got["last_s"]) - ended_s,
+            cpu_s=spent_s + number(sent["cpu_s"]),
+        )
+
+    def round_trips(self, wire: Wire, pings: int, *, poll: bool) -> list[float]:
+        """Return round-trip times in microseconds; fewer than ``pings`` when some were lost.
+
+        Raises:
+            LocalError: a process of the bench ended.
+        """
+        same = {"ethertype": wire.ethertype, "pings": pings, "poll": poll}
+        self._sink.ask(do="answer", frame=wire.back.hex(), **same)
+        times = floats(self._source.ask(do="ping", frame=wire.out.hex(), **same)["rtt_us"])
+        self._sink.read()
+        return times
+
+
+def _addresses(devices: Sequence[str]) -> dict[str, bytes]:
+    with IPRoute() as ipr:
+        links = {link.get("ifname"): link.get("address") for link in ipr.get_links()}
+    return {device: bytes.fromhex(links[device].replace(":", "")) for device in devices}
+
+
+def _set_mtus(devices: Sequence[str], mtu: int) -> None:
+    with IPRoute() as ipr:
+        for device in devices:
+            ipr.link("set", index=ipr.link_lookup(ifname=device)[0], mtu=mtu)
+
+
+def _all_offloads(devices: Sequence[str]) -> list[dict[str, bool]]:
+    return [offloads(device) for device in devices]

@@ -1,0 +1,221 @@
+"""Who forwards in the middle of a chain: our planes, the Linux bridge, the kernel's IPv4.
+
+Place: I/O; sets namespaces of the bench up and back. Every contender stands in the same chain, one at a time, and
+leaves it as it was.
+
+The others are set up as cheaply as they can be. The bridge learns both addresses from a round trip before it is
+measured. IPv4 has its neighbours written down, so nobody asks by ARP; and the last of them is written down with an
+address that is not the end's own, so that the IP stack there lets go of a frame at once instead of routing it (the
+end's socket sees it all the same).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+from socket import AF_INET
+from typing import Final, Protocol
+
+from chains import Chain
+from frames import SINK, SOURCE, Wire, gdp_frame, ip_frame
+from pyroute2 import IPRoute
+from worker import Worker
+
+from gdp.frame.kinds import ETHERTYPE
+
+__all__ = ["Bridge", "Contender", "Direct", "IPv4", "Plane"]
+
+_IPV4: Final = 0x0800
+_NOBODY: Final = "02:67:64:70:ff:ff"
+_BRIDGE: Final = "bridge"
+_IP_SETTINGS: Final = Path("/proc/sys/net/ipv4")
+
+
+class Contender(Protocol):
+    """A way to forward.
+
+    Attributes:
+        name: as it stands in tables.
+        processes: user processes in the middle that every frame goes through.
+    """
+
+    name: str
+    processes: bool
+
+    def wire(self, chain: Chain, size: int) -> Wire:
+        """Return frames of ``size`` bytes, Ethernet header included."""
+
+    def stand(self, chain: Chain) -> ExitStack:
+        """Set it up in every middle of the chain; closing takes it down.
+
+        Raises:
+            LocalError: it cannot be had here; says why.
+        """
+
+    def workers(self) -> list[Worker]:
+        """Return the processes that forward, while it stands."""
+
+
+def _gdp_wire(chain: Chain, size: int, *, far: bool) -> Wire:
+    """Return our frames, addressed to the next node, or (``far``) to the other end as a bridge wants it."""
+    nodes = chain.nodes
+    source, sink = chain.mac(nodes[0], nodes[1]), chain.mac(nodes[-1], nodes[-2])
+    first = sink if far else chain.mac(nodes[1], nodes[0])
+    last = source if far else chain.mac(nodes[-2], nodes[-1])
+    out, back = gdp_frame(first + source, size, SINK, SOURCE), gdp_frame(last + sink, size, SOURCE, SINK)
+    return Wire(ETHERTYPE, out, back)
+
+
+class Direct:
+    """Nobody: the ends side by side. What remains is what the ends cost."""
+
+    name = "ends alone"
+    processes = False
+
+    def wire(self, chain: Chain, size: int) -> Wire:
+        return _gdp_wire(chain, size, far=False)
+
+    def stand(self, chain: Chain) -> ExitStack:  # noqa: ARG002
+        return ExitStack()
+
+    def workers(self) -> list[Worker]:
+        return []
+
+
+class Plane:
+    """One of our planes, by the name that ``roles.py`` knows it by.
+
+    Args:
+        name: the plane.
+        processes: frames go through the process, not only through the kernel.
+        names: entries that each switch's table has room for, beside the two of the ends.
+    """
+
+    def __init__(self, name: str, *, processes: bool, names: int = 0) -> None:
+        self.name = name
+        self.processes = processes
+        self._names = names
+        self._workers: list[Worker] = []
+
+    def wire(self, chain: Chain, size: int) -> Wire:
+        return _gdp_wire(chain, size, far=False)
+
+    def stand(self, chain: Chain) -> ExitStack:
+        with ExitStack() as undo:
+            self._workers = []
+            undo.callback(self._workers.clear)
+            for node in chain.middles:
+                left, right = chain.devices(node)
+                ways = {
+                    "left": f"{left} {chain.mac(left, node).hex()}",
+                    "right": f"{right} {chain.mac(right, node).hex()}",
+                }
+                worker = Worker(chain.spaces, node, "switch", plane=self.name, ways=ways, names=self._names)
+                self._workers.append(undo.enter_context(worker))
+            for worker in self._workers:
+                worker.read()
+            return undo.pop_all()
+
+    def workers(self) -> list[Worker]:
+        return self._workers
+
+
+class Bridge:
+    """The Linux bridge: one in each middle namespace, with that node's two devices."""
+
+    name = "bridge"
+    processes = False
+
+    def wire(self, chain: Chain, size: int) -> Wire:
+        return _gdp_wire(chain, size, far=True)
+
+    def stand(self, chain: Chain) -> ExitStack:
+        with ExitStack() as undo:
+            for node in chain.middles:
+                undo.callback(chain.inside, node, _remove_bridge)
+                chain.inside(node, partial(_make_bridge, chain.devices(node)))
+            chain.round_trips(self.wire(chain, 128), 10, poll=False)  # so that every bridge has learnt both addresses
+            return undo.pop_all()
+
+    def workers(self) -> list[Worker]:
+        return []
+
+
+class IPv4:
+    """The kernel's IPv4 forwarding, by routes and written-down neighbours. Link n is 10.99.n.0/24."""
+
+    name = "IPv4"
+    processes = False
+
+    def wire(self, chain: Chain, size: int) -> Wire:
+        nodes, last = chain.nodes, len(chain.nodes) - 1
+        source, sink = chain.mac(nodes[0], nodes[1]), chain.mac(nodes[-1], nodes[-2])
+        far, near = f"10.99.{last}.2", "10.99.1.1"
+        return Wire(
+            _IPV4,
+            ip_frame(chain.mac(nodes[1], nodes[0]) + source, size, far, near),
+            ip_frame(chain.mac(nodes[-2], nodes[-1]) + sink, size, near, far),
+        )
+
+    def stand(self, chain: Chain) -> ExitStack:
+        with ExitStack() as undo:
+            for at, node in enumerate(chain.middles, 1):
+                undo.callback(chain.inside, node, partial(_clear_addresses, chain.devices(node)))
+                chain.inside(node, partial(_route, chain, node, at))
+            return undo.pop_all()
+
+    def workers(self) -> list[Worker]:
+        return []
+
+
+@contextmanager
+def _links() -> Iterator[tuple[IPRoute, dict[str, int]]]:
+    with IPRoute() as ipr:
+        yield ipr, {link.get("ifname"): link["index"] for link in ipr.get_links()}
+
+
+def _make_bridge(devices: list[str]) -> None:
+    with _links() as (ipr, index):
+        ipr.link("add", ifname=_BRIDGE, kind="bridge", br_stp_state=0, br_forward_delay=0)
+        bridge = ipr.link_lookup(ifname=_BRIDGE)[0]
+        for device in devices:
+            ipr.link("set", index=index[device], master=bridge)
+        ipr.link("set", index=bridge, state="up")
+
+
+def _remove_bridge() -> None:
+    with _links() as (ipr, index):
+        if _BRIDGE in index:
+            ipr.link("del", index=index[_BRIDGE])
+
+
+def _route(chain: Chain, node: str, at: int) -> None:
+    """Make the ``at``-th middle a router: its left link is number ``at``, its right one the next."""
+    (_IP_SETTINGS / "ip_forward").write_text("1", encoding="ascii")
+    for scope in ("all", "default", *chain.devices(node)):
+        (_IP_SETTINGS / "conf" / scope / "rp_filter").write_text("0", encoding="ascii")
+    left, right = chain.devices(node)
+    last = len(chain.nodes) - 1
+    with _links() as (ipr, index):
+        for device, own, other, ways in (
+            (left, f"10.99.{at}.2", f"10.99.{at}.1", range(1, at)),
+            (right, f"10.99.{at + 1}.1", f"10.99.{at + 1}.2", range(at + 2, last + 1)),
+        ):
+            is_end = device in (chain.nodes[0], chain.nodes[-1])
+            mac = _NOBODY if is_end else chain.mac(device, node).hex(":")
+            ipr.addr("add", index=index[device], address=own, prefixlen=24)
+            ipr.neigh("add", dst=other, lladdr=mac, ifindex=index[device], state="permanent")
+            for link in ways:
+                ipr.route("add", dst=f"10.99.{link}.0/24", gateway=other)
+
+
+def _clear_addresses(devices: list[str]) -> None:
+    """Take addresses, and with them routes, and neighbours away again."""
+    (_IP_SETTINGS / "ip_forward").write_text("0", encoding="ascii")
+    with _links() as (ipr, index):
+        for neighbour in ipr.get_neighbours(family=AF_INET):
+            ipr.neigh("del", dst=neighbour.get("dst"), ifindex=neighbour["ifindex"])
+        for device in devices:
+            ipr.flush_addr(index=index[device])

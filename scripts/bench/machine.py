@@ -1,0 +1,139 @@
+"""What a bench ran on: without it no figure means anything.
+
+Place: I/O; reads /proc and asks devices, by the old one-word ethtool requests, because the ``ethtool`` command and its
+netlink family are often absent. Whatever is about devices speaks of the namespace that the calling thread is in
+(``gdp.testbed.netns_files.inside`` enters another).
+Source: ``linux/ethtool.h``, ``linux/sockios.h``, netdevice(7).
+
+    state = machine_state()                            call it first: it also takes the load before the bench
+    offloads("s2")                                     {"tso": True, "gso": True, "gro": False, "tx-checksum": True}
+    set_offloads("s2", on=False)
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import os
+import platform
+import socket
+import struct
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Final
+
+__all__ = [
+    "MachineState",
+    "machine_state",
+    "offload_text",
+    "offloads",
+    "set_offloads",
+    "soft_interrupts_s",
+    "thread_s",
+]
+
+_SIOCETHTOOL: Final = 0x8946
+_GET_SET: Final = {"tso": (0x1E, 0x1F), "gso": (0x23, 0x24), "gro": (0x2B, 0x2C), "tx-checksum": (0x16, 0x17)}
+_NEEDS: Final = ("tx-checksum", "tso")  # segmentation cannot be on without checksums: switch these in this order
+
+
+@dataclass(frozen=True, slots=True)
+class MachineState:
+    """The machine as a bench found it. ``load_before``: runnable processes, mean over the last minute."""
+
+    kernel: str
+    processor: str
+    cores: int
+    python: str
+    load_before: float
+
+    def __str__(self) -> str:
+        return (
+            f"Linux {self.kernel}, {self.cores} cores ({self.processor}), Python {self.python},"
+            f" load before {self.load_before:.2f}"
+        )
+
+
+def machine_state() -> MachineState:
+    """Look at the machine; only the cores that this process may use are counted."""
+    return MachineState(
+        platform.release(),
+        _processor(),
+        len(os.sched_getaffinity(0)),
+        platform.python_version(),
+        os.getloadavg()[0],
+    )
+
+
+def _processor() -> str:
+    for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+        key, _, value = line.partition(":")
+        if key.strip() in ("model name", "Model"):
+            return value.strip()
+    return platform.machine()
+
+
+def offloads(ifname: str) -> dict[str, bool]:
+    """Return which of tso, gso, gro and tx-checksum a device has on.
+
+    Raises:
+        OSError: no such device.
+    """
+    return {name: bool(_ask(ifname, get, 0)) for name, (get, _) in _GET_SET.items()}
+
+
+def set_offloads(ifname: str, *, on: bool) -> None:
+    """Switch all four on or off; AF_PACKET frames never use them, IP does.
+
+    Raises:
+        OSError: no such device, or not allowed.
+    """
+    first = _NEEDS if on else _NEEDS[::-1]
+    for name in (*first, *(name for name in _GET_SET if name not in first)):
+        _ask(ifname, _GET_SET[name][1], int(on))
+
+
+def offload_text(found: Iterable[Mapping[str, bool]]) -> str:
+    """Return the offloads of several devices in a word each: on, off, or mixed."""
+    values: dict[str, set[bool]] = {}
+    for one in found:
+        for name, is_on in one.items():
+            values.setdefault(name, set()).add(is_on)
+    return ", ".join(
+        f"{name} {'mixed' if len(each) > 1 else 'on' if True in each else 'off'}" for name, each in values.items()
+    )
+
+
+def _ask(ifname: str, command: int, value: int) -> int:
+    request = ctypes.create_string_buffer(struct.pack("=II", command, value), 8)
+    argument = struct.pack("16sP16x", ifname.encode(), ctypes.addressof(request))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+        fcntl.ioctl(asked, _SIOCETHTOOL, argument)
+    return int(struct.unpack("=II", request.raw)[1])
+
+
+def thread_s(pid: int) -> float:
+    """Return the processor time of a process of one thread, what its soft interrupts took included (schedstat).
+
+    Raises:
+        OSError: no such process.
+    """
+    return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii").split()[0]) / 1e9
+
+
+def soft_interrupts_s() -> float:
+    """Return the processor time of the kernel's soft interrupt threads, which take over when there is much to do."""
+    return sum(map(thread_s, _soft_interrupt_threads()))
+
+
+@lru_cache(maxsize=1)
+def _soft_interrupt_threads() -> list[int]:
+    found = []
+    for comm in Path("/proc").glob("[0-9]*/comm"):
+        with suppress(FileNotFoundError, ProcessLookupError):  # it ended meanwhile
+            if comm.read_text(encoding="utf-8").startswith("ksoftirqd/"):
+                found.append(int(comm.parent.name))
+    return found

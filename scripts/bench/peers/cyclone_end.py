@@ -1,0 +1,105 @@
+"""What runs of Cyclone DDS: the two ends.
+
+Place: process of its own, started by ``cyclone_net.py``.
+
+Messages go in and out as serialised bytes, which is what a ROS 2 node hands to the middleware; the binding's own
+serialiser, in Python, would cost an image 26 ms. To that end the type is one octet: of a longer message Cyclone takes
+the rest along. Each end waits in the thread that works on, by a WaitSet: a listener would add a change of threads.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+from cyclonedds._clayer import ddspy_take, ddspy_write
+from cyclonedds.core import InstanceState, Policy, Qos, ReadCondition, SampleState, ViewState, WaitSet
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl.types import uint8
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+
+from peers.exchange import ANSWER, answer_to, exchange
+from peers.lines import EndSettings, say
+
+__all__ = ["main"]
+
+_ANY: Final = SampleState.Any | ViewState.Any | InstanceState.Any
+_AT_ONCE: Final = 16
+_FOREVER_S: Final = 3_600.0
+_PREFIX: Final = b"\x00\x01\x00\x00"  # of CDR: little-endian; the answer needs one
+
+
+@dataclass
+class Opaque(IdlStruct, typename="bench::Opaque"):
+    """Any serialised message."""
+
+    first: uint8
+
+
+class CycloneWay:
+    """One end: writes one topic, reads the other."""
+
+    def __init__(self, writes: str, reads: str) -> None:
+        qos = Qos(
+            Policy.Reliability.Reliable(max_blocking_time=10_000_000_000),
+            Policy.History.KeepLast(10),
+            Policy.DataRepresentation(use_cdrv0_representation=True),
+        )
+        participant = DomainParticipant(0)
+        self._writer = DataWriter(participant, Topic(participant, writes, Opaque), qos=qos)
+        self._reader = DataReader(participant, Topic(participant, reads, Opaque), qos=qos)
+        self._waiting = WaitSet(participant)
+        self._waiting.attach(ReadCondition(self._reader, _ANY))
+        self._arrived = deque[bytes]()
+
+    def send(self, message: bytes) -> None:
+        """Let a message go."""
+        result = ddspy_write(self._writer._ref, message)
+        if result < 0:
+            raise OSError(f"Cyclone DDS does not write: {result}")
+
+    def receive(self, deadline_s: float) -> bytes | None:
+        """Return the next message; None when the monotonic second passed."""
+        while not self._arrived:
+            rest_s = deadline_s - time.monotonic()
+            if rest_s <= 0:
+                return None
+            self._waiting.wait(int(rest_s * 1e9))
+            self._arrived.extend(self._take())
+        return self._arrived.popleft()
+
+    def wait(self, deadline_s: float) -> bytes | None:
+        """Return the next answer without its prefix; None when the monotonic second passed."""
+        message = self.receive(deadline_s)
+        return None if message is None else message[len(_PREFIX) : len(_PREFIX) + ANSWER.size]
+
+    def _take(self) -> Iterator[bytes]:
+        taken = ddspy_take(self._reader._ref, _ANY, _AT_ONCE)
+        if not isinstance(taken, list):
+            raise OSError(f"Cyclone DDS does not read: {taken}")
+        return (message for message, info in taken if info.valid_data)
+
+
+def main() -> None:
+    """Be ``ping`` or ``pong``."""
+    settings = EndSettings.from_argument()
+    os.environ["CYCLONEDDS_URI"] = settings.own["xml"]  # read when the participant is made
+    if settings.role == "ping":
+        pids = {"sender": [os.getpid()], **settings.pids}
+        say(series="cyclone", sizes=exchange(CycloneWay("ping", "pong"), settings.load, pids))
+        return
+    way = CycloneWay("pong", "ping")
+    say(event="ready")
+    while (message := way.receive(time.monotonic() + _FOREVER_S)) is not None:
+        way.send(_PREFIX + answer_to(message))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,53 @@
+"""Cyclone DDS on the row, unsecured: peers known by address, no multicast, the kernel forwards IPv4.
+
+Place: shell; starts processes. Everything else is as Cyclone comes, also its packet sizes.
+"""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from typing import Final
+
+from peers.chain import LEFT, NODES, RIGHT, Chain, address
+from peers.contender import READY_S, Measured, ask_end, start_end
+from peers.exchange import Load
+from peers.process import Started
+
+__all__ = ["CycloneNet", "cyclone_xml"]
+
+_MODULE: Final = "peers.cyclone_end"
+
+
+def cyclone_xml(own: str, other: str) -> str:
+    """Return the configuration of an end at the IPv4 address ``own`` whose only peer is at ``other``."""
+    return (
+        f'<CycloneDDS><Domain id="any"><General><Interfaces><NetworkInterface address="{own}"/></Interfaces>'
+        "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
+        f'<MaxAutoParticipantIndex>1</MaxAutoParticipantIndex><Peers><Peer address="{other}"/></Peers></Discovery>'
+        "</Domain></CycloneDDS>"
+    )
+
+
+class CycloneNet:
+    """Cyclone DDS, reliable."""
+
+    name = "cyclone"
+    labels = ("cyclone",)
+
+    def measure(self, chain: Chain, load: Load) -> list[Measured]:
+        """Start B, then A.
+
+        Raises:
+            FailedError: as ``Contender.measure``.
+        """
+        with ExitStack() as stack:
+            pong = stack.enter_context(_end(chain, RIGHT, load, {}))
+            pong.read(READY_S)
+            ping = stack.enter_context(_end(chain, LEFT, load, {"receiver": [pong.pid]}))
+            return ask_end(ping, {"cyclone": self.name})
+
+
+def _end(chain: Chain, node: str, load: Load, pids: dict[str, list[int]]) -> Started:
+    left, right = address(LEFT, NODES[1]), address(RIGHT, NODES[-2])
+    own, other = (left, right) if node == LEFT else (right, left)
+    return start_end(chain, _MODULE, node, load, {"xml": cyclone_xml(own, other)}, pids)

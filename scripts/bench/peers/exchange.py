@@ -1,0 +1,148 @@
+"""The one measurement: a message goes from A to B, a small answer comes back, the next one goes.
+
+Place: of A's and B's processes; reads clocks, the way there is the contender's (``Way``).
+
+The message is a ``sensor_msgs/msg/Image`` in CDR of exactly so many bytes, its last eight a number. The answer has 16
+bytes: the number, how many bytes came, and, where the number asks for it, their CRC (once for every size).
+
+CPU is what the processes' own clocks say over the measured messages: A's, B's, and that of all in between. What the
+kernel forwards on the way runs in whichever process was interrupted, mostly the one that sent.
+Source of the clocks: clock_getcpuclockid(3).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import secrets
+import struct
+import time
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+__all__ = ["ANSWER", "IMAGE", "PATIENCE_S", "SIZE_MIN", "Load", "Way", "answer_to", "exchange", "image"]
+
+IMAGE: Final = "sensor_msgs/msg/Image"
+PATIENCE_S: Final = 20.0
+ANSWER: Final = struct.Struct("!QII")  # number, bytes, CRC-32 or 0
+_NUMBER: Final = struct.Struct("!Q")
+_CHECKED: Final = 1 << 63  # in a number: answer with the CRC
+_LARGE_BYTES: Final = 100_000
+_GREETING_S: Final = 0.1
+_WARM_UP_SHARE: Final = 5  # a fifth more, before: windows open, caches fill
+
+# CDR_LE; stamp; frame_id "cam"; height 1, width; encoding "mono8"; is_bigendian, step; length of data.
+_IMAGE_HEAD: Final = struct.Struct("<4siII4sIII6sBxII")
+SIZE_MIN: Final = _IMAGE_HEAD.size + _NUMBER.size
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """How many messages of which sizes. ``count`` is for messages above 100 kB; of smaller ones four times as many."""
+
+    sizes: tuple[int, ...]
+    count: int
+
+    def repeats(self, size: int) -> int:
+        """Return how many messages of a size are measured."""
+        return self.count if size > _LARGE_BYTES else 4 * self.count
+
+
+class Way(Protocol):
+    """A contender as seen from A."""
+
+    def send(self, message: bytes) -> None:
+        """Let a message go."""
+
+    def wait(self, deadline_s: float) -> bytes | None:
+        """Return the next answer; None when the monotonic second passed."""
+
+
+def image(size: int) -> bytearray:
+    """Return a serialised image of exactly ``size`` bytes, with random pixels.
+
+    Raises:
+        ValueError: no room for the number.
+    """
+    pixels = size - _IMAGE_HEAD.size
+    if pixels < _NUMBER.size:
+        raise ValueError(f"a message has at least {SIZE_MIN} bytes")
+    head = _IMAGE_HEAD.pack(b"\x00\x01\x00\x00", 0, 0, 4, b"cam\x00", 1, pixels, 6, b"mono8\x00", 0, pixels, pixels)
+    return bytearray(head + secrets.token_bytes(pixels))
+
+
+def answer_to(message: bytes) -> bytes:
+    """Return B's answer to a message."""
+    (number,) = _NUMBER.unpack_from(message, len(message) - _NUMBER.size)
+    return ANSWER.pack(number, len(message), zlib.crc32(message) if number & _CHECKED else 0)
+
+
+def exchange(way: Way, load: Load, pids: Mapping[str, Sequence[int]]) -> list[dict[str, object]]:
+    """Measure every size; return for each its ``size``, ``rtt_s`` of every message, and ``cpu_s`` a message by place.
+
+    Args:
+        pids: of the processes at each place.
+
+    Raises:
+        TimeoutError: an answer did not come.
+        ValueError: what B got is not what was sent.
+    """
+    clocks = {place: [_clock(pid) for pid in each] for place, each in pids.items()}
+    numbers = iter(range(1, _CHECKED))
+    _greet(way)
+    found: list[dict[str, object]] = []
+    for size in load.sizes:
+        message, repeats, rtts = image(size), load.repeats(size), list[float]()
+        _once(way, message, next(numbers) | _CHECKED)
+        for _ in range(repeats // _WARM_UP_SHARE):
+            _once(way, message, next(numbers))
+        before = _read(clocks)
+        for _ in range(repeats):
+            rtts.append(_once(way, message, next(numbers)))
+        after = _read(clocks)
+        cpu = {place: (after[place] - before[place]) / repeats for place in clocks}
+        found.append({"size": size, "rtt_s": rtts, "cpu_s": cpu})
+    return found
+
+
+def _greet(way: Way) -> None:
+    """Send small messages, all numbered 0, until one is answered: the way may not stand yet."""
+    message = bytes(image(SIZE_MIN)[: -_NUMBER.size]) + bytes(_NUMBER.size)
+    deadline_s = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline_s:
+        way.send(message)
+        if way.wait(time.monotonic() + _GREETING_S) is not None:
+            return
+    raise TimeoutError("the far end never answered")
+
+
+def _once(way: Way, image_bytes: bytearray, number: int) -> float:
+    """Send one message, wait for its answer, return the seconds between."""
+    _NUMBER.pack_into(image_bytes, len(image_bytes) - _NUMBER.size, number)
+    message = bytes(image_bytes)
+    begun_s = time.monotonic()
+    way.send(message)
+    while True:
+        answer = way.wait(begun_s + PATIENCE_S)
+        ended_s = time.monotonic()
+        if answer is None:
+            raise TimeoutError(f"a message of {len(message)} bytes was not answered")
+        if ANSWER.unpack(answer)[0]:  # otherwise one more answer to a greeting
+            break
+    if answer != answer_to(message):
+        raise ValueError(f"of {len(message)} bytes something else arrived: {ANSWER.unpack(answer)}")
+    return ended_s - begun_s
+
+
+def _clock(pid: int) -> int:
+    clock = ctypes.c_int()
+    error = ctypes.CDLL(None).clock_getcpuclockid(pid, ctypes.byref(clock))
+    if error:
+        raise OSError(error, f"{os.strerror(error)}: CPU clock of process {pid}")
+    return clock.value
+
+
+def _read(clocks: Mapping[str, Sequence[int]]) -> dict[str, float]:
+    return {place: sum(map(time.clock_gettime, each)) for place, each in clocks.items()}

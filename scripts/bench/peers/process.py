@@ -1,0 +1,96 @@
+"""One process of a contender: started on a machine of the row, heard, ended.
+
+Place: shell. What it prints on standard error goes to a file of the run, whose last line is the reason if it fails.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Final
+
+from gdp.testbed.processes import Process, end_all
+from gdp.testbed.runs import Run
+
+__all__ = ["FailedError", "Started"]
+
+_BENCH: Final = Path(__file__).resolve().parents[1]
+_REASON_CHARS: Final = 200
+
+
+class FailedError(Exception):
+    """A process of a contender ended, was silent for too long, or said that it cannot."""
+
+
+class Started:
+    """A running process; a context manager that ends it, and its group with it.
+
+    Args:
+        command: from the command line to the one that enters the machine.
+    """
+
+    def __init__(
+        self, run: Run, what: str, command: Callable[[Sequence[str]], list[str]], arguments: Sequence[str]
+    ) -> None:
+        self._what = what
+        self._unread = b""
+        self._log = run.directory / f"{what.replace(' ', '-')}.log"
+        with self._log.open("wb") as log:
+            self._process = subprocess.Popen(
+                command([sys.executable, *arguments]),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(_BENCH), os.getenv("PYTHONPATH"))))},
+                start_new_session=True,
+            )
+        run.note_process(self._process.pid)
+
+    @property
+    def pid(self) -> int:
+        """Return the process's id, the same in every namespace of the row."""
+        return self._process.pid
+
+    def __enter__(self) -> Started:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if self._process.poll() is None:
+            with suppress(ProcessLookupError):  # it ended by itself just now
+                end_all([Process.of(self.pid)])
+        self._process.communicate()
+
+    def read(self, patience_s: float) -> dict[str, object]:
+        """Return the next line that it prints, a JSON object.
+
+        Raises:
+            FailedError: it ended, or printed nothing in time, or something else.
+        """
+        assert self._process.stdout is not None
+        deadline_s = time.monotonic() + patience_s
+        while b"\n" not in self._unread:
+            ready, _, _ = select.select([self._process.stdout], [], [], max(deadline_s - time.monotonic(), 0.0))
+            if not ready:
+                raise FailedError(f"{self._what} said nothing for {patience_s:g} s; {self._reason()}")
+            part = os.read(self._process.stdout.fileno(), 1 << 16)
+            if not part:
+                raise FailedError(f"{self._what} ended: {self._reason()}")
+            self._unread += part
+        line, _, self._unread = self._unread.partition(b"\n")
+        said = json.loads(line)
+        if not isinstance(said, dict):
+            raise FailedError(f"{self._what} said {said!r}")
+        return said
+
+    def _reason(self) -> str:
+        lines = self._log.read_text(encoding="utf-8", errors="replace").split("\n")
+        said = [line.strip() for line in lines if line.strip()]
+        return said[-1][-_REASON_CHARS:] if said else "without a word"

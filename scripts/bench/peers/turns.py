@@ -1,0 +1,123 @@
+"""The turns of the bench of messages: in every round, on every row, each contender once.
+
+Place: shell; lays the rows and takes them down.
+
+A contender that fails the first time is not here, for the reason that it gives. One that fails later has no figures in
+that round, and the failure is told with the results.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+from report import Rounds, percentile, progress
+
+from gdp.testbed.runs import Runs
+from peers.chain import Chain
+from peers.contender import Contender, Measured
+from peers.exchange import Load
+from peers.figures import CPU, MEDIAN, P99, case_of
+from peers.process import FailedError
+
+__all__ = ["Plan", "Turns"]
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What is measured: every combination of these, in every round."""
+
+    mtus: tuple[int, ...]
+    offloads: tuple[bool, ...]
+    contenders: tuple[Contender, ...]
+    load: Load
+    rounds: int
+
+    @property
+    def cases(self) -> list[tuple[int, int, bool]]:
+        """Return bytes, MTU and offloads of every case."""
+        return [(size, mtu, on) for size in self.load.sizes for mtu in self.mtus for on in self.offloads]
+
+    @property
+    def labels(self) -> list[str]:
+        """Return all rows."""
+        return [label for contender in self.contenders for label in contender.labels]
+
+
+class Turns:
+    """The rounds under way.
+
+    Attributes:
+        over: the figures.
+        notes: what went wrong, or was sent twice.
+        offload_states: of the devices, as they say themselves, by what was asked for.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+        self.over = Rounds()
+        self.notes: list[str] = []
+        self.offload_states: dict[bool, str] = {}
+        self._seen: set[str] = set()
+        self._absent: set[str] = set()
+
+    def run(self, runs: Runs) -> None:
+        """Lay a row for each MTU, run all rounds, take the rows down."""
+        with ExitStack() as stack:
+            chains = []
+            for mtu in self.plan.mtus:
+                run = runs.start()
+                stack.callback(run.end)
+                chains.append(Chain(mtu, run))
+            for number in range(1, self.plan.rounds + 1):
+                for chain in chains:
+                    for on in self.plan.offloads:
+                        self.offload_states[on] = chain.set_offloads(on=on)
+                        self._round(number, chain, on)
+
+    def _round(self, number: int, chain: Chain, on: bool) -> None:
+        for contender in self.plan.contenders:
+            if contender.name in self._absent:
+                continue
+            where = f"round {number}/{self.plan.rounds}, MTU {chain.mtu}, offloads {_word(on)}: {contender.name}"
+            begun_s = time.monotonic()
+            try:
+                measured = contender.measure(chain, self.plan.load)
+            except FailedError as error:
+                progress(f"{where} FAILED: {error}")
+                self._miss(contender, chain.mtu, on, where, str(error))
+                continue
+            self._seen.add(contender.name)
+            self._add(measured, chain.mtu, on)
+            resent = sum({each.label: each.resent for each in measured}.values())
+            if resent:
+                self.notes.append(f"{where}: {resent} parts sent again")
+            progress(f"{where}, {time.monotonic() - begun_s:.1f} s")
+
+    def _add(self, measured: Sequence[Measured], mtu: int, on: bool) -> None:
+        for each in measured:
+            case = case_of(each.size, mtu, offloads=on)
+            self.over.add(each.label, case, MEDIAN, 1e3 * percentile(each.rtt_s, 0.5))
+            self.over.add(each.label, case, P99, 1e3 * percentile(each.rtt_s, 0.99))
+            for place, column in CPU.items():
+                if place in each.cpu_s:
+                    self.over.add(each.label, case, column, 1e3 * each.cpu_s[place])
+
+    def _miss(self, contender: Contender, mtu: int, on: bool, where: str, reason: str) -> None:
+        """Take note of a failure: who never came up is not here, whoever did has no figures in this round."""
+        if contender.name not in self._seen:
+            self._absent.add(contender.name)
+            for label in contender.labels:
+                self.over.absent(label, reason)
+            return
+        self.notes.append(f"{where}: {reason}")
+        for label in contender.labels:
+            for size in self.plan.load.sizes:
+                for column in (MEDIAN, P99, *CPU.values()):
+                    self.over.add(label, case_of(size, mtu, offloads=on), column, None)
+
+
+def _word(on: bool) -> str:
+    return "on" if on else "off"

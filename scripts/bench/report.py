@@ -1,0 +1,262 @@
+"""What every bench says in the same way: figures over rounds, a table, ratios asked and got, JSON, a line about here.
+
+Place: pure, but for ``show`` (prints), ``progress`` (stderr) and ``write_json`` (one file). The machine is
+``machine.py``'s, the picture ``plot.py``'s. Scripts of this folder import it by its bare name: ``from report import``.
+
+    state = machine_state()                                          # machine.py, before anything else
+    over = Rounds()                                                  # figures, by what and by whom
+    for number in range(rounds):                                     # contenders interleaved: A B C, A B C ...
+        for contender in contenders:
+            progress(f"round {number + 1}/{rounds}: {contender}")
+            over.add(contender, "1400 B, 3 switches", "frames/s", 450_000.0)      # None: it could not be measured
+    over.absent("kernel", "no CAP_BPF")                              # is shown as "not here: no CAP_BPF"
+    over.spread("kernel", "1400 B, 3 switches", "frames/s")          # Spread(median, low, high) | None
+    goal = over.ratio("kernel / bridge, frames/s", "kernel", "bridge", "1400 B, 3 switches", "frames/s", 1.3)
+    show(title, state, settings, over, [goal, ...])                  # tables, ratio lines
+    write_json(path, "forwarding", state, settings, over, [goal, ...])
+    save_bars(path, ...)                                             # plot.py
+
+A ratio is taken in each round and then medianed, so that what slows a whole round slows both of its sides. A figure of
+one round is itself a median (or p99) over many frames; whoever adds it says so in its column's name.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from machine import MachineState
+from rich.console import Console
+from rich.table import Table
+
+__all__ = ["Goal", "Rounds", "Settings", "Spread", "number_text", "percentile", "progress", "show", "write_json"]
+
+Settings = Mapping[str, str | int | float | bool | Sequence[int] | Sequence[str]]
+_CONSOLE_COLUMNS = 165
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """A figure over rounds: its median, lowest and highest value."""
+
+    median: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Spread:
+        """Return the spread of one value or more.
+
+        Raises:
+            ValueError: none at all.
+        """
+        return cls(statistics.median(values), min(values), max(values))
+
+    def __str__(self) -> str:
+        if self.low == self.high:
+            return number_text(self.median)
+        return f"{number_text(self.median)} ({number_text(self.low)}-{number_text(self.high)})"
+
+
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """A figure that was asked for, and what came of it.
+
+    Attributes:
+        what: the figure in words, with its unit unless it is a ratio.
+        asked: the bound; None where the figure is only told.
+        at_most: the bound is an upper one.
+        got: over rounds; None when a side of it could not be measured.
+        why_not: then, the reason.
+    """
+
+    what: str
+    asked: float | None
+    at_most: bool
+    got: Spread | None
+    why_not: str = ""
+
+    @property
+    def reached(self) -> bool | None:
+        """Tell whether the median keeps the bound; None when there is none, or nothing was measured."""
+        if self.got is None or self.asked is None:
+            return None
+        return self.got.median <= self.asked if self.at_most else self.got.median >= self.asked
+
+    def __str__(self) -> str:
+        got = f"got {self.got}" if self.got else f"got nothing: {self.why_not}"
+        if self.asked is None:
+            return f"{self.what}: {got}"
+        asked = f"asked {'≤' if self.at_most else '≥'} {number_text(self.asked)}"
+        if self.got is None:
+            return f"{self.what}: {asked}, {got}"
+        return f"{self.what}: {asked}, {got}, {'reached' if self.reached else 'NOT reached'}"
+
+
+@dataclass(slots=True)
+class Rounds:
+    """All figures of a bench: contender, case (what was done), column (figure and unit), one value a round."""
+
+    values: dict[str, dict[str, dict[str, list[float | None]]]] = field(default_factory=dict)
+    reasons: dict[str, str] = field(default_factory=dict)
+
+    def add(self, contender: str, case: str, column: str, value: float | None) -> None:
+        """Add the value of the next round; None for one that failed."""
+        self.values.setdefault(contender, {}).setdefault(case, {}).setdefault(column, []).append(value)
+
+    def absent(self, contender: str, reason: str) -> None:
+        """Say why a contender does not take part."""
+        self.reasons[contender] = reason
+
+    def column(self, contender: str, case: str, column: str) -> list[float | None]:
+        """Return one value a round."""
+        return self.values.get(contender, {}).get(case, {}).get(column, [])
+
+    def spread(self, contender: str, case: str, column: str) -> Spread | None:
+        """Return a figure over the rounds that measured it; None when none did."""
+        known = [value for value in self.column(contender, case, column) if value is not None]
+        return Spread.of(known) if known else None
+
+    def cases(self) -> list[str]:
+        """Return the cases in the order in which they came."""
+        return list(dict.fromkeys(case for cases in self.values.values() for case in cases))
+
+    def columns(self, case: str) -> list[str]:
+        """Return the columns that any contender has in a case."""
+        return list(dict.fromkeys(column for cases in self.values.values() for column in cases.get(case, {})))
+
+    def goal(
+        self, what: str, contender: str, case: str, column: str, asked: float | None, *, at_most: bool = False
+    ) -> Goal:
+        """Return a bound on one contender's figure."""
+        return _goal(what, asked, at_most, self.column(contender, case, column), self._why_not(contender, case))
+
+    def ratio(
+        self,
+        what: str,
+        one: str,
+        other: str,
+        case: str,
+        column: str,
+        asked: float | None,
+        *,
+        other_case: str | None = None,
+        at_most: bool = False,
+    ) -> Goal:
+        """Return a bound on ``one / other``, round by round.
+
+        Args:
+            other_case: the other's case, where it is not the same.
+        """
+        beside = other_case or case
+        pairs = zip(self.column(one, case, column), self.column(other, beside, column), strict=False)
+        ratios = [None if a is None or not b else a / b for a, b in pairs]
+        return _goal(what, asked, at_most, ratios, self._why_not(one, case) or self._why_not(other, beside))
+
+    def difference(
+        self,
+        what: str,
+        one: str,
+        other: str,
+        case: str,
+        column: str,
+        asked: float | None,
+        *,
+        other_case: str | None = None,
+        at_most: bool = True,
+    ) -> Goal:
+        """Return a bound on ``one - other``, round by round."""
+        beside = other_case or case
+        pairs = zip(self.column(one, case, column), self.column(other, beside, column), strict=False)
+        gaps = [None if a is None or b is None else a - b for a, b in pairs]
+        return _goal(what, asked, at_most, gaps, self._why_not(one, case) or self._why_not(other, beside))
+
+    def _why_not(self, contender: str, case: str) -> str:
+        if contender in self.reasons:
+            return f"{contender} is not here: {self.reasons[contender]}"
+        return "" if case in self.values.get(contender, {}) else f"{contender} was not asked for"
+
+
+def _goal(what: str, asked: float | None, at_most: bool, values: Iterable[float | None], why_not: str) -> Goal:
+    known = [value for value in values if value is not None]
+    if known:
+        return Goal(what, asked, at_most, Spread.of(known))
+    return Goal(what, asked, at_most, None, why_not or "no round measured it")
+
+
+def percentile(values: Iterable[float], share: float) -> float:
+    """Return the smallest value that at least ``share`` (0 to 1) of the values do not pass.
+
+    Raises:
+        ValueError: no values.
+    """
+    ordered = sorted(values)
+    if not ordered:
+        raise ValueError("no values")
+    return ordered[max(0, math.ceil(share * len(ordered)) - 1)]
+
+
+def number_text(value: float) -> str:
+    """Return a figure with about three digits that mean something."""
+    size = abs(value)
+    if size >= 1_000:
+        return f"{value:,.0f}"
+    if size >= 100:
+        return f"{value:.0f}"
+    if size >= 10:
+        return f"{value:.1f}"
+    return f"{value:.2f}" if size >= 0.1 or not size else f"{value:.2g}"
+
+
+def progress(text: str) -> None:
+    """Say on stderr what is being done, so that stdout holds results alone."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def show(title: str, state: MachineState, settings: Settings, over: Rounds, goals: Sequence[Goal] = ()) -> None:
+    """Print the machine, a table a case, and a line for each figure that was asked for."""
+    console = Console() if sys.stdout.isatty() else Console(width=_CONSOLE_COLUMNS)
+    console.print(f"[bold]{title}[/bold]\n{state}", highlight=False)
+    console.print(
+        "; ".join(f"{key}: {_setting_text(value)}" for key, value in settings.items()), highlight=False, soft_wrap=True
+    )
+    for case in over.cases():
+        columns = over.columns(case)
+        table = Table(title=case, title_justify="left")
+        table.add_column("", no_wrap=True)
+        for column in columns:
+            table.add_column(column, justify="right")
+        for contender, cases in over.values.items():
+            if case in cases:
+                spreads = (over.spread(contender, case, column) for column in columns)
+                table.add_row(contender, *("-" if spread is None else str(spread) for spread in spreads))
+        console.print(table)
+    for contender, reason in over.reasons.items():
+        console.print(f"{contender} - not here: {reason}", markup=False, highlight=False, soft_wrap=True)
+    for goal in goals:
+        console.print(str(goal), markup=False, highlight=False, soft_wrap=True)
+
+
+def _setting_text(value: str | float | Sequence[int] | Sequence[str]) -> str:
+    return str(value) if isinstance(value, str | int | float) else ", ".join(map(str, value))
+
+
+def write_json(
+    path: Path, bench: str, state: MachineState, settings: Settings, over: Rounds, goals: Sequence[Goal] = ()
+) -> None:
+    """Write all values of all rounds, and the goals with what came of them."""
+    answer = {
+        "bench": bench,
+        "machine": asdict(state),
+        "settings": dict(settings),
+        "rounds": over.values,
+        "not_here": over.reasons,
+        "goals": [{**asdict(goal), "reached": goal.reached} for goal in goals],
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(answer, indent=1) + "\n", encoding="utf-8")

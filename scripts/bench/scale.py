@@ -1,0 +1,204 @@
+"""What a large forwarding table costs, and how much a RIB takes.
+
+    sudo .venv/bin/python scripts/bench/scale.py                      minutes; JSON and plot to docs/benchmarks
+    sudo .venv/bin/python scripts/bench/scale.py --quick --no-save    a small table, to see that all works
+
+Tables of 1,000, 100,000 and 1,000,000 names, in the raw and the kernel plane. Each stands in a chain of its own with
+one switch, all at the same time, so that frames are tried on all of them in turn:
+
+installs/s     new entries put into the table and, where there is one, the kernel's map: 100,000 a call
+renewals/s     the same entries again, under a new lease
+table B/entry  what the process grew by; "map" all that the kernel's maps hold beside that (memlock)
+frames/s       of 128 bytes, spread over 1,024 names of the table (--spread), under 0.1 % loss, through one switch
+CPU µs/frame   then: of source, soft interrupts and switch; the sink is left out
+
+Half of the entries are for a destination, half for destination and source. The RIB is one process without a network
+(``rib_load.py``): advertisements taken and queries answered in a second of one core, and memory a name.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import statistics
+import subprocess
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from chains import Chain
+from contenders import Plane
+from machine import machine_state
+from plot import Panel, panel_of, require_plot, save_bars
+from report import Goal, Rounds, progress, show, write_json
+from search import LOSS_MAX, Try, highest
+from worker import Worker, number
+
+from gdp.errors import LocalError
+from gdp.testbed.runs import Runs
+
+PLANES: Final = ("kernel", "raw")
+SIZES: Final = (1_000, 100_000, 1_000_000)
+RIB: Final = "RIB"
+SPREAD: Final = 1_024
+FRAME_BYTES: Final = 128
+GUESS: Final = 150_000.0  # frames/s of raw, to begin with
+REPEATS: Final = 3  # of a try that needs no search; their median is the round's figure
+INSTALLS, RENEWALS, RATE, CPU = "installs/s", "renewals/s", "frames/s", "CPU µs/frame"
+TABLE, MAP = "table B/entry", "map B/entry"
+ADVERTISED, ASKED, KEPT = "advertisements verified/s", "queries/s", "B/name"
+OUTPUT: Final = Path(__file__).parents[2] / "docs" / "benchmarks"
+
+
+def measure_plane(kind: str, chains: dict[int, Chain], over: Rounds, seconds: float, spread: int) -> None:
+    """Fill a table of every size, then send through all of them in turn."""
+    with ExitStack() as undo:
+        planes: dict[int, Plane] = {}
+        for names, chain in chains.items():
+            plane = Plane(kind, processes=kind == "raw", names=names)
+            try:
+                undo.enter_context(plane.stand(chain))
+            except LocalError as error:
+                over.absent(kind, str(error))
+                return
+            planes[names] = plane
+            progress(f"  {names:,} names")
+            _fill(plane.workers()[0], names, kind, over)
+        held: dict[int, list[Try]] = {names: [] for names in chains}
+        for _ in range(1 if planes[min(planes)].processes else REPEATS):
+            for names, plane in planes.items():
+                wire = plane.wire(chains[names], FRAME_BYTES)
+                attempt = partial(chains[names].attempt, wire, plane.workers(), seconds=seconds, spread=(spread, names))
+                best = highest(attempt, GUESS if plane.processes else None)
+                held[names] += [best] if best else []
+        for names, tries in held.items():
+            rates, costs = [each.rate for each in tries], [each.cpu_s / each.got * 1e6 for each in tries]
+            over.add(kind, case_of(names), RATE, statistics.median(rates) if rates else None)
+            over.add(kind, case_of(names), CPU, statistics.median(costs) if costs else None)
+
+
+def _fill(worker: Worker, names: int, kind: str, over: Rounds) -> None:
+    filled = worker.ask(do="fill")
+    case, placed = case_of(names), number(filled["placed"])
+    if placed != names:
+        raise LocalError(f"{kind}: the table took {placed:.0f} of {names} entries")
+    over.add(kind, case, INSTALLS, number(filled["installs_per_s"]))
+    over.add(kind, case, RENEWALS, number(filled["renewals_per_s"]))
+    over.add(kind, case, TABLE, number(filled["resident_bytes"]) / names)
+    over.add(kind, case, MAP, number(filled["map_bytes"]) / names)
+
+
+def measure_rib(names: int, over: Rounds) -> None:
+    """Run one RIB in a process of its own."""
+    script = str(Path(__file__).with_name("rib_load.py"))
+    done = subprocess.run([sys.executable, script, str(names)], stdout=subprocess.PIPE, text=True, check=False)
+    if done.returncode:
+        raise LocalError("the RIB of the bench ended early; see above")
+    load = json.loads(done.stdout)
+    over.add(RIB, f"RIB, {names:,} names", ADVERTISED, load["advertisements_per_s"])
+    over.add(RIB, f"RIB, {names:,} names", ASKED, load["queries_per_s"])
+    over.add(RIB, f"RIB, {names:,} names", KEPT, load["bytes_a_name"])
+
+
+def case_of(names: int) -> str:
+    """Return what a table is headed with."""
+    return f"{names:,} names"
+
+
+def goals_of(over: Rounds, sizes: Sequence[int], rib_names: int) -> list[Goal]:
+    """Return the figures that are to be reached."""
+    small, large = case_of(min(sizes)), case_of(max(sizes))
+    return [
+        *(
+            over.ratio(f"{plane}: {large} / {small}, frames/s", plane, plane, large, RATE, 0.95, other_case=small)
+            for plane in PLANES
+        ),
+        *(
+            over.ratio(f"{plane}: {large} / {small}, {CPU}", plane, plane, large, CPU, None, other_case=small)
+            for plane in PLANES
+        ),
+        *(over.goal(f"{plane}, {large}: {INSTALLS} in bulk", plane, large, INSTALLS, 300_000) for plane in PLANES),
+        over.goal(f"RIB: {ADVERTISED}, one core", RIB, f"RIB, {rib_names:,} names", ADVERTISED, 2_000),
+    ]
+
+
+def main() -> None:
+    """Run the bench."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=0.3, help="length of one try")
+    parser.add_argument("--spread", type=int, default=SPREAD, help="names that frames go to; a power of two")
+    parser.add_argument("--only", action="append", choices=[*PLANES, RIB], default=[], help="may be repeated")
+    parser.add_argument("--quick", action="store_true", help="one round, up to 10,000 names: does everything work?")
+    parser.add_argument("--json", type=Path, default=OUTPUT / "scale.json")
+    parser.add_argument("--plot", type=Path, default=OUTPUT / "scale.png")
+    parser.add_argument("--no-plot", action="store_true")
+    parser.add_argument("--no-save", action="store_true", help="print only")
+    options = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
+    state = machine_state()
+    if not (options.no_plot or options.no_save):
+        require_plot()
+    sizes = (1_000, 10_000) if options.quick else SIZES
+    rounds, seconds, rib_names = (1, 0.15, 300) if options.quick else (options.rounds, options.seconds, 3_000)
+    over, runs = Rounds(), Runs()
+    runs.sweep()
+    try:
+        with ExitStack() as undo:
+            chains = {names: undo.enter_context(Chain(runs, 1, 1_500)) for names in sizes}
+            for turn in range(rounds):
+                for kind in PLANES:
+                    if kind not in over.reasons and (not options.only or kind in options.only):
+                        progress(f"round {turn + 1} of {rounds}: {kind}")
+                        measure_plane(kind, chains, over, seconds, options.spread)
+                if not options.only or RIB in options.only:
+                    progress(f"round {turn + 1} of {rounds}: RIB")
+                    measure_rib(rib_names, over)
+    except KeyboardInterrupt:
+        sys.exit("stopped; everything that was made is gone")
+    except LocalError as error:
+        sys.exit(str(error))
+    settings = {
+        "rounds": rounds,
+        "seconds a try": seconds,
+        "loss below": LOSS_MAX,
+        "MTU": 1_500,
+        "frames": f"{FRAME_BYTES} B, one switch, {options.spread:,} names of the table",
+        "cores": "source 0, sink 1, switch anywhere",
+    }
+    goals = goals_of(over, sizes, rib_names)
+    show("Scale", state, settings, over, goals)
+    if options.no_save:
+        return
+    write_json(options.json, "scale", state, settings, over, goals)
+    if not options.no_plot:
+        save_bars(options.plot, "Scale", str(state), panels_of(over, sizes))
+
+
+def panels_of(over: Rounds, sizes: Sequence[int]) -> list[Panel]:
+    """Return a panel for each figure of a table: planes by sizes."""
+    return [
+        panel_of_cases(over, column, [case_of(names) for names in sizes]) for column in (RATE, INSTALLS, TABLE, MAP)
+    ]
+
+
+def panel_of_cases(over: Rounds, column: str, cases: Sequence[str]) -> Panel:
+    """Return one panel with a bar for each plane and size."""
+    panels = [panel_of(over, case, column, [plane], ours=PLANES) for plane in PLANES for case in cases]
+    labels = [f"{plane}, {case}" for plane in PLANES for case in cases]
+    bars = [
+        replace(bar, label=label)
+        for panel, label in zip(panels, labels, strict=True)
+        for bar in panel.bars
+        if bar.median
+    ]
+    return Panel(column, panels[0].unit, bars)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,116 @@
+"""The kernel's map against the table, after any changes."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from gdp.ports.kernel.loaded import Loaded
+from gdp.ports.kernel.mirror import Mirror
+from gdp.ports.kernel.shapes import BRANCHES_MAX, GROUP, NOWHERE_PORT, PORTS_MAX, EntryAt, group
+from gdp.switch.table import NOWHERE, Hops, Table
+
+ONE_HOP: Hops = ((1, b"m" * 12),)
+PAIR: Hops = ((1, b"m" * 12), (2, b"n" * 12))
+TRIPLE: Hops = (*PAIR, (3, b"o" * 12))
+WIDE: Hops = tuple((port, b"w" * 12) for port in range(BRANCHES_MAX + 1))
+FAR: Hops = ((PORTS_MAX, b"f" * 12),)
+
+
+def name(number: int) -> bytes:
+    return bytes([number]) * 32
+
+
+def in_kernel(loaded: Loaded, key: bytes) -> Hops | None:
+    """Return what the program would find for a key."""
+    value = loaded.entries.get(key.ljust(64, b"\0"))
+    if value is None:
+        return None
+
+    def number(at: int) -> int:
+        return int.from_bytes(value[at : at + 4], sys.byteorder)
+
+    port = number(EntryAt.PORT)
+    if port == NOWHERE_PORT:
+        return NOWHERE
+    if port != GROUP:
+        return ((port, value[EntryAt.MACS : EntryAt.GROUP]),)
+    body = loaded.groups.get(value[EntryAt.GROUP : EntryAt.GROUP + 4])
+    return next(hops for hops in (PAIR, TRIPLE) if group(hops) == body)
+
+
+def watched(loaded: Loaded) -> tuple[Table, Mirror]:
+    table = Table()
+    mirror = Mirror(table.entries, *loaded.of_entries)
+    table.observe(mirror)
+    return table, mirror
+
+
+KEYS = st.builds(lambda a, b: name(a) + (name(b) if b else b""), st.integers(1, 3), st.integers(0, 3)) | st.builds(
+    lambda a: name(a) + bytes(32), st.integers(1, 3)
+)
+CHANGES = st.lists(
+    st.tuples(KEYS, st.sampled_from([None, NOWHERE, ONE_HOP, PAIR, TRIPLE, WIDE, FAR])), min_size=1, max_size=20
+)
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(changes=CHANGES, at_once=st.booleans())
+def test_the_kernel_has_what_the_table_has_or_nothing(
+    small: Loaded, changes: list[tuple[bytes, Hops | None]], at_once: bool
+) -> None:
+    table, mirror = watched(small)
+    if at_once:
+        table.install_many([(key, hops) for key, hops in changes if hops is not None], 1.0)
+    for key, hops in changes:
+        if hops is None:
+            table.remove(key)
+        elif not at_once:
+            table.install(key, hops, 1.0)
+    try:
+        found = {key: in_kernel(small, key) for key in table.entries if key[32:] != bytes(32)}
+        assert all(hops in (None, table.entries[key]) for key, hops in found.items())
+        assert all(
+            found.get(key) is None for key in table.entries if len(key) == 32 and key + bytes(32) in table.entries
+        )
+        held = [key for key, hops in found.items() if hops is not None]
+        assert len(mirror) == len(held)
+        assert mirror.left_out == len(table) - len(held)
+        fit = [
+            key
+            for key, hops in table.entries.items()
+            if hops not in (WIDE, FAR) and key[32:] != bytes(32) and key[:32] + bytes(32) not in table.entries
+        ]
+        assert len(held) >= min(3, len([key for key in fit if len(key) == 32]))
+    finally:
+        table.expire(1.0)
+    assert len(mirror) == mirror.left_out == 0
+    assert all(small.groups.get(n.to_bytes(4, sys.byteorder)) is None for n in range(8))
+
+
+def test_a_counter_that_is_used_again_begins_at_zero(small: Loaded) -> None:
+    table, mirror = watched(small)
+    for number in (1, 2, 3):
+        table.install(name(number), ONE_HOP, 1.0)
+    value = (7).to_bytes(8, sys.byteorder) * (small.counts.value_bytes // 8)
+    for counter in (1, 2, 3):
+        small.counts.put(counter.to_bytes(4, sys.byteorder), value)
+    cpus = small.counts.value_bytes // 16
+    assert mirror.counts(10) == dict.fromkeys(map(name, (1, 2, 3)), (7 * cpus, 7 * cpus))
+    table.remove(name(2))
+    table.install(name(4), ONE_HOP, 1.0)
+    assert mirror.counts(10) == dict.fromkeys(map(name, (1, 3)), (7 * cpus, 7 * cpus))
+
+
+@pytest.mark.parametrize("hops", [NOWHERE, PAIR])
+def test_an_entry_that_changes_its_way_keeps_its_counts(small: Loaded, hops: Hops) -> None:
+    table, mirror = watched(small)
+    table.install(name(1), ONE_HOP, 1.0)
+    small.counts.put((1).to_bytes(4, sys.byteorder), (9).to_bytes(8, sys.byteorder) * (small.counts.value_bytes // 8))
+    before = mirror.counts(1)
+    table.install(name(1), hops, 1.0)
+    assert in_kernel(small, name(1)) == hops
+    assert mirror.counts(1) == before != {}

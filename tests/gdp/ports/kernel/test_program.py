@@ -1,0 +1,226 @@
+"""The program against ``decide`` and ``rewrite``, by ``BPF_PROG_TEST_RUN``: nothing is sent, no device is needed.
+
+The kernel lets a test frame come in on the loopback device, whose address is zero; so the frames here are addressed to
+zero, which no verdict depends on. What an entry with several hops becomes is tested on real devices, since the program
+sends the copies itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gdp.errors import DropReason
+from gdp.frame.codec import DESTINATION_AT, ETHER_BYTES, HEADER_BYTES, SOURCE_AT
+from gdp.frame.kinds import Flag, Kind
+from gdp.ports.kernel import syscall
+from gdp.ports.kernel.assembler import Assembler, Reg
+from gdp.ports.kernel.loaded import Loaded
+from gdp.ports.kernel.mirror import Mirror
+from gdp.ports.kernel.program import DROP, REDIRECT, UP
+from gdp.ports.kernel.syscall import LoadRefusedError
+from gdp.switch.forwarder import Drop, Forward, HandUp, decide, rewrite
+from gdp.switch.table import NOWHERE, Hops, Table
+from tests.fixtures_forwarding import (
+    ANYBODY,
+    CASES,
+    ENTRIES,
+    GONE,
+    MTUS,
+    ONE,
+    OTHER_SOURCE,
+    SOURCE,
+    SPLIT,
+    TO_ABSENT,
+    TO_NARROW,
+    TO_WIDE,
+    Case,
+    frame,
+)
+
+TO_US = bytes(6)  # the loopback's address
+LEFT_TO_PYTHON = {DropReason.TRUNCATED, DropReason.BAD_ETHERTYPE, DropReason.BAD_VERSION, DropReason.HOPS_EXPIRED}
+LEFT_TO_PYTHON |= {DropReason.TOO_BIG}
+DESTINATION = slice(ETHER_BYTES + DESTINATION_AT, ETHER_BYTES + SOURCE_AT)  # left to Python with an entry for no source
+UNTOLD = 9  # a port that the kernel was never told of
+TO_UNTOLD = (UNTOLD, bytes(12))
+
+
+@dataclass(frozen=True)
+class Step:
+    """What the program did with one frame, and what it counted."""
+
+    verdict: int
+    frame: bytes
+    drops: dict[DropReason, int]
+    taken: int
+    copies: int
+
+
+def forwards(loaded: Loaded, entries: Mapping[bytes, Hops], mtus: Mapping[int, int] = MTUS) -> Table:
+    """Let the program forward by these entries; ports have no device, for nothing is sent here."""
+    table = Table()
+    for port in range(UNTOLD):
+        loaded.set_port(port, 1 if port in mtus else 0, mtus.get(port, 0), 0)
+    for key in list(entries):
+        table.install(key, entries[key], 1.0)
+    table.observe(Mirror(table.entries, *loaded.of_entries))
+    return table
+
+
+def clear(table: Table) -> None:
+    table.expire(1.0)
+    table.observe(None)
+
+
+def step(loaded: Loaded, given: bytes) -> Step:
+    before = loaded.counters()
+    run = syscall.run(loaded.program, given)
+    after = loaded.counters()
+    drops = {reason: after.drops[reason] - before.drops[reason] for reason in DropReason}
+    return Step(
+        run.verdict,
+        run.frame,
+        {reason: count for reason, count in drops.items() if count},
+        after.frames_in - before.frames_in,
+        after.forwarded - before.forwarded,
+    )
+
+
+def check(done: Step, given: bytes, entries: Mapping[bytes, Hops]) -> None:
+    """Whether the program did what ``decide`` and ``rewrite`` say, or left it to them for a reason that it may."""
+    said = decide(given, entries, MTUS)
+    if done.verdict == UP:
+        reasons = {said.reason} if isinstance(said, Drop) else set(said.lost) if isinstance(said, Forward) else set()
+        assert isinstance(said, HandUp) or reasons & LEFT_TO_PYTHON or given[DESTINATION] + bytes(32) in entries
+        assert (done.frame, done.drops, done.taken, done.copies) == (given, {}, 0, 0)
+    elif done.verdict == DROP:
+        lost = (said.reason,) if isinstance(said, Drop) else said.lost if isinstance(said, Forward) else ()
+        assert not isinstance(said, Forward) or not said.hops
+        assert done.drops == {lost[0]: 1}
+        assert (done.taken, done.copies) == (1, 0)
+    else:
+        assert done.verdict == REDIRECT
+        assert isinstance(said, Forward)
+        ((_, macs),) = said.hops
+        assert done.frame == rewrite(given, macs)
+        assert (done.drops, done.taken, done.copies) == ({}, 1, 1)
+
+
+SINGLE = {key: hops for key, hops in ENTRIES.items() if len(hops) < 2}
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_each_fixture_of_one_hop_becomes_what_the_reference_says(case: Case, loaded: Loaded) -> None:
+    given = TO_US + case.frame[6:]
+    table = forwards(loaded, SINGLE)
+    try:
+        check(step(loaded, given), given, SINGLE)
+    finally:
+        clear(table)
+
+
+def test_the_ordinary_is_not_left_to_python(loaded: Loaded) -> None:
+    table = forwards(loaded, SINGLE)
+    try:
+        verdicts = [
+            step(loaded, TO_US + each[6:]).verdict
+            for each in (frame(ONE), frame(SPLIT, source=OTHER_SOURCE), frame(GONE, source=OTHER_SOURCE))
+        ]
+    finally:
+        clear(table)
+    assert verdicts == [REDIRECT, REDIRECT, DROP]
+
+
+NAMES = st.sampled_from([ONE, SPLIT, GONE, ANYBODY])
+SOURCES = st.sampled_from([SOURCE, OTHER_SOURCE, bytes(32)])
+HOPS = st.sampled_from([NOWHERE, (TO_WIDE,), (TO_NARROW,), (TO_ABSENT,), (TO_UNTOLD,)])
+TABLES = st.dictionaries(NAMES | st.builds(bytes.__add__, NAMES, SOURCES), HOPS, max_size=8)
+NEAR = st.integers(-3, 3)
+
+
+@st.composite
+def frames(draw: st.DrawFn) -> bytes:
+    """Frames near every bound that a verdict depends on."""
+    size = draw(st.sampled_from([0, 1, 600, MTUS[2] - HEADER_BYTES, MTUS[1] - HEADER_BYTES])) + draw(NEAR)
+    payload = bytes(max(size, 0))
+    whole = frame(
+        draw(NAMES),
+        payload,
+        source=draw(SOURCES),
+        kind=draw(st.sampled_from([Kind.DATA, 0x7F, 0x80, 0xFF])),
+        flags=draw(st.integers(0, 255)),
+        hops_left=draw(st.sampled_from([0, 1, 2, 64, 255])),
+        length=draw(st.none() | st.just(max(len(payload) + draw(NEAR), 0))),
+        padding=bytes(draw(st.integers(0, 3))),
+    )
+    changes = draw(st.lists(st.tuples(st.integers(12, 20), st.integers(0, 255)), max_size=1))
+    changed = bytearray(TO_US + whole[6:])
+    for at, value in changes:
+        changed[at] = value
+    return bytes(changed[: draw(st.sampled_from([len(changed)] * 6 + [ETHER_BYTES, 60, 109]))])
+
+
+@settings(deadline=None)
+@given(given=st.lists(frames(), min_size=1, max_size=8), entries=TABLES)
+def test_generated_frames_and_tables_get_the_verdict_of_the_reference(
+    loaded: Loaded, given: list[bytes], entries: dict[bytes, Hops]
+) -> None:
+    table = forwards(loaded, entries)
+    try:
+        for each in given:
+            check(step(loaded, each), each, entries)
+    finally:
+        clear(table)
+
+
+def test_only_what_is_urgent_gets_a_priority(loaded: Loaded) -> None:
+    table = forwards(loaded, SINGLE)
+    try:
+        plain = syscall.run(loaded.program, TO_US + frame(ONE)[6:])
+        urgent = syscall.run(loaded.program, TO_US + frame(ONE, flags=Flag.URGENT)[6:])
+    finally:
+        clear(table)
+    assert (plain.verdict, plain.priority) == (REDIRECT, 0)
+    assert (urgent.verdict, urgent.priority) == (REDIRECT, 6)
+
+
+def test_what_another_station_should_get_is_left_alone(loaded: Loaded) -> None:
+    table = forwards(loaded, SINGLE)
+    try:
+        assert step(loaded, bytes([2, 0, 0, 0, 0, 9]) + frame(ONE)[6:]).verdict == UP
+        assert step(loaded, b"\xff" * 6 + frame(ONE)[6:]).verdict == UP
+    finally:
+        clear(table)
+
+
+def test_a_lease_that_ended_leaves_everything_to_python(loaded: Loaded) -> None:
+    table = forwards(loaded, SINGLE)
+    given = TO_US + frame(ONE)[6:]
+    try:
+        loaded.renew(-1)
+        assert step(loaded, given).verdict == (UP if loaded.is_leased else REDIRECT)
+        loaded.renew(3_600)
+        assert step(loaded, given).verdict == REDIRECT
+    finally:
+        clear(table)
+
+
+def test_a_refused_program_says_why_in_the_words_of_the_verifier(loaded: Loaded) -> None:
+    bad = Assembler()
+    bad.load(Reg.R0, Reg.R5, 0, 8)
+    bad.leave()
+    with pytest.raises(LoadRefusedError) as refused:
+        syscall.load_program(bad.assemble(), "gdp_bad", b"Apache-2.0")
+    assert "R5 !read_ok" in refused.value.log
+    assert refused.value.log in str(refused.value)
+
+
+def test_an_unknown_machine_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("platform.machine", lambda: "pdp11")
+    with pytest.raises(Exception, match="pdp11"):
+        Loaded(1)

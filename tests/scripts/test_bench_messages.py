@@ -1,0 +1,221 @@
+"""The bench of messages, as far as it thinks: the message, the loop, the addresses, the figures to reach."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections import deque
+from ipaddress import ip_address, ip_network
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+from rosbags.typesys import Stores, get_typestore
+
+sys.path.append(str(Path(__file__).resolve().parents[2] / "scripts" / "bench"))
+
+from peers.certificates import make_certificates
+from peers.chain import LEFT, NODES, RIGHT, address, five, routes
+from peers.cyclone_net import cyclone_xml
+from peers.exchange import ANSWER, IMAGE, SIZE_MIN, Load, answer_to, exchange, image
+from peers.figures import MEDIAN, case_of, goals_of
+from peers.lines import EndSettings
+from report import Rounds
+
+from proxy.serial.channel import Channel
+from proxy.serial.serializer import Encoding, Serializer
+from proxy.serial.standard import standard_definition
+
+LOAD = Load((100, 10_000), 5)
+
+
+class Echo:
+    """A way whose far end answers at once; each test breaks it in its own manner."""
+
+    def __init__(self) -> None:
+        self.sent: list[bytes] = []
+        self.answers = deque[bytes]()
+
+    def send(self, message: bytes) -> None:
+        self.sent.append(message)
+        self.answers.append(answer_to(message))
+
+    def wait(self, deadline_s: float) -> bytes | None:
+        return self.answers.popleft() if self.answers else None
+
+
+@pytest.mark.parametrize("size", [SIZE_MIN, 100, 10_000, 921_600])
+def test_a_message_is_an_image_of_exactly_so_many_bytes(size: int) -> None:
+    raw = bytes(image(size))
+    read = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(raw, IMAGE)
+    assert len(raw) == size
+    assert read.encoding == "mono8"
+    assert read.height * read.step == len(read.data)
+    assert bytes(np.asarray(read.data)[-8:]) == raw[-8:]
+
+
+@pytest.mark.parametrize("encoding", ["json", "cbor", "cdr"])
+def test_a_message_passes_every_encoding_unchanged_and_not_as_opaque(encoding: Encoding) -> None:
+    channel = Channel("/x", IMAGE, 2, definition=standard_definition(IMAGE) or "", definition_format="msg")
+    serializer, raw = Serializer(channel, encoding), bytes(image(10_000))
+    body = serializer.encode(raw)
+    assert serializer.decode(body) == raw
+    assert b"$raw" not in body
+
+
+def test_a_message_without_room_for_its_number_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least"):
+        image(SIZE_MIN - 1)
+
+
+def test_as_many_round_trips_are_measured_as_asked_for_and_every_size_is_checked_once() -> None:
+    way = Echo()
+    found = exchange(way, LOAD, {})
+    assert [(each["size"], len(list(each["rtt_s"]))) for each in found] == [(100, 20), (10_000, 20)]  # type: ignore[call-overload]
+    numbers = [int.from_bytes(message[-8:], "big") for message in way.sent[1:]]
+    assert len(set(numbers)) == len(numbers)
+    assert [number >> 63 for number in numbers].count(1) == len(LOAD.sizes)
+
+
+def test_an_answer_to_a_greeting_that_comes_late_is_not_taken_for_an_answer() -> None:
+    class Late(Echo):
+        def send(self, message: bytes) -> None:
+            super().send(message)
+            if len(self.sent) == 1:
+                self.answers.append(answer_to(message))
+
+    found = exchange(Late(), LOAD, {})
+    assert len(found) == len(LOAD.sizes)
+
+
+def test_a_message_that_changed_on_the_way_ends_the_measurement() -> None:
+    class Broken(Echo):
+        def send(self, message: bytes) -> None:
+            super().send(b"\xff" + message[1:])
+
+    with pytest.raises(ValueError, match="something else"):
+        exchange(Broken(), LOAD, {})
+
+
+def test_a_message_that_is_not_answered_ends_the_measurement() -> None:
+    class Mute(Echo):
+        def send(self, message: bytes) -> None:
+            if not self.sent:
+                super().send(message)
+
+    with pytest.raises(TimeoutError, match="100 bytes"):
+        exchange(Mute(), LOAD, {})
+
+
+def test_nobody_at_the_far_end_is_an_error_and_not_a_wait_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Nobody(Echo):
+        def send(self, message: bytes) -> None:
+            monkeypatch.setattr(time, "monotonic", lambda: float("inf"))
+
+    with pytest.raises(TimeoutError, match="never answered"):
+        exchange(Nobody(), LOAD, {})
+
+
+def test_cpu_of_this_process_is_counted_where_it_is_named() -> None:
+    class Busy(Echo):
+        def send(self, message: bytes) -> None:
+            until_s = time.process_time() + 0.0005
+            while time.process_time() < until_s:
+                pass
+            super().send(message)
+
+    (found,) = exchange(Busy(), Load((100,), 2), {"sender": [os.getpid()], "nobody": []})
+    cpu = found["cpu_s"]
+    assert isinstance(cpu, dict)
+    assert cpu["sender"] >= 0.0005
+    assert cpu["nobody"] == 0
+
+
+def test_an_answer_has_sixteen_bytes() -> None:
+    assert len(answer_to(bytes(image(100)))) == ANSWER.size == 16
+
+
+@pytest.mark.parametrize("start", NODES)
+@pytest.mark.parametrize("end", NODES)
+def test_every_machine_reaches_every_address_over_its_neighbours(start: str, end: str) -> None:
+    topology = five(1_500)
+    for link in topology.links_of(end):
+        target, at, passed = ip_address(address(end, link.other(end))), start, [start]
+        while at != end:
+            own = {address(each.other(at), at): each.other(at) for each in topology.links_of(at)}
+            gateway = next((way for net, way in routes(at).items() if target in ip_network(net)), None)
+            if gateway is None:
+                (gateway,) = (each for each in own if target in ip_network(f"{each}/24", strict=False))
+            at = own[gateway]
+            passed.append(at)
+        assert len(passed) == abs(NODES.index(start) - NODES.index(end)) + 1
+
+
+def test_two_ends_of_a_link_share_a_network_and_nobody_else_does() -> None:
+    links = five(9_000).links
+    nets = [{ip_network(f"{address(*pair)}/24", strict=False) for pair in ((x.a, x.b), (x.b, x.a))} for x in links]
+    assert all(len(each) == 1 for each in nets)
+    assert len(set.union(*nets)) == len(links)
+
+
+def test_cyclone_knows_its_peer_by_address_and_asks_nobody_else() -> None:
+    tree = ElementTree.fromstring(cyclone_xml("10.99.0.1", "10.99.3.2"))
+    found = {each.tag: each for each in tree.iter()}
+    assert found["AllowMulticast"].text == "false"
+    assert [peer.get("address") for peer in tree.iter("Peer")] == ["10.99.3.2"]
+    assert found["NetworkInterface"].get("address") == "10.99.0.1"
+
+
+def test_a_certificate_holds_for_the_addresses_of_its_machine_only(tmp_path: Path) -> None:
+    make_certificates(tmp_path / "tls", {"s1": ["10.99.0.2", "10.99.1.1"]})
+    root, own = (
+        x509.load_pem_x509_certificate((tmp_path / "tls" / f"{name}.crt").read_bytes()) for name in ("ca", "s1")
+    )
+    names = own.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert names.get_values_for_type(x509.IPAddress) == [ip_address("10.99.0.2"), ip_address("10.99.1.1")]
+    own.verify_directly_issued_by(root)
+    key = load_pem_private_key((tmp_path / "tls" / "s1.key").read_bytes(), None)
+    assert key.public_key() == own.public_key()
+
+
+def test_settings_of_an_end_survive_the_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = EndSettings("ping", LOAD, {"receiver": [7]}, {"config": "x"})
+    monkeypatch.setattr(sys, "argv", ["end", settings.to_argument()])
+    assert EndSettings.from_argument() == settings
+
+
+def test_a_ratio_is_taken_within_one_round_and_one_case() -> None:
+    over, case = Rounds(), case_of(921_600, 1_500, offloads=True)
+    for ours, theirs in ((2.0, 4.0), (30.0, 40.0), (9.0, 10.0)):
+        over.add("gdp-raw cdr", case, MEDIAN, ours)
+        over.add("zenoh-mtls", case, MEDIAN, theirs)
+    over.add("zenoh-mtls", case_of(921_600, 1_500, offloads=False), MEDIAN, 1.0)
+    (goal,) = goals_of(over, ["gdp-raw cdr"], [(921_600, 1_500, True)])[:1]
+    assert goal.got is not None
+    assert goal.got.median == 0.75
+    assert goal.asked == 0.8
+    assert goal.reached
+
+
+def test_a_contender_that_is_not_here_reaches_nothing_and_says_why() -> None:
+    over, case = Rounds(), case_of(100, 1_500, offloads=False)
+    over.add("zenoh-mtls", case, MEDIAN, 1.0)
+    over.absent("gdp-kernel cdr", "no CAP_BPF")
+    (goal,) = goals_of(over, ["gdp-kernel cdr"], [(100, 1_500, False)])
+    assert goal.reached is None
+    assert "no CAP_BPF" in str(goal)
+
+
+def test_only_what_was_run_is_asked_for_and_only_of_rows_that_carry_bytes_as_they_are() -> None:
+    over = Rounds()
+    assert goals_of(over, ["gdp-raw cdr"], [(10_000, 1_500, False)]) == []
+    goals = goals_of(over, ["gdp-raw json", "gdp-raw cdr"], [(100, 1_500, False), (921_600, 9_000, True)])
+    assert [goal.what.split(",")[0] for goal in goals] == ["gdp-raw cdr / zenoh-mtls", "gdp-raw cdr - cyclone"]
+
+
+def test_the_ends_stand_at_the_two_ends() -> None:
+    assert {at.switch for at in five(1_500).attached("proxy")} == {LEFT, RIGHT}
