@@ -33,6 +33,7 @@ from gdp.limits import MTU_MIN_BYTES
 from gdp.metadata import Metadata
 from gdp.nodes.runtime import Runtime
 from gdp.ports.plane import MAC_BYTES, Plane
+from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.raw import RawPlane
 from gdp.ports.scapy_plane import ScapyPlane
 from gdp.rib.machine import Rib, RibSettings
@@ -236,7 +237,7 @@ def test_a_link_too_narrow_for_any_node_is_down_until_it_is_wider_again(lab: Lab
     assert lab.crosses_in(os.urandom(MEGABYTE))[0] == JUMBO
 
 
-PLANES = pytest.mark.parametrize("make", [RawPlane, ScapyPlane])
+PLANES = pytest.mark.parametrize("make", [RawPlane, ScapyPlane, KernelPlane])
 
 
 @PLANES

@@ -17,6 +17,7 @@ from gdp.limits import MESSAGE_MAX_BYTES
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.nodes.schema import Directory, Domain, Ifname, Metrics, NewFile, Section, load, relative
+from gdp.nodes.spin import SPIN_MAX_US, SPIN_US
 
 __all__ = ["Encoding", "ProxyConfig", "Record", "Rule"]
 
@@ -100,6 +101,7 @@ class ProxyConfig(Section):
     imports: tuple[Rule, ...] = Field(default=(), alias="import")
     record: Record | None = None
     metrics: Metrics | None = None
+    spin_us: int = Field(default=SPIN_US, ge=0, le=SPIN_MAX_US)
 
     @classmethod
     def load(cls, path: Path) -> ProxyConfig:

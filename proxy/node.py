@@ -78,7 +78,7 @@ def run_node(config: ProxyConfig) -> Iterator[ProxyNode]:
     with contextlib.ExitStack() as stack:
         plane = RawPlane([config.iface])
         stack.callback(plane.close)
-        runtime = Runtime(member, plane)
+        runtime = Runtime(member, plane, spin_s=config.spin_us / 1e6)
         stack.enter_context(runtime.signals(lambda: _renew(config, identity, member)))
         node = ProxyNode(member, runtime, plane, topics, Histogram())
         if config.metrics is not None:

@@ -11,7 +11,7 @@ root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 cd "$root"
 venv=$root/.venv
 extras=""
-[[ "${1:-}" == "--dev" ]] && extras="[dev]"
+[[ "${1:-}" == "--dev" ]] && extras="[dev,bench]"
 
 say() { printf 'setup: %s\n' "$*" >&2; }
 fail() { say "$@"; exit 1; }
@@ -61,7 +61,7 @@ compile_own() {
 python=$(find_python)
 wanted=$({ cat pyproject.toml; "$python" --version; echo "$root"; } | sha256sum | cut -d' ' -f1)
 # What was installed for testing is enough for running.
-for stamp in "$venv/.installed$extras" "$venv/.installed[dev]"; do
+for stamp in "$venv/.installed$extras" "$venv/.installed[dev,bench]"; do
     if [[ -f "$stamp" && $(<"$stamp") == "$wanted" ]] && "$venv/bin/python" -c '' 2>/dev/null; then
         compile_own
         exit 0

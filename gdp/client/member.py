@@ -35,7 +35,7 @@ from gdp.trust.right import Right
 from gdp.trust.verifier import ClaimVerifier
 
 _FOR_FEEDS: Final = (int(Kind.DATA), int(Kind.STATUS))
-BYTES_AT_ONCE: Final = 96 << 10  # of what is not urgent, before anything else has its turn
+BYTES_AT_ONCE: Final = 160 << 10  # of what is not urgent, before anything else has its turn
 
 __all__ = ["Member", "Message", "Topic"]
 

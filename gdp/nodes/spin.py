@@ -8,11 +8,14 @@ waits were short enough (compare the kernel's ``halt_poll_ns`` for idle virtual 
 
 from __future__ import annotations
 
-__all__ = ["SPIN_S", "Spin"]
+from typing import Final
 
-SPIN_S = 0.000_3
-_WEIGHT = 1 / 8  # of the newest wait
-_PAYS = 0.5
+__all__ = ["SPIN_MAX_US", "SPIN_US", "Spin"]
+
+SPIN_US: Final = 300
+SPIN_MAX_US: Final = 10_000
+_WEIGHT: Final = 1 / 8  # of the newest wait
+_PAYS: Final = 0.5
 
 
 class Spin:

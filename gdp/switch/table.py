@@ -23,7 +23,7 @@ from gdp.errors import LocalError
 from gdp.limits import TABLE_MAX
 from gdp.names import NAME_BYTES
 
-__all__ = ["MACS_BYTES", "NOWHERE", "Hop", "Hops", "Observer", "Table"]
+__all__ = ["EXPIRE_MAX", "MACS_BYTES", "NOWHERE", "Hop", "Hops", "Observer", "Table"]
 
 MACS_BYTES: Final = 12  # destination MAC, source MAC: the first bytes of the frame that goes out
 
@@ -34,6 +34,7 @@ NOWHERE: Final[Hops] = ()
 
 _KEY_SIZES: Final = (NAME_BYTES, 2 * NAME_BYTES)
 _UNSEEN: Final[tuple[Hops, Hops | None]] = (NOWHERE, None)
+EXPIRE_MAX: Final = 4_096
 _SHARED_MAX: Final = 4_096  # hop tuples remembered for sharing; a switch has far fewer different ones
 _SLACK: Final = 1_024  # stale heap items that are not yet worth a rebuild
 
@@ -158,9 +159,13 @@ class Table:
         return True
 
     def expire(self, now_s: float) -> list[bytes]:
-        """Take out every entry whose lease ended at or before ``now_s``; return their keys, earliest first."""
+        """Take out entries whose lease ended at or before ``now_s``, earliest first; return their keys.
+
+        No more than ``EXPIRE_MAX`` go at once, so that a node is not busy with them for long; while more are due,
+        ``next_expiry`` says so.
+        """
         gone: list[bytes] = []
-        while self._settle() and self._heap[0][0] <= now_s:
+        while len(gone) < EXPIRE_MAX and self._settle() and self._heap[0][0] <= now_s:
             key = heapq.heappop(self._heap)[1]
             del self._ends[key]
             del self.entries[key]

@@ -50,14 +50,15 @@ class Children:
         argv = namespaces.command(node, [sys.executable, *arguments], dies_with_us=not self._kept)
         return self.start(f"{role} {node}", argv, heard=heard)
 
-    async def ready(self, children: Sequence[Child]) -> None:
-        """Wait until each has said ``ready``; from then on they must stand.
+    async def ready(self, children: Sequence[Child]) -> list[Event]:
+        """Wait until each has said ``ready``, and return how; from then on they must stand.
 
         Raises:
             ChildError: one did not, or one that must stand ended.
         """
-        await self.guarded(_all(child.wait_for("ready", READY_S) for child in children))
+        said = await self.guarded(_all(child.wait_for("ready", READY_S) for child in children))
         self._standing += children
+        return said
 
     def may_end(self, child: Child) -> None:
         """Expect the end of this process from now on."""
@@ -99,5 +100,5 @@ async def cancel(*tasks: asyncio.Future[T] | asyncio.Future[Child]) -> None:
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def _all(works: Iterable[Coroutine[None, None, Event]]) -> None:
-    await asyncio.gather(*works)
+async def _all(works: Iterable[Coroutine[None, None, Event]]) -> list[Event]:
+    return await asyncio.gather(*works)

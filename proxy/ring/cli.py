@@ -59,7 +59,7 @@ def ring(
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON.")] = None,
     rate: Annotated[float, typer.Option(help="Pace of the replay; 0: as fast as it goes.")] = 1.0,
     encoding: Annotated[str, typer.Option(help=f"Of messages: {', '.join(ENCODINGS)}.")] = "json",
-    data_plane: Annotated[str, typer.Option(help=f"Of the switches: {', '.join(PLANES)}.")] = "raw",
+    data_plane: Annotated[str, typer.Option(help=f"Of the switches: {', '.join(PLANES)}.")] = "auto",
     mtu: Annotated[int, typer.Option(help="Of the links, in bytes.")] = MTU_BYTES,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the received recording here.")] = None,
     pcap: Annotated[Path | None, typer.Option(metavar="FILE", help="Write what an eavesdropper on nuc3 sees.")] = None,

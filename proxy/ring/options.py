@@ -17,7 +17,7 @@ from proxy.config import Encoding
 
 __all__ = ["Cut", "Options", "RingPlane"]
 
-RingPlane = Literal["raw", "scapy"]
+RingPlane = Literal["auto", "kernel", "raw", "scapy"]
 
 _CUT: Final = re.compile(r"([^@]+?)-([^@-]+)@(\d+(?:\.\d+)?)\Z")
 
@@ -70,7 +70,7 @@ class Options:
     bag: Path | None = None
     rate: float = 1.0
     encoding: Encoding = "json"
-    data_plane: RingPlane = "raw"
+    data_plane: RingPlane = "auto"
     mtu: int = MTU_BYTES
     out: Path | None = None
     json: Path | None = None

@@ -67,6 +67,7 @@ class Ring:
         self._materials = Materials(self.topology, run.directory, metrics=options.keep)
         self._children = Children(run, kept=options.keep)
         self.switches: dict[str, Child] = {}
+        self._planes: list[str] = []  # what the switches took
 
     @property
     def recording(self) -> Path:
@@ -93,7 +94,8 @@ class Ring:
         exact = self.options.encoding == "cdr"
         comparisons = await self._children.guarded(asyncio.to_thread(compare, self.bag, self.recording, exact=exact))
         topics = put_together(comparisons, report.topics)
-        return Result(topics, self.options.settings(), report.unread, report.complaints)
+        settings = {**self.options.settings(), "data_plane": ", ".join(self._planes)}
+        return Result(topics, settings, report.unread, report.complaints)
 
     def start_again(self) -> Path:
         """Start a receiver that outlives us, in place of the one that has ended; return the file it records into."""
@@ -121,7 +123,10 @@ class Ring:
             config = self._materials.switch(node, self.options.data_plane)
             argv = ["-m", "gdp.cli.switch", "--config", str(config), "--json"]
             self.switches[node] = self._start(node, "switch", argv)
-        await self._children.ready(list(self.switches.values()))
+        said = await self._children.ready(list(self.switches.values()))
+        self._planes = sorted({each.text("data_plane") for each in said})
+        for reason in sorted({each.text("reason") for each in said} - {""}):
+            self._teller.step(f"data plane {', '.join(self._planes)}: {reason}")
         self._teller.step("starting the RIB of each domain")
         configs = {at.switch: self._materials.rib(at) for at in self.topology.attached("rib")}
         await self._children.ready(

@@ -40,6 +40,7 @@ from plot import Panel, panel_of, require_plot, save_bars
 from report import Rounds, Settings, show, write_json
 
 from gdp.errors import LocalError
+from gdp.nodes.spin import SPIN_US
 from gdp.testbed.runs import Runs
 
 SIZES: Final = (100, 10_000, 921_600)
@@ -82,7 +83,7 @@ def arguments(names: Sequence[str]) -> argparse.ArgumentParser:
     parser.add_argument("--size", type=size_of, action="append", help="bytes of a message; may be repeated")
     parser.add_argument("--offloads", choices=("off", "on", "both"), default="both", help="of the veth devices")
     parser.add_argument("--encoding", action="append", choices=ENCODINGS, help="of ours; may be repeated")
-    parser.add_argument("--spin-us", type=int, default=0, help="ends of gdp look so long for frames before they sleep")
+    parser.add_argument("--spin-us", type=int, default=SPIN_US, help="as spin_us of proxy.yaml (default: %(default)s)")
     parser.add_argument("--realtime", action="store_true", help="SCHED_FIFO for all: what else runs does not disturb")
     parser.add_argument("--json", type=Path, help="write all figures here")
     parser.add_argument("--plot", type=Path, help="draw them here (PNG)")

@@ -46,7 +46,7 @@ def test_settings_are_what_json_can_write() -> None:
         "recording": "demo",
         "rate": 1.0,
         "encoding": "json",
-        "data_plane": "raw",
+        "data_plane": "auto",
         "mtu": 1_500,
         "cuts": ["nuc2-nuc3@5"],
     }

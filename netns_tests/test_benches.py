@@ -1,0 +1,34 @@
+"""Every bench runs: a short round of each, whose figures nobody looks at."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from tests.pages import ROOT
+
+pytestmark = pytest.mark.netns
+
+_PATIENCE_S = 300.0
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["forwarding.py", "--quick", "--no-save"],
+        ["scale.py", "--quick", "--no-save"],
+        ["messages.py", "--quick", "--mtu", "9000", "--offloads", "off"],
+        ["overlap.py", "--rounds", "1", "--count", "5"],
+        ["serial.py", "--help"],
+        ["claims.py", "--claims", "100"],
+    ],
+    ids=lambda command: command[0],
+)
+def test_a_bench_runs_to_its_table(command: list[str]) -> None:
+    name, *options = command
+    argv = [sys.executable, str(ROOT / "scripts" / "bench" / name), *options]
+    ran = subprocess.run(argv, capture_output=True, text=True, timeout=_PATIENCE_S, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert "not here" not in ran.stdout, ran.stdout

@@ -1,0 +1,126 @@
+"""Whether hashing or verifying in a thread of its own pays: both ways side by side, in one process and run.
+
+    .venv/bin/python scripts/bench/overlap.py [--rounds 5] [--count 60] [--json FILE]
+
+Place: benchmark; one process, no network. An image of 921,600 bytes is sealed as parts for MTU 1500 and hashed as they
+come, in place and by a thread beside; a small message is verified in place and by a thread beside. What a thread does
+must be handed over and waited for, and it helps only as far as the interpreter's lock is let go meanwhile: how far, is
+shown by what two threads take for twice the work (1: side by side, 2: one after the other).
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import secrets
+import statistics
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+from machine import machine_state
+from report import Rounds, progress, show, write_json
+
+from gdp.crypto.keys import SigningKey
+
+IMAGE_BYTES = 921_600
+ROOM_BYTES = 1_388  # plaintext in a part at MTU 1500
+CHUNK_PARTS = 64
+ADDITIONAL = bytes(95)
+LARGE = secrets.token_bytes(8 << 20)
+
+Hash = Callable[[list[bytes]], None]
+
+
+def seal(aead: AESGCM, image: memoryview, take: Hash) -> None:
+    """Encrypt part by part, giving each chunk of parts to ``take``."""
+    chunk: list[bytes] = []
+    for number, begin in enumerate(range(0, len(image), ROOM_BYTES)):
+        part = aead.encrypt(number.to_bytes(12, "big"), image[begin : begin + ROOM_BYTES], ADDITIONAL)
+        chunk.append(part)
+        if len(chunk) == CHUNK_PARTS:
+            take(chunk)
+            chunk = []
+    take(chunk)
+
+
+def in_place(aead: AESGCM, image: memoryview) -> None:
+    update = hashlib.sha256().update
+
+    def take(chunk: list[bytes]) -> None:
+        for part in chunk:
+            update(part)
+
+    seal(aead, image, take)
+
+
+def beside(worker: ThreadPoolExecutor, aead: AESGCM, image: memoryview) -> None:
+    running = hashlib.sha256()
+    under_way: list[Future[None]] = []
+
+    def take(chunk: list[bytes]) -> None:
+        while under_way:
+            under_way.pop().result()
+        under_way.append(worker.submit(running.update, b"".join(chunk)))
+
+    seal(aead, image, take)
+    under_way.pop().result()
+
+
+def by_two(work: Callable[[], object]) -> None:
+    threads = [threading.Thread(target=work) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+
+def median_ms(work: Callable[[], object], count: int) -> float:
+    times = []
+    for _ in range(count):
+        begun_s = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - begun_s)
+    return statistics.median(times) * 1e3
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--count", type=int, default=60, help="images in a round; small messages: ten times that")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    state, over = machine_state(), Rounds()
+    aead, image = AESGCM(secrets.token_bytes(32)), memoryview(secrets.token_bytes(IMAGE_BYTES))
+    key, digest = SigningKey.generate(), secrets.token_bytes(32)
+    verify = partial(key.public.verify_digest, key.sign_digest(digest), digest)
+    encrypt_large = partial(aead.encrypt, bytes(12), LARGE, None)
+    hash_large = partial(hashlib.sha256, LARGE)
+    with ThreadPoolExecutor(1) as worker:
+        for number in range(options.rounds):
+            progress(f"round {number + 1}/{options.rounds}")
+            for who, seal_by, verify_by in (
+                ("in place", partial(in_place, aead, image), verify),
+                ("thread", partial(beside, worker, aead, image), lambda: worker.submit(verify).result()),
+            ):
+                over.add(who, "an image sealed", "ms", median_ms(seal_by, options.count))
+                over.add(who, "a message verified", "ms", median_ms(verify_by, 10 * options.count))
+            for who, work in ("AES-GCM", encrypt_large), ("SHA-256", hash_large):
+                both = median_ms(partial(by_two, work), 5) / median_ms(work, 5)
+                over.add(who, "two threads, twice the work", "time ratio", both)
+    goals = [
+        over.ratio("thread / in place, image", "thread", "in place", "an image sealed", "ms", None),
+        over.ratio("thread / in place, verify", "thread", "in place", "a message verified", "ms", None),
+    ]
+    settings = {"rounds": options.rounds, "count": options.count}
+    show("hashing and verifying beside", state, settings, over, goals)
+    if options.json is not None:
+        write_json(options.json, "overlap", state, settings, over, goals)
+
+
+if __name__ == "__main__":
+    main()
