@@ -32,8 +32,8 @@ from gdp.frame.kinds import Kind
 from gdp.limits import MTU_MIN_BYTES
 from gdp.metadata import Metadata
 from gdp.nodes.runtime import Runtime
-from gdp.ports.plane import MAC_BYTES, Plane
 from gdp.ports.kernel.plane import KernelPlane
+from gdp.ports.plane import MAC_BYTES, Plane
 from gdp.ports.raw import RawPlane
 from gdp.ports.scapy_plane import ScapyPlane
 from gdp.rib.machine import Rib, RibSettings

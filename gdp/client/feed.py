@@ -257,6 +257,11 @@ class Feed:
     def _plan_report(self, header: Header, highest: int, now_s: float) -> None:
         if self.state is FeedState.NEW or not self._is_reliable:
             return
+        soonest_s = now_s + REPORT_DELAY_S
+        if header.parts == 1 and header.number == highest + 1 == self._expected and self._report_at_s <= soonest_s:
+            if self._owes_report():
+                self._report_at_s = now_s
+            return  # a whole message in its turn changes nothing else
         is_next = header.number == highest or (header.number == highest + 1 and self._is_whole(highest))
         is_in_order = is_next and (
             self._data.is_finished(header.number) or header.part == self._data.progress(header.number) - 1

@@ -200,8 +200,9 @@ class Sealed(Sequence[bytes]):
         plain = self._message[part * room : (part + 1) * room]
         is_last = part == header.parts - 1
         length = len(plain) + TAG_BYTES + (SIGNATURE_BYTES if is_last else 0)
-        flags = header.flags | _LAST if is_last else header.flags
-        head = encode(header._replace(part=part, length=length, flags=flags))
+        kind, flags, hops_left, epoch, _, number, _, parts, incarnation, to, source = header
+        flags |= _LAST * is_last
+        head = encode(Header(kind, flags, hops_left, epoch, length, number, part, parts, incarnation, to, source))
         sealed = self._encrypt(_NONCE.pack(header.number, part), plain, authenticated(head))
         self._running.update(sealed)
         frame = head + sealed

@@ -31,6 +31,7 @@ from gdp.message.replay import ReplayWindow
 __all__ = ["ALL_PARTS", "Joined", "Joiner", "OpensParts", "VerifiesDigest"]
 
 ALL_PARTS = 0xFFFF_FFFF
+_SHARED_FLAGS = 0xFF & ~int(Flag.LAST)  # a plain number: an IntFlag's operators cost a microsecond each
 _PREPAID_BYTES = 32 << 10  # memory is taken ahead for so much of a message whose parts come in order
 _PART_OVERHEAD_BYTES = 128  # what a kept part costs beside its bytes
 _AHEAD_PARTS = 64  # heads made at once
@@ -201,7 +202,7 @@ class Joiner:
         self.highest = max(self.highest, number)
         self.new_parts += 1
         self.window.finish(number)
-        return Joined(number, header.flags & ~Flag.LAST, plain, 1, max(HOPS_MAX - header.hops_left, 0))
+        return Joined(number, header.flags & _SHARED_FLAGS, plain, 1, max(HOPS_MAX - header.hops_left, 0))
 
     def _start(self, header: Header, opener: OpensParts, now_s: float) -> _Unfinished:
         """Return a message of which nothing is kept yet; one with another number of parts gives way."""
@@ -253,7 +254,7 @@ class Joiner:
             return None  # not finished: the writer's own parts may still come
         self.window.finish(number)
         whole = b"".join([message.plain[part] for part in range(message.parts)])
-        return Joined(number, header.flags & ~Flag.LAST, whole, message.parts, message.hops)
+        return Joined(number, header.flags & _SHARED_FLAGS, whole, message.parts, message.hops)
 
     def _is_signed(self, signature: bytes, running: _Hash) -> bool:
         try:

@@ -235,12 +235,14 @@ class SendWindow:
                 kept.repaired_s[part] = now_s
                 self.repairs += 1
                 self._sample = None  # Karn: nothing is learnt from what was sent twice
-        if self._sent_at == self._acked_at():
+        acked_at = self._acked_at()
+        if self._sent_at == acked_at:
             self._quiet_s = now_s
+        may_reach = acked_at + self._flight_bytes
+        below = 0
         if self._next:
             self._start_clocks(now_s)
-        may_reach = self._acked_at() + self._flight_bytes
-        below = self._least_number() + FLIGHT_MESSAGES_MAX
+            below = self._least_number() + FLIGHT_MESSAGES_MAX
         while self._next and self._sent_at < may_reach and len(frames) < limit and self._next[0][0] < below:
             number, part = self._next[0]
             kept = self._kept[number]

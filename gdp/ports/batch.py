@@ -238,7 +238,7 @@ class PlainBatch:
 
 
 def put_one(sink: socket.socket, frame: bytes, macs: bytes, drops: list[int]) -> int:
-    """Send one frame (from the GDP header on), for which this is quicker than a batch; return whether it left, 0 or 1."""
+    """Send one frame (from the GDP header on), quicker so than by a batch; return how many left: 0 or 1."""
     try:
         sink.send(macs + _ETHERTYPE + frame)
     except OSError as error:

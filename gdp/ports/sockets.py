@@ -125,8 +125,9 @@ def only_ours(opened: socket.socket, lane: Lane = Lane.ALL) -> None:
     Raises:
         OSError: not a packet socket.
     """
-    program = array("B", b"".join(struct.pack("=HBBI", *step) for step in lane.value))
-    opened.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", len(lane.value), program.buffer_info()[0]))
+    steps = lane.value
+    program = array("B", b"".join(struct.pack("=HBBI", *step) for step in steps))
+    opened.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", len(steps), program.buffer_info()[0]))
     try:
         opened.setsockopt(_SOL_PACKET, _PACKET_IGNORE_OUTGOING, 1)
     except OSError as error:

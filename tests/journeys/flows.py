@@ -118,7 +118,9 @@ def advertise(
     """Return a topic that a member publishes from now on."""
     member = world.members[source]
     topic = world.topic(name, member, [Right.PUBLISH])
-    publisher = member.advertise(topic, b"described", reliable=reliable, depth=depth, is_global=is_global, urgent=urgent)
+    publisher = member.advertise(
+        topic, b"described", reliable=reliable, depth=depth, is_global=is_global, urgent=urgent
+    )
     world.network.touch(source)
     return Flow(world, name, source, topic, publisher)
 

@@ -23,7 +23,7 @@ def test_an_urgent_message_leaves_before_what_waits_of_others() -> None:
     urgent.publisher.publish(b"stop")
     headers = [decode(frame) for each in member.take() for frame in each.frames]
     assert len(sent_before) * 1_500 < len(IMAGE)  # most of the images still wait
-    assert [header.destination for header in headers if header.kind == Kind.DATA][0] == urgent.topic.name
+    assert next(header.destination for header in headers if header.kind == Kind.DATA) == urgent.topic.name
     assert headers[0].flags & Flag.URGENT
 
 
