@@ -14,6 +14,7 @@ MTU_MIN_BYTES: Final = 576  # a link below this is refused: a signed hello would
 
 # Messages
 MESSAGE_MAX_BYTES: Final = 24 << 20  # serialised message, before sealing; it must fit, in parts, into JOIN_SOURCE_BYTES
+NUMBER_MAX: Final = (1 << 64) - 2  # message numbers have 64 bits, and each must have a next
 PARTS_MAX: Final = 1 << 17  # 64 MiB over the smallest link
 JOIN_SOURCE_BYTES: Final = 48 << 20  # reassembly memory of one source, so that one cannot starve all others
 JOIN_TOTAL_BYTES: Final = 64 << 20  # reassembly memory of a node

@@ -24,6 +24,7 @@ from gdp.frame.codec import Header
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import (
     NACKS_PER_REPORT,
+    NUMBER_MAX,
     REPLAY_WINDOW_MESSAGES,
     REPORT_DELAY_S,
     REPORT_EVERY_BYTES,
@@ -220,6 +221,9 @@ class Feed:
 
     def _take_data(self, header: Header, frame: bytes, now_s: float) -> None:
         joiner = self._data
+        if header.number > NUMBER_MAX:
+            joiner.drops[DropReason.MALFORMED] += 1
+            return
         if self.state is FeedState.LIVE and not 0 <= header.number - self._expected < REPLAY_WINDOW_MESSAGES:
             joiner.drops[DropReason.LATE if header.number < self._expected else DropReason.MEMORY_FULL] += 1
             return

@@ -35,7 +35,8 @@ from gdp.trust.right import Right
 from gdp.trust.verifier import ClaimVerifier
 
 _FOR_FEEDS: Final = (int(Kind.DATA), int(Kind.STATUS))
-BYTES_AT_ONCE: Final = 160 << 10  # of what is not urgent, before anything else has its turn
+BYTES_AT_ONCE: Final = 96 << 10  # of what is not urgent, before anything else has its turn
+BYTES_BESIDE_URGENT: Final = 64 << 10  # ... where there is an urgent topic: it may have to wait for so much
 
 __all__ = ["Member", "Message", "Topic"]
 
@@ -101,7 +102,7 @@ class Member:
 
     def drops(self) -> Mapping[DropReason, int]:
         """Return what was dropped, by reason."""
-        total = self._drops + self._closed_drops + self.attachment.joiner.drops
+        total = self._drops + self._closed_drops + self.attachment.joiner.drops + self.attachment.refusals
         for publisher in self._publishers.values():
             total += publisher.drops
         for feed in self.feeds():
@@ -239,18 +240,23 @@ class Member:
             return
         self._now_s = now_s
         self._may_send = False
+        at_once = BYTES_BESIDE_URGENT if self._urgent else BYTES_AT_ONCE
+        left = at_once
         for publisher in self._urgent:
-            if frames := publisher.take(now_s, BYTES_AT_ONCE):
+            if frames := publisher.take(now_s, at_once):
                 self.attachment.send(frames)
                 self._may_send = True
-        left = BYTES_AT_ONCE
+                left -= sum(map(len, frames))
+        if at_once // 2 < left < at_once:
+            return  # it leaves now; the others' next chunk is sealed after that
+        left = at_once
         for _ in range(len(self._ordinary)):
             if frames := self._ordinary[0].take(now_s, left):
                 self.attachment.send(frames)
                 self._may_send = True
                 left -= sum(map(len, frames))
             self._ordinary.rotate(-1)
-            if left < BYTES_AT_ONCE // 2:
+            if left < at_once // 2:
                 break
         for feed in self.feeds():
             report = feed.take_report(now_s)

@@ -27,6 +27,7 @@ __all__ = ["NoteOpener", "NoteSealer", "topic_of"]
 
 _NONCE: Final = struct.Struct("!QI")
 _INCARNATION: Final = struct.Struct("!Q")
+JUMP_MAX: Final = 1 << 16  # numbers between two notes that one opener sees; a reader's feeds share its numbers
 _BODY_AT: Final = HEADER_BYTES + NAME_BYTES
 
 
@@ -101,6 +102,8 @@ class NoteOpener:
         """
         if header.number <= self._last:
             raise EnvelopeError(DropReason.REPLAYED, "note")
+        if self._last and header.number > self._last + JUMP_MAX:
+            raise EnvelopeError(DropReason.MALFORMED, "a note far ahead of its time")
         sealed = frame[_BODY_AT : HEADER_BYTES + header.length]
         try:
             body = self._aead.decrypt(_NONCE.pack(header.number, 0), sealed, authenticated(frame) + self._context)

@@ -24,7 +24,9 @@ __all__ = [
     "HEADER_BYTES",
     "HOPS_AT",
     "KIND_AT",
+    "NUMBER_AT",
     "OVERHEAD_BYTES",
+    "PARTS_AT",
     "SOURCE_AT",
     "Header",
     "authenticated",
@@ -39,6 +41,8 @@ OVERHEAD_BYTES: Final = ETHER_BYTES + HEADER_BYTES
 KIND_AT: Final = 1
 FLAGS_AT: Final = 2
 HOPS_AT: Final = 3
+NUMBER_AT: Final = 8
+PARTS_AT: Final = 20
 DESTINATION_AT: Final = 32
 SOURCE_AT: Final = 64
 AAD_BYTES: Final = HEADER_BYTES - 1

@@ -13,6 +13,7 @@ holds; and when there are too many unfinished messages, the one that is needed l
 
 from __future__ import annotations
 
+import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
@@ -22,7 +23,7 @@ from gdp.crypto.envelope import digest_of
 from gdp.crypto.heads import Heads
 from gdp.effects import Arrival
 from gdp.errors import DropReason, EnvelopeError, RemoteError
-from gdp.frame.codec import Header
+from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, NUMBER_AT, PARTS_AT, Header
 from gdp.frame.kinds import Flag
 from gdp.limits import HOPS_MAX, JOIN_MESSAGES_MAX, JOIN_PATIENCE_S, REPLAY_WINDOW_MESSAGES
 from gdp.message.memory import Budget
@@ -34,6 +35,7 @@ ALL_PARTS = 0xFFFF_FFFF
 _SHARED_FLAGS = 0xFF & ~int(Flag.LAST)  # a plain number: an IntFlag's operators cost a microsecond each
 _PREPAID_BYTES = 32 << 10  # memory is taken ahead for so much of a message whose parts come in order
 _PART_OVERHEAD_BYTES = 128  # what a kept part costs beside its bytes
+_NUMBER_AND_PART = struct.Struct("!QI")
 _AHEAD_PARTS = 64  # heads made at once
 _SCAN_PARTS = 4_096  # above the parts that an honest publisher has under way
 
@@ -135,6 +137,12 @@ class Joiner:
         message = self._unfinished.get(self._under_way)
         if message is None or message.early:
             return 0
+        frame, header = arrivals[at].frame, message.header
+        if (
+            frame[NUMBER_AT:PARTS_AT] != _NUMBER_AND_PART.pack(header.number, message.hashed)
+            or frame[DESTINATION_AT:HEADER_BYTES] != header.destination + header.source
+        ):
+            return 0  # another message's turn
         taken, first = 0, message.hashed
         while at + taken < len(arrivals):
             part, heads = message.hashed, message.heads

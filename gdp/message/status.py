@@ -11,6 +11,7 @@ import struct
 from typing import Final, NamedTuple
 
 from gdp.errors import DropReason, FrameError
+from gdp.limits import NUMBER_MAX
 from gdp.message.move import MOVES_MAX, Move
 
 __all__ = ["STARTS_MAX", "Status"]
@@ -55,7 +56,7 @@ class Status(NamedTuple):
         if starts > STARTS_MAX or moves > MOVES_MAX or len(wire) < end or oldest > sent_number:
             raise FrameError(DropReason.MALFORMED, "status")
         moved = tuple(Move(*each) for each in _MOVE.iter_unpack(wire[moves_at:end]))
-        if any(move.first + move.span >= move.to for move in moved):
+        if any(move.first + move.span >= move.to or 2 * move.to - move.first > NUMBER_MAX for move in moved):
             raise FrameError(DropReason.MALFORMED, "status")
         started = dict(_START.iter_unpack(wire[_HEAD.size : moves_at]))
         return cls(oldest, sent_number, sent_part, started, wire[end:], moved)

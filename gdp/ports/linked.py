@@ -51,7 +51,7 @@ class LinkedPlane(ABC):
         self._next_index = 0
         self._epoll = select.epoll()
         self._ready: dict[int, Callable[[], None]] = {}
-        self._urgent_fds: set[int] = set()  # served first
+        self._ranks: dict[int, int] = {}  # the lowest are served first
         self._arrivals: list[Arrival] = []
         self._on_link: list[LinkCallback] = []
         self._links = LinkWatch()
@@ -112,7 +112,7 @@ class LinkedPlane(ABC):
         if not events or not self._polls % _AUDIT_POLLS:
             self._audit()
         if len(events) > 1:
-            events.sort(key=lambda event: event[0] not in self._urgent_fds)
+            events.sort(key=lambda event: self._ranks[event[0]])
         for fd, _ in events:
             ready = self._ready.get(fd)
             if ready is not None:  # an earlier one of this round may have closed it
@@ -121,17 +121,16 @@ class LinkedPlane(ABC):
         self._counters.handed_up += len(arrivals)
         return arrivals
 
-    def watch(self, source: HasFileno, ready: Callable[[], None], *, is_urgent: bool = False) -> None:
+    def watch(self, source: HasFileno, ready: Callable[[], None], *, rank: int = 0) -> None:
         fd = source.fileno()
         self._epoll.register(fd, select.EPOLLIN)
         self._ready[fd] = ready
-        if is_urgent:
-            self._urgent_fds.add(fd)
+        self._ranks[fd] = rank
 
     def unwatch(self, source: HasFileno) -> None:
         fd = source.fileno()
         if self._ready.pop(fd, None) is not None:
-            self._urgent_fds.discard(fd)
+            del self._ranks[fd]
             self._epoll.unregister(fd)
 
     def add_port(self, ifname: str) -> int:

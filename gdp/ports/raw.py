@@ -3,7 +3,7 @@
 Place: I/O; no Scapy, and the struct codec's offsets only.
 Source: DESIGN section 7. What is ordinary is decided here, in one pass over the batch; whatever is not goes to
 ``gdp.switch.forwarder.decide``, and fixtures hold the two together. Neighbouring frames of a batch that go the same way
-leave in one call, a *run*; what is urgent has sockets of its own, and goes first::
+leave in one call, a *run*; each lane of a port has its own socket, and the first one goes first::
 
     take  | A A A A B B A |      decide      runs: A A A A | B B | A      put, put, put
 """
@@ -14,17 +14,16 @@ import socket
 import struct
 from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
-from itertools import chain
 from typing import Final
 
-from gdp.errors import DropReason
+from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import ETHER_BYTES, FLAGS_AT, HEADER_BYTES, HOPS_AT, KIND_AT, OVERHEAD_BYTES
 from gdp.frame.kinds import CONTROL_FROM, VERSION, Flag
 from gdp.names import NAME_BYTES
 from gdp.ports.batch import SLOTS, Batch, make_batch, put_one
 from gdp.ports.linked import LinkedPlane
 from gdp.ports.plane import MAC_BYTES, Arrival, Port
-from gdp.ports.sockets import Lane, kernel_drops, open_port
+from gdp.ports.sockets import Lane, hear_nothing, kernel_drops, open_port
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.table import NOWHERE, Hops, Table
 
@@ -35,12 +34,19 @@ _GLANCE: Final = struct.Struct("!HxBxxH24x64s")
 _FIRST: Final = VERSION << 8
 _FIRST_CONTROL: Final = _FIRST | CONTROL_FROM
 _URGENT: Final = int(Flag.URGENT)
+_LANES: Final = (Lane.CONTROL, Lane.URGENT, Lane.ORDINARY)  # as they are served
 
 
 @lru_cache(maxsize=4_096)  # more than the sizes that come often
 def _shape(size: int) -> struct.Struct:
     """Return what takes the sender's address and a frame of ``size`` bytes out of a slot, in one call."""
     return struct.Struct(f"{MAC_BYTES}x{MAC_BYTES}s{ETHER_BYTES - 2 * MAC_BYTES}x{size}s")
+
+
+def _lane_of(frame: bytes) -> Lane:
+    if frame[KIND_AT] >= CONTROL_FROM:
+        return Lane.CONTROL
+    return Lane.URGENT if frame[FLAGS_AT] & _URGENT else Lane.ORDINARY
 
 
 class RawPlane(LinkedPlane):
@@ -59,37 +65,56 @@ class RawPlane(LinkedPlane):
         self, ifnames: Sequence[str] = (), table: Table | None = None, *, bypass_qdisc: bool = False
     ) -> None:
         self._bypass_qdisc = bypass_qdisc
-        self._sockets: dict[int, socket.socket] = {}
-        self._urgent: dict[int, socket.socket] = {}  # of the same ports: what goes first
+        self._lanes: dict[Lane, dict[int, socket.socket]] = {lane: {} for lane in _LANES}  # by port
         self._batch: Batch = make_batch(OVERHEAD_BYTES)
         super().__init__(ifnames, table)
 
     def _open(self, port: Port) -> None:
         self._widen(port)
-        for lane, sockets in (Lane.URGENT, self._urgent), (Lane.ORDINARY, self._sockets):
-            opened = sockets[port.index] = open_port(port.ifname, lane, bypass_qdisc=self._bypass_qdisc)
-            if self._entries is None:
-                ready = partial(self._hand_up_all, port.index, opened)
-            else:
-                ready = partial(self._forward_all, self._entries, port.index, opened, sockets)
-            self.watch(opened, ready, is_urgent=lane is Lane.URGENT)
+        try:
+            for rank, lane in enumerate(_LANES):
+                self._open_lane(port, lane, rank)
+        except LocalError:
+            self._shut(port.index)
+            raise
+
+    def _open_lane(self, port: Port, lane: Lane, rank: int) -> None:
+        sockets = self._lanes[lane]
+        opened = sockets[port.index] = open_port(port.ifname, lane, bypass_qdisc=self._bypass_qdisc)
+        if self._entries is None:
+            ready = partial(self._hand_up_all, port.index, opened)
+        else:
+            ready = partial(self._forward_all, self._entries, port.index, opened, sockets)
+        self.watch(opened, ready, rank=rank)
 
     def _widen(self, port: Port) -> None:
         if port.mtu + ETHER_BYTES > self._batch.slot_bytes:
             self._batch = make_batch(port.mtu + ETHER_BYTES)
 
     def _shut(self, index: int) -> None:
-        for sockets in self._urgent, self._sockets:
+        self._finish([sockets[index] for sockets in self._lanes.values() if index in sockets])
+        for sockets in self._lanes.values():
             opened = sockets.pop(index, None)
             if opened is not None:
                 self.unwatch(opened)
                 opened.close()
 
+    def _finish(self, sources: Sequence[socket.socket]) -> None:
+        """Take what has arrived at sockets before they are closed, which would lose it without a word."""
+        for source in sources:
+            hear_nothing(source)
+            source.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)  # that its device went down would be read first
+            ready, before = self._ready.get(source.fileno()), -1
+            while ready is not None and self._counters.frames_in > before:
+                before = self._counters.frames_in
+                ready()
+        self._audit()
+
     def _is_open(self, index: int) -> bool:
-        return index in self._sockets
+        return index in self._lanes[Lane.ORDINARY]
 
     def _kernel_drops(self) -> int:
-        return sum(map(kernel_drops, chain(self._urgent.values(), self._sockets.values())))
+        return sum(kernel_drops(opened) for sockets in self._lanes.values() for opened in sockets.values())
 
     def transmit(self, port: int, destination_mac: bytes, frames: Sequence[bytes]) -> int:
         counters, facts, batch = self._counters, self._ports.get(port), self._batch
@@ -100,8 +125,7 @@ class RawPlane(LinkedPlane):
         counters.drops[DropReason.TOO_BIG] += len(frames) - len(fitting)
         if not fitting:
             return 0
-        is_urgent = fitting[0][FLAGS_AT] & _URGENT or fitting[0][KIND_AT] >= CONTROL_FROM
-        sink = (self._urgent if is_urgent else self._sockets)[port]
+        sink = self._lanes[_lane_of(fitting[0])][port]
         macs, left = destination_mac + facts.mac, 0
         if len(fitting) == 1:
             left = put_one(sink, fitting[0], macs, counters.drops)

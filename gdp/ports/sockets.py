@@ -9,9 +9,10 @@ to another station (``PACKET_OTHERHOST``, seen on a shared or promiscuous link),
 sending, and a data frame that was broadcast (which every switch on a shared link would forward once more) are none of
 our business: neither forwarded nor counted.
 
-A port may have two sockets, so that what is urgent never waits in a queue behind what is not: one for frames flagged
-urgent and for what neighbours say to each other, one for all the rest. What leaves by the urgent one carries a priority
-that every queueing discipline with bands honours (``pfifo_fast``, ``prio``, and the access categories of Wi-Fi).
+A port may have a socket for each *lane*, so that nothing waits in a queue behind what matters less: what neighbours
+say to each other, frames flagged urgent, all the rest. A flood on one lane fills that lane's queue alone. What leaves
+by the first two carries a priority that every queueing discipline with bands honours (``pfifo_fast``, ``prio``, and the
+access categories of Wi-Fi).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import errno
 import socket
 import struct
 from array import array
+from collections.abc import Sequence
 from enum import Enum
 from typing import Final
 
@@ -27,7 +29,7 @@ from gdp.errors import LocalError
 from gdp.frame.codec import ETHER_BYTES, FLAGS_AT, KIND_AT
 from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, Flag
 
-__all__ = ["NO_RAW_SOCKETS", "Lane", "kernel_drops", "large_buffers", "only_ours", "open_port"]
+__all__ = ["NO_RAW_SOCKETS", "Lane", "hear_nothing", "kernel_drops", "large_buffers", "only_ours", "open_port"]
 
 NO_RAW_SOCKETS: Final = "raw sockets need root or CAP_NET_RAW (or a user namespace with its own network)"
 
@@ -40,7 +42,9 @@ _SO_SNDBUFFORCE: Final = 32
 _SO_RCVBUFFORCE: Final = 33
 _BUFFER_BYTES: Final = 16 << 20  # a 921,600-byte message is 1.6 MB of socket memory at MTU 1500
 
-_LOAD_BYTE: Final = 0x30  # BPF_LD | BPF_B | BPF_ABS
+_Step = tuple[int, int, int, int]  # code, steps to jump if it holds, if it does not, value
+_LOAD_BYTE: Final = 0x30  # BPF_LD | BPF_B | BPF_ABS; beyond the frame's end, the frame is left
+_LOAD_LENGTH: Final = 0x80  # BPF_LD | BPF_W | BPF_LEN
 _JUMP_EQUAL: Final = 0x15  # BPF_JMP | BPF_JEQ | BPF_K
 _JUMP_GREATER_EQUAL: Final = 0x35  # BPF_JMP | BPF_JGE | BPF_K
 _RETURN: Final = 0x06  # BPF_RET | BPF_K
@@ -51,6 +55,8 @@ _PRIORITY: Final = 6  # TC_PRIO_INTERACTIVE: the first band; 7 would need CAP_NE
 _KIND: Final = (_LOAD_BYTE, 0, 0, ETHER_BYTES + KIND_AT)
 _FLAGS: Final = (_LOAD_BYTE, 0, 0, ETHER_BYTES + FLAGS_AT)
 _TYPE: Final = (_LOAD_BYTE, 0, 0, _PACKET_TYPE)
+_LANED_BYTES: Final = ETHER_BYTES + FLAGS_AT + 1  # what tells a frame's lane
+_LENGTH: Final = (_LOAD_LENGTH, 0, 0, 0)
 _TAKE: Final = (_RETURN, 0, 0, _WHOLE)
 _LEAVE: Final = (_RETURN, 0, 0, 0)
 
@@ -67,20 +73,32 @@ class Lane(Enum):
         _TAKE,
         _LEAVE,
     )
-    URGENT = (
+    CONTROL = (
         _TYPE,
         (_JUMP_EQUAL, 1, 0, socket.PACKET_HOST),
-        (_JUMP_EQUAL, 2, 5, socket.PACKET_BROADCAST),
-        _FLAGS,
-        (_JUMP_SET, 2, 0, Flag.URGENT),
+        (_JUMP_EQUAL, 0, 5, socket.PACKET_BROADCAST),
+        _LENGTH,
+        (_JUMP_GREATER_EQUAL, 0, 3, _LANED_BYTES),
         _KIND,
         (_JUMP_GREATER_EQUAL, 0, 1, CONTROL_FROM),
         _TAKE,
         _LEAVE,
     )
-    ORDINARY = (
+    URGENT = (
         _TYPE,
         (_JUMP_EQUAL, 0, 5, socket.PACKET_HOST),
+        _KIND,
+        (_JUMP_GREATER_EQUAL, 3, 0, CONTROL_FROM),
+        _FLAGS,
+        (_JUMP_SET, 0, 1, Flag.URGENT),
+        _TAKE,
+        _LEAVE,
+    )
+    ORDINARY = (
+        _TYPE,
+        (_JUMP_EQUAL, 0, 7, socket.PACKET_HOST),
+        _LENGTH,
+        (_JUMP_GREATER_EQUAL, 0, 4, _LANED_BYTES),  # shorter ones are for the plane to count
         _KIND,
         (_JUMP_GREATER_EQUAL, 3, 0, CONTROL_FROM),
         _FLAGS,
@@ -106,7 +124,7 @@ def open_port(ifname: str, lane: Lane = Lane.ALL, *, bypass_qdisc: bool = False)
         raise LocalError(NO_RAW_SOCKETS) from error
     try:
         only_ours(opened, lane)
-        if lane is Lane.URGENT:
+        if lane in (Lane.CONTROL, Lane.URGENT):
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_PRIORITY, _PRIORITY)
         if bypass_qdisc:
             opened.setsockopt(_SOL_PACKET, _PACKET_QDISC_BYPASS, 1)
@@ -125,14 +143,26 @@ def only_ours(opened: socket.socket, lane: Lane = Lane.ALL) -> None:
     Raises:
         OSError: not a packet socket.
     """
-    steps = lane.value
-    program = array("B", b"".join(struct.pack("=HBBI", *step) for step in steps))
-    opened.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", len(steps), program.buffer_info()[0]))
+    _filter(opened, lane.value)
     try:
         opened.setsockopt(_SOL_PACKET, _PACKET_IGNORE_OUTGOING, 1)
     except OSError as error:
         if error.errno != errno.ENOPROTOOPT:
             raise
+
+
+def hear_nothing(opened: socket.socket) -> None:
+    """Let nothing more in; what has arrived can still be taken.
+
+    Raises:
+        OSError: not a packet socket.
+    """
+    _filter(opened, (_LEAVE,))
+
+
+def _filter(opened: socket.socket, steps: Sequence[_Step]) -> None:
+    program = array("B", b"".join(struct.pack("=HBBI", *step) for step in steps))
+    opened.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", len(steps), program.buffer_info()[0]))
 
 
 def kernel_drops(opened: socket.socket) -> int:

@@ -160,6 +160,8 @@ class Switch:
             self._follow_links(now_s)
         else:
             self._plan_follow(now_s)
+        if self.unicast.is_refreshing:
+            self.unicast.refresh_more(now_s)
         self._joiner.expire(now_s)
         self._hellos.expire(now_s)
         self.parked.expire(now_s)
@@ -182,6 +184,8 @@ class Switch:
             self.table.next_expiry(),
             self.planter.next_timeout(),
         ]
+        if self.unicast.is_refreshing:
+            times.append(self._followed_s)  # past: at once
         if self.inquirer.rib is not None:
             times += [self.attached.next_event(), self.places.next_due()]
         return min((time for time in times if time is not None), default=None)

@@ -8,7 +8,7 @@ leaves it: then only domains that the policies of both ends trust may carry the 
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Final
 
@@ -27,6 +27,7 @@ __all__ = ["Unicast"]
 
 NODE_LEASE_S: Final = 30.0  # an entry for a switch or a RIB, which the link states renew
 NEGATIVE_S: Final = 1.0
+_REFRESH_AT_ONCE: Final = 4_096  # ways; about 50 ms
 _TAKES_FRAMES: Final = (Right.ATTACH, Right.SERVE)
 
 
@@ -62,6 +63,7 @@ class Unicast:
         self._parked = parked
         self._outbox = outbox
         self._installed: dict[bytes, _Installed] = {}
+        self._stale = deque[bytes]()  # keys of ways to be computed anew
         self._keys_of: dict[Name, set[bytes]] = {}  # of what is installed, by destination
         self.drops: Counter[DropReason] = Counter()
 
@@ -85,11 +87,26 @@ class Unicast:
             self._find(Name(frame[DESTINATION_AT:SOURCE_AT]), Name(frame[SOURCE_AT:HEADER_BYTES]), frame, now_s)
 
     def refresh(self, now_s: float) -> None:
-        """Compute every installed way anew: links have changed."""
-        for key, why in list(self._installed.items()):
-            self._uninstall(key)
+        """Compute every installed way anew, for links have changed; ``refresh_more`` does the rest of very many."""
+        self._stale = deque(self._installed)
+        self.refresh_more(now_s)
+
+    def refresh_more(self, now_s: float) -> None:
+        """Go on with what ``refresh`` has begun, a slice at a time: a node must not be busy with it for long."""
+        for _ in range(min(len(self._stale), _REFRESH_AT_ONCE)):
+            key = self._stale.popleft()
+            why = self._installed.get(key)
+            if why is None:
+                continue
             if not why.is_negative:  # what led nowhere is looked for when the next frame comes
                 self._resolve(why.destination, why.source, now_s)
+            if self._installed.get(key) is why:  # it was not installed anew
+                self._uninstall(key)
+
+    @property
+    def is_refreshing(self) -> bool:
+        """Return whether ``refresh_more`` has something to do."""
+        return bool(self._stale)
 
     def forget(self, name: Name) -> None:
         """Take out the entries to a name whose place has changed, those too that say there is none."""

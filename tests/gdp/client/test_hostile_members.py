@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from itertools import count
 
+import pytest
+
 from gdp.client.feed import FeedState
 from gdp.crypto.envelope import Sealer, Signer
 from gdp.crypto.keys import SigningKey
@@ -12,6 +14,7 @@ from gdp.errors import DropReason
 from gdp.frame.codec import decode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import JOIN_PATIENCE_S, JOIN_SOURCE_BYTES, JOIN_TOTAL_BYTES, NACKS_PER_REPORT
+from gdp.message.move import Move
 from gdp.message.report import Missing, Report, ReportFlag
 from gdp.message.status import Status
 from gdp.names import Name
@@ -124,6 +127,28 @@ def test_a_status_whose_oldest_is_giant_ends_its_own_feed_and_no_more() -> None:
     pipe.run(2.0)
     assert end.messages == []
     assert end.feed.drops[DropReason.LATE] > 0
+
+
+@pytest.mark.parametrize("reliable", [Flag.RELIABLE, Flag.NONE])
+def test_a_message_whose_number_has_no_next_is_refused_and_ends_nobody(reliable: Flag) -> None:
+    pipe, end = live()
+    status = Status((1 << 64) - 2, (1 << 64) - 1, 0, {}, b"").to_wire()
+    give(pipe, end, forge(500, status, kind=Kind.STATUS, signer=WRITER))
+    for number in ((1 << 64) - 2, (1 << 64) - 1):
+        sealer = Sealer(SECRETS[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, WRITER)
+        give(pipe, end, list(sealer.seal(number, reliable, b"last", 1_500)))
+    assert end.feed.take_report(pipe.now_s) is not None
+    assert end.feed.drops[DropReason.MALFORMED] == 1
+
+
+def test_a_move_beyond_all_numbers_is_refused() -> None:
+    pipe, end = live()
+    move = Move(0, (1 << 64) - 3, (1 << 64) - 1)
+    status = Status(0, 0, 0, {}, b"", (move,)).to_wire()
+    give(pipe, end, forge(500, status, kind=Kind.STATUS, signer=WRITER))
+    assert end.feed.drops[DropReason.MALFORMED] == 1
+    pipe.publish([b"still here"])
+    assert pipe.run(1.0, lambda: end.messages == [b"still here"])
 
 
 def test_a_signed_status_that_makes_no_sense_is_counted() -> None:

@@ -102,3 +102,12 @@ def test_arbitrary_payloads_are_refused(payload: bytes) -> None:
             topic_of(header, frame)
     else:
         assert topic_of(header, frame) == payload[:32]
+
+
+def test_a_note_far_ahead_of_the_last_is_refused_and_the_next_real_one_opens() -> None:
+    to, real = opener(), sealer()
+    first = real.seal(b"1")
+    to.open(decode(first), first)
+    assert reason_of(to, sealer(first=(1 << 64) - 1).seal(b"bye")) is DropReason.MALFORMED
+    second = real.seal(b"2")
+    assert to.open(decode(second), second) == b"2"

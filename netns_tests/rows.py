@@ -1,0 +1,131 @@
+"""Three switches' planes in a row on real devices of one namespace, driven by the thread of the test.
+
+::
+
+    A a0 -- a1 [s1] b0 -- b1 [s2] c0 -- c1 [s3] d0 -- d1 B           A and B are plain packet sockets
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+from gdp.errors import DropReason
+from gdp.frame.codec import Header, encode
+from gdp.frame.kinds import ETHERTYPE, Flag, Kind
+from gdp.limits import HOPS_MAX
+from gdp.ports.kernel.plane import KernelPlane
+from gdp.ports.linked import LinkedPlane
+from gdp.ports.raw import RawPlane
+from gdp.switch.table import NOWHERE, Table
+from netns_tests.spaces import Space
+from netns_tests.test_planes import LOOK_S, PATIENCE_S, far_end
+
+__all__ = ["B", "FORGOTTEN", "KINDS", "NOWHERE_NAME", "UNKNOWN", "Row", "frame", "mac_of", "waiting"]
+
+B, UNKNOWN, NOWHERE_NAME, FORGOTTEN = (bytes([0xE0 + n]) * 32 for n in range(4))
+KINDS: Mapping[str, Callable[[Sequence[str], Table], LinkedPlane]] = {"raw": RawPlane, "kernel": KernelPlane}
+LINKS = ("a", "b", "c", "d")
+RECEIVE_BYTES = 1 << 26
+SO_RCVBUFFORCE = 33
+
+
+def mac_of(ifname: str) -> bytes:
+    """Return the address of a device of the row."""
+    return b"\x02\x00\x00\x00" + ifname.encode()
+
+
+def frame(
+    name: bytes = B, payload: bytes = b"payload", *, hops_left: int = HOPS_MAX, urgent: bool = False, number: int = 0
+) -> bytes:
+    """Return a frame as A sends it to the first switch."""
+    flags = Flag.LAST | (Flag.URGENT if urgent else 0)
+    header = Header(Kind.DATA, flags, hops_left, 0, len(payload), number, 0, 1, 1, name, b"\xaa" * 32)
+    return mac_of("a1") + mac_of("a0") + ETHERTYPE.to_bytes(2, "big") + encode(header) + payload
+
+
+def waiting(end: socket.socket) -> Iterator[bytes]:
+    """Yield what has arrived."""
+    end.setblocking(False)
+    while True:
+        try:
+            yield end.recv(1 << 16)
+        except BlockingIOError:
+            return
+
+
+class Row:
+    """The planes, and what A and B saw.
+
+    Args:
+        kind: a key of ``KINDS``.
+        mtus: of links by letter; others have 1,500.
+
+    Attributes:
+        sent: frames that A's device took.
+        delivered: what came to B, in order.
+        handed_up: frames that planes gave to their node, which here has no use for them.
+    """
+
+    def __init__(self, space: Space, kind: str, **mtus: int) -> None:
+        for link in LINKS:
+            space.veth(f"{link}0", f"{link}1", mac_of(f"{link}0"), mac_of(f"{link}1"), mtus.get(link, 1_500))
+        self.space = space
+        self.sent = self.handed_up = 0
+        self.delivered: list[bytes] = []
+        self.a, self.b = far_end("a0"), far_end("d1")
+        self.b.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BYTES)
+        self.planes: list[LinkedPlane] = []
+        for left, right in zip(LINKS, LINKS[1:], strict=False):
+            table = Table()
+            to_next = (1, mac_of(f"{right}1") + mac_of(f"{right}0"))
+            table.install(B, (to_next,), float("inf"))
+            table.install(NOWHERE_NAME, NOWHERE, float("inf"))
+            table.install(FORGOTTEN, (to_next,), float("inf"))
+            self.planes.append(KINDS[kind]([f"{left}1", f"{right}0"], table))
+            self.last_table = table
+
+    def send(self, *frames: bytes) -> None:
+        """Let A send; nothing is polled meanwhile."""
+        for each in frames:
+            self.sent += self.a.send(each) == len(each)
+
+    def poll(self, *planes: int) -> None:
+        """Let planes (all, if none is named) work once."""
+        for plane in [self.planes[at] for at in planes] or self.planes:
+            self.handed_up += len(plane.poll(0))
+
+    def until(self, done: Callable[[], bool]) -> None:
+        """Let all planes work until something is so."""
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not done():
+            assert time.monotonic() < deadline_s, f"it did not come about: {self.sums()}"
+            self.poll()
+            self.handed_up += len(self.planes[-1].poll(LOOK_S / 10))
+            self.delivered += waiting(self.b)
+
+    def drops(self) -> dict[DropReason, int]:
+        """Return what all planes dropped, by reason."""
+        lists = [plane.counters.drops for plane in self.planes]
+        found = {reason: sum(counts[reason] for counts in lists) for reason in DropReason}
+        return {reason: count for reason, count in found.items() if count}
+
+    def sums(self) -> tuple[int, int]:
+        """Return how many frames were sent, and of how many it is known what became of them."""
+        return self.sent, len(self.delivered) + sum(self.drops().values()) + self.handed_up
+
+    def settle(self) -> None:
+        """Return when every frame that was sent is accounted for, and nothing more happens."""
+        self.until(lambda: self.sums()[1] >= self.sent)
+        for plane in self.planes:
+            while arrivals := plane.poll(LOOK_S):
+                self.handed_up += len(arrivals)
+        self.delivered += waiting(self.b)
+
+    def close(self) -> None:
+        """Close every socket."""
+        for plane in self.planes:
+            plane.close()
+        self.a.close()
+        self.b.close()
