@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 
+from gdp.errors import LocalError
+from gdp.ports.kernel.plane import KernelPlane
+from gdp.switch.table import Table
 from netns_tests.spaces import Space
+from tests.fixtures_forwarding import IN, IN_MAC, MTUS, NARROW, NARROW_MAC, PEER_MACS, WIDE, WIDE_MAC
+
+MakeKernel = Callable[..., KernelPlane]
+PORT_MACS = {IN: IN_MAC, WIDE: WIDE_MAC, NARROW: NARROW_MAC}
 
 
 def _why_not() -> str:
@@ -32,3 +39,22 @@ def space() -> Iterator[Space]:
     """A network namespace of its own, in which the test runs."""
     with Space() as entered:
         yield entered
+
+
+@pytest.fixture
+def make_kernel(space: Space) -> Iterator[MakeKernel]:
+    """Makes kernel planes on p0 to p2, whose links are there; they are closed at the end."""
+    for port, mac in PORT_MACS.items():
+        space.veth(f"p{port}", f"q{port}", mac, PEER_MACS[port], MTUS[port])
+    made: list[KernelPlane] = []
+
+    def make(table: Table, **settings: int) -> KernelPlane:
+        try:
+            made.append(KernelPlane(["p0", "p1", "p2"], table, **settings))  # type: ignore[arg-type]
+        except LocalError as error:
+            pytest.skip(str(error).partition("\n")[0])
+        return made[-1]
+
+    yield make
+    for plane in made:
+        plane.close()

@@ -138,7 +138,7 @@ def test_a_killed_switch_leaves_no_program_and_no_link(ports: list[str]) -> None
         child.wait()
     assert gone(mine)
     assert not crosses(0.1)
-    assert attached(socket.if_nametoindex(ports[0]), TCX_INGRESS) == 0
+    assert attached(socket.if_nametoindex(ports[0]), TCX_INGRESS) == []
 
 
 def test_the_filter_of_a_killed_switch_forwards_no_more_and_the_next_run_replaces_it(ports: list[str]) -> None:
@@ -158,10 +158,12 @@ def test_the_filter_of_a_killed_switch_forwards_no_more_and_the_next_run_replace
     assert not any(map(has_clsact, ports))
 
 
-def test_a_device_that_a_live_switch_has_by_a_filter_is_refused(ports: list[str]) -> None:
-    with running("filter", ports) as (child, _):
-        with pytest.raises(LocalError, match=f"live process {child.pid}"):
-            KernelPlane(ports, table(), clsact=True)
+@pytest.mark.parametrize("clsact", [False, True], ids=["link", "filter"])
+@pytest.mark.parametrize(("first", "words"), [("link", "a live switch"), ("filter", "live process {pid}")])
+def test_a_device_that_a_live_switch_has_is_refused(ports: list[str], first: str, words: str, clsact: bool) -> None:
+    with running(first, ports) as (child, _):
+        with pytest.raises(LocalError, match=words.format(pid=child.pid)):
+            KernelPlane(ports, table(), clsact=clsact)
         assert crosses(PATIENCE_S)
 
 
@@ -180,7 +182,7 @@ def test_somebody_elses_program_on_the_same_hook_stays(ports: list[str], clsact:
     assert crosses(PATIENCE_S)
     plane.close()
     assert filters(ports[0]) == ["theirs"]
-    assert attached(ifindex, TCX_INGRESS) == 1
+    assert len(attached(ifindex, TCX_INGRESS)) == 1
     os.close(link)
     os.close(theirs)
 

@@ -2,31 +2,23 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import socket
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pyroute2 import IPRoute
 
-from gdp.errors import DropReason, LocalError
+from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
-from gdp.ports.kernel.assembler import Assembler
-from gdp.ports.kernel.device import has_free_peer
+from gdp.ports.kernel.device import Refusals
 from gdp.ports.kernel.plane import KernelPlane
-from gdp.ports.kernel.program import UP
-from gdp.ports.kernel.shapes import BRANCHES_MAX, PortAt, PortFlag
-from gdp.ports.kernel.syscall import create_link, load_program
+from gdp.ports.kernel.shapes import BRANCHES_MAX
 from gdp.switch.forwarder import Forward, decide, rewrite
 from gdp.switch.table import Hop, Table
-from gdp.testbed.netns_files import inside
+from netns_tests.conftest import MakeKernel
 from netns_tests.spaces import Space
 from netns_tests.test_planes import PORT_MACS, far_end
 from tests.fixtures_forwarding import (
@@ -41,44 +33,22 @@ from tests.fixtures_forwarding import (
     NOBODY,
     ONE,
     OTHER_SOURCE,
-    PEER_MACS,
     SPLIT,
     TO_ABSENT,
     TO_NARROW,
     TO_WIDE,
     WIDE,
     frame,
-    leaves,
 )
 
 pytestmark = pytest.mark.netns
 
-TCX_EGRESS = 47
 PATIENCE_S = 10.0
 LOOK_S = 0.05
-Make = Callable[..., KernelPlane]
 
 
 @pytest.fixture
-def make(space: Space) -> Iterator[Make]:
-    for port, mac in PORT_MACS.items():
-        space.veth(f"p{port}", f"q{port}", mac, PEER_MACS[port], MTUS[port])
-    made: list[KernelPlane] = []
-
-    def make(table: Table, **settings: int) -> KernelPlane:
-        try:
-            made.append(KernelPlane(["p0", "p1", "p2"], table, **settings))  # type: ignore[arg-type]
-        except LocalError as error:
-            pytest.skip(str(error).partition("\n")[0])
-        return made[-1]
-
-    yield make
-    for plane in made:
-        plane.close()
-
-
-@pytest.fixture
-def ends(make: Make) -> Iterator[dict[int, socket.socket]]:
+def ends(make_kernel: MakeKernel) -> Iterator[dict[int, socket.socket]]:
     opened = {port: far_end(f"q{port}") for port in PORT_MACS}
     yield opened
     for end in opened.values():
@@ -113,8 +83,10 @@ def waiting(end: socket.socket) -> list[bytes]:
             return got
 
 
-def test_what_was_sent_is_delivered_or_dropped_by_reason(make: Make, ends: dict[int, socket.socket]) -> None:
-    plane = make(filled())
+def test_what_was_sent_is_delivered_or_dropped_by_reason(
+    make_kernel: MakeKernel, ends: dict[int, socket.socket]
+) -> None:
+    plane = make_kernel(filled())
     kinds = {
         "one hop": frame(ONE),
         "two hops": frame(BOTH),
@@ -150,8 +122,8 @@ def test_what_was_sent_is_delivered_or_dropped_by_reason(make: Make, ends: dict[
     assert counters.handed_up == handed_up == 2 * rounds
 
 
-def test_what_the_kernel_takes_wakes_nobody(make: Make, ends: dict[int, socket.socket]) -> None:
-    plane = make(filled())
+def test_what_the_kernel_takes_wakes_nobody(make_kernel: MakeKernel, ends: dict[int, socket.socket]) -> None:
+    plane = make_kernel(filled())
     plane.poll(0)
     for _ in range(5):
         ends[IN].send(frame(ONE))
@@ -160,22 +132,47 @@ def test_what_the_kernel_takes_wakes_nobody(make: Make, ends: dict[int, socket.s
     assert plane.counters.forwarded == 5
 
 
-def test_what_a_full_queue_refuses_is_counted(make: Make, ends: dict[int, socket.socket]) -> None:
+def test_what_a_full_queue_refuses_is_counted(make_kernel: MakeKernel, ends: dict[int, socket.socket]) -> None:
     with IPRoute() as ask:  # a queue of one frame that sends one in a second or so
         tbf = {"handle": 0x10000, "rate": 1_000, "burst": 1_600, "limit": 1_600}
         ask.tc("add", "tbf", socket.if_nametoindex("p1"), **tbf)
-    plane = make(filled())
+    plane = make_kernel(filled())
     plane.poll(0)
     given = frame(ONE, bytes(1_300))
     for _ in range(20):
         ends[IN].send(given)
     settle(plane, 20)
-    while plane.poll(LOOK_S):
-        pass
-    delivered = len(waiting(ends[WIDE]))
-    queued = 1
+    refused = 20 - 2  # one left at once, one is queued
+    deadline_s = time.monotonic() + PATIENCE_S
+    while plane.counters.drops[DropReason.PORT_FULL] < refused:
+        assert time.monotonic() < deadline_s
+        plane.poll(LOOK_S)
     assert plane._counters.frames_in == 0
-    assert delivered + queued + plane.counters.drops[DropReason.PORT_FULL] == plane.counters.forwarded == 20
+    assert plane.counters.drops[DropReason.PORT_FULL] == refused
+    assert plane.counters.forwarded == 20
+
+
+def test_what_was_refused_until_the_end_is_counted(make_kernel: MakeKernel, ends: dict[int, socket.socket]) -> None:
+    with IPRoute() as ask:
+        ask.tc("add", "tbf", socket.if_nametoindex("p1"), handle=0x10000, rate=1_000, burst=1_600, limit=1_600)
+    plane = make_kernel(filled())
+    for _ in range(20):
+        ends[IN].send(frame(ONE, bytes(1_300)))
+    plane.close()
+    assert plane.counters.drops[DropReason.PORT_FULL] == 20 - 2
+
+
+def test_an_idle_poll_asks_no_device(make_kernel: MakeKernel, monkeypatch: pytest.MonkeyPatch) -> None:
+    plane = make_kernel(filled())
+    looks: list[object] = []
+    monkeypatch.setattr(Refusals, "look", lambda *given: looks.append(given))
+    plane._next_upkeep_s = float("inf")
+    for _ in range(5):
+        plane.poll(0)
+    assert looks == []
+    plane._next_upkeep_s = 0.0
+    plane.poll(0)
+    assert len(looks) == 1
 
 
 GROUPS = st.lists(st.sampled_from([TO_WIDE, TO_NARROW, TO_ABSENT]), min_size=2, max_size=6).map(tuple)
@@ -184,9 +181,9 @@ GROUPS = st.lists(st.sampled_from([TO_WIDE, TO_NARROW, TO_ABSENT]), min_size=2, 
 @settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(hops=GROUPS, size=st.sampled_from([0, 604, 605, 1404]), hops_left=st.sampled_from([2, 64, 255]))
 def test_generated_groups_copy_as_the_reference_says(
-    make: Make, ends: dict[int, socket.socket], hops: tuple[Hop, ...], size: int, hops_left: int
+    make_kernel: MakeKernel, ends: dict[int, socket.socket], hops: tuple[Hop, ...], size: int, hops_left: int
 ) -> None:
-    plane = make(filled({ONE: hops}))
+    plane = make_kernel(filled({ONE: hops}))
     given = frame(ONE, bytes(size), hops_left=hops_left)
     said = decide(given, {ONE: hops}, MTUS)
     assert isinstance(said, Forward)
@@ -200,10 +197,10 @@ def test_generated_groups_copy_as_the_reference_says(
 
 @pytest.mark.parametrize(("branches", "by_kernel"), [(BRANCHES_MAX, 1), (BRANCHES_MAX + 1, 0)])
 def test_a_larger_group_than_the_kernel_knows_is_copied_by_python(
-    make: Make, ends: dict[int, socket.socket], branches: int, by_kernel: int
+    make_kernel: MakeKernel, ends: dict[int, socket.socket], branches: int, by_kernel: int
 ) -> None:
     hops = tuple((WIDE, n.to_bytes(6, "big") + bytes(6)) for n in range(branches))
-    plane = make(filled({ONE: hops}))
+    plane = make_kernel(filled({ONE: hops}))
     ends[IN].send(frame(ONE))
     settle(plane, 1)
     assert waiting(ends[WIDE]) == [rewrite(frame(ONE), macs) for _, macs in hops]
@@ -212,11 +209,11 @@ def test_a_larger_group_than_the_kernel_knows_is_copied_by_python(
 
 
 def test_what_finds_no_room_in_the_kernel_is_forwarded_by_python_until_there_is(
-    make: Make, ends: dict[int, socket.socket]
+    make_kernel: MakeKernel, ends: dict[int, socket.socket]
 ) -> None:
     names = [n.to_bytes(32, "big") for n in range(1, 6)]
     table = filled(dict.fromkeys(names, (TO_WIDE,)))
-    plane = make(table, entries_max=2)
+    plane = make_kernel(table, entries_max=2)
     assert plane.left_out == 3
     for name in names:
         ends[IN].send(frame(name))
@@ -233,8 +230,8 @@ def test_what_finds_no_room_in_the_kernel_is_forwarded_by_python_until_there_is(
     assert plane._counters.forwarded == 3
 
 
-def test_each_entry_counts_its_frames_and_bytes(make: Make, ends: dict[int, socket.socket]) -> None:
-    plane = make(filled())
+def test_each_entry_counts_its_frames_and_bytes(make_kernel: MakeKernel, ends: dict[int, socket.socket]) -> None:
+    plane = make_kernel(filled())
     for each, count in ((frame(ONE), 3), (frame(BOTH, bytes(50)), 2), (frame(SPLIT, source=OTHER_SOURCE), 1)):
         for _ in range(count):
             ends[IN].send(each)
@@ -247,9 +244,9 @@ def test_each_entry_counts_its_frames_and_bytes(make: Make, ends: dict[int, sock
     assert list(plane.entry_counts(1)) == [ONE]
 
 
-def test_a_removed_entry_goes_to_nobody_any_more(make: Make, ends: dict[int, socket.socket]) -> None:
+def test_a_removed_entry_goes_to_nobody_any_more(make_kernel: MakeKernel, ends: dict[int, socket.socket]) -> None:
     table = filled()
-    plane = make(table)
+    plane = make_kernel(table)
     table.remove(ONE)
     table.install(SPLIT, (TO_NARROW,), 5.0)
     ends[IN].send(frame(ONE))
@@ -261,8 +258,10 @@ def test_a_removed_entry_goes_to_nobody_any_more(make: Make, ends: dict[int, soc
     assert settle(plane, 3) == 1
 
 
-def test_a_deleted_port_is_down_for_the_kernel_too(make: Make, space: Space, ends: dict[int, socket.socket]) -> None:
-    plane = make(filled())
+def test_a_deleted_port_is_down_for_the_kernel_too(
+    make_kernel: MakeKernel, space: Space, ends: dict[int, socket.socket]
+) -> None:
+    plane = make_kernel(filled())
     space.ip("del", "p1")
     deadline_s = time.monotonic() + PATIENCE_S
     while plane.port_state(WIDE):
@@ -274,79 +273,3 @@ def test_a_deleted_port_is_down_for_the_kernel_too(make: Make, space: Space, end
     assert len(waiting(ends[NARROW])) == 1
     assert plane.counters.drops[DropReason.PORT_DOWN] == 2
     assert plane._counters.drops[DropReason.PORT_DOWN] == 0
-
-
-@contextlib.contextmanager
-def elsewhere() -> Iterator[int]:
-    """A namespace of its own, by the process that holds it."""
-    with subprocess.Popen(["unshare", "--net", "cat"], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
-        assert holder.stdin is not None
-        assert holder.stdout is not None
-        holder.stdin.write(b"here\n")
-        holder.stdin.flush()
-        holder.stdout.readline()  # so it is in its namespace
-        yield holder.pid
-        holder.stdin.close()
-
-
-@contextlib.contextmanager
-def passing_program() -> Iterator[int]:
-    code = Assembler()
-    code.leave(UP)
-    program = load_program(code.assemble(), "passing", b"Apache-2.0")
-    yield program
-    os.close(program)
-
-
-def test_the_other_end_is_reached_straight_only_where_nothing_is_passed_by(space: Space) -> None:
-    space.veth("p0", "q0", PORT_MACS[IN], PEER_MACS[IN])
-    port = socket.if_nametoindex("p0")
-    assert not has_free_peer(port)  # the other end is here
-    with elsewhere() as holder, passing_program() as program:
-        space.ip("set", "q0", "netns", str(holder))
-        assert has_free_peer(port)
-        with IPRoute() as ask:
-            ask.tc("add", "pfifo", port, handle=0x10000)
-            assert not has_free_peer(port)
-            ask.tc("del", "pfifo", port, handle=0x10000, parent=0xFFFFFFFF)
-            assert has_free_peer(port)
-            ask.tc("add", "clsact", port)
-            assert has_free_peer(port)
-            ask.tc("add-filter", "bpf", port, parent=0xFFFFFFF3, fd=program, name="passing", direct_action=True)
-            assert not has_free_peer(port)
-            ask.tc("del", "clsact", port)
-        link = create_link(program, port, TCX_EGRESS)
-        assert not has_free_peer(port)
-        os.close(link)
-        assert has_free_peer(port)
-
-
-def is_straight(plane: KernelPlane, port: int) -> bool:
-    facts = plane._loaded.ports.get(port.to_bytes(4, sys.byteorder))
-    assert facts is not None
-    return bool(facts[PortAt.FLAGS] & PortFlag.PEER)
-
-
-@pytest.mark.parametrize("peer", [True, False])
-def test_a_frame_reaches_another_namespace_straight_or_by_the_queue_that_was_put_in_between(
-    make: Make, space: Space, peer: bool
-) -> None:
-    with elsewhere() as holder, far_end("q0") as sender:
-        space.ip("set", "q1", "netns", str(holder))
-        there = Path(f"/proc/{holder}/ns/net")
-        inside(there, lambda: space.ip("set", "q1", "up"))
-        space.ready("p1")
-        plane = make(filled(), peer=peer)
-        with inside(there, lambda: far_end("q1")) as receiver, IPRoute() as ask:
-            assert is_straight(plane, WIDE) == peer
-            sender.send(frame(ONE))
-            assert receiver.recv(1 << 16) == leaves(frame(ONE), WIDE)[WIDE]
-            ask.tc("add", "tbf", socket.if_nametoindex("p1"), handle=0x10000, rate=1_000_000, burst=3_000, limit=9_000)
-            deadline_s = time.monotonic() + PATIENCE_S
-            while is_straight(plane, WIDE):
-                assert time.monotonic() < deadline_s
-                plane.poll(LOOK_S)
-            sender.send(frame(BOTH))
-            assert receiver.recv(1 << 16) == leaves(frame(BOTH), WIDE)[WIDE]
-        assert plane._counters.frames_in == 0
-        assert plane.counters.forwarded == 3

@@ -1,6 +1,7 @@
 """Where the program is attached: a TCX link on Linux 6.6 and later, else a filter of a clsact qdisc.
 
-Place: I/O; one attachment a device. Whoever else stands at the same hook stays there.
+Place: I/O; one attachment a device, and one live switch: where a second one is seen, either way, it is refused. Whoever
+else stands at the same hook stays there.
 Source: Linux, include/uapi/linux/bpf.h (``BPF_TCX_INGRESS``); tc-bpf(8).
 
 A TCX link is a descriptor: it ends with its process, whatever ends that. A filter does not, so it carries the process
@@ -22,8 +23,8 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from gdp.errors import LocalError
 from gdp.ports.kernel.loaded import PROGRAM
-from gdp.ports.kernel.netlink import link
-from gdp.ports.kernel.syscall import BpfError, attached, create_link
+from gdp.ports.kernel.netlink import CLSACT_EGRESS, CLSACT_INGRESS, Questions
+from gdp.ports.kernel.syscall import BpfError, attached, create_link, name_of
 
 if TYPE_CHECKING:
     from pyroute2 import IPRoute
@@ -32,7 +33,6 @@ __all__ = ["Attachment", "FilterAttachment", "LinkAttachment", "has_links"]
 
 _TCX_INGRESS: Final = 46
 _LOOPBACK: Final = 1  # the index of lo in every namespace
-_INGRESS, _EGRESS = 0xFFFFFFF2, 0xFFFFFFF3  # TC_H_MAKE(TC_H_CLSACT, TC_H_MIN_INGRESS or TC_H_MIN_EGRESS)
 _NAME: Final = re.compile(rf"{PROGRAM}:(?P<pid>\d+):(?P<started>\d+)", re.ASCII)
 _START_TIME: Final = 19  # field 22 of proc_pid_stat(5), counted from behind the command
 
@@ -64,9 +64,11 @@ class LinkAttachment:
 
     Raises:
         BpfError: refused.
+        LocalError: a live switch has the device.
     """
 
-    def __init__(self, program: int, ifindex: int) -> None:
+    def __init__(self, program: int, ifindex: int, ask: Questions) -> None:
+        _refuse_second(ask, ifindex)
         self._link = create_link(program, ifindex, _TCX_INGRESS)
 
     def close(self) -> None:
@@ -85,11 +87,13 @@ class FilterAttachment:
     """A bpf filter of a clsact qdisc.
 
     Raises:
-        LocalError: refused, or a live process of ours has the device.
+        LocalError: refused, or a live switch has the device.
     """
 
-    def __init__(self, program: int, ifindex: int) -> None:
+    def __init__(self, program: int, ifindex: int, ask_briefly: Questions) -> None:
+        _refuse_second(ask_briefly, ifindex)
         self._ifindex = ifindex
+        self._ask_briefly = ask_briefly
         self._name = f"{PROGRAM}:{os.getpid()}:{_started(os.getpid())}"
         with _asking(ifindex) as ask:
             had_qdisc = any(qdisc.get_attr("TCA_KIND") == "clsact" for qdisc in ask.get_qdiscs(index=ifindex))
@@ -99,38 +103,61 @@ class FilterAttachment:
             else:
                 ask.tc("add", "clsact", ifindex)
                 self._made_qdisc = True
-            place = {"parent": _INGRESS, "fd": program, "name": self._name, "direct_action": True}
+            place = {"parent": CLSACT_INGRESS, "fd": program, "name": self._name, "direct_action": True}
             ask.tc("add-filter", "bpf", ifindex, **place)
 
     def close(self) -> None:
         try:
             with _asking(self._ifindex) as ask:
-                for each in _filters(ask, self._ifindex, _INGRESS):
+                for each in _filters(ask, self._ifindex, CLSACT_INGRESS):
                     if each.name == self._name:
                         _remove(ask, self._ifindex, each)
                 if self._made_qdisc and self._is_bare(ask):
                     ask.tc("del", "clsact", self._ifindex)
         except LocalError:
-            if link(self._ifindex):
+            if self._ask_briefly.link(self._ifindex):
                 raise
             # the device is gone, and all that stood there with it
 
     def _remove_dead(self, ask: IPRoute) -> bool:
         """Take away what dead runs left; return whether there was any."""
         removed = False
-        for each in _filters(ask, self._ifindex, _INGRESS):
-            name = _NAME.fullmatch(each.name)
-            if name is None:
-                continue
-            if _started(int(name["pid"])) == name["started"]:
-                raise LocalError(f"device {self._ifindex} already serves the live process {name['pid']}")
-            _remove(ask, self._ifindex, each)
-            removed = True
+        for each in _filters(ask, self._ifindex, CLSACT_INGRESS):
+            if _NAME.fullmatch(each.name):  # those of the living were refused before
+                _remove(ask, self._ifindex, each)
+                removed = True
         return removed
 
     def _is_bare(self, ask: IPRoute) -> bool:
         """Whether no filter stands at the qdisc, either way."""
-        return not any(_filters(ask, self._ifindex, parent) for parent in (_INGRESS, _EGRESS))
+        return not any(_filters(ask, self._ifindex, parent) for parent in (CLSACT_INGRESS, CLSACT_EGRESS))
+
+
+def _refuse_second(ask: Questions, ifindex: int) -> None:
+    """Two switches on one device would each forward by half of what they are told.
+
+    A link stands only while its process holds it, so its program is a live one's. Where others' programs may not be
+    opened (that takes CAP_SYS_ADMIN, which forwarding does not), a second one by a link goes unseen.
+
+    Raises:
+        LocalError: a live switch has the device.
+    """
+    for name in ask.filters(ifindex, CLSACT_INGRESS):
+        of_ours = _NAME.fullmatch(name)
+        if of_ours and _started(int(of_ours["pid"])) == of_ours["started"]:
+            raise LocalError(f"device {ifindex} already serves the live process {of_ours['pid']}")
+    if PROGRAM in _linked(ifindex):
+        raise LocalError(f"device {ifindex} already serves a live switch")
+
+
+def _linked(ifindex: int) -> list[str | None]:
+    """Return the names of the programs at the links' hook, as far as they may be known."""
+    try:
+        return [name_of(program) for program in attached(ifindex, _TCX_INGRESS)]
+    except BpfError as error:
+        if error.number in (errno.EINVAL, errno.EPERM):  # no links before Linux 6.6; not ours to open
+            return []
+        raise
 
 
 def _started(pid: int) -> str:
@@ -147,11 +174,11 @@ def _asking(ifindex: int) -> Iterator[IPRoute]:
     from pyroute2 import IPRoute  # large, and needed for this alone
     from pyroute2.netlink.exceptions import NetlinkError
 
-    with IPRoute() as ask:
-        try:
+    try:
+        with IPRoute() as ask:
             yield ask
-        except NetlinkError as error:
-            raise LocalError(f"traffic control of device {ifindex}: {error}") from error
+    except (NetlinkError, OSError) as error:
+        raise LocalError(f"traffic control of device {ifindex}: {error}") from error
 
 
 def _filters(ask: IPRoute, ifindex: int, parent: int) -> list[_Filter]:
@@ -164,5 +191,5 @@ def _filters(ask: IPRoute, ifindex: int, parent: int) -> list[_Filter]:
 
 
 def _remove(ask: IPRoute, ifindex: int, which: _Filter) -> None:
-    place = {"parent": _INGRESS, "handle": which.handle, "prio": which.priority, "protocol": which.protocol}
+    place = {"parent": CLSACT_INGRESS, "handle": which.handle, "prio": which.priority, "protocol": which.protocol}
     ask.tc("del-filter", "bpf", ifindex, **place)

@@ -2,47 +2,69 @@
 
 Place: I/O. ``bpf_redirect_peer`` passes by everything on the way out of the device and into the other end: so it is
 right only where nothing stands there. The device must be one end of a veth pair whose other end is in another
-namespace (the kernel drops the frame otherwise), without a queue, and without programs or filters on its way out.
+namespace (the kernel drops the frame otherwise), without a queue, and without programs or filters on its way out; and
+the other end without an XDP program in its driver (a generic one is run all the same, and so is whatever comes later).
 Source: Linux, net/core/filter.c, ``skb_do_redirect``; if_link.h, ``rtnl_link_stats64``; gen_stats.h.
 """
 
 from __future__ import annotations
 
+import errno
 import struct
 from collections.abc import Iterable
 from typing import Final
 
-from gdp.ports.kernel.netlink import CLSACT_EGRESS, ROOT, LinkAttribute, filters, link, listen, nested, queues
+from gdp.ports.kernel.netlink import CLSACT_EGRESS, ROOT, LinkAttribute, Questions, listen, nested
 from gdp.ports.kernel.syscall import BpfError, attached
 
 __all__ = ["QueueWatch", "Refusals", "has_free_peer"]
 
 _INFO_KIND: Final = 1  # IFLA_INFO_KIND
 _TCX_EGRESS: Final = 47
+_XDP_ATTACHED: Final = 2  # IFLA_XDP_ATTACHED
+_PASSED_BY_NO_PEER: Final = (0, 2)  # XDP_ATTACHED_NONE, XDP_ATTACHED_SKB
+_NUMBER: Final = struct.Struct("=i")
 _STATS2, _STATS_QUEUE = 7, 3  # TCA_STATS2, TCA_STATS_QUEUE
 _QUEUE_DROPS_AT: Final = 8
 _TX_DROPPED_AT: Final = 7 * 8
 _READ_BYTES: Final = 1 << 16
 
 
-def has_free_peer(ifindex: int) -> bool:
-    """Say whether nothing stands between this device and the other end of its pair, in another namespace."""
-    facts = link(ifindex)
+def has_free_peer(ask: Questions, ifindex: int) -> bool:
+    """Say whether nothing stands between this device and the other end of its pair, in another namespace.
+
+    Raises:
+        LocalError: a question was refused; about the other end, that takes CAP_NET_ADMIN there.
+    """
+    facts = ask.link(ifindex)
     kind = nested(facts.get(LinkAttribute.LINKINFO, b"")).get(_INFO_KIND, b"")
     return (
         kind.rstrip(b"\0") == b"veth"
         and LinkAttribute.LINK_NETNSID in facts
         and facts.get(LinkAttribute.QDISC, b"").rstrip(b"\0") == b"noqueue"
         and not _has_programs(ifindex)
-        and not filters(ifindex, CLSACT_EGRESS)
+        and not ask.filters(ifindex, CLSACT_EGRESS)
+        and not _has_driver_xdp(ask, facts)
     )
 
 
 def _has_programs(ifindex: int) -> bool:
     try:
-        return attached(ifindex, _TCX_EGRESS) > 0
-    except BpfError:  # before Linux 6.6 there are none
-        return False
+        return bool(attached(ifindex, _TCX_EGRESS))
+    except BpfError as error:
+        if error.number == errno.EINVAL:  # before Linux 6.6 there are none
+            return False
+        raise
+
+
+def _has_driver_xdp(ask: Questions, facts: dict[int, bytes]) -> bool:
+    """Whether the other end, or what cannot be found there, is not to be passed by."""
+    if LinkAttribute.LINK not in facts:
+        return True
+    there, namespace = (_NUMBER.unpack(facts[each])[0] for each in (LinkAttribute.LINK, LinkAttribute.LINK_NETNSID))
+    peer = ask.link(there, namespace)
+    modes = nested(peer.get(LinkAttribute.XDP, b"")).get(_XDP_ATTACHED, b"\0")
+    return not peer or modes[0] not in _PASSED_BY_NO_PEER
 
 
 class QueueWatch:
@@ -83,18 +105,23 @@ class Refusals:
         """Frames refused since each device was first looked at."""
         return self._total
 
-    def look(self, ifindexes: Iterable[int]) -> None:
-        """Ask about these devices, and forget the others."""
-        now = {ifindex: _dropped(ifindex) for ifindex in ifindexes}
-        for ifindex, parent, facts in queues() if now else ():
+    def look(self, ask: Questions, ifindexes: Iterable[int]) -> None:
+        """Ask about these devices, and forget the others. Costs a dump of all queues: 4 ms where there are 32 ports.
+
+        Raises:
+            LocalError: a question was refused; what was known stays.
+        """
+        asked = {ifindex: ask.link(ifindex) for ifindex in ifindexes}
+        now = {ifindex: _dropped(facts) for ifindex, facts in asked.items() if facts}
+        for ifindex, parent, facts in ask.queues() if now else ():
             if ifindex in now and parent == ROOT:
                 now[ifindex] += _queue_drops(facts)
         self._total += sum(max(count - self._last.get(ifindex, count), 0) for ifindex, count in now.items())
         self._last = now
 
 
-def _dropped(ifindex: int) -> int:
-    stats = link(ifindex).get(LinkAttribute.STATS64, b"")
+def _dropped(facts: dict[int, bytes]) -> int:
+    stats = facts.get(LinkAttribute.STATS64, b"")
     return int(struct.unpack_from("=Q", stats, _TX_DROPPED_AT)[0]) if stats else 0
 
 

@@ -21,7 +21,11 @@ from gdp.ports.kernel.syscall import NAME_MAX, BpfError, Command, address, bpf
 
 __all__ = ["KernelMap", "MapKind", "possible_cpus"]
 
-_NO_PREALLOC: Final = 1  # BPF_F_NO_PREALLOC: an entry costs memory when it is there
+# BPF_F_NO_PREALLOC: an entry costs memory when it is there. From Linux 6.1 on, what is removed or replaced may be used
+# again at once, while a frame on its way still reads it: for some nanoseconds that frame may see the port of one entry
+# and the addresses of another, and one sealed frame goes astray, which nobody but its reader can open. To allocate
+# before is no cure, for such elements have always been used again at once; and it costs 18 MB for the usual table.
+_NO_PREALLOC: Final = 1
 _POSSIBLE: Final = Path("/sys/devices/system/cpu/possible")
 _BATCH: Final = struct.Struct("=QQQQIIQQ")
 _STOPPED: Final = (errno.E2BIG, errno.ENOENT)

@@ -11,6 +11,7 @@ on its way may still hold them.
 
 from __future__ import annotations
 
+import errno
 import heapq
 import sys
 from collections import deque
@@ -94,6 +95,7 @@ class Mirror:
         values: list[bytes] = []
         left: list[_Group] = []
         used: list[int] = []
+        fresh: set[bytes] = set()  # those that the kernel did not have
         heads: dict[int, bytes] = {}  # by identity, since the table shares equal hops; those of groups are not here
         counter_of, group_of = self._counter_of, self._group_of
         for key, hops in items.items():
@@ -110,11 +112,13 @@ class Mirror:
             counter = counter_of.get(key)
             if counter is None:
                 counter = counter_of[key] = self._new_counter(key, used)
+                fresh.add(key)
             keys.append(key)
+            # ``_kernel_key`` and ``_index``, written out: a table may bring a hundred thousand names at once
             kernel_keys.append(key if len(key) > NAME_BYTES else key + EVERY_SOURCE)
             values.append(head + counter.to_bytes(INDEX_BYTES, sys.byteorder))
         self._counts.put_many([*map(_index, used)], [bytes(self._counts.value_bytes)] * len(used))
-        self._write(keys, kernel_keys, values)
+        self._write(keys, kernel_keys, values, fresh)
         for name in self._zero_sources:  # empty, but for a strange peer
             if name in counter_of:
                 self._leave_out(name)
@@ -149,24 +153,36 @@ class Mirror:
 
     # entries
 
-    def _write(self, keys: list[bytes], kernel_keys: list[bytes], values: list[bytes]) -> None:
+    def _write(self, keys: list[bytes], kernel_keys: list[bytes], values: list[bytes], fresh: set[bytes]) -> None:
         """Give entries to the kernel; those that it has no room for wait."""
+        is_full = False
         at = self._entries.put_many(kernel_keys, values)
         if self._waiting or self._unfit:
             for key in keys[:at]:
                 self._waiting.pop(key, None)
                 self._unfit.discard(key)
         for key, kernel_key, value in zip(keys[at:], kernel_keys[at:], values[at:], strict=True):
+            if is_full and key in fresh:
+                self._give_back([key])
+                self._wait(key)
+                continue
             try:  # what replaces another still finds room
                 self._entries.put(kernel_key, value)
-            except BpfError:
+            except BpfError as error:
+                is_full = is_full or error.number == errno.E2BIG
                 self._take_out([key])  # an older one there would be wrong now
-                self._unfit.discard(key)
-                self._waiting[key] = None
+                self._wait(key)
+
+    def _wait(self, key: bytes) -> None:
+        self._unfit.discard(key)
+        self._waiting[key] = None
 
     def _take_out(self, keys: Sequence[bytes]) -> None:
         """Take what is in the kernel out of it, then give back what it used."""
         self._entries.remove_many([*map(_kernel_key, keys)])
+        self._give_back(keys)
+
+    def _give_back(self, keys: Sequence[bytes]) -> None:
         for key in keys:
             counter = self._counter_of.pop(key, _UNCOUNTED)
             if counter != _UNCOUNTED:

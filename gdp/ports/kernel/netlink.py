@@ -1,18 +1,25 @@
 """Questions to the kernel about devices, their queues and filters: netlink by hand, as in ``gdp/ports/link.py``.
 
-Place: I/O; a socket for each question, in the namespace of whoever asks.
-Source: rtnetlink(7), netlink(7); ``struct nlmsghdr``, ``struct ifinfomsg`` and ``struct tcmsg`` in host byte order.
+Place: I/O; one socket for all questions, in the namespace it was opened in, whatever namespace asks later.
+Source: rtnetlink(7), netlink(7); ``struct nlmsghdr``, ``struct nlmsgerr``, ``struct ifinfomsg`` and ``struct tcmsg`` in
+host byte order. A dump's end may carry an error, as an error message does.
 """
 
 from __future__ import annotations
 
+import errno
+import os
 import socket
 import struct
 from collections.abc import Iterator
-from typing import Final
+from enum import IntEnum
+from typing import Final, NamedTuple
 
-__all__ = ["CLSACT_EGRESS", "ROOT", "LinkAttribute", "filters", "link", "listen", "nested", "queues"]
+from gdp.errors import LocalError
 
+__all__ = ["CLSACT_EGRESS", "CLSACT_INGRESS", "ROOT", "LinkAttribute", "Questions", "listen", "nested"]
+
+CLSACT_INGRESS: Final = 0xFFFFFFF2  # TC_H_MAKE(TC_H_CLSACT, TC_H_MIN_INGRESS)
 CLSACT_EGRESS: Final = 0xFFFFFFF3
 ROOT: Final = 0xFFFFFFFF
 
@@ -20,6 +27,7 @@ _HEADER: Final = struct.Struct("=IHHII")
 _INFO: Final = struct.Struct("=BxHiII")
 _TRAFFIC: Final = struct.Struct("=BxxxiIII")
 _ATTRIBUTE: Final = struct.Struct("=HH")
+_NUMBER: Final = struct.Struct("=i")
 _RTMGRP_TC: Final = 8
 _NLMSG_ERROR, _NLMSG_DONE = 2, 3
 _RTM_NEWLINK, _RTM_GETLINK = 16, 18
@@ -27,40 +35,137 @@ _RTM_NEWQDISC, _RTM_GETQDISC = 36, 38
 _RTM_NEWTFILTER, _RTM_GETTFILTER = 44, 46
 _NLM_F_REQUEST, _NLM_F_DUMP = 0x1, 0x300
 _NESTED: Final = 0x8000  # NLA_F_NESTED
+_TCA_KIND, _TCA_OPTIONS, _TCA_BPF_NAME = 1, 2, 7
 _READ_BYTES: Final = 1 << 16
 _FOREVER_S: Final = 5.0  # the kernel answers at once; this only keeps a bug from hanging a node
 
 
-class LinkAttribute:
+class LinkAttribute(IntEnum):
     """Attributes of a device, as far as they are used."""
 
-    QDISC: Final = 6
-    LINKINFO: Final = 18
-    STATS64: Final = 23
-    LINK_NETNSID: Final = 37
+    LINK = 5  # the other end of a pair, by its ifindex there
+    QDISC = 6
+    LINKINFO = 18
+    STATS64 = 23
+    LINK_NETNSID = 37
+    XDP = 43
+    TARGET_NETNSID = 46
 
 
-def link(ifindex: int) -> dict[int, bytes]:
-    """Return the attributes of one device; none where there is no such device."""
-    body = _INFO.pack(socket.AF_UNSPEC, 0, ifindex, 0, 0)
-    for kind, answer in _ask(_RTM_GETLINK, body, 0):
-        if kind == _RTM_NEWLINK:
-            return nested(answer[_INFO.size :])
-    return {}
+class _Message(NamedTuple):
+    kind: int
+    sequence: int
+    body: bytes
 
 
-def queues() -> Iterator[tuple[int, int, dict[int, bytes]]]:
-    """Yield ifindex, parent and attributes of every queueing discipline of this namespace."""
-    for kind, answer in _ask(_RTM_GETQDISC, _TRAFFIC.pack(socket.AF_UNSPEC, 0, 0, 0, 0), _NLM_F_DUMP):
-        if kind == _RTM_NEWQDISC:
-            _, ifindex, _, parent, _ = _TRAFFIC.unpack_from(answer)
-            yield ifindex, parent, nested(answer[_TRAFFIC.size :])
+class _RefusedError(LocalError):
+    """The kernel's answer is an error.
+
+    Attributes:
+        number: its errno.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"netlink question: {os.strerror(number)}")
+        self.number = number
 
 
-def filters(ifindex: int, parent: int) -> int:
-    """Return how many filters stand at one place of a device."""
-    question = _TRAFFIC.pack(socket.AF_UNSPEC, ifindex, 0, parent, 0)
-    return [kind for kind, _ in _ask(_RTM_GETTFILTER, question, _NLM_F_DUMP)].count(_RTM_NEWTFILTER)
+class Questions:
+    """One socket to ask by. For one thread at a time.
+
+    Every question raises ``LocalError`` where the kernel refuses it, or there is no answer; that never reads as an
+    answer of nothing. The next question may be asked all the same.
+
+    Raises:
+        LocalError: no socket is to be had.
+    """
+
+    def __init__(self) -> None:
+        self._socket = _open(0)
+        self._socket.settimeout(_FOREVER_S)
+        self._sequence = 0
+        self._has_leftovers = False
+
+    def close(self) -> None:
+        self._socket.close()
+
+    def link(self, ifindex: int, namespace: int | None = None) -> dict[int, bytes]:
+        """Return the attributes of one device; none where there is no such device.
+
+        Args:
+            namespace: where else the device is, by this namespace's number for that one.
+        """
+        body = _INFO.pack(socket.AF_UNSPEC, 0, ifindex, 0, 0)
+        if namespace is not None:
+            body += _ATTRIBUTE.pack(_ATTRIBUTE.size + _NUMBER.size, LinkAttribute.TARGET_NETNSID)
+            body += _NUMBER.pack(namespace)
+        try:
+            answers = self._ask(_RTM_GETLINK, body, 0)
+        except _RefusedError as error:
+            if error.number == errno.ENODEV:
+                return {}
+            raise
+        return next((nested(answer[_INFO.size :]) for kind, answer in answers if kind == _RTM_NEWLINK), {})
+
+    def queues(self) -> list[tuple[int, int, dict[int, bytes]]]:
+        """Return ifindex, parent and attributes of every queueing discipline of the namespace."""
+        found: list[tuple[int, int, dict[int, bytes]]] = []
+        for kind, answer in self._ask(_RTM_GETQDISC, _TRAFFIC.pack(socket.AF_UNSPEC, 0, 0, 0, 0), _NLM_F_DUMP):
+            if kind == _RTM_NEWQDISC:
+                _, ifindex, _, parent, _ = _TRAFFIC.unpack_from(answer)
+                found.append((ifindex, parent, nested(answer[_TRAFFIC.size :])))
+        return found
+
+    def filters(self, ifindex: int, parent: int) -> list[str]:
+        """Return the filters at one place of a device, by the names of those that are programs; the others have none.
+
+        A filter's chain may be listed with it.
+        """
+        question = _TRAFFIC.pack(socket.AF_UNSPEC, ifindex, 0, parent, 0)
+        answers = self._ask(_RTM_GETTFILTER, question, _NLM_F_DUMP)
+        return [_program_name(nested(body[_TRAFFIC.size :])) for kind, body in answers if kind == _RTM_NEWTFILTER]
+
+    def _ask(self, kind: int, body: bytes, flags: int) -> list[tuple[int, bytes]]:
+        if self._has_leftovers:
+            self._forget()
+        self._sequence += 1
+        header = _HEADER.pack(_HEADER.size + len(body), kind, _NLM_F_REQUEST | flags, self._sequence & 0xFFFFFFFF, 0)
+        self._has_leftovers = True
+        try:
+            self._socket.send(header + body)
+            answers = self._answers(is_dump=bool(flags))
+        except OSError as error:
+            raise LocalError(f"netlink question: {error}") from error
+        self._has_leftovers = False
+        return answers
+
+    def _answers(self, *, is_dump: bool) -> list[tuple[int, bytes]]:
+        answers: list[tuple[int, bytes]] = []
+        while True:
+            for message in _messages(self._socket.recv(_READ_BYTES)):
+                if message.sequence != self._sequence & 0xFFFFFFFF:
+                    continue
+                if message.kind in (_NLMSG_DONE, _NLMSG_ERROR):
+                    number = _NUMBER.unpack_from(message.body)[0] if len(message.body) >= _NUMBER.size else 0
+                    if number:
+                        raise _RefusedError(-number)
+                    return answers
+                answers.append((message.kind, message.body))
+            if answers and not is_dump:
+                return answers
+
+    def _forget(self) -> None:
+        """Read what a question that failed left behind: while its dump lasts, the kernel begins no other."""
+        self._socket.setblocking(False)
+        try:
+            while True:
+                self._socket.recv(_READ_BYTES)
+        except BlockingIOError:
+            self._has_leftovers = False
+        except OSError as error:
+            raise LocalError(f"netlink question: {error}") from error
+        finally:
+            self._socket.settimeout(_FOREVER_S)
 
 
 def nested(body: bytes) -> dict[int, bytes]:
@@ -75,35 +180,38 @@ def nested(body: bytes) -> dict[int, bytes]:
 
 
 def listen() -> socket.socket:
-    """Return a socket that hears of queues and filters that change; never blocking."""
+    """Return a socket that hears of queues and filters that change; never blocking.
+
+    Raises:
+        LocalError: none is to be had.
+    """
     opened = _open(_RTMGRP_TC)
     opened.setblocking(False)
     return opened
 
 
-def _ask(kind: int, body: bytes, flags: int) -> list[tuple[int, bytes]]:
-    answers: list[tuple[int, bytes]] = []
-    with _open(0) as question:
-        question.settimeout(_FOREVER_S)
-        question.send(_HEADER.pack(_HEADER.size + len(body), kind, _NLM_F_REQUEST | flags, 1, 0) + body)
-        while True:
-            for answer, content in _messages(question.recv(_READ_BYTES)):
-                if answer in (_NLMSG_DONE, _NLMSG_ERROR):
-                    return answers
-                answers.append((answer, content))
-            if not flags:
-                return answers
+def _program_name(facts: dict[int, bytes]) -> str:
+    if facts.get(_TCA_KIND, b"").rstrip(b"\0") != b"bpf":
+        return ""
+    return nested(facts.get(_TCA_OPTIONS, b"")).get(_TCA_BPF_NAME, b"").rstrip(b"\0").decode(errors="replace")
 
 
 def _open(groups: int) -> socket.socket:
-    opened = socket.socket(socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_CLOEXEC, socket.NETLINK_ROUTE)
-    opened.bind((0, groups))
+    try:
+        opened = socket.socket(socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_CLOEXEC, socket.NETLINK_ROUTE)
+    except OSError as error:
+        raise LocalError(f"netlink socket: {error}") from error
+    try:
+        opened.bind((0, groups))
+    except OSError as error:
+        opened.close()
+        raise LocalError(f"netlink socket: {error}") from error
     return opened
 
 
-def _messages(data: bytes) -> Iterator[tuple[int, bytes]]:
+def _messages(data: bytes) -> Iterator[_Message]:
     at = 0
     while at + _HEADER.size <= len(data):
-        length, kind, *_ = _HEADER.unpack_from(data, at)
-        yield kind, data[at + _HEADER.size : at + length]
+        length, kind, _, sequence, _ = _HEADER.unpack_from(data, at)
+        yield _Message(kind, sequence, data[at + _HEADER.size : at + length])
         at += max(length, _HEADER.size) + 3 & ~3

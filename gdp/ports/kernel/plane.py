@@ -13,6 +13,7 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack, closing
 from typing import Final
 
 from gdp.errors import DropReason, LocalError
@@ -20,6 +21,7 @@ from gdp.ports.kernel.attach import Attachment, FilterAttachment, LinkAttachment
 from gdp.ports.kernel.device import QueueWatch, Refusals, has_free_peer
 from gdp.ports.kernel.loaded import Loaded
 from gdp.ports.kernel.mirror import EntryCounts, Mirror
+from gdp.ports.kernel.netlink import Questions
 from gdp.ports.kernel.shapes import ENTRIES_DEFAULT, PortFlag
 from gdp.ports.plane import Arrival, Counters, Port
 from gdp.ports.raw import RawPlane
@@ -59,15 +61,17 @@ class KernelPlane(RawPlane):
     ) -> None:
         self._peer = peer
         self._attachments: dict[int, Attachment] = {}
-        self._queues: QueueWatch | None = None
         self._table = table
         self._next_upkeep_s = 0.0
         self._refusals = Refusals()
         self._unread = 0  # frames that came up to a full socket
-        self._loaded = Loaded(entries_max, leased=clsact or not has_links())
-        self._mirror = Mirror({} if table is None else table.entries, *self._loaded.of_entries)
-        super().__init__(ifnames, table, bypass_qdisc=bypass_qdisc)
-        self._queues = QueueWatch()
+        with ExitStack() as opened:
+            self._loaded = opened.enter_context(closing(Loaded(entries_max, leased=clsact or not has_links())))
+            self._questions = opened.enter_context(closing(Questions()))
+            self._queues = opened.enter_context(closing(QueueWatch()))
+            self._mirror = Mirror({} if table is None else table.entries, *self._loaded.of_entries)
+            super().__init__(ifnames, table, bypass_qdisc=bypass_qdisc)
+            opened.pop_all()  # from now on ``close`` does it
         self.watch(self._queues, self._review_queues)
         if table is not None:
             table.observe(self._mirror)
@@ -78,7 +82,7 @@ class KernelPlane(RawPlane):
         """The counts of the kernel and of this process together, as they are now.
 
         A device tells nobody when it refuses what the kernel sent on: such a frame counts as forwarded, and as
-        ``PORT_FULL`` from the next idle ``poll`` on.
+        ``PORT_FULL`` from the next time that devices are asked on, which ``poll`` does twice a second.
         """
         here, there = self._counters, self._loaded.counters()
         drops = [a + b for a, b in zip(here.drops, there.drops, strict=True)]
@@ -112,9 +116,13 @@ class KernelPlane(RawPlane):
         if self._table is not None:
             self._table.observe(None)
         super().close()
-        if self._queues is not None:
-            self._queues.close()
+        self._queues.close()
+        self._questions.close()
         self._loaded.close()
+
+    def remove_port(self, index: int) -> None:
+        self._look_at_devices()  # while what the port's device refused can still be asked
+        super().remove_port(index)
 
     # ports
 
@@ -123,7 +131,7 @@ class KernelPlane(RawPlane):
         try:
             ifindex = _ifindex(port.ifname)
             attach = FilterAttachment if self._loaded.is_leased else LinkAttachment
-            self._attachments[port.index] = attach(self._loaded.program, ifindex)
+            self._attachments[port.index] = attach(self._loaded.program, ifindex, self._questions)
         except LocalError as error:
             self._shut(port.index)
             raise LocalError(f"port {port.ifname}: {error}") from error
@@ -137,34 +145,45 @@ class KernelPlane(RawPlane):
 
     def _know(self, port: Port) -> None:
         self._tell_kernel(port)
-        self._refusals.look(self._devices)  # from now on, not only from the next idle poll
+        self._look_at_devices()  # what it refuses from now on is counted
         super()._know(port)
 
     def _kernel_drops(self) -> int:
         unread = super()._kernel_drops()
         self._unread += unread
-        self._refusals.look(self._devices)
         return unread
 
     def _tell_kernel(self, port: Port) -> None:
         ifindex = next((ifindex for ifindex, index in self._devices.items() if index == port.index), 0)
         if port.up and ifindex:
-            is_free = self._peer and has_free_peer(ifindex)
-            self._loaded.set_port(port.index, ifindex, port.mtu, PortFlag.PEER if is_free else 0)
+            flags = PortFlag.PEER if self._peer and self._has_free_peer(ifindex) else 0
+            self._loaded.set_port(port.index, ifindex, port.mtu, flags)
         else:
             self._loaded.set_port(port.index, 0, 0, 0)
 
+    def _has_free_peer(self, ifindex: int) -> bool:
+        try:
+            return has_free_peer(self._questions, ifindex)
+        except LocalError:  # who cannot know takes the way that is always right; the next upkeep asks again
+            return False
+
+    def _look_at_devices(self) -> None:
+        try:
+            self._refusals.look(self._questions, self._devices)
+        except LocalError:  # nothing is lost: devices go on counting, and the next upkeep asks again
+            return
+
     def _review_queues(self) -> None:
         """See anew where frames may pass by what stands on the way out."""
-        if self._queues is not None:
-            self._queues.drain()
+        self._queues.drain()
         for port in self._ports.values():
             self._tell_kernel(port)
 
     def _keep_up(self) -> None:
-        """Do what nobody gives news of: the lease, and programs that came to stand on a port's way out."""
+        """Do what nobody gives news of: the lease, programs that came to stand on a port's way out, and refusals."""
         self._loaded.renew(_LEASE_S)
         self._review_queues()
+        self._look_at_devices()
         self._next_upkeep_s = time.monotonic() + _UPKEEP_S / 2
 
 

@@ -9,8 +9,9 @@ A frame is taken (forwarded, or dropped and counted) where the program is sure; 
 the port's packet socket, where Python decides by the same table and counts. So the program needs no word for what is
 rare::
 
-    to our station? -> whole header? -> version, kind, hops, length good? -> known? -> nowhere | one hop | a group
-          no: up            no: up                no: up                     no: up
+    to our station? -> leased, and over? -> whole header? -> version, kind, hops, length good? -> known?
+          no: up            yes: up             no: up                 no: up                     no: up
+                                                               known -> nowhere | one hop | a group
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ DROP: Final = 2  # TC_ACT_SHOT, TCX_DROP
 REDIRECT: Final = 7  # TC_ACT_REDIRECT, TCX_REDIRECT
 
 _SKB: Final = Reg.R6
-_FRAME, _BRANCH = Reg.R7, Reg.R7  # a frame's bytes may not be kept over what a group does
+_UNTIL, _FRAME, _PORT, _BRANCH = (Reg.R7,) * 4  # in turn; a frame's bytes may not be kept over what a group does
 _TOTALS: Final = Reg.R8
 _ENTRY, _TURN = Reg.R9, Reg.R9
 
@@ -59,6 +60,12 @@ _LOOKUP, _KTIME_NS, _STORE_BYTES, _CLONE_REDIRECT, _REDIRECT, _PULL, _REDIRECT_P
 _URGENT_PRIORITY: Final = 6  # TC_PRIO_INTERACTIVE: the first band of pfifo_fast and prio
 _CONGESTION_NOTED: Final = 2  # NET_XMIT_CN: sent, though the queue is getting full
 
+# The stack, from R10 down:
+#
+#     -64  key: destination (32)  every source (32)
+#     -72  index of a map (4)  unused (4)
+#     -80  where the group is (8)
+#     -88  ifindex of a branch (8)
 _KEY: Final = -2 * NAME_BYTES
 _INDEX: Final = _KEY - 8
 _GROUP: Final = _INDEX - 8
@@ -114,9 +121,9 @@ class _Story(Assembler):
         """A program that may outlive its switch forwards only while that says so."""
         self._find(lease, 0)
         self.jump_if(Reg.R0, "==", 0, "up")
-        self.load(Reg.R7, Reg.R0, 0, 8)
+        self.load(_UNTIL, Reg.R0, 0, 8)
         self.call(_KTIME_NS)
-        self.jump_if(Reg.R0, ">", Reg.R7, "up")
+        self.jump_if(Reg.R0, ">", _UNTIL, "up")
 
     def _whole_header(self) -> None:
         """Make the header readable, then prove it to the verifier."""
@@ -180,6 +187,7 @@ class _Story(Assembler):
         self.load(Reg.R2, _ENTRY, EntryAt.PORT, 4)
         self.jump_if(Reg.R2, "==", GROUP, "group")
         self.jump_if(Reg.R2, "==", NOWHERE_PORT, "nowhere")
+        # any other falls into ``_one_hop``, its port in R2
 
     def _one_hop(self) -> None:
         """R2: the port."""
@@ -194,12 +202,12 @@ class _Story(Assembler):
         for at in range(0, MACS_BYTES, 4):
             self.load(Reg.R2, _ENTRY, EntryAt.MACS + at, 4)
             self.store(_FRAME, at, Reg.R2, 4)
-        self.move(Reg.R7, Reg.R0)  # the port; the frame is done with
+        self.move(_PORT, Reg.R0)  # the frame is done with
         self._count(Total.TAKEN)
         self._count_copy()
         self._count_entry("one hop")
-        self.load(Reg.R1, Reg.R7, PortAt.IFINDEX, 4)
-        self.load(Reg.R3, Reg.R7, PortAt.FLAGS, 4)
+        self.load(Reg.R1, _PORT, PortAt.IFINDEX, 4)
+        self.load(Reg.R3, _PORT, PortAt.FLAGS, 4)
         self.move(Reg.R2, 0)
         self.jump_if(Reg.R3, "&", PortFlag.PEER, "to the peer")
         self.call(_REDIRECT)
@@ -276,6 +284,7 @@ class _Story(Assembler):
         self.label("down")
         self._count(Total.TAKEN)
         self._count(DropReason.PORT_DOWN)
+        # falls into "drop"; a group, which has counted already, ends there too
         self.label("drop")
         self.leave(DROP)
         self.label("urgent")

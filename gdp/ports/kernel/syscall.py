@@ -30,6 +30,7 @@ __all__ = [
     "create_link",
     "link_program",
     "load_program",
+    "name_of",
     "objects",
     "program_id",
     "program_name",
@@ -40,6 +41,7 @@ NAME_MAX: Final = 15  # BPF_OBJ_NAME_LEN - 1
 _LOG_BYTES: Final = 1 << 20
 _SCHED_CLS: Final = 3  # BPF_PROG_TYPE_SCHED_CLS
 _INFO_BYTES: Final = 256
+_ATTACHED_MAX: Final = 64  # BPF_MPROG_MAX: more are never at one hook
 _SKB_BYTES: Final = 512  # more than struct __sk_buff has
 _PRIORITY_AT: Final = 32
 _NUMBERS: Final = {  # of the call itself; where Python is 32-bit, under the machine that it was built for
@@ -193,15 +195,35 @@ def create_link(program: int, ifindex: int, attach_type: int) -> int:
     return bpf(Command.LINK_CREATE, attributes, f"attach to device {ifindex}")
 
 
-def attached(ifindex: int, attach_type: int) -> int:
-    """Return how many programs stand at one hook of a device.
+def attached(ifindex: int, attach_type: int) -> list[int]:
+    """Return the programs that stand at one hook of a device, by id.
 
     Raises:
-        BpfError: this kernel cannot be asked about that hook.
+        BpfError: EINVAL: this kernel does not know that hook.
     """
-    attributes = bytearray(struct.pack("=IIII48x", ifindex, attach_type, 0, 0))
+    ids = bytearray(4 * _ATTACHED_MAX)
+    attributes = bytearray(struct.pack("=IIIIQI36x", ifindex, attach_type, 0, 0, address(ids), _ATTACHED_MAX))
     bpf(Command.PROG_QUERY, attributes, f"ask for the programs of device {ifindex}")
-    return int(struct.unpack_from("=I", attributes, 24)[0])
+    count = struct.unpack_from("=I", attributes, 24)[0]
+    return [*struct.unpack_from(f"={count}I", ids)]
+
+
+def name_of(program: int) -> str | None:
+    """Return the name of a program by id; None where it is gone.
+
+    Raises:
+        BpfError: EPERM: it takes CAP_SYS_ADMIN to open what others loaded.
+    """
+    try:
+        opened = bpf(Command.PROG_GET_FD_BY_ID, bytearray(struct.pack("=I12x", program)), "open what is loaded")
+    except BpfError as error:
+        if error.number == errno.ENOENT:
+            return None
+        raise
+    try:
+        return program_name(opened)
+    finally:
+        os.close(opened)
 
 
 def run(program: int, frame: bytes, repeat: int = 1) -> Run:

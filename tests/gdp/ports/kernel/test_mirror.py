@@ -114,3 +114,26 @@ def test_an_entry_that_changes_its_way_keeps_its_counts(small: Loaded, hops: Hop
     table.install(name(1), hops, 1.0)
     assert in_kernel(small, name(1)) == hops
     assert mirror.counts(1) == before != {}
+
+
+def test_a_full_map_is_asked_no_more_for_room_by_each_name(small: Loaded, monkeypatch: pytest.MonkeyPatch) -> None:
+    table, mirror = watched(small)
+    held = [name(number) for number in (1, 2, 3)]
+    table.install_many([(key, ONE_HOP) for key in held], 1.0)
+    tried: list[bytes] = []
+    put = small.entries.put
+
+    def count(key: bytes, value: bytes) -> None:
+        tried.append(key)
+        put(key, value)
+
+    monkeypatch.setattr(small.entries, "put", count)
+    new = [name(number) for number in range(10, 60)]
+    table.install_many([(key, PAIR) for key in (*new, *held)], 1.0)
+    assert {key[:32] for key in tried} == {new[0], *held}
+    assert [in_kernel(small, key) for key in held] == [PAIR] * 3
+    assert all(in_kernel(small, key) is None for key in new)
+    assert (len(mirror), mirror.left_out) == (3, 50)
+    table.expire(1.0)
+    assert len(mirror) == mirror.left_out == 0
+    assert all(small.groups.get(n.to_bytes(4, sys.byteorder)) is None for n in range(8))

@@ -1,0 +1,145 @@
+"""Which frames a port's sockets let in: each of ours by one lane and no other, whatever its length.
+
+The filters run here as the kernel runs them (classic BPF, Linux, Documentation/networking/filter.rst), as far as they
+use it.
+"""
+
+from __future__ import annotations
+
+import errno
+import socket
+import struct
+from itertools import product
+
+import pytest
+
+from gdp.frame.kinds import CONTROL_FROM, Flag, Kind
+from gdp.ports import sockets
+from gdp.ports.sockets import Lane, only_ours
+from tests.fixtures_forwarding import ONE, frame
+
+LOAD_BYTE, LOAD_LENGTH, JUMP_EQUAL, JUMP_AT_LEAST, JUMP_SET, RETURN = 0x30, 0x80, 0x15, 0x35, 0x45, 0x06
+PACKET_TYPE_AT = 0xFFFFF004
+TO_US, TO_ALL, TO_MANY, TO_ANOTHER, FROM_US = (
+    socket.PACKET_HOST,
+    socket.PACKET_BROADCAST,
+    socket.PACKET_MULTICAST,
+    socket.PACKET_OTHERHOST,
+    socket.PACKET_OUTGOING,
+)
+KINDS = (0x00, Kind.DATA, Kind.REPORT, CONTROL_FROM - 1, CONTROL_FROM, Kind.HELLO, Kind.REVOKE, 0xFF)
+FLAGS = (Flag.NONE, Flag.LAST, Flag.URGENT, Flag.URGENT | Flag.RELIABLE, 0xFF, 0xFF & ~Flag.URGENT)
+
+
+def takes(lane: Lane, packet: bytes, kind: int = TO_US) -> bool:
+    """Run a lane's filter on a packet, from the Ethernet header on."""
+    at, value = 0, 0
+    while True:
+        code, if_true, if_false, operand = lane.value[at]
+        at += 1
+        if code == RETURN:
+            return operand > 0
+        if code == LOAD_LENGTH:
+            value = len(packet)
+        elif code == LOAD_BYTE and operand == PACKET_TYPE_AT:
+            value = kind
+        elif code == LOAD_BYTE:
+            if operand >= len(packet):
+                return False
+            value = packet[operand]
+        else:
+            holds = {
+                JUMP_EQUAL: value == operand,
+                JUMP_AT_LEAST: value >= operand,
+                JUMP_SET: bool(value & operand),
+            }[code]
+            at += if_true if holds else if_false
+
+
+def lanes_of(packet: bytes, kind: int = TO_US) -> list[str]:
+    """Return the names of the lanes that take a packet."""
+    return [lane.name for lane in Lane if takes(lane, packet, kind)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("flags", FLAGS)
+def test_a_frame_to_us_comes_by_one_lane_as_its_kind_and_flags_say(kind: int, flags: int) -> None:
+    of_data = "URGENT" if flags & Flag.URGENT else "ORDINARY"
+    assert lanes_of(frame(ONE, kind=kind, flags=flags)) == ["ALL", "CONTROL" if kind >= CONTROL_FROM else of_data]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("flags", FLAGS)
+def test_of_broadcasts_only_a_neighbours_word_comes_in(kind: int, flags: int) -> None:
+    wanted = ["ALL", "CONTROL"] if kind >= CONTROL_FROM else []
+    assert lanes_of(frame(ONE, kind=kind, flags=flags), TO_ALL) == wanted
+
+
+@pytest.mark.parametrize("station", [TO_MANY, TO_ANOTHER, FROM_US])
+def test_what_is_for_others_comes_in_by_no_lane(station: int) -> None:
+    for kind, flags in product(KINDS, FLAGS):
+        assert lanes_of(frame(ONE, kind=kind, flags=flags), station) == []
+
+
+@pytest.mark.parametrize("length", range(14, 20))
+@pytest.mark.parametrize(("kind", "flags"), [(Kind.DATA, 0), (Kind.DATA, Flag.URGENT), (Kind.HELLO, 0)])
+def test_a_frame_cut_short_still_comes_by_one_lane_so_that_it_is_counted(length: int, kind: int, flags: int) -> None:
+    short = frame(ONE, kind=kind, flags=flags)[:length]
+    found = lanes_of(short)
+    assert found[0] == "ALL"
+    assert len(found) == 2
+
+
+def test_every_jump_of_a_filter_ends_inside_it() -> None:
+    for lane in Lane:
+        steps = lane.value
+        for at, (code, if_true, if_false, _) in enumerate(steps):
+            assert code in (LOAD_BYTE, LOAD_LENGTH, JUMP_EQUAL, JUMP_AT_LEAST, JUMP_SET, RETURN)
+            assert at + 1 + max(if_true, if_false) < len(steps) or code == RETURN
+        assert steps[-1][0] == RETURN
+
+
+class Recorder:
+    """A socket that notes what it is asked, and refuses one option."""
+
+    def __init__(self, refuses: int | None = None, number: int = errno.ENOPROTOOPT) -> None:
+        self.options: dict[tuple[int, int], int | bytes] = {}
+        self._refuses = refuses
+        self._number = number
+
+    def setsockopt(self, level: int, option: int, value: int | bytes) -> None:
+        if option == self._refuses:
+            raise OSError(self._number, "refused")
+        self.options[level, option] = value
+
+
+@pytest.mark.parametrize("lane", Lane)
+def test_the_kernel_is_given_the_whole_filter(lane: Lane) -> None:
+    asked = Recorder()
+    only_ours(asked, lane)  # type: ignore[arg-type]
+    given = asked.options[socket.SOL_SOCKET, 26]
+    assert isinstance(given, bytes)
+    assert struct.unpack("@HP", given)[0] == len(lane.value)
+
+
+def test_an_older_kernel_without_the_option_to_ignore_what_leaves_will_do() -> None:
+    only_ours(Recorder(refuses=23))  # type: ignore[arg-type]
+    with pytest.raises(OSError, match="refused"):
+        only_ours(Recorder(refuses=23, number=errno.EPERM))  # type: ignore[arg-type]
+
+
+def test_buffers_are_asked_for_past_the_limit_and_else_up_to_it() -> None:
+    free, bound = Recorder(), BoundRecorder()
+    sockets.large_buffers(free)  # type: ignore[arg-type]
+    sockets.large_buffers(bound)  # type: ignore[arg-type]
+    assert {option for _, option in free.options} == {32, 33}
+    assert {option for _, option in bound.options} == {socket.SO_SNDBUF, socket.SO_RCVBUF}
+
+
+class BoundRecorder(Recorder):
+    """A socket of a process that may not pass the system's limits."""
+
+    def setsockopt(self, level: int, option: int, value: int | bytes) -> None:
+        if option in (32, 33):
+            raise PermissionError
+        super().setsockopt(level, option, value)
