@@ -10,6 +10,7 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import pairwise
 
 from gdp.errors import DropReason
 from gdp.frame.codec import Header, encode
@@ -22,13 +23,13 @@ from gdp.switch.table import NOWHERE, Table
 from netns_tests.spaces import Space
 from netns_tests.test_planes import LOOK_S, PATIENCE_S, far_end
 
-__all__ = ["B", "FORGOTTEN", "KINDS", "NOWHERE_NAME", "UNKNOWN", "Row", "frame", "mac_of", "waiting"]
+__all__ = ["FORGOTTEN", "KINDS", "NOWHERE_NAME", "UNKNOWN", "B", "Row", "frame", "mac_of", "waiting"]
 
 B, UNKNOWN, NOWHERE_NAME, FORGOTTEN = (bytes([0xE0 + n]) * 32 for n in range(4))
 KINDS: Mapping[str, Callable[[Sequence[str], Table], LinkedPlane]] = {"raw": RawPlane, "kernel": KernelPlane}
 LINKS = ("a", "b", "c", "d")
-RECEIVE_BYTES = 1 << 26
-SO_RCVBUFFORCE = 33
+BUFFER_BYTES = 1 << 26
+SO_SNDBUFFORCE, SO_RCVBUFFORCE = 32, 33
 
 
 def mac_of(ifname: str) -> bytes:
@@ -65,6 +66,7 @@ class Row:
     Attributes:
         sent: frames that A's device took.
         delivered: what came to B, in order.
+        discarded: frames that the kernel had nobody to give to, as the test found them counted.
         handed_up: frames that planes gave to their node, which here has no use for them.
     """
 
@@ -72,12 +74,13 @@ class Row:
         for link in LINKS:
             space.veth(f"{link}0", f"{link}1", mac_of(f"{link}0"), mac_of(f"{link}1"), mtus.get(link, 1_500))
         self.space = space
-        self.sent = self.handed_up = 0
+        self.sent = self.handed_up = self.discarded = 0
         self.delivered: list[bytes] = []
         self.a, self.b = far_end("a0"), far_end("d1")
-        self.b.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BYTES)
+        self.a.setsockopt(socket.SOL_SOCKET, SO_SNDBUFFORCE, BUFFER_BYTES)  # it holds what waits at the next queue
+        self.b.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER_BYTES)
         self.planes: list[LinkedPlane] = []
-        for left, right in zip(LINKS, LINKS[1:], strict=False):
+        for left, right in pairwise(LINKS):
             table = Table()
             to_next = (1, mac_of(f"{right}1") + mac_of(f"{right}0"))
             table.install(B, (to_next,), float("inf"))
@@ -113,7 +116,7 @@ class Row:
 
     def sums(self) -> tuple[int, int]:
         """Return how many frames were sent, and of how many it is known what became of them."""
-        return self.sent, len(self.delivered) + sum(self.drops().values()) + self.handed_up
+        return self.sent, len(self.delivered) + sum(self.drops().values()) + self.handed_up + self.discarded
 
     def settle(self) -> None:
         """Return when every frame that was sent is accounted for, and nothing more happens."""

@@ -1,29 +1,40 @@
-"""No frame is lost without a word on real devices: sent = delivered + dropped by reason + handed up, and none in flight.
+"""No frame is lost without a word on real devices: sent = delivered + dropped by reason + handed up, none in flight.
 
 What the kernel itself discards, and how it is known: a full packet socket by the socket's own statistics; a queue or a
 device that refuses, by the error of the send, or for what the kernel plane sends on by the device's and the queue's
-statistics. One thing it tells nobody: a frame that the kernel plane redirects to a device that is gone, until the news
-of that has been read (in the tests: the next poll). It counts as forwarded.
+statistics; what reaches a device at which nobody listens, by that device's ``rx_dropped``.
+
+One thing it tells nobody: a frame that the kernel plane redirects to a device that is gone, until the news of that has
+been read (in the tests: the next poll). It counts as forwarded.
 """
 
 from __future__ import annotations
 
+import contextlib
+import json
+import os
+import signal
 import socket
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 from pyroute2 import IPRoute
 
 from gdp.errors import DropReason, LocalError
-from gdp.limits import HOPS_MAX
 from gdp.ports import sockets
-from netns_tests.rows import B, FORGOTTEN, KINDS, NOWHERE_NAME, UNKNOWN, Row, frame, mac_of, waiting
+from gdp.switch.table import Table
+from netns_tests.rows import FORGOTTEN, KINDS, NOWHERE_NAME, UNKNOWN, B, Row, frame, mac_of
 from netns_tests.spaces import Space
-from netns_tests.test_planes import far_end
+from netns_tests.test_planes import PATIENCE_S, far_end, poll_until
 
 pytestmark = pytest.mark.netns
 
 MakeRow = Callable[..., Row]
+ROOT = Path(__file__).parents[1]
+WHERE = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])}
 
 
 @pytest.fixture(params=list(KINDS))
@@ -41,6 +52,13 @@ def lay(request: pytest.FixtureRequest, space: Space) -> Iterator[MakeRow]:
     yield lay
     for row in made:
         row.close()
+
+
+def discarded(ifname: str) -> int:
+    """Return how many frames a device's kernel had nobody to give to."""
+    with IPRoute() as here:
+        (link,) = here.get_links(socket.if_nametoindex(ifname))
+        return int(link.get_attr("IFLA_STATS64")["rx_dropped"])
 
 
 def test_every_wrong_frame_is_dropped_for_its_own_reason_at_whichever_switch(lay: MakeRow) -> None:
@@ -118,15 +136,18 @@ def test_a_device_that_is_deleted_and_made_again_under_a_stream_loses_nothing_un
     for _ in range(3):
         row.send(*[frame()] * 100)
         row.poll()
+        row.discarded += discarded("c1")  # what the second switch sent before the third had opened the device
         row.space.ip("del", "c0")
         row.until(lambda: not row.planes[1].port_state(1) and not row.planes[2].port_state(0))
         row.send(*[frame()] * 10)
         row.space.veth("c0", "c1", mac_of("c0"), mac_of("c1"))
         row.until(lambda: row.planes[1].port_state(1) and row.planes[2].port_state(0))
+    row.discarded += discarded("c1")
     row.send(*[frame()] * 100)
     row.settle()
     assert row.sums() == (430, 430)
     assert len(row.delivered) >= 100
+    assert set(row.drops()) <= {DropReason.PORT_DOWN, DropReason.PORT_FULL}
 
 
 def test_what_a_full_socket_drops_is_counted_with_what_it_hands_up(
@@ -162,19 +183,61 @@ def test_a_port_that_is_removed_sends_on_what_had_arrived_at_it(lay: MakeRow) ->
     assert (len(row.delivered), row.drops()) == (200, {})
 
 
-def test_a_reader_whose_socket_is_gone_costs_the_switches_nothing(lay: MakeRow, space: Space) -> None:
+def test_what_comes_to_a_reader_that_has_left_is_counted_by_its_device(lay: MakeRow) -> None:
     row = lay()
-    with far_end("d0") as tap:  # what leaves the last switch, as it would reach a reader
-        tap.setsockopt(263, 23, 0)  # SOL_PACKET, PACKET_IGNORE_OUTGOING
-        row.b.close()
-        row.b = far_end("a0")  # of which nothing comes
-        row.send(*[frame()] * 50)
-        left: list[bytes] = []
+    row.send(*[frame()] * 50)
+    row.settle()
+    row.b.close()
+    row.b = far_end("d0")  # where nothing comes in
+    row.send(*[frame()] * 50)
+    row.until(lambda: discarded("d1") >= 50)
+    assert (len(row.delivered), discarded("d1"), row.drops()) == (50, 50, {})
 
-        def have_left() -> bool:
-            left.extend(waiting(tap))
-            return len(left) >= 50
 
-        row.until(have_left)
-    assert row.drops() == {}
-    assert all(B in each for each in left)
+@contextlib.contextmanager
+def readers(**buffers: int) -> Iterator[list[subprocess.Popen[str]]]:
+    """Processes that read one device each, with so many bytes of buffer; killed at the end, whatever happens."""
+    with contextlib.ExitStack() as stack:
+        started = []
+        for ifname, buffer_bytes in buffers.items():
+            argv = [sys.executable, "-m", "netns_tests.reader_child", ifname, str(buffer_bytes)]
+            child = stack.enter_context(subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, env=WHERE, cwd=ROOT))
+            stack.callback(child.kill)
+            started.append(child)
+        for child in started:
+            assert child.stdout is not None
+            assert child.stdout.readline() == "ready\n"
+        yield started
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_of_three_readers_the_one_that_stands_still_alone_loses_and_counts_it(space: Space, kind: str) -> None:
+    count, large, small = 2_000, 16 << 20, 256 << 10
+    for link in "abcd":
+        space.veth(f"{link}0", f"{link}1", mac_of(f"{link}0"), mac_of(f"{link}1"))
+    hops = tuple((at, mac_of(f"{link}1") + mac_of(f"{link}0")) for at, link in enumerate("bcd", 1))
+    table = Table()
+    table.install(B, hops, float("inf"))
+    with far_end("a0") as sender, readers(b1=large, c1=large, d1=small) as (*quick, slow):
+        try:
+            plane = KINDS[kind](["a1", "b0", "c0", "d0"], table)
+        except LocalError as error:
+            pytest.skip(str(error).partition("\n")[0])
+        slow.send_signal(signal.SIGSTOP)
+        for number in range(count):
+            sender.send(frame(payload=bytes(500), number=number))
+            plane.poll(0)
+        poll_until(plane, lambda: plane.counters.forwarded >= 3 * count)
+        sender.send(frame(urgent=True))
+        poll_until(plane, lambda: plane.counters.forwarded >= 3 * (count + 1))
+        slow.send_signal(signal.SIGCONT)
+        said = [json.loads(each.communicate(timeout=PATIENCE_S)[0]) for each in (*quick, slow)]
+        drops = plane.counters.drops
+        plane.close()
+    assert sum(drops) == 0
+    for each in said[:2]:
+        assert (each["numbers"], each["dropped"]) == (list(range(count)), 0)
+    lost = said[2]["dropped"]
+    assert lost > 0
+    assert len(said[2]["numbers"]) + lost == count
+    assert said[2]["numbers"] == sorted(set(said[2]["numbers"]))

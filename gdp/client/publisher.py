@@ -109,6 +109,7 @@ class Publisher:
         self._skipped = 0  # numbers that moves left behind
         self._waiting = deque[Sealed]()  # best-effort messages
         self._waiting_bytes = 0
+        self._waiting_part = 0  # of the oldest: the first that has not left
         self._early = deque[bytes](maxlen=depth or None)  # latched messages from before the first reader
         self.drops: Counter[DropReason] = Counter()
         self.messages = 0
@@ -174,7 +175,9 @@ class Publisher:
         self.messages += 1
         self.payload_bytes += len(message)
         if self._repairs_wanted:
+            let_go = self._window.let_go
             self._window.add(number, frames, frames.size_bytes)
+            self.drops[DropReason.MEMORY_FULL] += self._window.let_go - let_go
         else:
             self._wait(frames)
         return number
@@ -224,12 +227,11 @@ class Publisher:
             return []
         while self._early:
             self.publish(self._early.popleft())
-        frames = [frame for message in self._waiting for frame in message]
-        self._waiting.clear()
-        self._waiting_bytes = 0
+        limit = max(limit_bytes // self._mtu, 1)
+        frames = self._take_waiting(limit)
         if self._status_wanted and now_s >= self._status_at_s:
             frames += self._seal_status(now_s)
-        return frames + self._window.take(now_s, max(limit_bytes // self._mtu - len(frames), 1))
+        return frames + self._window.take(now_s, max(limit - len(frames), 1))
 
     def _seal(self, message: bytes, mtu: int) -> Sealed:
         number = self._next_number
@@ -241,7 +243,7 @@ class Publisher:
         if any(each.largest > mtu for each in self._waiting):
             waiting = [each.message() for each in self._waiting]
             self._waiting.clear()
-            self._waiting_bytes = 0
+            self._waiting_bytes = self._waiting_part = 0
             for message in waiting:
                 self._wait(self._seal(message, mtu))
         kept = [(number, each) for number, each in self._window.kept() if isinstance(each, Sealed)]
@@ -341,8 +343,24 @@ class Publisher:
         self._waiting.append(frames)
         self._waiting_bytes += frames.size_bytes
         while self._waiting_bytes > WINDOW_BYTES and len(self._waiting) > 1:
-            self._waiting_bytes -= self._waiting.popleft().size_bytes
+            self._let_oldest_go()
             self.drops[DropReason.MEMORY_FULL] += 1
+
+    def _take_waiting(self, limit: int) -> list[bytes]:
+        """Return at most so many frames of best-effort messages, in order, sealed as they are taken."""
+        frames: list[bytes] = []
+        while self._waiting and len(frames) < limit:
+            oldest, first = self._waiting[0], self._waiting_part
+            taken = oldest[first : first + limit - len(frames)]
+            frames += taken
+            self._waiting_part += len(taken)
+            if self._waiting_part == len(oldest):
+                self._let_oldest_go()
+        return frames
+
+    def _let_oldest_go(self) -> None:
+        self._waiting_bytes -= self._waiting.popleft().size_bytes
+        self._waiting_part = 0
 
     def _seal_status(self, now_s: float) -> list[bytes]:
         assert self._mtu is not None

@@ -37,7 +37,12 @@ class _Installed:
 
     destination: Name
     source: Name
-    is_negative: bool = False
+    nowhere: DropReason | None = None  # why it leads nowhere
+
+    @property
+    def is_negative(self) -> bool:
+        """Return whether it leads nowhere."""
+        return self.nowhere is not None
 
 
 class Unicast:
@@ -150,7 +155,8 @@ class Unicast:
     def _forward(self, destination: Name, source: Name, frame: bytes) -> None:
         hop = self._hop(destination, source)
         if hop is None:
-            self.drops[DropReason.NO_ROUTE] += 1
+            why = self._installed.get(destination + source)
+            self.drops[DropReason.NO_ROUTE if why is None or why.nowhere is None else why.nowhere] += 1
         elif frame[HOPS_AT] <= 1:
             self.drops[DropReason.HOPS_EXPIRED] += 1
         else:
@@ -254,7 +260,6 @@ class Unicast:
 
     def _install_nowhere(self, destination: Name, source: Name, reason: DropReason, now_s: float) -> None:
         """Have the data plane drop such frames for a moment, unless a tree stands there."""
-        self.drops[reason] += 1
         key = destination + source
         if not self._table.entries.get(key) and self._table.install(key, NOWHERE, now_s + NEGATIVE_S):
-            self._note(key, _Installed(destination, source, is_negative=True))
+            self._note(key, _Installed(destination, source, reason))

@@ -20,7 +20,6 @@ when a tick was due to when B's program has it. Asked: p99 of no flood above twi
 from __future__ import annotations
 
 import argparse
-import os
 import signal
 import sys
 import time
@@ -35,7 +34,6 @@ from plot import Panel, panel_of, require_plot, save_bars
 from priority_end import TICK_S
 from priority_row import MTU, SHAPED_BITS_S, Row
 from report import Goal, Rounds, Settings, percentile, progress, show, write_json
-from worker import floats, number
 
 from gdp.errors import LocalError
 from gdp.nodes.spin import SPIN_US
@@ -82,14 +80,17 @@ def measure(row: Row, flood: str, seconds: float, spin_s: float) -> dict[str, fl
         ticker = stack.enter_context(row.end("a", "tick", flood=own, seconds=seconds, spin_s=spin_s))
         ticker.read(2 * READY_S + seconds)
         said = reader.read(READY_S)
-    latencies_ms = [1e3 * each for each in floats(said["latencies_s"])]
+    latencies_s, images_s = said.get("latencies_s"), said.get("images_s")
+    if not isinstance(latencies_s, list) or not isinstance(images_s, float):
+        raise FailedError(f"B said {said}")
+    latencies_ms = [1e3 * each for each in latencies_s]
     if len(latencies_ms) < round(seconds / TICK_S):
         raise FailedError(f"of {round(seconds / TICK_S)} ticks {len(latencies_ms)} arrived")
     return {
         MEDIAN: percentile(latencies_ms, 0.5),
         P99: percentile(latencies_ms, 0.99),
         WORST: max(latencies_ms),
-        IMAGES: number(said["images_s"]),
+        IMAGES: images_s,
     }
 
 
@@ -101,8 +102,18 @@ class Turns:
         notes: what went wrong.
     """
 
-    def __init__(self, runs: Runs, planes: Sequence[str], links: Sequence[str], seconds: float, spin_s: float) -> None:
+    def __init__(
+        self,
+        runs: Runs,
+        planes: Sequence[str],
+        links: Sequence[str],
+        seconds: float,
+        spin_s: float,
+        *,
+        realtime: bool,
+    ) -> None:
         self._runs = runs
+        self._is_realtime = realtime
         self._cases = [(plane, link) for plane in planes for link in links]
         self._seconds = seconds
         self._spin_s = spin_s
@@ -126,7 +137,7 @@ class Turns:
     def _on_row(self, run: Run, plane: str, link: str, where: str) -> None:
         case = case_of(plane, link)
         bound_ms: float | None = None
-        with Row(run, plane, shaped=link == "shaped") as row:
+        with Row(run, plane, shaped=link == "shaped", realtime=self._is_realtime) as row:
             for flood in FLOODS:
                 progress(f"{where}, {case}: {flood}")
                 try:
@@ -167,7 +178,7 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--only", action="append", choices=PLANES, help="this data plane")
     parser.add_argument("--link", action="append", choices=list(LINKS), help="on such links")
     parser.add_argument("--spin-us", type=int, default=SPIN_US, help="as spin_us of proxy.yaml (default: %(default)s)")
-    parser.add_argument("--realtime", action="store_true", help="SCHED_FIFO for all: what else runs does not disturb")
+    parser.add_argument("--realtime", action="store_true", help="SCHED_FIFO: what else runs does not disturb")
     parser.add_argument("--json", type=Path, default=OUTPUT / "priority.json", help="where the figures go")
     parser.add_argument("--plot", type=Path, default=OUTPUT / "priority.png", help="where the picture goes")
     parser.add_argument("--no-plot", action="store_true", help="no picture")
@@ -183,13 +194,11 @@ def main() -> None:
         require_plot()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
     state, begun_s = machine_state(), time.monotonic()
-    if options.realtime:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))  # children inherit it
     planes, links = options.only or PLANES, options.link or list(LINKS)
     rounds, seconds = (1, QUICK_S) if options.quick else (options.rounds, options.seconds)
     runs = Runs()
     runs.sweep()
-    turns = Turns(runs, planes, links, seconds, options.spin_us / 1e6)
+    turns = Turns(runs, planes, links, seconds, options.spin_us / 1e6, realtime=options.realtime)
     try:
         turns.run(rounds)
     except KeyboardInterrupt:

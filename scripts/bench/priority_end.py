@@ -129,7 +129,7 @@ class Ticks:
         self._sent = 0
         self._due_ns = time.monotonic_ns() + round(TICK_S * 1e9)
         self._timer = Timer(self._due_ns, TICK_S)
-        end.plane.watch(self._timer, self._publish, is_urgent=True)
+        end.plane.watch(self._timer, self._publish)
 
     @property
     def is_over(self) -> bool:

@@ -11,6 +11,7 @@ Place: shell; makes namespaces, keys and processes through ``gdp.testbed`` and t
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -47,6 +48,7 @@ _TOPOLOGY: Final = Topology(
     attachments=(Attachment("s2", "rib", "rib"), *(Attachment(end, "proxy", "end") for end in _ENDS)),
 )
 _READY_S: Final = 20.0
+_PRIORITIES: Final = {"switch": 3, "rib": 3, "tick": 2, "read": 2, "flood": 1}
 
 
 class Row:
@@ -56,14 +58,16 @@ class Row:
         run: of which the namespaces are.
         plane: as ``gdp-switch --data-plane``.
         shaped: whether s1's way to s2 carries no more than ``SHAPED_BITS_S``, urgent frames first.
+        realtime: under SCHED_FIFO, switches before the ticking and the reading end, and these before the other one: a
+            flood never sleeps, so equals would starve.
 
     Raises:
         LocalError: the kernel refuses.
         FailedError: a process did not come up.
     """
 
-    def __init__(self, run: Run, plane: str, *, shaped: bool) -> None:
-        self._plane = plane
+    def __init__(self, run: Run, plane: str, *, shaped: bool, realtime: bool) -> None:
+        self._is_realtime = realtime
         self._run = run
         self._undo = ExitStack()
         self._spaces = Namespaces(_TOPOLOGY, run)
@@ -99,7 +103,10 @@ class Row:
         return self._start(node, what, ["-m", "priority_end", what, told])
 
     def _start(self, node: str, what: str, arguments: Sequence[str]) -> Started:
-        return Started(self._run, f"{what} at {node}", partial(self._spaces.command, node), arguments)
+        started = Started(self._run, f"{what} at {node}", partial(self._spaces.command, node), arguments)
+        if self._is_realtime:
+            os.sched_setscheduler(started.pid, os.SCHED_FIFO, os.sched_param(_PRIORITIES[what]))
+        return started
 
     def _config(self, node: str) -> str:
         return str(self._files / f"end-{node}.yaml")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from gdp.client.member import BYTES_BESIDE_URGENT
 from gdp.frame.codec import decode
 from gdp.frame.kinds import Flag, Kind
 from tests.journeys.flows import ROBOT, SERVER, advertise, flowing, ring
@@ -41,3 +42,18 @@ def test_topics_that_are_not_urgent_take_turns() -> None:
     names = {flow.topic.name for flow in flows}
     assert set().union(*turns) == names
     assert turns[0] != turns[1]
+
+
+def test_an_urgent_message_waits_for_no_more_than_a_chunk_of_a_best_effort_image() -> None:
+    world = ring()
+    images = flowing(world, "/image", reliable=False)
+    urgent = advertise(world, "/cmd_vel", urgent=True)
+    urgent.read_by(SERVER)
+    assert world.network.run(5, lambda: urgent.is_read_by(1))
+    member = world.members[ROBOT]
+    images.publisher.publish(IMAGE)
+    member.flush(world.network.now.mono_s)
+    assert sum(len(frame) for each in member.take() for frame in each.frames) <= BYTES_BESIDE_URGENT
+    urgent.publisher.publish(b"stop")
+    headers = [decode(frame) for each in member.take() for frame in each.frames]
+    assert {header.destination for header in headers} == {urgent.topic.name}

@@ -38,7 +38,7 @@ def takes(lane: Lane, packet: bytes, kind: int = TO_US) -> bool:
         code, if_true, if_false, operand = lane.value[at]
         at += 1
         if code == RETURN:
-            return operand > 0
+            return bool(operand)
         if code == LOAD_LENGTH:
             value = len(packet)
         elif code == LOAD_BYTE and operand == PACKET_TYPE_AT:
