@@ -1,107 +1,79 @@
-"""The configuration of a proxy: which local topics are global, under which names, in which form.
+"""The configuration of a proxy: what crosses (``proxy/rules``), and between which graphs and devices.
 
 Place: shell; loading reads files and changes nothing. What no rule names stays local.
 """
 
 from __future__ import annotations
 
-import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    Field,
+    ValidationError,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+    model_validator,
+)
+from pydantic.config import JsonDict
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from gdp.crypto.keys import PublicKey
-from gdp.errors import GdpError, LocalError
-from gdp.limits import MESSAGE_MAX_BYTES
-from gdp.metadata import Metadata
-from gdp.names import Name
-from gdp.nodes.schema import Directory, Domain, Ifname, Metrics, NewFile, Section, load, relative
+from gdp.errors import LocalError
+from gdp.nodes.schema import Directory, Domain, Ifname, Metrics, NewFile, Section, load
 from gdp.nodes.spin import SPIN_MAX_US, SPIN_US
+from proxy.json_schema import JsonSchema, editor_schema
+from proxy.rules.choice import Fault, clashes
+from proxy.rules.ros_end import RosEnd
+from proxy.rules.rule import Rule
+from proxy.serial.serializer import Encoding
 
-__all__ = ["Encoding", "ProxyConfig", "Record", "Rule"]
-
-Encoding = Literal["json", "cbor", "cdr"]
-
-_TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*/(?:msg|srv|action)/[A-Za-z][A-Za-z0-9_]*\Z")
-_OWN_KEYS: Final = frozenset({"kind", "name", "type"})
-
-
-def _type_name(text: str) -> str:
-    if not _TYPE.match(text):
-        raise ValueError("expected a type as ROS 2 writes it, such as sensor_msgs/msg/Image (for ROS 1 as well)")
-    return text
+__all__ = ["Encoding", "ProxyConfig", "Record", "RosEnd", "Rule"]
 
 
-def _extra_metadata(items: dict[str, str | int]) -> dict[str, str | int]:
-    if _OWN_KEYS & items.keys():
-        raise ValueError(f"{', '.join(sorted(_OWN_KEYS & items.keys()))}: state it as a key of the rule itself")
-    try:
-        Metadata({"kind": "topic", **items})
-    except LocalError as error:
-        raise ValueError(str(error)) from error
-    return items
+def _one_or_several(value: object, validate: ValidatorFunctionWrapHandler, info: ValidationInfo) -> object:
+    """Take a single mapping for a list of one; what is wrong in it is told at its own key."""
+    if isinstance(value, dict):
+        return (RosEnd.model_validate(value, strict=True, context=info.context),)
+    if isinstance(value, int | str):
+        raise ValueError("expected a mapping such as {endpoint: ros2, domain: 0}, or a list of such")
+    return validate(tuple(value) if isinstance(value, list) else value)
 
 
-def _owner_key(value: object, info: ValidationInfo) -> object:
-    """Read the public key file that ``owner`` names; anything but a text goes on to be refused as such."""
-    if not isinstance(value, str):
-        return value
-    path = relative(Path(value), info)
-    try:
-        return PublicKey.from_pem(path.read_bytes())
-    except OSError as error:
-        raise ValueError(f"expected an owner's public key file: {path}: {error.strerror}") from error
-    except GdpError as error:
-        raise ValueError(f"expected an owner's public key file: {path}: {error}") from error
-
-
-class Rule(Section):
-    """One topic that crosses; its overlay name follows from kind, name, type, metadata and owner."""
-
-    name: str = Field(min_length=1, max_length=512)
-    kind: Literal["topic"] = "topic"
-    type_name: Annotated[str, AfterValidator(_type_name)] = Field(alias="type")
-    metadata: Annotated[dict[str, str | int], AfterValidator(_extra_metadata)] = Field(default_factory=dict)
-    owner: Annotated[PublicKey, BeforeValidator(_owner_key)]
-    encoding: Encoding = "json"
-    reliable: bool = True
-    latched: bool = False
-    priority: Literal["normal", "urgent"] = "normal"
-    max_bytes: int = Field(default=MESSAGE_MAX_BYTES, ge=1, le=MESSAGE_MAX_BYTES)
-    is_global: bool = Field(default=True, alias="global")
-
-    @property
-    def overlay_metadata(self) -> Metadata:
-        """Return the flat map that the name digests."""
-        return Metadata({"kind": self.kind, "name": self.name, "type": self.type_name, **self.metadata})
-
-    @property
-    def overlay_name(self) -> Name:
-        """Return the 256-bit name under which the topic is known everywhere."""
-        return self.overlay_metadata.name(self.owner.compressed)
+def _or_one(schema: JsonDict) -> None:
+    schema["anyOf"] = [schema["items"], {"type": schema.pop("type"), "items": schema.pop("items")}]
 
 
 class Record(Section):
     """Where what arrives is written."""
 
-    path: NewFile
-    format: Literal["mcap", "ros1"] = "mcap"
+    path: NewFile = Field(description="File that is written; its directory must exist.")
+    format: Literal["mcap", "ros1"] = Field(default="mcap", description="`mcap` or `ros1` (a bag).")
 
 
 class ProxyConfig(Section):
     """``proxy.yaml``. ``expose`` lists what leaves this machine, ``import`` what is wanted from elsewhere."""
 
-    identity: Directory
-    domain: Domain
-    iface: Ifname
-    delegations: Directory
-    ros: Literal[1, 2] = 2
-    expose: tuple[Rule, ...] = ()
-    imports: tuple[Rule, ...] = Field(default=(), alias="import")
-    record: Record | None = None
-    metrics: Metrics | None = None
-    spin_us: int = Field(default=SPIN_US, ge=0, le=SPIN_MAX_US)
+    identity: Directory = Field(description="Directory of the proxy's keys and membership.")
+    domain: Domain = Field(description="The trust domain, and the others whose members are believed.")
+    iface: Ifname = Field(description="Device towards the switch: a name of its `attach`, or a NIC.")
+    delegations: Directory = Field(description="Directory of what owners gave this node.")
+    ros: Annotated[tuple[RosEnd, ...], WrapValidator(_one_or_several)] = Field(
+        default=(),
+        description="The ROS graph, or a list of graphs, to take part in. Without it there are only recordings.",
+        json_schema_extra=_or_one,
+    )
+    expose: tuple[Rule, ...] = Field(default=(), description="Rules for what leaves this machine.")
+    imports: tuple[Rule, ...] = Field(default=(), alias="import", description="Rules for what comes from elsewhere.")
+    record: Record | None = Field(default=None, description="Write what arrives into a file.")
+    metrics: Metrics | None = Field(default=None, description="Serve Prometheus text on 127.0.0.1.")
+    spin_us: int = Field(
+        default=SPIN_US,
+        ge=0,
+        le=SPIN_MAX_US,
+        description="Microseconds to look for more frames before sleeping, where most waits were shorter. 0: never.",
+    )
 
     @classmethod
     def load(cls, path: Path) -> ProxyConfig:
@@ -112,18 +84,53 @@ class ProxyConfig(Section):
         """
         return load(cls, path)
 
-    @field_validator("expose", "imports")
     @classmethod
-    def _each_name_once(cls, rules: tuple[Rule, ...]) -> tuple[Rule, ...]:
-        seen: dict[Name, str] = {}
-        for rule in rules:
-            if rule.overlay_name in seen:
-                raise ValueError(f"two rules give the same name: {rule.name} of {rule.type_name}")
-            seen[rule.overlay_name] = rule.name
-        return rules
+    def json_schema(cls) -> JsonSchema:
+        """Return the schema of the file, for editors."""
+        return editor_schema(cls, "proxy.yaml")
+
+    def endpoint_of(self, rule: Rule) -> int:
+        """Return which of ``ros`` a rule is about; of a loaded file every rule has exactly one, if ``ros`` has any.
+
+        Raises:
+            LocalError: none, or more than one.
+        """
+        fitting = [index for index, end in enumerate(self.ros) if end.fits(rule)]
+        if len(fitting) > 1:
+            raise LocalError("several graphs under ros fit; say which: ros: 1 or 2, domain: its number")
+        if not fitting:
+            raise LocalError("none of the graphs under ros fits" if self.ros else "no graph is stated under ros")
+        return fitting[0]
 
     @model_validator(mode="after")
-    def _what_is_recorded_is_imported(self) -> ProxyConfig:
-        if self.record is not None and not self.imports:
-            raise ValueError("record: there is nothing to record without a rule under import")
+    def _holds_together(self) -> ProxyConfig:
+        errors: list[InitErrorDetails] = [
+            {"type": PydanticCustomError("rule", "{why}", {"why": why}), "loc": key, "input": None}
+            for key, why in self._faults()
+        ]
+        if errors:
+            raise ValidationError.from_exception_data("proxy.yaml", errors)
         return self
+
+    def _faults(self) -> Iterator[Fault]:
+        if self.record is not None and not self.imports:
+            yield ("record",), "there is nothing to record without a rule under import"
+        try:
+            wheres = [end.where for end in self.ros]
+        except LocalError as error:
+            yield ("ros",), str(error)
+            return
+        for index, where in enumerate(wheres):
+            if where in wheres[:index]:
+                yield ("ros", index), f"ros[{wheres.index(where)}] is the same graph"
+        places: dict[int, int | None] = {}
+        for side, rules in (("expose", self.expose), ("import", self.imports)):
+            for index, rule in enumerate(rules):
+                places[id(rule)] = None
+                if not self.ros and rule.kind == "topic" and rule.ros is None and rule.domain is None:
+                    continue  # recordings are enough for it
+                try:
+                    places[id(rule)] = self.endpoint_of(rule)
+                except LocalError as error:
+                    yield (side, index), str(error)
+        yield from clashes(self.expose, self.imports, lambda rule: places[id(rule)])

@@ -99,9 +99,8 @@ class Inbound:
         delivered = message.delivered
         tally.count_number(delivered.publisher, delivered.incarnation, delivered.number)
         tally.add(latency_ms, delivered.parts, delivered.hops)
-        self._node.latency.observe(latency_ms / 1e3)
-        self._node.messages_in += 1
-        self._node.bytes_in += len(message.delivered.message)
+        self._node.traffic.latency.observe(latency_ms / 1e3)
+        self._node.traffic.received(len(delivered.message))
 
     def _source(self, message: Message) -> _Source | None:
         """Return what describes a message; a description is read once."""

@@ -1,4 +1,4 @@
-"""A proxy at work: a member of the overlay on one device, with the topics that its configuration makes global.
+"""A proxy at work: a member of the overlay on one device, with what its configuration makes global.
 
 Place: shell.
 """
@@ -9,8 +9,8 @@ import contextlib
 import logging
 import secrets
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 
 from gdp.client.member import Member, Topic
 from gdp.control.settings import NodeSettings
@@ -23,29 +23,37 @@ from gdp.nodes.runtime import Runtime
 from gdp.nodes.switch import count_list
 from gdp.ports.plane import Plane
 from gdp.ports.raw import RawPlane
-from gdp.stores.keyring import load_delegations
-from gdp.telemetry.metrics import Histogram, Metrics, Sources
-from gdp.trust.delegation import Delegation
-from proxy.config import ProxyConfig, Rule
+from gdp.telemetry.metrics import Metrics, Sources
+from proxy.config import ProxyConfig
+from proxy.faults import Faults
+from proxy.held import Held
+from proxy.traffic import Traffic
 
-__all__ = ["ProxyNode", "open_topics", "run_node"]
+__all__ = ["ProxyNode", "open_topics", "renew_topics", "run_node"]
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
 class ProxyNode:
-    """What runs, for the command that drives it."""
+    """What runs, for the command that drives it.
 
+    Attributes:
+        on_reload: called after a SIGHUP; None: nothing is read anew.
+    """
+
+    identity: Identity
     member: Member
     runtime: Runtime
     plane: Plane
-    topics: Mapping[Name, Topic]
-    latency: Histogram
-    messages_out: int = 0
-    bytes_out: int = 0
-    messages_in: int = 0
-    bytes_in: int = 0
+    on_reload: Callable[[], None] | None = None
+    traffic: Traffic = field(default_factory=Traffic)
+    faults: Faults = field(default_factory=Faults)
+
+    def reload(self) -> None:
+        """Read anew what can be."""
+        if self.on_reload is not None:
+            self.on_reload()
 
     def linger(self, duration_s: float) -> None:
         """Work on for a while, so that a goodbye is heard."""
@@ -57,10 +65,11 @@ class ProxyNode:
         return Sources(
             frames=lambda: {"in": counters.frames_in, "out": counters.frames_out},
             drops=[lambda: counters.drops, lambda: count_list(member.drops())],
-            messages=lambda: {"in": self.messages_in, "out": self.messages_out},
-            message_bytes=lambda: {"in": self.bytes_in, "out": self.bytes_out},
+            messages=self.traffic.messages,
+            message_bytes=self.traffic.message_bytes,
             repairs=lambda: {"sent": sum(publisher.repairs for publisher in member.publishers())},
-            latency=lambda: self.latency,
+            faults=lambda: self.faults.counts,
+            latency=lambda: self.traffic.latency,
         )
 
 
@@ -72,57 +81,47 @@ def run_node(config: ProxyConfig) -> Iterator[ProxyNode]:
         LocalError: keys, delegations or the device are not as the configuration says.
     """
     identity, policy = load_member(config.identity, config.domain, Role.PROXY)
-    topics = open_topics(config, identity)
     settings = NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes)
     member = Member(identity, policy, settings)
     with contextlib.ExitStack() as stack:
         plane = RawPlane([config.iface])
         stack.callback(plane.close)
         runtime = Runtime(member, plane, spin_s=config.spin_us / 1e6)
-        stack.enter_context(runtime.signals(lambda: _renew(config, identity, member)))
-        node = ProxyNode(member, runtime, plane, topics, Histogram())
+        node = ProxyNode(identity, member, runtime, plane)
+        stack.enter_context(runtime.signals(node.reload))
         if config.metrics is not None:
             metrics = Metrics(node.sources())
             metrics.serve(config.metrics.port)
             stack.callback(metrics.close)
-        log.info("proxy up name=%s iface=%s topics=%d", identity.name.short, config.iface, len(topics))
+        log.info("proxy up name=%s iface=%s", identity.name.short, config.iface)
         yield node
 
 
-def open_topics(config: ProxyConfig, identity: Identity) -> dict[Name, Topic]:
-    """Return, for every rule, what this node may do with its name, verified, and the topic's secrets.
+def open_topics(config: ProxyConfig, held: Held) -> dict[Name, Topic]:
+    """Return, for every rule, what this node may do with its name and the topic's secrets.
 
     Raises:
-        LocalError: a rule without a delegation that holds.
+        LocalError: a rule without a type, or without a delegation that holds.
     """
-    held = {delegation.name: delegation for delegation in load_delegations(config.delegations)}
     topics: dict[Name, Topic] = {}
     for rule in [*config.expose, *config.imports]:
-        delegation = held.get(rule.overlay_name)
-        if delegation is None:
+        topic = held.get(rule.overlay_name)
+        if topic is None:
             raise LocalError(
                 f"{rule.name}: no delegation for {rule.overlay_name.to_text()} in {config.delegations};"
                 " the owner makes one with 'gdp delegate'"
             )
-        topics[rule.overlay_name] = _open(rule, delegation, identity)
+        topics[rule.overlay_name] = topic
     return topics
 
 
-def _renew(config: ProxyConfig, identity: Identity, member: Member) -> None:
+def renew_topics(node: ProxyNode, config: ProxyConfig) -> None:
     """Read the delegations anew: new epochs and longer validity take effect without a message lost."""
     try:
-        topics = open_topics(config, identity)
+        topics = open_topics(config, Held(config.delegations, node.identity))
     except GdpError as error:
         log.error("delegations not renewed reason=%s", error)
         return
     for topic in topics.values():
-        member.renew(topic)
+        node.member.renew(topic)
     log.info("delegations renewed topics=%d", len(topics))
-
-
-def _open(rule: Rule, delegation: Delegation, identity: Identity) -> Topic:
-    delegation.verify(identity, time.time())
-    secrets_by_epoch = {epoch: grant.secret for epoch, grant in delegation.open(identity).items()}
-    if not secrets_by_epoch:
-        raise LocalError(f"{rule.name}: the delegation holds no secret of any epoch")
-    return Topic(delegation, secrets_by_epoch)

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from gdp.client.member import Topic
 from gdp.client.publisher import Publisher
+from gdp.names import Name
 from proxy.config import Rule
 from proxy.node import ProxyNode
 from proxy.parcel import Description, Parcel
@@ -37,14 +39,18 @@ class Outbound:
     """Publishes the channels that rules expose; what no rule names stays local.
 
     Args:
+        topics: what the node may do with the rules' names.
         channels: of the endpoint; those with one topic are one topic on the overlay, too.
 
     Raises:
         LocalError: a channel whose type is not the rule's, or one that may not be published.
     """
 
-    def __init__(self, node: ProxyNode, rules: Sequence[Rule], channels: Sequence[Channel]) -> None:
+    def __init__(
+        self, node: ProxyNode, rules: Sequence[Rule], topics: Mapping[Name, Topic], channels: Sequence[Channel]
+    ) -> None:
         self._node = node
+        self._topics = topics
         self._ways: dict[int, _Way] = {}
         self.publishers: dict[str, Publisher] = {}
         self.too_large = 0
@@ -75,8 +81,7 @@ class Outbound:
             return False
         message = Parcel(way.number, stamp_ns, way.serializer.encode(raw)).to_wire()
         way.publisher.publish(message)
-        self._node.messages_out += 1
-        self._node.bytes_out += len(message)
+        self._node.traffic.sent(len(message))
         self._node.member.flush(time.monotonic())
         return True
 
@@ -86,7 +91,7 @@ class Outbound:
         if rule.latched:
             depth = max(depth, 1)
         publisher = self._node.member.advertise(
-            self._node.topics[rule.overlay_name],
+            self._topics[rule.overlay_name],
             Description(rule.encoding, mine).to_wire(),
             reliable=rule.reliable,
             depth=depth,

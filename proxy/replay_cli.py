@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import time
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -14,11 +15,13 @@ import typer
 
 from gdp.cli.node import Check, Config, Json, Verbose, emit, failing_clearly, set_up_logging
 from gdp.errors import LocalError
-from proxy.cli import GOODBYE_S, check_proxy
+from proxy.checking import check_proxy
 from proxy.config import ProxyConfig
 from proxy.endpoints.bag import BagReader
-from proxy.node import ProxyNode, run_node
+from proxy.held import Held
+from proxy.node import ProxyNode, open_topics, renew_topics, run_node
 from proxy.outbound import Outbound
+from proxy.recording import GOODBYE_S
 from proxy.replayer import Played, Replayer
 
 __all__ = ["main"]
@@ -56,7 +59,9 @@ def replay(
 def _replay(
     node: ProxyNode, reader: BagReader, settings: ProxyConfig, rate: float, wait_s: float, *, json: bool
 ) -> bool:
-    outbound = Outbound(node, settings.expose, reader.channels)
+    topics = open_topics(settings, Held(settings.delegations, node.identity))
+    node.on_reload = partial(renew_topics, node, settings)
+    outbound = Outbound(node, settings.expose, topics, reader.channels)
     if not outbound.publishers:
         raise LocalError(f"{reader.path}: no topic of it is exposed by the configuration")
     if not node.runtime.run(lambda: node.member.attachment.is_attached, time.monotonic() + ATTACH_PATIENCE_S):

@@ -27,13 +27,15 @@ class Tally:
     parts: int = 0  # of the message that had most
     hops: Counter[int] = field(default_factory=Counter)
     latencies_ms: deque[float] = field(default_factory=lambda: deque(maxlen=SAMPLES_MAX))
-    newest: dict[tuple[bytes, int], int] = field(default_factory=dict)  # publisher, incarnation -> message number
+    newest: dict[tuple[bytes, int], tuple[int, int]] = field(default_factory=dict)
+    # publisher, incarnation -> message number, place in its bundle
 
-    def count_number(self, publisher: bytes, incarnation: int, number: int) -> None:
-        """Count a message that came again: numbers rise within an incarnation."""
-        life = (publisher, incarnation)
-        self.duplicated += number <= self.newest.get(life, -1)
-        self.newest[life] = max(number, self.newest.get(life, -1))
+    def count_number(self, publisher: bytes, incarnation: int, number: int, place: int = 0) -> None:
+        """Count a message that came again: numbers rise within an incarnation, places within a bundle."""
+        life, at = (publisher, incarnation), (number, place)
+        newest = self.newest.get(life, (-1, 0))
+        self.duplicated += at <= newest
+        self.newest[life] = max(at, newest)
 
     def add(self, latency_ms: float, parts: int, hops: int) -> None:
         """Count one message."""

@@ -2,7 +2,8 @@
 # Makes .venv with this package and what it needs; does nothing, in well under a second, if that is done already.
 #
 #   scripts/setup.sh          to run
-#   scripts/setup.sh --dev    to test as well
+#   scripts/setup.sh --ros2   to run where no ROS 2 is installed: with a real one from the package index
+#   scripts/setup.sh --dev    to test as well, with all that tests use: ROS 2, Cyclone DDS, and ROS 1 from Debian
 #
 # Needs: python3 >= 3.10. System packages are installed only where something is missing, and only as root.
 set -euo pipefail
@@ -11,7 +12,11 @@ root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 cd "$root"
 venv=$root/.venv
 extras=""
-[[ "${1:-}" == "--dev" ]] && extras="[dev,bench]"
+dev="[dev,bench,dds,ros2]"
+case "${1:-}" in
+    --dev) extras=$dev ;;
+    --ros2) extras="[ros2]" ;;
+esac
 
 say() { printf 'setup: %s\n' "$*" >&2; }
 fail() { say "$@"; exit 1; }
@@ -61,7 +66,7 @@ compile_own() {
 python=$(find_python)
 wanted=$({ cat pyproject.toml; "$python" --version; echo "$root"; } | sha256sum | cut -d' ' -f1)
 # What was installed for testing is enough for running.
-for stamp in "$venv/.installed$extras" "$venv/.installed[dev,bench]"; do
+for stamp in "$venv/.installed$extras" "$venv/.installed$dev"; do
     if [[ -f "$stamp" && $(<"$stamp") == "$wanted" ]] && "$venv/bin/python" -c '' 2>/dev/null; then
         compile_own
         exit 0
@@ -74,7 +79,10 @@ for tool in nsenter setpriv unshare; do
 done
 "$python" -c 'import ensurepip, venv; ensurepip.version()' 2>/dev/null ||
     package "$(basename "$python")-venv" "python3 cannot make virtual environments without it"
-if [[ -n "$extras" ]]; then
+if [[ "$extras" == "$dev" ]]; then
+    if [[ $(id -u) -eq 0 ]] && command -v apt-get >/dev/null; then
+        scripts/setup_ros1.sh || say "tests of ROS 1 will be skipped"
+    fi
     command -v openssl >/dev/null || package openssl "tests read our certificates with it"
 fi
 

@@ -18,7 +18,7 @@ from types import FrameType
 from gdp.effects import Arrival, Instant, Machine
 from gdp.nodes.allocator import settle_memory
 from gdp.nodes.spin import Spin
-from gdp.ports.plane import Plane
+from gdp.ports.plane import HasFileno, Plane
 
 __all__ = ["Runtime", "now"]
 
@@ -49,6 +49,7 @@ class Runtime:
         self._costs = dict(costs or {})
         self._spin = Spin(spin_s)
         self._is_stopped = False
+        self._is_woken = False  # by a watched source: whoever drives us has work
         self._streak = 0  # steps in a row that brought frames, without a look at the timers
         self._deadline_s: float | None = None
         moment = now()
@@ -78,16 +79,31 @@ class Runtime:
             self.step(deadline_s)
         return until is None
 
+    def watch(self, source: HasFileno, ready: Callable[[], None] | None = None) -> None:
+        """End a step as soon as ``source`` can be read, after calling ``ready`` from within it."""
+
+        def wake() -> None:
+            self._is_woken = True
+            if ready is not None:
+                ready()
+
+        self._plane.watch(source, wake)
+
+    def unwatch(self, source: HasFileno) -> None:
+        """Undo ``watch``, before the source is closed."""
+        self._plane.unwatch(source)
+
     def step(self, latest_s: float | None = None) -> None:
         """Wait for something to do, no longer than a monotonic second, and do it.
 
         While the machine has more to say, nothing is waited for, but what came meanwhile is heard: a large message on
         its way out holds up nobody.
         """
+        self._is_woken = False
         is_sending, arrivals = self.send(), list[Arrival]()
         if is_sending or self._streak:
             arrivals = self._plane.poll(0.0)
-        if not is_sending and not arrivals:
+        if not is_sending and not arrivals and not self._is_woken:
             self._deadline_s = self._machine.next_timeout()
             times = [each for each in (self._deadline_s, latest_s) if each is not None]
             arrivals = self._wait(max(min(times) - time.monotonic(), 0.0) if times else None)
@@ -106,14 +122,14 @@ class Runtime:
             spin_s = self._spin.longest_s if timeout_s is None else min(self._spin.longest_s, timeout_s)
             while (waited_s := time.monotonic() - begun_s) < spin_s:
                 arrivals = self._plane.poll(0.0)
-                if arrivals:
+                if arrivals or self._is_woken:
                     self._spin.waited(waited_s)
                     return arrivals
                 os.sched_yield()  # whoever else wants this core goes first
             if timeout_s is not None:
                 timeout_s = max(timeout_s - waited_s, 0.0)
         arrivals = self._plane.poll(timeout_s)
-        if arrivals:
+        if arrivals or self._is_woken:
             self._spin.waited(time.monotonic() - begun_s)
         return arrivals
 

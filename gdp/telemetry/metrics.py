@@ -70,6 +70,7 @@ class Sources:
         messages: whole messages by direction.
         message_bytes: their bytes by direction, before sealing.
         repairs: lost parts by what happened to them: asked, sent, given-up.
+        faults: what a proxy could not carry, or not as it should be, by what was wrong.
         latency: one-way, from the source's stamp to delivery.
     """
 
@@ -83,6 +84,7 @@ class Sources:
     messages: Counts | None = None
     message_bytes: Counts | None = None
     repairs: Counts | None = None
+    faults: Counts | None = None
     latency: Callable[[], Histogram] | None = None
 
 
@@ -113,6 +115,7 @@ class Metrics(Collector):
         yield from _counter("gdp_messages", "Whole messages by direction", "direction", of.messages)
         yield from _counter("gdp_message_bytes", "Their bytes before sealing", "direction", of.message_bytes)
         yield from _counter("gdp_repairs", "Lost parts by what happened to them", "step", of.repairs)
+        yield from _counter("gdp_proxy_faults", "What was not carried as it should be, by fault", "fault", of.faults)
         if of.latency is not None:
             yield _histogram("gdp_latency_seconds", "One-way latency of messages", of.latency())
 

@@ -1,0 +1,165 @@
+"""A topic of far publishers on its way in: joined while somebody local reads it, decoded, converted, published here.
+
+Place: shell; endpoint and member do the I/O. The virtual publisher stands as long as the rule does, so that local
+tools see the topic; the overlay's tree stands while a local reader does.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+
+from gdp.client.member import Message, Topic
+from gdp.errors import LocalError, RemoteError
+from proxy.bridge.incoming import Incoming
+from proxy.bridge.seat import Seat
+from proxy.bridge.site import Site
+from proxy.bridge.wishes import Wish
+from proxy.endpoints.endpoint import End, Event, Faulted
+from proxy.faults import Fault
+from proxy.parcel import Description, Parcel
+from proxy.qos import default, offer, unmatched
+from proxy.serial.channel import Channel, Qos
+from proxy.serial.schema import DefinitionError
+from proxy.tally import Tally
+
+__all__ = ["ImportedTopic"]
+
+_SAMPLES_MAX = 4_096  # latencies kept
+_SOURCES_MAX = 1_024  # descriptions kept ready; the oldest go
+
+
+class ImportedTopic:
+    """Carries one far topic in."""
+
+    def __init__(self, site: Site, seat: Seat, wish: Wish, topic: Topic) -> None:
+        self._site = site
+        self._seat = seat
+        self._wish = wish
+        self._topic = topic
+        self._wants: tuple[Qos, ...] = ()
+        self._handle: int | None = None
+        self._channel: Channel | None = None  # as it is offered here
+        self._source: Channel | None = None
+        self._sources: dict[tuple[bytes, bytes], Incoming | None] = {}
+        self._is_joined = False
+        self.tally = Tally(wish.local, wish.type_name, latencies_ms=deque(maxlen=_SAMPLES_MAX))
+        try:
+            self._offer(seat.endpoint.channel(wish.local, wish.type_name))
+        except LocalError:
+            self._channel = None  # the far side's own definition may do
+
+    def follow(self, ends: Sequence[End]) -> None:
+        """Learn who reads here now."""
+        if bool(ends) != self._is_joined:
+            self._is_joined = bool(ends)
+            if ends:
+                self._site.member.subscribe(self._topic)
+            else:
+                self._site.member.unsubscribe(self._topic.name)
+        self._wants = tuple(end.qos for end in sorted(ends, key=lambda end: end.key) if end.qos is not None)
+        for end in ends:
+            if end.qos is not None and (policy := unmatched(end.qos)):
+                detail = f"{end.node or 'a node'} will get nothing: {policy}, which no network can promise"
+                self._site.faults.tell(self._wish.local, Fault.QOS, detail)
+        if self._channel is not None:
+            self._offer(self._channel)
+
+    def receive(self, message: Message, now_s: float) -> None:
+        """Take a message from the overlay."""
+        del now_s
+        try:
+            self._receive(message)
+        except RemoteError as error:
+            self.tally.refused += 1
+            self._site.faults.tell(self._wish.local, Fault.MALFORMED, str(error))
+
+    def take(self, event: Event, now_s: float) -> None:
+        """Take what the endpoint says of the virtual publisher."""
+        del now_s
+        if isinstance(event, Faulted):
+            self._site.faults.tell(self._wish.local, Fault.QOS, event.reason)
+
+    def close(self) -> None:
+        """Carry nothing any more."""
+        self.follow(())
+        if self._handle is not None:
+            self._seat.close(self._handle)
+
+    def renew(self, topic: Topic) -> None:
+        """Take the delegation anew."""
+        self._topic = topic
+        if self._is_joined:
+            self._site.member.renew(topic)
+
+    def _receive(self, message: Message) -> None:
+        delivered, traffic = message.delivered, self._site.traffic
+        key = (delivered.publisher, message.description)
+        if key not in self._sources:
+            self._sources[key] = self._describe(Description.from_wire(message.description))
+            while len(self._sources) > _SOURCES_MAX:
+                del self._sources[next(iter(self._sources))]
+        incoming = self._sources[key]
+        if incoming is None or self._handle is None:
+            self.tally.refused += 1
+            return
+        parcel = Parcel.from_wire(delivered.message)
+        self._seat.endpoint.publish(self._handle, incoming.decode(parcel.body))
+        latency_ms = (time.time_ns() - parcel.stamp_ns) / 1e6
+        self.tally.count_number(delivered.publisher, delivered.incarnation, delivered.number, delivered.place)
+        self.tally.add(latency_ms, delivered.parts, delivered.hops)
+        traffic.latency.observe(latency_ms / 1e3)
+        traffic.received(len(delivered.message))
+
+    def _describe(self, description: Description) -> Incoming | None:
+        """Make ready for a publisher's messages; None if they cannot be had here."""
+        source, what = description.channels[0], self._wish.local
+        if source.type_name != self._wish.type_name:
+            self._site.faults.tell(what, Fault.OTHER_TYPE, f"the far side sends {source.type_name}")
+            return None
+        try:
+            incoming = Incoming.ready(source, description.encoding, self._known(), self._seat.endpoint.ros)
+        except DefinitionError as error:
+            self._site.faults.tell(what, Fault.OTHER_TYPE, f"the far side's definition does not fit: {error}")
+            return None
+        self._source = source
+        try:
+            self._offer(incoming.target)
+        except LocalError as error:
+            self._site.faults.tell(what, Fault.UNKNOWN_TYPE, str(error))
+            return None
+        return incoming
+
+    def _known(self) -> Channel | None:
+        try:
+            return self._seat.endpoint.channel(self._wish.local, self._wish.type_name)
+        except LocalError:
+            return None
+
+    def _offer(self, channel: Channel) -> None:
+        """Be the publisher that the far one is, as far as local readers allow; again where that has changed."""
+        if self._source is None:
+            latched = bool(self._wish.rule.latched)
+            profile = offer(default(latched=latched), self._wants)
+        else:
+            source = self._source.qos[0] if self._source.qos else None
+            profile = offer(source, self._wants, is_latched=self._source.latched)
+        latched = profile.durability == "transient_local"
+        offered = replace(channel, topic=self._wish.local, qos=(profile,), latched=latched, callerid=None)
+        if self._handle is not None and self._channel is not None and _is_served(self._channel, offered):
+            return
+        if self._handle is not None:
+            self._seat.close(self._handle)
+            self._handle = None
+        self._handle = self._seat.advertise(self, offered)
+        self._channel = offered
+
+
+def _is_served(standing: Channel, wanted: Channel) -> bool:
+    """Return whether a publisher that stands does for what is wanted: the same, or only with a smaller depth."""
+    if replace(standing, qos=()) != replace(wanted, qos=()):
+        return False
+    before, after = standing.qos[0], wanted.qos[0]
+    return replace(before, depth=0) == replace(after, depth=0) and before.depth >= after.depth

@@ -1,0 +1,64 @@
+"""One endpoint at work in a bridge: who owns each of its handles.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from proxy.endpoints.endpoint import Endpoint, Event, GraphChanged
+from proxy.serial.channel import Channel, Qos
+from proxy.serial.service import Service
+
+__all__ = ["Owner", "Seat"]
+
+
+class Owner(Protocol):
+    """Who is told what happens at a handle."""
+
+    def take(self, event: Event, now_s: float) -> None:
+        """Take an event of one of its handles."""
+
+
+class Seat:
+    """An endpoint with the owners of its handles."""
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        self.endpoint = endpoint
+        self._owners: dict[int, Owner] = {}
+
+    def deliver(self, now_s: float) -> bool:
+        """Hand out what happened; return whether the graph changed."""
+        is_changed = False
+        for event in self.endpoint.take():
+            if isinstance(event, GraphChanged):
+                is_changed = True
+            elif (owner := self._owners.get(event.handle)) is not None:
+                owner.take(event, now_s)
+        return is_changed
+
+    def subscribe(self, owner: Owner, topic: str, type_name: str, qos: Qos | None) -> int:
+        """Hear a topic; as ``Endpoint.subscribe``."""
+        return self._own(self.endpoint.subscribe(topic, type_name, qos), owner)
+
+    def advertise(self, owner: Owner, channel: Channel) -> int:
+        """Be a publisher; as ``Endpoint.advertise``."""
+        return self._own(self.endpoint.advertise(channel), owner)
+
+    def serve(self, owner: Owner, service: Service) -> int:
+        """Be a server; as ``Endpoint.serve``."""
+        return self._own(self.endpoint.serve(service), owner)
+
+    def dial(self, owner: Owner, name: str, type_name: str) -> int:
+        """Be a client; as ``Endpoint.dial``."""
+        return self._own(self.endpoint.dial(name, type_name), owner)
+
+    def close(self, handle: int) -> None:
+        """End what a handle stands for."""
+        if self._owners.pop(handle, None) is not None:
+            self.endpoint.close(handle)
+
+    def _own(self, handle: int, owner: Owner) -> int:
+        self._owners[handle] = owner
+        return handle

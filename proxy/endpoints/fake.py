@@ -1,0 +1,339 @@
+"""A ROS graph in memory, and an endpoint in it: for tests, without ROS.
+
+Place: pure, but for the descriptor that an endpoint must have. Everything happens at once, in the caller's thread. As
+in ROS, a late joiner of a latched topic gets its publishers' last messages, and ends whose QoS cannot match do not.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import count
+
+from gdp.errors import LocalError
+from proxy.endpoints.endpoint import (
+    Answered,
+    Asked,
+    Described,
+    End,
+    Event,
+    Failed,
+    Graph,
+    GraphChanged,
+    Heard,
+    Role,
+)
+from proxy.qos import default, depth_of
+from proxy.serial.channel import Channel, Qos, RosVersion
+from proxy.serial.service import Service
+
+__all__ = ["FakeEndpoint", "FakeGraph", "Publication", "Server"]
+
+
+@dataclass(slots=True, eq=False)
+class Publication:
+    """A publisher in the graph."""
+
+    graph: FakeGraph
+    end: End
+    qos: Qos
+    kept: deque[bytes]
+
+    def publish(self, raw: bytes) -> None:
+        """Hand a message to all who match."""
+        if self.qos.durability == "transient_local":
+            self.kept.append(raw)
+        for subscription in self.graph.subscriptions(self.end.name, self.end.type_name):
+            if subscription.end.node != self.end.node and _match(self.qos, subscription.qos):
+                subscription.hear(raw)
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self.graph.publications.remove(self)
+        self.graph.changed()
+
+
+@dataclass(slots=True, eq=False)
+class Subscription:
+    """A subscription in the graph."""
+
+    graph: FakeGraph
+    end: End
+    qos: Qos
+    hear: Callable[[bytes], None]
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self.graph.readers.remove(self)
+        self.graph.changed()
+
+
+@dataclass(slots=True, eq=False)
+class Server:
+    """A server in the graph; ``ask`` is given a request and what to call with the response or a reason."""
+
+    graph: FakeGraph
+    end: End
+    ask: Callable[[bytes, Callable[[bytes | str], None]], None]
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self.graph.servers.remove(self)
+        self.graph.changed()
+
+
+class FakeGraph:
+    """One ROS graph.
+
+    Args:
+        ros: which dialect its messages have.
+        channels: what a machine in it knows of message types, by type name.
+        services: what it knows of service types.
+    """
+
+    def __init__(
+        self, ros: RosVersion, channels: Mapping[str, Channel], services: Mapping[str, Service] | None = None
+    ) -> None:
+        self.ros: RosVersion = ros
+        self.channels = channels
+        self.services = dict(services or {})
+        self.publications: list[Publication] = []
+        self.readers: list[Subscription] = []
+        self.servers: list[Server] = []
+        self.endpoints: list[FakeEndpoint] = []
+        self._keys = count()
+
+    def publish(self, node: str, topic: str, type_name: str, qos: Qos | None = None) -> Publication:
+        """Add a node's publisher."""
+        qos = qos or default()
+        end = self._end(Role.PUBLISHES, node, topic, type_name, qos)
+        publication = Publication(self, end, qos, deque(maxlen=depth_of(qos)))
+        self.publications.append(publication)
+        self.changed()
+        return publication
+
+    def subscribe(
+        self, node: str, topic: str, type_name: str, hear: Callable[[bytes], None], qos: Qos | None = None
+    ) -> Subscription:
+        """Add a node's subscription."""
+        qos = qos or default()
+        subscription = Subscription(self, self._end(Role.SUBSCRIBES, node, topic, type_name, qos), qos, hear)
+        self.readers.append(subscription)
+        self.changed()
+        for publication in self.publications:
+            same = (publication.end.name, publication.end.type_name) == (topic, type_name)
+            if same and qos.durability == "transient_local" and _match(publication.qos, qos):
+                for raw in publication.kept:
+                    hear(raw)
+        return subscription
+
+    def serve(
+        self, node: str, name: str, type_name: str, ask: Callable[[bytes, Callable[[bytes | str], None]], None]
+    ) -> Server:
+        """Add a node's server."""
+        server = Server(self, self._end(Role.SERVES, node, name, type_name, None), ask)
+        self.servers.append(server)
+        self.changed()
+        return server
+
+    def call(self, name: str, raw: bytes, done: Callable[[bytes | str], None]) -> None:
+        """Ask the first server of a name; ``done`` gets a response, or a reason at once if there is none."""
+        server = next((server for server in self.servers if server.end.name == name), None)
+        if server is None:
+            done("no server")
+        else:
+            server.ask(raw, done)
+
+    def subscriptions(self, topic: str, type_name: str) -> list[Subscription]:
+        """Return the subscriptions of a topic."""
+        return [each for each in self.readers if (each.end.name, each.end.type_name) == (topic, type_name)]
+
+    def ends(self) -> list[End]:
+        """Return everything in the graph."""
+        topics = [*(each.end for each in self.publications), *(each.end for each in self.readers)]
+        return [*topics, *(each.end for each in self.servers)]
+
+    def changed(self) -> None:
+        """Tell the endpoints."""
+        for endpoint in self.endpoints:
+            endpoint.tell(GraphChanged())
+
+    def _end(self, role: Role, node: str, name: str, type_name: str, qos: Qos | None) -> End:
+        return End(role, name, type_name, node, str(next(self._keys)), qos=qos)
+
+
+@dataclass(slots=True)
+class _Open:
+    close: Callable[[], None]
+    publication: Publication | None = None
+    name: str = ""
+    calls: set[int] = field(default_factory=set)
+    tickets: dict[int, Callable[[bytes | str], None]] = field(default_factory=dict)
+
+
+class FakeEndpoint:
+    """An endpoint in a graph in memory."""
+
+    def __init__(self, graph: FakeGraph, node: str) -> None:
+        self._graph = graph
+        self._node = node
+        self._events = deque[Event]()
+        self._open: dict[int, _Open] = {}
+        self._numbers = count(1)
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        graph.endpoints.append(self)
+        self.tell(GraphChanged())
+
+    @property
+    def ros(self) -> RosVersion:
+        """Return which ROS it speaks."""
+        return self._graph.ros
+
+    @property
+    def label(self) -> str:
+        """Return what people call it."""
+        return f"fake ros{self._graph.ros}"
+
+    @property
+    def handles(self) -> int:
+        """Return how many handles are open."""
+        return len(self._open)
+
+    def fileno(self) -> int:
+        """Return a descriptor that is readable while ``take`` has something."""
+        return self._wake
+
+    def tell(self, event: Event) -> None:
+        """Let the proxy know."""
+        if not self._events:
+            os.eventfd_write(self._wake, 1)
+        self._events.append(event)
+
+    def take(self) -> Sequence[Event]:
+        """Return, once, what happened."""
+        if not self._events:
+            return ()
+        os.eventfd_read(self._wake)
+        events = list(self._events)
+        self._events.clear()
+        return [each for each in events if isinstance(each, GraphChanged) or each.handle in self._open]
+
+    def graph(self) -> Graph:
+        """Return who is there but us."""
+        return frozenset(end for end in self._graph.ends() if end.node != self._node)
+
+    def channel(self, topic: str, type_name: str) -> Channel:
+        """Return how this machine knows a type."""
+        known = self._graph.channels.get(type_name)
+        if known is None:
+            raise LocalError(f"{type_name}: not installed")
+        return replace(known, topic=topic)
+
+    def service(self, name: str, type_name: str) -> Service:
+        """Return how this machine knows a service type."""
+        known = self._graph.services.get(type_name)
+        if known is None:
+            raise LocalError(f"{type_name}: not installed")
+        return replace(known, name=name)
+
+    def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
+        """Hear a topic."""
+        channel, handle = self.channel(topic, type_name), next(self._numbers)
+        self._open[handle] = _Open(lambda: None)
+        self.tell(Described(handle, channel))
+        subscription = self._graph.subscribe(
+            self._node, topic, type_name, lambda raw: self.tell(Heard(handle, 0, raw)), qos
+        )
+        self._open[handle].close = subscription.close
+        return handle
+
+    def advertise(self, channel: Channel) -> int:
+        """Be a publisher."""
+        qos = channel.qos[0] if channel.qos else default(latched=channel.latched, depth=1)
+        publication = self._graph.publish(self._node, channel.topic, channel.type_name, qos)
+        return self._add(_Open(publication.close, publication))
+
+    def publish(self, handle: int, raw: bytes) -> None:
+        """Publish one message."""
+        publication = self._open[handle].publication
+        if publication is None:
+            raise LocalError(f"handle {handle} is no publisher")
+        publication.publish(raw)
+
+    def subscribers(self, handle: int) -> int:
+        """Return how many subscriptions a publisher of ours has."""
+        publication = self._open[handle].publication
+        if publication is None:
+            raise LocalError(f"handle {handle} is no publisher")
+        return len(self._graph.subscriptions(publication.end.name, publication.end.type_name))
+
+    def serve(self, service: Service) -> int:
+        """Be a server."""
+        opened = _Open(lambda: None)
+        handle = self._add(opened)
+
+        def ask(raw: bytes, done: Callable[[bytes | str], None]) -> None:
+            ticket = next(self._numbers)
+            opened.tickets[ticket] = done
+            self.tell(Asked(handle, ticket, raw))
+
+        opened.close = self._graph.serve(self._node, service.name, service.type_name, ask).close
+        return handle
+
+    def answer(self, handle: int, ticket: int, raw: bytes) -> None:
+        """Answer a request."""
+        done = self._open[handle].tickets.pop(ticket, None)
+        if done is not None:
+            done(raw)
+
+    def refuse(self, handle: int, ticket: int, reason: str) -> None:
+        """Fail a request."""
+        done = self._open[handle].tickets.pop(ticket, None)
+        if done is not None:
+            done(reason)
+
+    def dial(self, name: str, type_name: str) -> int:
+        """Be a client."""
+        self.service(name, type_name)
+        return self._add(_Open(lambda: None, name=name))
+
+    def call(self, handle: int, call: int, raw: bytes) -> None:
+        """Send a request."""
+        opened = self._open[handle]
+        opened.calls.add(call)
+
+        def done(outcome: bytes | str) -> None:
+            if call in opened.calls:
+                opened.calls.discard(call)
+                said = Failed(handle, call, outcome) if isinstance(outcome, str) else Answered(handle, call, outcome)
+                self.tell(said)
+
+        self._graph.call(opened.name, raw, done)
+
+    def drop(self, handle: int, call: int) -> None:
+        """Forget a call."""
+        self._open[handle].calls.discard(call)
+
+    def close(self, handle: int) -> None:
+        """End what a handle stands for."""
+        self._open.pop(handle).close()
+
+    def shut(self) -> None:
+        """Leave the graph."""
+        for handle in list(self._open):
+            self.close(handle)
+        self._graph.endpoints.remove(self)
+        os.close(self._wake)
+
+    def _add(self, opened: _Open) -> int:
+        handle = next(self._numbers)
+        self._open[handle] = opened
+        return handle
+
+
+def _match(offered: Qos, wanted: Qos) -> bool:
+    if wanted.reliability == "reliable" and offered.reliability != "reliable":
+        return False
+    return wanted.durability != "transient_local" or offered.durability == "transient_local"

@@ -1,0 +1,44 @@
+"""Opening the endpoints that a configuration names.
+
+Place: shell. Only what is named is imported: each endpoint brings packages of its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+
+from proxy.endpoints.endpoint import Endpoint
+from proxy.rules.ros_end import RosEnd
+
+__all__ = ["open_endpoint", "open_endpoints"]
+
+
+def open_endpoint(end: RosEnd, node: str) -> Endpoint:
+    """Join a graph as a node of this name.
+
+    Raises:
+        LocalError: what the endpoint needs is not installed; the text says how to get it.
+    """
+    if end.endpoint == "ros1":
+        from proxy.endpoints.ros1 import Ros1Endpoint
+
+        return Ros1Endpoint(end.master_uri, node)
+    if end.endpoint == "dds":
+        from proxy.endpoints.dds import DdsEndpoint
+
+        return DdsEndpoint(end.domain_id, node)
+    from proxy.endpoints.ros2 import Ros2Endpoint
+
+    return Ros2Endpoint(end.domain_id, node)
+
+
+@contextlib.contextmanager
+def open_endpoints(ends: Sequence[RosEnd], node: str) -> Iterator[list[Endpoint]]:
+    """Join all graphs; leave them on leaving."""
+    with contextlib.ExitStack() as stack:
+        opened = list[Endpoint]()
+        for end in ends:
+            opened.append(open_endpoint(end, node))
+            stack.callback(opened[-1].shut)
+        yield opened

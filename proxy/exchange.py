@@ -1,0 +1,172 @@
+"""How calls of a service or an action travel inside sealed messages, and what describes them.
+
+Place: pure. A service has one part, itself. An action has five, in this order: the services ``send_goal``,
+``cancel_goal`` and ``get_result``, and the topics ``feedback`` and ``status``. Wire forms, big-endian::
+
+    request   version (1) | part (1) | call (8) | patience in ms, 0: none (4) | body
+    answer    version (1) | part (1) | call (8) | outcome (1)                 | body, or a reason in UTF-8
+    news      version (1) | part (1) | stamp in ns (8)                        | body
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+from gdp.crypto.cbor import decode, encode
+from gdp.errors import DropReason, RemoteError
+from proxy.serial.channel import CHANNEL_MAX_BYTES, Channel
+from proxy.serial.serializer import Encoding
+from proxy.serial.service import Service
+
+__all__ = ["Answer", "Exchange", "News", "Outcome", "Request"]
+
+VERSION: Final = 1
+PARTS_MAX: Final = 8
+PATIENCE_MAX_MS: Final = (1 << 32) - 1
+_REASON_MAX_BYTES: Final = 1_024
+_REQUEST: Final = struct.Struct("!BBQI")
+_ANSWER: Final = struct.Struct("!BBQB")
+_NEWS: Final = struct.Struct("!BBQ")
+_ENCODINGS: Final[dict[object, Encoding]] = {"json": "json", "cbor": "cbor", "cdr": "cdr"}
+
+
+class Outcome(IntEnum):
+    """What became of a call."""
+
+    ANSWERED = 0
+    FAILED = 1  # at the server's side; the body is the reason
+
+
+class Request(NamedTuple):
+    """A call, from a client's proxy to a server's."""
+
+    part: int
+    call: int
+    patience_ms: int
+    body: bytes
+
+    def to_wire(self) -> bytes:
+        """Return the wire form."""
+        return _REQUEST.pack(VERSION, self.part, self.call, self.patience_ms) + self.body
+
+    @classmethod
+    def from_wire(cls, wire: bytes) -> Request:
+        """Read the wire form.
+
+        Raises:
+            RemoteError: MALFORMED or BAD_VERSION.
+        """
+        part, call, patience_ms = _head(_REQUEST, wire)
+        return cls(part, call, patience_ms, wire[_REQUEST.size :])
+
+
+class Answer(NamedTuple):
+    """What a call came to, back to the one client that made it."""
+
+    part: int
+    call: int
+    outcome: Outcome
+    body: bytes
+
+    @classmethod
+    def failed(cls, part: int, call: int, reason: str) -> Answer:
+        """Return the answer to a call that could not be served."""
+        return cls(part, call, Outcome.FAILED, reason.encode()[:_REASON_MAX_BYTES])
+
+    @property
+    def reason(self) -> str:
+        """Return why the call failed."""
+        return self.body[:_REASON_MAX_BYTES].decode("utf-8", "replace")
+
+    def to_wire(self) -> bytes:
+        """Return the wire form."""
+        return _ANSWER.pack(VERSION, self.part, self.call, self.outcome) + self.body
+
+    @classmethod
+    def from_wire(cls, wire: bytes) -> Answer:
+        """Read the wire form.
+
+        Raises:
+            RemoteError: MALFORMED or BAD_VERSION.
+        """
+        part, call, outcome = _head(_ANSWER, wire)
+        if outcome not in Outcome.__members__.values():
+            raise RemoteError(DropReason.MALFORMED, "an answer that says neither yes nor no")
+        return cls(part, call, Outcome(outcome), wire[_ANSWER.size :])
+
+
+class News(NamedTuple):
+    """A message of an action's topics, from its server to all clients."""
+
+    part: int
+    stamp_ns: int
+    body: bytes
+
+    def to_wire(self) -> bytes:
+        """Return the wire form."""
+        return _NEWS.pack(VERSION, self.part, self.stamp_ns) + self.body
+
+    @classmethod
+    def from_wire(cls, wire: bytes) -> News:
+        """Read the wire form.
+
+        Raises:
+            RemoteError: MALFORMED or BAD_VERSION.
+        """
+        part, stamp_ns = _head(_NEWS, wire)
+        return cls(part, stamp_ns, wire[_NEWS.size :])
+
+
+def _head(form: struct.Struct, wire: bytes) -> tuple[int, ...]:
+    if len(wire) < form.size:
+        raise RemoteError(DropReason.MALFORMED, "a call that is too short")
+    version, *rest = form.unpack_from(wire)
+    if version != VERSION:
+        raise RemoteError(DropReason.BAD_VERSION, f"call version {version}")
+    return tuple(rest)
+
+
+@dataclass(frozen=True, slots=True)
+class Exchange:
+    """What one side of a service or an action knows of it, and in which form it writes.
+
+    Args:
+        services: by part.
+        topics: of an action; their parts follow the services'.
+    """
+
+    encoding: Encoding
+    services: tuple[Service, ...]
+    topics: tuple[Channel, ...] = ()
+
+    def to_wire(self) -> bytes:
+        """Return the wire form.
+
+        Raises:
+            LocalError: a part is longer than a peer would take.
+        """
+        services = [service.to_wire() for service in self.services]
+        return encode({"e": self.encoding, "s": services, "c": [channel.to_wire() for channel in self.topics]})
+
+    @classmethod
+    def from_wire(cls, wire: bytes) -> Exchange:
+        """Read the wire form.
+
+        Raises:
+            RemoteError: MALFORMED, whatever else these bytes are.
+        """
+        match decode(wire, 2 * PARTS_MAX * CHANNEL_MAX_BYTES):
+            case {"e": str(encoding), "s": [*services], "c": [*topics]} if (
+                encoding in _ENCODINGS and services and len(services) + len(topics) <= PARTS_MAX
+            ):
+                parts = [each for each in [*services, *topics] if isinstance(each, bytes)]
+                if len(parts) == len(services) + len(topics):
+                    return cls(
+                        _ENCODINGS[encoding],
+                        tuple(map(Service.from_wire, parts[: len(services)])),
+                        tuple(map(Channel.from_wire, parts[len(services) :])),
+                    )
+        raise RemoteError(DropReason.MALFORMED, "a description of a service")

@@ -1,0 +1,121 @@
+"""A proxy in live graphs: the loop that drives the overlay's member, the endpoints and the bridge between them.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+from typing import Final
+
+import typer
+
+from gdp.cli.node import emit
+from gdp.errors import GdpError
+from proxy.bridge.bridge import Bridge
+from proxy.bridge.site import Site
+from proxy.config import ProxyConfig
+from proxy.endpoints.endpoint import proxy_node_name
+from proxy.endpoints.live import open_endpoints
+from proxy.held import Held
+from proxy.node import ProxyNode, run_node
+from proxy.recording import GOODBYE_S, tell_refusals
+
+__all__ = ["carry"]
+
+log = logging.getLogger(__name__)
+
+TICK_S: Final = 0.5
+
+
+def carry(path: Path, settings: ProxyConfig, *, json: bool) -> None:
+    """Carry what the configuration names between its graphs and the overlay until stopped.
+
+    Args:
+        path: of the configuration, to read it again after a SIGHUP.
+
+    Raises:
+        LocalError: keys, delegations or the device are not as the configuration says, or an endpoint cannot be had.
+    """
+    with run_node(settings) as node:
+        name = proxy_node_name(node.identity.name.to_text())
+        with open_endpoints(settings.ros, name) as endpoints:
+            held = Held(settings.delegations, node.identity)
+            bridge = Bridge(Site(node.member, node.traffic, node.faults), settings, endpoints, held)
+            node.on_reload = lambda: _reload(path, settings, node, bridge)
+            for endpoint in endpoints:
+                node.runtime.watch(endpoint)
+            try:
+                _work(node, bridge, json=json)
+            finally:
+                for endpoint in endpoints:
+                    node.runtime.unwatch(endpoint)
+            bridge.close()
+            node.member.leave()
+            node.linger(GOODBYE_S)
+        if json:
+            emit("done", topics=[tally.to_fields() for tally in bridge.tallies], faults=dict(node.faults.counts))
+        else:
+            carried = f"{node.traffic.messages_out} messages sent, {node.traffic.messages_in} received"
+            typer.echo(f"{carried}, {node.faults.total} faults")
+
+
+def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
+    """Carry until stopped, telling of progress."""
+    is_ready = False
+    tick_at_s = 0.0
+    while not node.runtime.is_stopped:
+        due_s = bridge.next_timeout()
+        node.runtime.step(tick_at_s if due_s is None else min(due_s, tick_at_s))
+        now_s = time.monotonic()
+        bridge.work(now_s)
+        if not is_ready and node.member.attachment.is_attached and bridge.is_settled:
+            is_ready = True
+            tell_refusals(node)
+            _tell_ready(node, bridge, json=json)
+        if now_s >= tick_at_s:
+            tick_at_s = now_s + TICK_S
+            if json and is_ready:
+                _tell_progress(node, bridge)
+
+
+def _tell_ready(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
+    if json:
+        emit("ready", name=node.member.name.to_text())
+        return
+    typer.echo(f"proxy {node.member.name.short} is attached, in {', '.join(bridge.labels)}; Ctrl-C ends it")
+    for wish, _ in bridge.flows:
+        typer.echo(f"  {'expose' if wish.is_exposed else 'import'} {wish.local} [{wish.type_name}]")
+
+
+def _tell_progress(node: ProxyNode, bridge: Bridge) -> None:
+    emit(
+        "progress",
+        sent=node.traffic.messages_out,
+        received=node.traffic.messages_in,
+        flows=len(bridge.flows),
+        faults=node.faults.total,
+        topics=[
+            {"topic": tally.topic, "received": tally.received, "latency_ms": tally.latencies_ms[-1]}
+            for tally in bridge.tallies
+            if tally.latencies_ms
+        ],
+    )
+
+
+def _reload(path: Path, first: ProxyConfig, node: ProxyNode, bridge: Bridge) -> None:
+    """Read the configuration and the delegations again; flows whose rule is the same go on."""
+    try:
+        settings = ProxyConfig.load(path)
+        held = Held(settings.delegations, node.identity)
+    except GdpError as error:
+        log.error("configuration not reloaded, the old one holds reason=%s", error)
+        return
+    for key in ("identity", "domain", "iface", "ros", "metrics"):
+        if getattr(settings, key) != getattr(first, key):
+            log.error("configuration not reloaded, the old one holds reason=%s needs a restart to change", key)
+            return
+    bridge.reload(settings, held)
+    log.info("configuration reloaded rules=%d", len(settings.expose) + len(settings.imports))

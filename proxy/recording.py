@@ -1,0 +1,88 @@
+"""A proxy without a live graph: what is imported is recorded, or only counted.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from functools import partial
+from typing import Final
+
+import typer
+
+from gdp.cli.node import emit
+from proxy.config import ProxyConfig
+from proxy.endpoints.bag import BagWriter
+from proxy.held import Held
+from proxy.inbound import Inbound
+from proxy.node import ProxyNode, open_topics, renew_topics, run_node
+
+__all__ = ["GOODBYE_S", "record", "tell_refusals"]
+
+log = logging.getLogger(__name__)
+
+TICK_S: Final = 0.5
+GOODBYE_S: Final = 0.2
+
+
+def record(settings: ProxyConfig, *, json: bool) -> None:
+    """Receive what the configuration imports until stopped.
+
+    Raises:
+        LocalError: keys, delegations, the device or the file are not as the configuration says.
+    """
+    with run_node(settings) as node, contextlib.ExitStack() as stack:
+        topics = open_topics(settings, Held(settings.delegations, node.identity))
+        node.on_reload = partial(renew_topics, node, settings)
+        writer = None
+        if settings.record is not None:
+            writer = BagWriter(settings.record.path, 1 if settings.record.format == "ros1" else 2)
+            stack.callback(writer.close)
+        inbound = Inbound(node, settings.imports, writer)
+        for rule in settings.imports:
+            node.member.subscribe(topics[rule.overlay_name])
+        _work(node, inbound, json=json)
+        node.member.leave()
+        node.linger(GOODBYE_S)
+        stack.close()
+        if json:
+            emit("done", topics=inbound.to_fields())
+        else:
+            typer.echo(f"{inbound.received} messages received, {inbound.lost} lost")
+
+
+def tell_refusals(node: ProxyNode) -> None:
+    """Warn of each claim that the overlay has refused."""
+    for each in node.member.attachment.claims:
+        if each.refused is not None:
+            name, right, reason = each.subject.name.short, each.right.value, each.refused.label
+            log.warning("claim refused name=%s right=%s reason=%s", name, right, reason)
+
+
+def _work(node: ProxyNode, inbound: Inbound, *, json: bool) -> None:
+    """Receive until stopped, telling of progress."""
+    is_ready = False
+    tick_at_s = 0.0
+    while not node.runtime.is_stopped:
+        node.runtime.step(max(tick_at_s, time.monotonic()))
+        inbound.take()
+        if not is_ready and node.member.attachment.is_attached:
+            is_ready = True
+            tell_refusals(node)
+            if json:
+                emit("ready", name=node.member.name.to_text())
+            else:
+                typer.echo(f"proxy {node.member.name.short} is attached; Ctrl-C ends it")
+        if time.monotonic() >= tick_at_s:
+            tick_at_s = time.monotonic() + TICK_S
+            if json and is_ready:
+                latest = [tally.latencies_ms[-1] for tally in inbound.tallies.values() if tally.latencies_ms]
+                emit(
+                    "progress",
+                    received=inbound.received,
+                    lost=inbound.lost,
+                    latency_ms=round(sum(latest) / len(latest), 3) if latest else None,
+                )

@@ -1,0 +1,50 @@
+"""What a proxy has carried, as its metrics show it.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from gdp.telemetry.metrics import Histogram
+
+__all__ = ["Traffic"]
+
+
+@dataclass(slots=True)
+class Traffic:
+    """Counts of one proxy.
+
+    Attributes:
+        unread: messages that nobody was there to read.
+        thinned: messages left out because their rule limits the rate.
+        latency: one-way, from the far proxy's stamp until handed over here.
+    """
+
+    messages_out: int = 0
+    bytes_out: int = 0
+    messages_in: int = 0
+    bytes_in: int = 0
+    unread: int = 0
+    thinned: int = 0
+    latency: Histogram = field(default_factory=Histogram)
+
+    def sent(self, size: int) -> None:
+        """Count a message on its way out."""
+        self.messages_out += 1
+        self.bytes_out += size
+
+    def received(self, size: int) -> None:
+        """Count a message that came in."""
+        self.messages_in += 1
+        self.bytes_in += size
+
+    def messages(self) -> Mapping[str, int]:
+        """Return the counts of messages by what became of them."""
+        return {"in": self.messages_in, "out": self.messages_out, "unread": self.unread, "thinned": self.thinned}
+
+    def message_bytes(self) -> Mapping[str, int]:
+        """Return the bytes carried, before sealing, by direction."""
+        return {"in": self.bytes_in, "out": self.bytes_out}
