@@ -18,9 +18,22 @@ from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
 
 from gdp.errors import LocalError
 
-__all__ = ["Array", "DefinitionError", "Number", "Record", "Sequence", "Text", "Type", "UnparsedError", "parse"]
+__all__ = [
+    "Array",
+    "DefinitionError",
+    "Number",
+    "Record",
+    "Sequence",
+    "Text",
+    "Type",
+    "UnparsedError",
+    "msg_name",
+    "parse",
+    "parsed",
+]
 
 _DEPTH_MAX: Final = 32  # records within records
+_FIELDS_MAX: Final = 4_096  # of a type with all that it contains: each record as often as it stands somewhere
 _RULE: Final = "=" * 80 + "\n"
 
 
@@ -125,17 +138,31 @@ def parse(type_name: str, definition: str, definition_format: str, ros: int) -> 
         DefinitionError: no definition, a used type that it lacks, a type within itself, or a field of a kind that has
             no form here (``wchar``, ``long double``, fixed point).
     """
+    types = parsed(type_name, definition, definition_format)
+    return _Builder(types, ros).record(msg_name(type_name, definition_format), 0)
+
+
+def msg_name(type_name: str, definition_format: str) -> str:
+    """Return the name under which a type stands in its parsed definition: ``msg`` text knows no services or actions."""
+    if definition_format != "msg":
+        return type_name
+    package, _, name = type_name.partition("/")
+    return f"{package}/msg/{name.rpartition('/')[2]}"
+
+
+def parsed(type_name: str, definition: str, definition_format: str) -> Typesdict:
+    """Return constants and fields of the types in a definition.
+
+    Raises:
+        DefinitionError: there is none.
+        UnparsedError: the text cannot be read.
+    """
     if definition_format not in ("msg", "idl"):
         raise DefinitionError(f"{type_name}: no definition")
-    types = _parsed(type_name, definition, definition_format)
-    return _Builder(types, ros).record(type_name, 0)
-
-
-def _parsed(type_name: str, definition: str, definition_format: str) -> Typesdict:
     text = definition.replace("\r\n", "\n")
     try:
         if definition_format == "msg":
-            return get_types_from_msg(_plain_wide(text), type_name)
+            return get_types_from_msg(_plain_wide(text), msg_name(type_name, "msg"))
         if not text.startswith(f"{_RULE}IDL: "):
             return get_types_from_idl(text)
         types: Typesdict = {}
@@ -165,6 +192,7 @@ class _Builder:
         self._ros = ros
         self._done: dict[str, Record] = {}
         self._open: set[str] = set()
+        self._counts: dict[str, int] = {}  # of fields, with those of contained records
 
     def record(self, name: str, depth: int) -> Record:
         if name in self._done:
@@ -181,9 +209,16 @@ class _Builder:
             raise DefinitionError(f"{name}: the definition does not contain it")
         if not fields and self._ros == 2:
             fields = (_DUMMY,)
+        self._counts[name] = sum(self._count(kind) for _, kind in fields)
+        if self._counts[name] > _FIELDS_MAX:
+            raise DefinitionError(f"{name}: more than {_FIELDS_MAX} fields with those of the types in it")
         self._open.discard(name)
         self._done[name] = Record(name, fields)
         return self._done[name]
+
+    def _count(self, kind: Type) -> int:
+        item = kind.item if isinstance(kind, Array | Sequence) else kind
+        return 1 + self._counts[item.name] if isinstance(item, Record) else 1
 
     def _type(self, owner: str, desc: FieldDesc, depth: int) -> Type:
         if desc[0] == Nodetype.ARRAY:

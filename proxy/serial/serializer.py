@@ -26,7 +26,7 @@ from proxy.serial.schema import Array as ArrayType
 from proxy.serial.schema import DefinitionError, Record, Sequence, Text, Type, parse
 from proxy.serial.writer import Writer, write_with
 
-__all__ = ["Encoding", "Serializer", "canonical"]
+__all__ = ["Codec", "Encoding", "Serializer", "canonical"]
 
 _LITTLE: Final = b"\x00\x01"  # CDR_LE
 _BIG: Final = b"\x00\x00"  # CDR_BE
@@ -57,7 +57,7 @@ class Serializer:
         self.channel = channel
         self._encoding = encoding
         self.opaque = ""  # why messages travel opaque, empty where they do not
-        self._codec: _Codec | None = None
+        self._codec: Codec | None = None
         if encoding != "cdr":
             try:
                 self._codec = _codec(channel, encoding)
@@ -128,12 +128,12 @@ def _raw_of(value: object) -> bytes:
     raise MisfitError("not bytes")
 
 
-class _Codec:
+class Codec:
     """Readers for each way a message of the type may lie, and the one writer."""
 
     __slots__ = ("_dialect", "_readers", "_record", "_ros", "_turned", "_write")
 
-    def __init__(self, record: Record, ros: int, dialect: Dialect, turned: _Codec | None) -> None:
+    def __init__(self, record: Record, ros: int, dialect: Dialect, turned: Codec | None) -> None:
         self._record = record
         self._ros = ros
         self._dialect = dialect
@@ -191,11 +191,11 @@ def _has_wide(kind: Type, seen: set[int]) -> bool:
 
 
 @lru_cache(maxsize=1024)
-def _native(type_name: str, definition: str, definition_format: str, ros: int) -> _Codec:
-    return _Codec(parse(type_name, definition, definition_format, ros), ros, _NATIVE, None)
+def _native(type_name: str, definition: str, definition_format: str, ros: int) -> Codec:
+    return Codec(parse(type_name, definition, definition_format, ros), ros, _NATIVE, None)
 
 
-def _codec(channel: Channel, encoding: Encoding) -> _Codec:
+def _codec(channel: Channel, encoding: Encoding) -> Codec:
     named = (channel.type_name, channel.definition, channel.definition_format, channel.ros)
     dialect: Dialect = JsonDialect() if encoding == "json" else CborDialect()
-    return _Codec(parse(*named), channel.ros, dialect, _native(*named))
+    return Codec(parse(*named), channel.ros, dialect, _native(*named))

@@ -83,3 +83,16 @@ def test_a_text_that_is_no_definition_is_told_apart() -> None:
 def test_no_definition_is_refused() -> None:
     with pytest.raises(DefinitionError, match="no definition"):
         fields("", definition_format="")
+
+
+@pytest.mark.parametrize("type_name", ["std_srvs/srv/SetBool_Request", "test_msgs/action/Fibonacci_SendGoal_Response"])
+def test_halves_of_services_and_actions_are_types_like_any_other(type_name: str) -> None:
+    assert [name for name, _ in parse(type_name, "bool data\n", "msg", 2).fields] == ["data"]
+
+
+def test_a_definition_that_grows_without_end_is_refused() -> None:
+    rule = "=" * 80 + "\n"
+    levels = [f"MSG: a/L{n}\nL{n + 1} x\nL{n + 1} y\n" for n in range(1, 20)]
+    text = "L1 x\nL1 y\n" + "".join(rule + level for level in [*levels, "MSG: a/L20\nuint8 z\n"])
+    with pytest.raises(DefinitionError, match="more than"):
+        parse("a/msg/Top", text, "msg", 1)
