@@ -12,6 +12,7 @@ from proxy.checking import check_proxy
 from proxy.config import ProxyConfig
 from proxy.live import carry
 from proxy.recording import record
+from proxy.schema_cli import Schema
 
 __all__ = ["main"]
 
@@ -19,11 +20,14 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
 @app.command(epilog="Example: gdp-proxy --config proxy.yaml --check")
-def proxy(config: Config, check: Check = False, json: Json = False, verbose: Verbose = False) -> None:
+def proxy(
+    config: Config, check: Check = False, json: Json = False, verbose: Verbose = False, schema: Schema = False
+) -> None:
     """Carry what the configuration names between ROS and the overlay, until Ctrl-C; SIGHUP reads it again.
 
     With a ros section it takes part in that graph; without one it records what it imports.
     """
+    del schema  # it ends the command by itself
     set_up_logging(verbose=verbose)
     with failing_clearly():
         settings = ProxyConfig.load(config)

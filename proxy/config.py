@@ -36,9 +36,9 @@ def _one_or_several(value: object, validate: ValidatorFunctionWrapHandler, info:
     """Take a single mapping for a list of one; what is wrong in it is told at its own key."""
     if isinstance(value, dict):
         return (RosEnd.model_validate(value, strict=True, context=info.context),)
-    if isinstance(value, int | str):
+    if not isinstance(value, list):
         raise ValueError("expected a mapping such as {endpoint: ros2, domain: 0}, or a list of such")
-    return validate(tuple(value) if isinstance(value, list) else value)
+    return validate(tuple(value))
 
 
 def _or_one(schema: JsonDict) -> None:

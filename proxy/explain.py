@@ -19,14 +19,14 @@ from proxy.rules.choice import choose, imported
 from proxy.rules.rule import Kind, Rule
 from proxy.serial.channel import Qos
 
-__all__ = ["Held", "explain"]
+__all__ = ["Delegated", "explain"]
 
 _GOAL: Final = "/_action/send_goal"  # https://design.ros2.org/articles/actions.html
 _GOAL_TYPE: Final = "_SendGoal"
 _OPTIONS: Final = ("author", "maintainer", "description")  # metadata for which ``gdp delegate`` has an option
 
 
-class Held(Protocol):
+class Delegated(Protocol):
     """What an explanation asks of a delegation."""
 
     @property
@@ -57,7 +57,7 @@ _SIDES: Final[dict[tuple[Direction, bool], _Side]] = {  # the flag: whether it i
 
 
 def explain(
-    expose: Sequence[Rule], imports: Sequence[Rule], graph: Graph | None, held: Mapping[Name, Held]
+    expose: Sequence[Rule], imports: Sequence[Rule], graph: Graph | None, held: Mapping[Name, Delegated]
 ) -> list[Finding]:
     """Return one finding for each rule, in the order of the file.
 
@@ -75,7 +75,12 @@ class _Look:
     """At one rule among its equals."""
 
     def __init__(
-        self, direction: Direction, rules: Sequence[Rule], rule: Rule, graph: Graph | None, held: Mapping[Name, Held]
+        self,
+        direction: Direction,
+        rules: Sequence[Rule],
+        rule: Rule,
+        graph: Graph | None,
+        held: Mapping[Name, Delegated],
     ) -> None:
         self._direction = direction
         self._rules = rules
@@ -141,7 +146,7 @@ class _Look:
         elif others:
             yield f"a node here {self._side.does} it as {', '.join(others)}, too: say in the rule which type is meant"
 
-    def _right_faults(self, local: str, type_name: str, delegation: Held | None) -> Iterator[str]:
+    def _right_faults(self, local: str, type_name: str, delegation: Delegated | None) -> Iterator[str]:
         if not type_name or (delegation is not None and self._has_right(delegation)):
             return
         if delegation is not None:
@@ -184,9 +189,12 @@ class _Look:
             yield f"of another proxy, hence left alone: {', '.join(self._proxied)}"
         silent = sum(each.metadata is None and self._has_right(each) for each in self._held.values())
         if silent and (self._rule.is_pattern or not self._rule.type_name):
-            yield f"{silent} delegations do not say what they are for; only a rule with a full name and type finds them"
+            yield (
+                f"delegations that do not say what they are for: {silent};"
+                " only a rule with a full name and type finds them"
+            )
 
-    def _has_right(self, delegation: Held) -> bool:
+    def _has_right(self, delegation: Delegated) -> bool:
         return self._side.right in {right.value for right in delegation.rights}
 
 

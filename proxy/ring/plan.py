@@ -125,7 +125,7 @@ def proxy_yaml(
         at: where it is attached.
         credentials: who it is.
         delegations: directory of what owners gave it.
-        ros: 1 or 2.
+        ros: 1 or 2, the form of the recording.
         rules: by ``expose`` and ``import``.
         record: the file to write what arrives into.
     """
@@ -134,7 +134,6 @@ def proxy_yaml(
         **credentials.to_yaml(),
         "iface": at.ifname,
         "delegations": str(delegations),
-        "ros": ros,
         **{side: list(each) for side, each in rules.items()},
         **({"record": {"path": str(record), "format": form}} if record is not None else {}),
         **_metrics("proxy", wanted=metrics),

@@ -1,0 +1,214 @@
+"""Rules as people write them: which are taken, which are refused and where, and what they mean."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gdp.errors import LocalError
+from gdp.metadata import Metadata
+from proxy.rules.choice import choose, imported
+from tests.proxy.rule_files import OTHER, OWNER, furnish, proxy, refusals, rule, rules
+
+IMAGE = "sensor_msgs/msg/Image"
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    furnish(tmp_path)
+    return tmp_path
+
+
+GOOD = [
+    "name: /chatter",
+    "name: /camera/**",
+    "name: /a, type: std_msgs/msg/String",
+    "name: /a/_service_event, type: std_srvs/srv/SetBool_Event",
+    "name: /fold/_action/feedback, type: test_msgs/action/Fibonacci_FeedbackMessage",
+    "name: /set, kind: service, type: std_srvs/srv/SetBool",
+    "name: /set, kind: service, timeout_s: null",
+    "name: /set, kind: service, timeout_s: 0.5, priority: urgent, max_bytes: 100",
+    "name: /fold, kind: action, type: test_msgs/action/Fibonacci, timeout_s: 10",
+    "name: /a, remap: /b/c",
+    "name: /a, max_hz: 10",
+    "name: /a, max_hz: 0.1, reliable: null, latched: null",
+    "name: /a, ros: 2, domain: 0",
+    "name: /a, metadata: {author: lab, pin: 7}",
+]
+
+
+@pytest.mark.parametrize("text", GOOD)
+def test_a_good_rule_is_taken(place: Path, text: str) -> None:
+    assert rule(place, text)
+
+
+BAD = [
+    ("name: chatter", "name: expected a full ROS name, such as /camera/image, or a pattern"),
+    ("name: /a/", "name: expected a full ROS name"),
+    ("name: '/a b'", "name: expected a full ROS name"),
+    ("name: /a**", "name: expected a full ROS name"),
+    (f"name: /{'a' * 512}", "name: expected a full ROS name"),
+    ("name: 5", "name: expected a text, not 5"),
+    ("name: /a, kind: node", "kind: expected 'topic', 'service' or 'action', not 'node'"),
+    ("name: /a, kind: node, type: x", "kind: expected 'topic', 'service' or 'action', not 'node'"),
+    ("name: /a, type: Image", "type: expected the type of a topic as ROS 2 writes it, such as sensor_msgs/msg/Image"),
+    ("name: /a, type: std_srvs/srv/SetBool", "type: expected the type of a topic"),
+    ("name: /a, kind: service, type: std_msgs/msg/String", "type: expected the type of a service"),
+    ("name: /a, kind: action, type: std_srvs/srv/SetBool", "type: expected the type of an action"),
+    ("name: /a, remap: b", "remap: expected a full ROS name"),
+    ("name: /a, remap: /*", "remap: expected a full ROS name"),
+    ("name: /a/*, remap: /b", "remap: a pattern cannot be remapped; write a rule for each name"),
+    ("name: /a, max_hz: 0", "max_hz: expected greater than 0, not 0"),
+    ("name: /a, max_hz: fast", "max_hz: expected a number, not 'fast'"),
+    ("name: /a, max_bytes: 0", "max_bytes: expected greater than or equal to 1"),
+    ("name: /a, timeout_s: 1", "timeout_s: only services and actions have this"),
+    ("name: /a, kind: service, timeout_s: 0", "timeout_s: expected greater than 0, not 0"),
+    ("name: /a, kind: service, max_hz: 1", "max_hz: only topics have this"),
+    ("name: /a, kind: service, reliable: true", "reliable: only topics have this"),
+    ("name: /a, kind: action, latched: true", "latched: only topics have this"),
+    ("name: /a, ros: 3", "ros: expected 1 or 2, not 3"),
+    ("name: /a, domain: 233", "domain: expected less than or equal to 232"),
+    ("name: /a, metadata: {name: /b}", "metadata: name: state it as a key of the rule itself"),
+    ("name: /a, direction: out", "direction: unknown key; expected one of kind, name, type, remap"),
+]
+
+
+@pytest.mark.parametrize(("text", "complaint"), BAD)
+def test_a_bad_rule_is_refused_at_the_key_that_is_wrong(place: Path, text: str, complaint: str) -> None:
+    (line,) = refusals(place, "ros: {endpoint: ros2, domain: 0}\nexpose:\n" + rules(text))
+    where, _, rest = line.partition(": expose[0].")
+    assert rest.startswith(complaint)
+    key = complaint.partition(":")[0]
+    shown = key if "unknown key" in complaint else f"{key}: "  # a wrong value is shown where it begins
+    begins = text.index(key) if shown == key else text.rindex(shown) + len(shown)
+    assert where == f"proxy.yaml:7:{begins + len('  - {') + 1}"
+
+
+CLASHES = [
+    ("expose", ["name: /a", "name: /a"], "expose[1].name: expose[0] gives the same name: /a"),
+    ("expose", ["name: /a", "name: /a, type: std_msgs/msg/String"], "expose[1].name: expose[0] gives the same name"),
+    ("expose", ["name: /a", "name: /a, remap: /b"], "expose[1].name: expose[0] gives the same name"),
+    ("expose", ["name: /a", "name: /b, remap: /a"], "expose[1].name: expose[0] is about /a of this machine, too"),
+    ("expose", ["name: /a", "name: /a, owner: other.pub"], "expose[1].name: expose[0] is about /a of this machine"),
+    ("expose", ["name: /*", "name: /*, owner: other.pub"], "expose[1].name: expose[0] is about /* of this machine"),
+    ("import", ["name: /a", "name: /a, metadata: {by: x}"], "import[1].name: import[0] is about /a of this machine"),
+    ("import", ["name: /*", "name: /*"], "import[1].name: import[0] gives the same name: /*"),
+]
+
+
+@pytest.mark.parametrize(("side", "texts", "complaint"), CLASHES)
+def test_two_rules_about_one_thing_are_refused(place: Path, side: str, texts: list[str], complaint: str) -> None:
+    (line,) = refusals(place, f"{side}:\n{rules(*texts)}")
+    assert line.startswith(f"proxy.yaml:7:12: {complaint}")
+
+
+@pytest.mark.parametrize(
+    ("side", "texts"),
+    [
+        ("expose", ["name: /a", "name: /*", "name: /**"]),
+        ("expose", ["name: /a, type: std_msgs/msg/String", "name: /a, type: std_msgs/msg/Int8"]),  # a recording may
+        ("expose", ["name: /a", "name: /a, kind: service", "name: /a, kind: action"]),
+        ("import", ["name: /*", "name: /*, owner: other.pub"]),
+        ("import", ["name: /a", "name: /a, metadata: {by: x}, remap: /b"]),
+    ],
+)
+def test_rules_about_different_things_stand_together(place: Path, side: str, texts: list[str]) -> None:
+    assert proxy(place, f"ros: {{endpoint: ros2, domain: 0}}\n{side}:\n{rules(*texts)}")
+
+
+@pytest.mark.parametrize("kind", ["service", "action"])
+def test_a_service_is_not_both_exposed_and_imported_but_a_topic_may_be(place: Path, kind: str) -> None:
+    def both(of: str) -> str:
+        one = rules(f"name: /a, kind: {of}")
+        return f"ros: {{endpoint: ros2, domain: 0}}\nexpose:\n{one}import:\n{one}"
+
+    (line,) = refusals(place, both(kind))
+    assert line.startswith("proxy.yaml:9:12: import[0].name: expose[0] gives the same name: /a; one machine serves a")
+    assert proxy(place, both("topic"))
+
+
+def test_what_a_rule_leaves_open_follows_the_source(place: Path) -> None:
+    free = rule(place, "name: /a")
+    assert (free.wants_reliable, free.wants_latched, free.reliable, free.latched) == (None, None, True, False)
+    set_ = rule(place, "name: /a, reliable: false, latched: true")
+    assert (set_.wants_reliable, set_.wants_latched, set_.reliable, set_.latched) == (False, True, False, True)
+
+
+def test_a_remapped_rule_knows_both_names(place: Path) -> None:
+    given = rule(place, f"name: /camera/image, type: {IMAGE}, remap: /usb_cam/image_raw, metadata: {{author: lab}}")
+    assert given.matches("/usb_cam/image_raw")
+    assert not given.matches("/camera/image")
+    metadata = Metadata({"kind": "topic", "name": "/camera/image", "type": IMAGE, "author": "lab"})
+    assert given.overlay_metadata == given.metadata_of("/usb_cam/image_raw", IMAGE) == metadata
+    assert given.overlay_name == given.overlay_name_of("/usb_cam/image_raw", IMAGE) == metadata.name(_key())
+    assert given.local_of(metadata) == "/usb_cam/image_raw"
+
+
+def test_a_pattern_gives_each_name_its_own(place: Path) -> None:
+    given = rule(place, "name: /camera/**, metadata: {author: lab}")
+    assert given.metadata_of("/camera/left/image", IMAGE)["name"] == "/camera/left/image"
+    assert given.local_of(given.metadata_of("/camera/left/image", IMAGE)) == "/camera/left/image"
+
+
+@pytest.mark.parametrize("text", ["name: /camera/*, type: sensor_msgs/msg/Image", "name: /camera/image"])
+def test_what_depends_on_what_is_found_has_no_overlay_name(place: Path, text: str) -> None:
+    with pytest.raises(LocalError, match="has no name of its own"):
+        _ = rule(place, text).overlay_name
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"kind": "service"}, {"name": "/other/image"}, {"type": "sensor_msgs/msg/Imu"}, {"author": "they"}, {"more": 1}],
+)
+@pytest.mark.parametrize("name", ["/camera/*", "/camera/image"])
+def test_metadata_of_something_else_do_not_fit(place: Path, name: str, change: dict[str, str | int]) -> None:
+    given = rule(place, f"name: {name}, type: {IMAGE}, metadata: {{author: lab}}")
+    right: dict[str, str | int] = {"kind": "topic", "name": "/camera/image", "type": IMAGE, "author": "lab"}
+    assert given.local_of(Metadata(right)) == "/camera/image"
+    assert given.local_of(Metadata({**right, **change})) is None
+
+
+def test_metadata_without_a_name_or_a_type_fit_nothing(place: Path) -> None:
+    given = rule(place, "name: /**")
+    assert given.local_of(Metadata({"kind": "topic", "name": "/a"})) is None
+    assert given.local_of(Metadata({"kind": "topic", "type": IMAGE})) is None
+    assert given.local_of(Metadata({"kind": "topic", "name": "/a", "type": "std_srvs/srv/SetBool"})) is None
+
+
+def test_a_full_name_comes_before_a_pattern_and_the_first_pattern_before_the_next(place: Path) -> None:
+    texts = ["name: /**", "name: /camera/*", "name: /camera/image", "name: /camera/*, kind: service"]
+    given = proxy(place, f"ros: {{endpoint: ros2, domain: 0}}\nexpose:\n{rules(*texts)}").expose
+    assert choose(given, "topic", "/camera/image") is given[2]
+    assert choose(given, "topic", "/camera/info") is given[0]
+    assert choose(given, "service", "/camera/info") is given[3]
+    assert choose(given, "service", "/info") is None
+
+
+def test_a_full_name_of_another_type_is_not_taken_by_a_pattern(place: Path) -> None:
+    given = proxy(place, f"expose:\n{rules('name: /**', f'name: /image, type: {IMAGE}')}").expose
+    assert choose(given, "topic", "/image", IMAGE) is given[1]
+    assert choose(given, "topic", "/image") is given[1]
+    assert choose(given, "topic", "/image", "std_msgs/msg/String") is None
+
+
+def test_a_pattern_with_a_type_takes_only_that(place: Path) -> None:
+    given = proxy(place, f"expose:\n{rules(f'name: /*, type: {IMAGE}', 'name: /**')}").expose
+    assert choose(given, "topic", "/a", IMAGE) is given[0]
+    assert choose(given, "topic", "/a", "std_msgs/msg/String") is given[1]
+
+
+def test_an_overlay_name_is_imported_by_the_rule_of_its_owner(place: Path) -> None:
+    texts = ["name: /*", "name: /*, owner: other.pub", "name: /a, remap: /b"]
+    given = proxy(place, f"import:\n{rules(*texts)}").imports
+    metadata = {name: Metadata({"kind": "topic", "name": name, "type": IMAGE}) for name in ("/a", "/c", "/d/e")}
+    owner, other = OWNER.public.compressed, OTHER.public.compressed
+    assert imported(given, metadata["/a"].name(owner), metadata["/a"]) == (given[2], "/b")
+    assert imported(given, metadata["/a"].name(other), metadata["/a"]) == (given[1], "/a")
+    assert imported(given, metadata["/c"].name(owner), metadata["/c"]) == (given[0], "/c")
+    assert imported(given, metadata["/d/e"].name(owner), metadata["/d/e"]) is None
+    assert imported(given, metadata["/a"].name(b""), metadata["/a"]) is None
+
+
+def _key() -> bytes:
+    return OWNER.public.compressed
