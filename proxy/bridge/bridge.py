@@ -187,7 +187,12 @@ class Bridge:
                 if key not in self._flows and key not in self._failed and self._is_our_turn(key, view, now_s):
                     complaint = self._begin(key, wish, view)
                     complaints += [] if complaint is None else [complaint]
-                self._follow(key, wish, view)
+                try:
+                    self._follow(key, wish, view)
+                except LocalError as error:
+                    self._end(key)
+                    self._failed.add(key)
+                    complaints.append(Complaint(wish.local, Fault.NO_GRAPH, str(error)))
         for key in [key for key in self._flows if key not in wished]:
             self._end(key)
         self._since = {key: since for key, since in self._since.items() if key in wished}

@@ -37,11 +37,15 @@ class ExposedTopic:
         self._wish = wish
         self._topic = topic
         self._offers = _offers(ends)
-        self._handle = self._subscribe()
         self._publisher: Publisher | None = None
         self._serializer: Serializer | None = None
         self._is_latched = False
         self._next_s = 0.0  # when the next message may go, where the rule limits the rate
+        self._handle = self._subscribe()
+        try:
+            self._describe(seat.endpoint.channel(wish.local, wish.type_name))  # far readers may come before a message
+        except LocalError:
+            self._publisher = None  # the first message brings its definition
 
     def follow(self, ends: Sequence[End]) -> None:
         """Learn who publishes now."""

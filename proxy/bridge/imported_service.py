@@ -112,8 +112,9 @@ class ImportedService:
         self._site.member.renew(topic)
 
     def _follow(self) -> None:
-        feeds = self._site.member.feeds_of(self._topic.name) if self._publisher.readers else []
-        descriptions = {feed.publisher: feed.description for feed in feeds if feed.description}
+        peers = self._site.member.peers(self._topic.name)
+        feeds = self._site.member.feeds_of(self._topic.name) if peers else []
+        descriptions = {feed.publisher: feed.description for feed in feeds if feed.publisher in peers}
         for name in [name for name in self._servers if name not in descriptions]:
             del self._servers[name]
         for name, description in descriptions.items():
