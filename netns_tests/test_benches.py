@@ -22,6 +22,7 @@ _PATIENCE_S = 300.0
         ["messages.py", "--quick", "--mtu", "9000", "--offloads", "off"],
         ["overlap.py", "--rounds", "1", "--count", "5"],
         ["priority.py", "--quick", "--no-save"],
+        ["bundles.py", "--quick", "--no-save"],
         ["serial.py", "--help"],
         ["claims.py", "--claims", "100"],
     ],

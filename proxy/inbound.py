@@ -97,7 +97,7 @@ class Inbound:
             self._sink.write(handle, stamp_ns, raw)
         latency_ms = (stamp_ns - parcel.stamp_ns) / 1e6
         delivered = message.delivered
-        tally.count_number(delivered.publisher, delivered.incarnation, delivered.number)
+        tally.count_number(delivered.publisher, delivered.incarnation, delivered.number, delivered.place)
         tally.add(latency_ms, delivered.parts, delivered.hops)
         self._node.traffic.latency.observe(latency_ms / 1e3)
         self._node.traffic.received(len(delivered.message))

@@ -71,6 +71,7 @@ def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
         node.runtime.step(tick_at_s if due_s is None else min(due_s, tick_at_s))
         now_s = time.monotonic()
         bridge.work(now_s)
+        node.member.flush(now_s)  # once for all that waited: small messages share a seal
         if not is_ready and node.member.attachment.is_attached and bridge.is_settled:
             is_ready = True
             tell_refusals(node)

@@ -219,9 +219,9 @@ def test_following_the_readme_makes_two_machines_whose_commands_accept_their_fil
 
 
 def test_both_machines_of_the_readme_mean_the_same_name(machines: Machines) -> None:
-    sent = machines.run("gdp-proxy --config robot/proxy.yaml --check", machines.robot)
-    wanted = machines.run("gdp-proxy --config server/proxy.yaml --check", machines.server)
-    assert re.findall(r"as (\w{64})", sent) == re.findall(r"as (\w{64})", wanted) != []
+    sent = machines.run("gdp-proxy --config robot/proxy.yaml --check --json", machines.robot)
+    wanted = machines.run("gdp-proxy --config server/proxy.yaml --check --json", machines.server)
+    assert re.findall(r'"overlay":"(\w{64})"', sent) == re.findall(r'"overlay":"(\w{64})"', wanted) != []
 
 
 def test_the_commands_of_the_security_page_work_one_after_the_other(machines: Machines) -> None:

@@ -32,7 +32,7 @@ from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.trust.claim import make_claim
 from gdp.trust.domain import Policy
-from gdp.trust.right import Right
+from gdp.trust.right import HEARS, Right
 from gdp.trust.rtcert import RtCert
 
 __all__ = ["Attachment", "Claimed"]
@@ -107,15 +107,16 @@ class Attachment:
         """Claim a name from now on."""
         self._claims[subject.name, right] = Claimed(subject, right, chain, is_global)
 
-    def renew(self, name: Name, right: Right, chain: tuple[bytes, ...]) -> None:
-        """Claim a name that is claimed already by a newer delegation, at once."""
-        claimed = self._claims[name, right]
-        claimed.chain, claimed.claim_at_s, claimed.refused = chain, 0.0, None
+    def renew(self, name: Name, chain: tuple[bytes, ...]) -> None:
+        """Claim what is claimed of a name already by a newer delegation, at once."""
+        for (its, _), claimed in self._claims.items():
+            if its == name:
+                claimed.chain, claimed.claim_at_s, claimed.refused = chain, 0.0, None
 
     def withdraw(self, name: Name, right: Right) -> None:
         """Claim a name no more, and say so."""
         if self._claims.pop((name, right), None) is not None and self._switch is not None:
-            body = {"n": name, "s": self._next_sequence()}
+            body = {"n": name, "right": right.value, "s": self._next_sequence()}
             wire = sign(StatementType.WITHDRAW, body, self._identity.name, self._identity.key)
             self._say(Kind.WITHDRAW, wire)
 
@@ -226,8 +227,10 @@ class Attachment:
         Raises:
             StatementError: REPLAYED: a newer one overtook it, and what it says of the tree is no longer so.
         """
-        claimed = self._claims.get((join.topic, Right.PUBLISH))
-        if claimed is not None:
+        for right in HEARS.values():
+            claimed = self._claims.get((join.topic, right))
+            if claimed is None:
+                continue
             if join.sequence < claimed.join_sequence:
                 raise StatementError(DropReason.REPLAYED, "a newer join overtook it")
             claimed.join_sequence = join.sequence

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from itertools import count
-from typing import Final
+from typing import Final, NamedTuple
 
 from gdp.client.publisher import Secrets
 from gdp.crypto.envelope import Opener
@@ -33,6 +33,7 @@ from gdp.limits import (
     REPORT_IDLE_S,
     REPORT_PAUSE_S,
 )
+from gdp.message.bundle import unpack
 from gdp.message.join import Joined, Joiner, VerifiesDigest
 from gdp.message.memory import Budget
 from gdp.message.move import Move
@@ -40,11 +41,13 @@ from gdp.message.report import Missing, Report, ReportFlag
 from gdp.message.status import Status
 from gdp.names import Name
 
-__all__ = ["Delivered", "Feed", "FeedState", "Reader"]
+__all__ = ["Delivered", "Ended", "Feed", "FeedState", "Reader"]
 
 ANNOUNCE_S: Final = 0.1
 ANNOUNCE_TRIES: Final = 3  # under one epoch, before the next is tried
 _READY_OVERHEAD_BYTES: Final = 256  # what a message that waits for others costs beside its bytes
+_BUNDLE: Final = int(Flag.BUNDLE)
+_LATCHED: Final = int(Flag.LATCHED)
 _WAITING: Final = int(Flag.RELIABLE | Flag.LATCHED)  # topics whose readers wait for what is missing
 
 
@@ -64,8 +67,7 @@ class Reader:
     note_numbers: Iterator[int] = field(default_factory=lambda: count(1), compare=False)
 
 
-@dataclass(frozen=True, slots=True)
-class Delivered:
+class Delivered(NamedTuple):
     """One message, opened, verified and in its place."""
 
     publisher: bytes
@@ -74,10 +76,26 @@ class Delivered:
     message: bytes
     parts: int
     hops: int
+    place: int = 0  # among the messages of one number: several come in one bundle
+
+
+class Ended(NamedTuple):
+    """Where a feed ended, for another one of the same: what came before is not opened again."""
+
+    number: int = 0  # of the next message
+    status: int = 0  # the highest seen
+
+
+_NOWHERE: Final = Ended()
 
 
 class Feed:
-    """Reads one incarnation of one publisher of a topic."""
+    """Reads one incarnation of one publisher of a topic.
+
+    Args:
+        ended: where an earlier feed of the same ended. A latched topic's last messages come again all the same, as its
+            publisher says in a new status.
+    """
 
     def __init__(
         self,
@@ -89,13 +107,16 @@ class Feed:
         secrets: Secrets,
         budget: Budget,
         now_s: float,
+        ended: Ended = _NOWHERE,
     ) -> None:
         self.publisher = publisher
         self.incarnation = incarnation
-        self._topic = topic
+        self.topic = topic
         self._reader = reader
         self._secrets = secrets
         self._budget = budget
+        self._before = ended
+        self._described = 0  # by which status
         self._openers: dict[tuple[int, int], Opener] = {}
         self._announced = 0
         self._note = self._note_sealer(max(secrets))
@@ -113,7 +134,7 @@ class Feed:
         self._clean_bytes = 0  # reported since something was last missing
         self.claim = b""  # of the publisher, the newest
         self.claim_sequence = 0
-        self.lost = 0
+        self.lost = 0  # at least: of a bundle that did not come nobody knows how many were in it
         self.delivered = 0
 
     @property
@@ -121,10 +142,18 @@ class Feed:
         """Return what was dropped, by reason."""
         return self._data.drops + self._status.drops
 
+    @property
+    def ended(self) -> Ended:
+        """Return where it is, for one that goes on after it."""
+        before = self._before
+        return Ended(max(self._expected, before.number), max(self._status.window.top, before.status))
+
     def receive(self, header: Header, frame: bytes, now_s: float) -> None:
         """Take one DATA or STATUS frame of this publisher."""
         if header.incarnation != self.incarnation:
             self._data.drops[DropReason.WRONG_INCARNATION] += 1
+        elif header.kind == Kind.STATUS and header.number <= self._before.status:
+            self._status.drops[DropReason.REPLAYED] += 1
         elif header.kind == Kind.STATUS:
             joined = self._status.add(header, frame, now_s)
             if joined is not None:
@@ -181,6 +210,7 @@ class Feed:
         self._status.close()
         for number in list(self._ready):
             self._take_ready(number)
+        self._report_at_s = float("inf")
         return self._note.seal(Report(ReportFlag.BYE, self._expected, 0, ()).to_wire())
 
     def renew(self, secrets: Secrets) -> None:
@@ -197,7 +227,7 @@ class Feed:
             reader.name,
             reader.incarnation,
             self.publisher,
-            self._topic,
+            self.topic,
             self.incarnation,
             reader.note_numbers,
         )
@@ -215,7 +245,7 @@ class Feed:
             secret = self._secrets.get(epoch)
             if secret is None:
                 raise EnvelopeError(DropReason.UNKNOWN_EPOCH, str(epoch))
-            opener = Opener(secret, kind, self.publisher, self.incarnation, self._topic)
+            opener = Opener(secret, kind, self.publisher, self.incarnation, self.topic)
             self._openers[kind, epoch] = opener
         return opener
 
@@ -317,10 +347,13 @@ class Feed:
             self.state = FeedState.LIVE
             self._note = self._note_sealer(epoch)
             self._expected = status.starts[self._reader.name]
-            self.description = status.description
+            if not joined.flags & _LATCHED:
+                self._expected = max(self._expected, self._before.number)
             for number in [n for n in self._ready if not 0 <= n - self._expected < REPLAY_WINDOW_MESSAGES]:
                 self._take_ready(number)
             self._data.begin(self._expected, self._ready)
+        if status.description and joined.number > self._described:
+            self.description, self._described = status.description, joined.number
         self._sent = max(self._sent, (status.sent_number, status.sent_part))
         for move in status.moves:
             if move.is_before(self._expected):
@@ -369,9 +402,17 @@ class Feed:
         return joined
 
     def _hand_out(self, joined: Joined) -> None:
-        self.delivered += 1
-        about = joined.number, joined.message, joined.parts, joined.hops
-        self._out.append(Delivered(self.publisher, self.incarnation, *about))
+        messages = [joined.message]
+        if joined.flags & _BUNDLE:
+            try:
+                messages = unpack(joined.message)
+            except RemoteError as error:
+                self._data.drops[error.reason] += 1
+                return
+        self.delivered += len(messages)
+        number, way = joined.number, (joined.parts, joined.hops)
+        for place, message in enumerate(messages):
+            self._out.append(Delivered(self.publisher, self.incarnation, number, message, *way, place))
 
 
 def _below(ranges: list[tuple[int, int]], end: int) -> list[tuple[int, int]]:

@@ -2,6 +2,9 @@
 
 Place: pure; time comes in as ``now_s`` (monotonic seconds). Frames come out of ``take`` and go to the switch.
 
+A small message waits until frames are asked for, and those that wait together become one bundle, sealed and signed once
+(``gdp/message/bundle.py``); not of a latched topic, whose late joiners get so many messages and no more.
+
 A message is sealed once. Where the path has become too narrow for what is kept, that is split anew, and all that is
 kept moves to new numbers; statuses say which (``gdp/message/move.py``). Without a reader nothing is sealed; the last
 ``depth`` messages of a latched topic wait for late joiners.
@@ -13,52 +16,37 @@ may hold the window again.
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict, deque
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections import Counter, deque
+from collections.abc import Callable
 from typing import Final
 
-from gdp.crypto.envelope import Sealed, Sealer, Signer
-from gdp.crypto.note import NoteOpener
-from gdp.errors import DropReason, EnvelopeError, FrameError, LocalError, RemoteError
+from gdp.client.best_effort import Unsent
+from gdp.client.kept import Kept
+from gdp.client.notice import Notice
+from gdp.client.pasts import FIRST, Past
+from gdp.client.readers import Readers
+from gdp.client.source import Secrets, Source
+from gdp.crypto.envelope import SIGNATURE_BYTES, Sealed, Sealer, part_room
+from gdp.errors import DropReason, LocalError, RemoteError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Flag, Kind
-from gdp.limits import MTU_MIN_BYTES, READER_LEASE_S, WINDOW_BYTES
+from gdp.limits import MTU_MIN_BYTES, WINDOW_BYTES
+from gdp.message.bundle import BUNDLE_BYTES, Counts, Gathered, pack
 from gdp.message.move import MOVES_MAX, Move
 from gdp.message.report import Report, ReportFlag
 from gdp.message.status import STARTS_MAX, Status
-from gdp.message.window import SendWindow
 from gdp.names import Name
 
 __all__ = ["Publisher", "Secrets", "Source"]
 
-_READERS_MAX: Final = 1_024
 _ALL: Final = 1 << 30
-_LIVES_MAX: Final = 4_096  # incarnations of readers whose old notes are known as such
 _STATUS_GAP_S: Final = 0.02  # between two statuses
 _STATUS_BYTES_PER_S: Final = 8 << 20  # ... and longer after a large one
-_PENANCE_MIN_S: Final = 2 * READER_LEASE_S
-_PENANCE_MAX_S: Final = 16 * READER_LEASE_S
-
-Secrets = Mapping[int, bytes]  # key epoch -> topic secret, 32 bytes
+_BUNDLE: Final = int(Flag.BUNDLE)
 
 
-@dataclass(frozen=True, slots=True)
-class Source:
-    """Who publishes, in this life of its process."""
-
-    name: Name
-    incarnation: int
-    signer: Signer
-
-
-@dataclass(slots=True)
-class _Reader:
-    incarnation: int
-    heard_s: float
-    start: int | None = None  # its first message; None once it has begun to confirm
-    out_until_s: float = 0.0  # it may not hold the window before
-    penance_s: float = _PENANCE_MIN_S
+def _told_nobody(_: Publisher) -> None:
+    return None
 
 
 class Publisher:
@@ -69,6 +57,7 @@ class Publisher:
         description: what a reader must know to understand the messages; travels sealed.
         depth: how many messages late joiners get (0: none).
         urgent: its frames go before those of other topics, wherever they queue.
+        past: where the one that published the same before, in this life, ended.
     """
 
     def __init__(
@@ -81,35 +70,37 @@ class Publisher:
         reliable: bool,
         depth: int = 0,
         urgent: bool = False,
+        past: Past = FIRST,
     ) -> None:
         if not secrets:
             raise LocalError("a publisher needs a topic secret")
         self.topic = topic
         self._source = source
         self._secrets = secrets
-        self._description = description
+        self._notice = Notice(description)
+        self._is_reliable = reliable
         self._repairs_wanted = reliable or depth > 0
-        self.has_new = False  # something was published since ``take`` was last asked
-        wanted = (reliable, Flag.RELIABLE), (depth, Flag.LATCHED), (urgent, Flag.URGENT)
-        self._flags = sum(int(flag) for is_set, flag in wanted if is_set)
-        self._window = SendWindow(depth)
+        self.is_urgent = urgent
+        self.has_more = False  # ``take`` came to its limit
+        self.published: Callable[[Publisher], None] = _told_nobody  # called when something waits to be taken
+        self._window = Kept(depth, past.next_number - 1)
         self._depth = depth
+        self._flags = self._flags_now()
         self._epoch = max(secrets)
         self._data = self._sealer(Kind.DATA)
         self._status = self._sealer(Kind.STATUS)
-        self._next_number = 1
-        self._status_number = 0
+        self._next_number, self._status_number = past
         self._mtu: int | None = None  # unknown until a tree stands
-        self._readers: dict[bytes, _Reader] = {}
-        self._lives: OrderedDict[tuple[bytes, int, int], NoteOpener] = OrderedDict()
+        self._readers = Readers(topic, source)
         self._starts: dict[bytes, int] = {}
         self._status_wanted = False
         self._status_at_s = float("-inf")  # when the next one may go
         self._moves: deque[Move] = deque(maxlen=MOVES_MAX)
-        self._skipped = 0  # numbers that moves left behind
-        self._waiting = deque[Sealed]()  # best-effort messages
-        self._waiting_bytes = 0
-        self._waiting_part = 0  # of the oldest: the first that has not left
+        self._skipped = past.next_number - 1  # numbers that its past used, or that moves left behind
+        self.bundle_bytes = BUNDLE_BYTES  # 0: each message has a seal of its own
+        self._gathered = Gathered()  # not sealed yet
+        self._counts = Counts()
+        self._unsent = Unsent()  # of a best-effort topic; the window has the others
         self._early = deque[bytes](maxlen=depth or None)  # latched messages from before the first reader
         self.drops: Counter[DropReason] = Counter()
         self.messages = 0
@@ -120,6 +111,20 @@ class Publisher:
         """Return how many readers have introduced themselves and are alive; none before a tree stands."""
         return 0 if self._mtu is None else len(self._readers)
 
+    def has_reader(self, name: Name) -> bool:
+        """Return whether a reader has introduced itself and is alive, and a tree stands."""
+        return self._mtu is not None and name in self._readers
+
+    @property
+    def mtu(self) -> int | None:
+        """Return the smallest MTU on the tree, or None before one stands."""
+        return self._mtu
+
+    @property
+    def past(self) -> Past:
+        """Return where it is, for another one that goes on with the same."""
+        return Past(self._next_number, self._status_number)
+
     @property
     def repairs(self) -> int:
         """Return how many parts were sent again."""
@@ -127,16 +132,19 @@ class Publisher:
 
     def has_room(self) -> bool:
         """Return whether a message may be published without pushing an unacknowledged one out."""
-        return self._window.has_room()
+        return self._window.has_room() and self._gathered.held_bytes < WINDOW_BYTES
 
     def is_acknowledged(self) -> bool:
         """Return whether every reader has confirmed everything."""
-        return not self._early and not self._waiting and self._window.is_acknowledged()
+        return not (self._early or self._gathered or self._unsent) and self._window.is_acknowledged()
 
     @property
     def acknowledged(self) -> int:
         """Return how many messages every reader has confirmed; of a best-effort topic, how many were sent."""
-        return self._window.acknowledged - self._skipped if self._repairs_wanted else self.messages
+        if not self._repairs_wanted:
+            return self.messages
+        number = self._window.acknowledged
+        return number - self._skipped + self._counts.beyond_one(number)
 
     def renew(self, secrets: Secrets) -> None:
         """Take the topic's secrets anew; messages from now on are sealed under the newest epoch.
@@ -152,44 +160,90 @@ class Publisher:
             self._data = self._sealer(Kind.DATA)
             self._status = self._sealer(Kind.STATUS)
 
+    def describe(self, description: bytes) -> None:
+        """Say from now on that messages are something else; who reads already is told at once.
+
+        What is published right behind it may overtake the news, where a frame is lost.
+        """
+        if self._notice.change(description):
+            self._status_wanted = True
+            self.published(self)
+
+    def set_depth(self, depth: int) -> None:
+        """Keep another number of messages for late joiners from now on; 0: none."""
+        if depth == self._depth:
+            return
+        self._seal_gathered()
+        self._depth = depth
+        self._repairs_wanted = self._is_reliable or depth > 0
+        self._flags = self._flags_now()
+        self._window.keep(depth, self._next_number - 1)
+        early = self._early
+        self._early = deque(early if depth else (), maxlen=depth or None)
+        self.drops[DropReason.NO_READER] += len(early) - len(self._early)
+        if not self._repairs_wanted:
+            for name in self._readers:
+                self._window.drop_reader(name)
+        self._status_wanted = True
+        self.published(self)
+
+    def close(self) -> None:
+        """Let go of all readers and of what waits for them; nothing is sent any more."""
+        self.drops[DropReason.NO_READER] += len(self._early) + len(self._gathered)
+        for name in self._readers:
+            self._forget(name)
+        self._early.clear()
+        self._gathered, self._unsent = Gathered(), Unsent()
+        self.published(self)  # the last time: who waits for its frames finds none
+        self.published = _told_nobody
+
     def tree_stands(self, mtu: int) -> None:
         """Learn that a tree reaches this publisher, and the smallest MTU on it (bytes after the Ethernet header)."""
         self._mtu = max(mtu, MTU_MIN_BYTES)
         self._split_anew(self._mtu)
 
     def publish(self, message: bytes) -> int | None:
-        """Seal and queue a message; return its number, or None when nobody is there to read it.
+        """Queue a message; return how many that makes, or None when nobody is there to read it.
+
+        It is confirmed when ``acknowledged`` has come so far.
 
         Raises:
             LocalError: above the limits.
         """
-        self.has_new = True
         if self._mtu is None or not self._readers:
             if self._depth:
                 self._early.append(message)
             else:
                 self.drops[DropReason.NO_READER] += 1
             return None
-        number = self._next_number
-        frames = self._seal(message, self._mtu)
+        if self._depth or not self._gathered.is_small(message, self._bundle_room()):
+            self._seal_gathered()
+            self._queue(message)
+        else:
+            self._gathered.add(message)
+            if self._gathered.held_bytes > WINDOW_BYTES:
+                self._seal_next()
         self.messages += 1
         self.payload_bytes += len(message)
-        if self._repairs_wanted:
-            let_go = self._window.let_go
-            self._window.add(number, frames, frames.size_bytes)
-            self.drops[DropReason.MEMORY_FULL] += self._window.let_go - let_go
-        else:
-            self._wait(frames)
-        return number
+        self.published(self)
+        return self.messages
+
+    def admit(self, name: Name, incarnation: int, now_s: float) -> None:
+        """Take for a reader who has not introduced itself, but is known all the same; its first message is the next."""
+        if name not in self._readers:
+            self._readers.admit(name, incarnation, now_s)
+            self._window.add_reader(name, self._next_number, now_s)
 
     def receive_report(self, header: Header, frame: bytes, now_s: float) -> None:
         """Take a reader's sealed report; what is wrong with it is counted."""
         try:
-            report = self._open_report(header, frame, now_s)
+            report, is_new = self._readers.open(header, frame, self._secrets, now_s)
         except RemoteError as error:
             self.drops[error.reason] += 1
             return
         name = header.source
+        if is_new:
+            self._let_go(name)
         if ReportFlag.BYE in report.flags:
             self._forget(name)
         elif ReportFlag.NEW in report.flags:
@@ -201,66 +255,108 @@ class Publisher:
 
     def timeout(self, now_s: float) -> None:
         """Let silent readers go, let laggards hold nothing, and ask those that owe a report."""
-        for name in [name for name, reader in self._readers.items() if now_s - reader.heard_s > READER_LEASE_S]:
+        for name in self._readers.silent(now_s):
             self._forget(name)
         for name in self._window.laggards(now_s):
-            reader = self._readers[name]
-            reader.out_until_s = now_s + reader.penance_s
-            reader.penance_s = min(2 * reader.penance_s, _PENANCE_MAX_S)
+            self._readers[name].do_penance(now_s)
             self._window.drop_reader(name)
             self._status_wanted = True
-        if self._window.probe_due(now_s):
+        again_s = self._notice.due()
+        if self._window.probe_due(now_s) or (again_s is not None and again_s <= now_s):
             self._status_wanted = True
 
     def next_timeout(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        lease = min((reader.heard_s for reader in self._readers.values()), default=None)
-        times = [self._window.next_probe(), None if lease is None else lease + READER_LEASE_S + 0.001]
-        if self._status_wanted and self._readers and self._mtu is not None:
-            times.append(self._status_at_s)
+        times = [self._window.next_probe(), self._readers.next_silent()]
+        if self._readers and self._mtu is not None:
+            times.append(self._status_at_s if self._status_wanted else self._notice.due())
         return min((time for time in times if time is not None), default=None)
 
     def take(self, now_s: float, limit_bytes: int = _ALL) -> list[bytes]:
         """Return frames that may go now, about ``limit_bytes`` at a time: the rest is sealed when it is asked for."""
-        self.has_new = False
+        self.has_more = False
         if self._mtu is None or not self._readers:
             return []
         while self._early:
             self.publish(self._early.popleft())
         limit = max(limit_bytes // self._mtu, 1)
-        frames = self._take_waiting(limit)
+        frames = self._unsent.take(limit)
         if self._status_wanted and now_s >= self._status_at_s:
             frames += self._seal_status(now_s)
-        return frames + self._window.take(now_s, max(limit - len(frames), 1))
+        frames += self._window.take(now_s, max(limit - len(frames), 1))
+        while self._gathered and len(frames) < limit and not self._has_unsent():
+            self._seal_next()
+            left = limit - len(frames)
+            frames += self._window.take(now_s, left) if self._repairs_wanted else self._unsent.take(left)
+        self.has_more = len(frames) >= limit
+        return frames
 
-    def _seal(self, message: bytes, mtu: int) -> Sealed:
+    def _has_unsent(self) -> bool:
+        return self._window.sent[0] < self._next_number if self._repairs_wanted else bool(self._unsent)
+
+    def _bundle_room(self) -> int:
+        """Return how large a bundle may be: one frame of a best-effort topic, which loses all of it with one part."""
+        if self._repairs_wanted or self._mtu is None:
+            return self.bundle_bytes
+        return min(self.bundle_bytes, part_room(self._mtu) - SIGNATURE_BYTES)
+
+    def _seal_next(self) -> None:
+        """Seal of what was gathered as much as goes together."""
+        together = self._gathered.take(self._bundle_room())
+        if len(together) == 1:
+            self._queue(together[0])
+        else:
+            self._queue(pack(together), len(together))
+
+    def _seal_gathered(self) -> None:
+        while self._gathered:
+            self._seal_next()
+
+    def _queue(self, body: bytes, messages: int = 1) -> None:
+        """Number and seal a message, or a bundle of several; what is too much of all that waits goes, oldest first."""
+        assert self._mtu is not None
         number = self._next_number
+        frames = self._seal(number, body, self._mtu, is_bundle=messages > 1)
         self._next_number += 1
-        return self._data.seal(number, self._flags, message, mtu)
+        if not self._repairs_wanted:
+            self.drops[DropReason.MEMORY_FULL] += self._unsent.add(frames, messages)
+            return
+        self._counts.forget(self._oldest())
+        self._counts.note(number, messages)
+        let_go = self._window.let_go
+        self._window.add(number, frames, frames.size_bytes)
+        gone = self._window.let_go - let_go
+        self.drops[DropReason.MEMORY_FULL] += gone + self._counts.forget(self._oldest())
+
+    def _oldest(self) -> int:
+        """Return the first number that is kept, or will be."""
+        oldest = self._window.oldest
+        return self._next_number if oldest is None else oldest
+
+    def _seal(self, number: int, body: bytes, mtu: int, *, is_bundle: bool) -> Sealed:
+        return self._data.seal(number, self._flags | _BUNDLE * is_bundle, body, mtu)
 
     def _split_anew(self, mtu: int) -> None:
         """Seal anew what has become too large for its path."""
-        if any(each.largest > mtu for each in self._waiting):
-            waiting = [each.message() for each in self._waiting]
-            self._waiting.clear()
-            self._waiting_bytes = self._waiting_part = 0
-            for message in waiting:
-                self._wait(self._seal(message, mtu))
+        for body, messages in self._unsent.take_back(mtu):
+            self._queue(body, messages)
         kept = [(number, each) for number, each in self._window.kept() if isinstance(each, Sealed)]
         if not any(each.largest > mtu for _, each in kept):
             return
         first, end = kept[0][0], self._next_number
         move = Move(first, end - first, end + 1)
         moved = [
-            (move.of(number), self._data.seal(move.of(number), self._flags, each.message(), mtu))
+            (move.of(number), self._seal(move.of(number), each.message(), mtu, is_bundle=number in self._counts))
             for number, each in kept
         ]
+        self._counts.forget(first)
+        self._counts.move(move)
         self._next_number = move.of(end)
         self._skipped += move.to - first
         self._moves.append(move)
         self._window.move(move, [(number, each, each.size_bytes) for number, each in moved])
         self._starts = {name: move.of(start) for name, start in self._starts.items()}
-        for reader in self._readers.values():
+        for reader in self._readers.readings():
             if reader.start is not None:
                 reader.start = move.of(reader.start)
         self._status_wanted = True
@@ -278,44 +374,19 @@ class Publisher:
         secret = self._secrets[self._epoch]
         return Sealer(secret, self._epoch, kind, source.name, source.incarnation, self.topic, source.signer)
 
-    def _open_report(self, header: Header, frame: bytes, now_s: float) -> Report:
-        name, life = header.source, (header.source, header.incarnation, header.epoch)
-        opener = self._lives.get(life)
-        is_known = opener is not None
-        if opener is None:
-            secret = self._secrets.get(header.epoch)
-            if secret is None:
-                raise EnvelopeError(DropReason.UNKNOWN_EPOCH)
-            source = self._source
-            opener = NoteOpener(
-                secret, Kind.REPORT, name, header.incarnation, source.name, self.topic, source.incarnation
-            )
-        report = Report.from_wire(opener.open(header, frame))
-        reader = self._readers.get(name)
-        if reader is None and len(self._readers) >= _READERS_MAX:
-            raise EnvelopeError(DropReason.QUOTA, "readers")
-        is_current = is_known if reader is None else reader.incarnation == header.incarnation
-        if not is_current and ReportFlag.NEW not in report.flags:
-            raise FrameError(DropReason.UNKNOWN_SENDER, "a report of a life that never began, or is over")
-        self._lives[life] = opener
-        self._lives.move_to_end(life)
-        if len(self._lives) > _LIVES_MAX:
-            self._lives.popitem(last=False)
-        if reader is None or reader.incarnation != header.incarnation:
-            self._forget(name)
-            reader = self._readers[name] = _Reader(header.incarnation, now_s)
-        reader.heard_s = now_s
-        return report
-
     def _forget(self, name: bytes) -> None:
-        if self._readers.pop(name, None) is not None:
-            self._starts.pop(name, None)
-            self._window.drop_reader(name)
+        if self._readers.forget(name):
+            self._let_go(name)
+
+    def _let_go(self, name: bytes) -> None:
+        self._starts.pop(name, None)
+        self._window.drop_reader(name)
 
     def _welcome(self, name: bytes, now_s: float) -> None:
         """Give a new reader its first message; one that asks again gets the same answer."""
         reader = self._readers[name]
         if name not in self._starts and len(self._starts) < STARTS_MAX:
+            self._seal_gathered()  # it was published before this reader came
             oldest = self._window.oldest
             is_gone = oldest is not None and reader.start is not None and reader.start < oldest
             if reader.start is None or is_gone or not self._repairs_wanted:
@@ -338,34 +409,14 @@ class Publisher:
         if report.missing and (oldest is None or report.missing[0].number < oldest):
             self._status_wanted = True  # it asks for what is gone
 
-    def _wait(self, frames: Sealed) -> None:
-        """Queue a best-effort message; the oldest go when nobody takes them."""
-        self._waiting.append(frames)
-        self._waiting_bytes += frames.size_bytes
-        while self._waiting_bytes > WINDOW_BYTES and len(self._waiting) > 1:
-            self._let_oldest_go()
-            self.drops[DropReason.MEMORY_FULL] += 1
-
-    def _take_waiting(self, limit: int) -> list[bytes]:
-        """Return at most so many frames of best-effort messages, in order, sealed as they are taken."""
-        frames: list[bytes] = []
-        while self._waiting and len(frames) < limit:
-            oldest, first = self._waiting[0], self._waiting_part
-            taken = oldest[first : first + limit - len(frames)]
-            frames += taken
-            self._waiting_part += len(taken)
-            if self._waiting_part == len(oldest):
-                self._let_oldest_go()
-        return frames
-
-    def _let_oldest_go(self) -> None:
-        self._waiting_bytes -= self._waiting.popleft().size_bytes
-        self._waiting_part = 0
+    def _flags_now(self) -> int:
+        wanted = (self._is_reliable, Flag.RELIABLE), (self._depth, Flag.LATCHED), (self.is_urgent, Flag.URGENT)
+        return sum(int(flag) for is_set, flag in wanted if is_set)
 
     def _seal_status(self, now_s: float) -> list[bytes]:
         assert self._mtu is not None
         oldest = self._window.oldest
-        about = self._description if self._starts else b""
+        about = self._notice.say(now_s, is_asked=bool(self._starts))
         sent = self._window.sent if self._repairs_wanted else (self._next_number, 0)
         first = sent[0] if oldest is None else oldest
         status = Status(first, *sent, dict(self._starts), about, tuple(self._moves))

@@ -75,11 +75,16 @@ class Attached:
         """Return all claims of one node."""
         return [claims[advertiser] for claims in self._by_name.values() if advertiser in claims]
 
-    def settle(self, name: Name, advertiser: Name) -> Attachment | None:
-        """Note that the RIB has answered; return the claim."""
+    def settle(self, name: Name, advertiser: Name, taken: int | None) -> Attachment | None:
+        """Note that the RIB has answered; return the claim.
+
+        Args:
+            taken: the sequence number that it took, if it did: what was claimed anew since is not settled by that.
+        """
         attachment = self.get(name, advertiser)
-        if attachment is not None:
-            attachment.is_settled = True
+        if attachment is None or (taken is not None and taken < attachment.claim.sequence):
+            return None
+        attachment.is_settled = True
         return attachment
 
     def relay_all(self, now_s: float) -> None:

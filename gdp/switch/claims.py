@@ -1,6 +1,7 @@
 """What attached nodes bring to their switch: claims and withdrawals, checked before anything is done for them.
 
-Place: pure. A reader's claim is judged here and plants trees; any other is kept, relayed, and judged by the RIB.
+Place: pure. The claim of whoever hears others on a name (``HEARS``) plants trees. A reader's is judged here; any other
+is kept, relayed, and judged by the RIB: those who hear it must find it.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from gdp.switch.places import Places
 from gdp.switch.planter import Planter
 from gdp.switch.unicast import Unicast
 from gdp.trust.claim import ClaimBody
-from gdp.trust.right import Right
+from gdp.trust.right import HEARS, Right
 from gdp.trust.verifier import ClaimVerifier
 
 __all__ = ["Claims"]
@@ -69,12 +70,13 @@ class Claims:
         if claim.sequence < newest:
             self._judge(neighbour, claim.name, DropReason.STALE, newest)
             raise StatementError(DropReason.STALE, "a claim that its maker has renewed")
-        if claim.right is Right.READ:
+        if claim.right in HEARS:
             if self._planter.add_reader(claim, at, self._places.of(claim.name, now.mono_s), now.mono_s):
                 self._places.want(claim.name, now.mono_s, watch=True)
-            self._judge(neighbour, claim.name, None, claim.sequence)
             for place in self._places.of(claim.name, now.mono_s):
-                self._inquirer.tell_reader(at, place, now.mono_s)
+                self._inquirer.tell_reader(at, claim.right, place, now.mono_s)
+        if claim.right is Right.READ:
+            self._judge(neighbour, claim.name, None, claim.sequence)
         else:
             self._attached.put(claim, *at, now.mono_s)
             self._unicast.forget(claim.name)
@@ -117,8 +119,9 @@ class Claims:
         name = fields.name("n")
         if fields.uint("s") <= self._sequence_of(name, neighbour):
             raise StatementError(DropReason.STALE, "a withdrawal of what was claimed anew")
-        if self._planter.remove_reader(name, (neighbour.port, neighbour.mac)):
+        right = Right.from_wire(fields.text("right"))
+        if right in HEARS and self._planter.remove_reader(name, (neighbour.port, neighbour.mac)):
             self._places.unwatch(name)
-        if self._attached.remove(name, neighbour.name) is not None:
+        if right is not Right.READ and self._attached.remove(name, neighbour.name) is not None:
             self._unicast.forget(name)
             self._inquirer.relay(statement.wire, now.mono_s)

@@ -26,7 +26,7 @@ from gdp.switch.trees import At
 from gdp.switch.unicast import Unicast
 from gdp.trust.claim import ClaimBody
 from gdp.trust.domain import Policy
-from gdp.trust.right import Right
+from gdp.trust.right import HEARS, Right
 
 __all__ = ["Inquirer"]
 
@@ -145,13 +145,13 @@ class Inquirer:
             self._unicast.forget(place.name)
         self._planter.publisher_found(place, now_s)
         if before is None or before.claim != place.claim:
-            for at in self._planter.readers(place.name):
-                self.tell_reader(at, place, now_s)
+            for at, right in self._planter.readers(place.name):
+                self.tell_reader(at, right, place, now_s)
         self._unicast.release(place.name, now_s)
 
-    def tell_reader(self, at: At, place: Place, now_s: float) -> None:
-        """Hand a publisher's claim to an attached reader, which verifies it itself."""
-        if place.right is Right.PUBLISH:
+    def tell_reader(self, at: At, right: Right, place: Place, now_s: float) -> None:
+        """Hand the claim of whoever an attached node hears, by its right, on to it; it verifies that itself."""
+        if HEARS[right] is place.right:
             lease_s = max(place.expires_s - now_s, 0.0)
             answer = Answer(
                 place.name, place.advertiser, place.claim, place.domain, tuple(sorted(place.transit)), lease_s
@@ -162,7 +162,7 @@ class Inquirer:
         self._places.remove(answer.name, answer.advertiser, now_s)
         self._planter.publisher_gone(answer.name, answer.advertiser)
         self._unicast.forget(answer.name)
-        for at in self._planter.readers(answer.name):
+        for at, _ in self._planter.readers(answer.name):
             self._answer_reader(at, answer)
 
     def _answer_reader(self, at: At, answer: Answer) -> None:
@@ -175,6 +175,7 @@ class Inquirer:
 
     def _take_verdict(self, statement: Statement) -> None:
         verdict = Verdict.from_fields(statement.fields)
-        attachment = self._attached.settle(verdict.name, verdict.advertiser)
+        taken = verdict.sequence if verdict.refused is None else None
+        attachment = self._attached.settle(verdict.name, verdict.advertiser, taken)
         if attachment is not None:
             self._outbox.say_at(attachment.port, attachment.mac, Kind.VERDICT, statement.wire)

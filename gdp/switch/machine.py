@@ -41,7 +41,7 @@ from gdp.switch.revoker import Revoker
 from gdp.switch.table import Table
 from gdp.switch.unicast import Unicast
 from gdp.trust.domain import Policy
-from gdp.trust.right import Right
+from gdp.trust.right import HEARS
 from gdp.trust.verifier import ClaimVerifier
 
 __all__ = ["Switch"]
@@ -343,6 +343,6 @@ class Switch:
         self.greeter.ports[neighbour.port].take_join(join, neighbour.name)
         if join.lease_s > 0:
             claim = self._verifier.verify(join.evidence, now.unix_s)
-            if claim.right is not Right.READ or claim.name != join.topic:
+            if claim.right not in HEARS or claim.name != join.topic:
                 raise StatementError(DropReason.NOT_DELEGATED, "a join without a reader's claim")
         self.planter.join(join, neighbour, now.mono_s)

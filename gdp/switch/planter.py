@@ -2,7 +2,8 @@
 
 Place: pure; time comes in as ``now_s`` (monotonic seconds).
 
-A reader's claim and each known publisher of its topic make a tree. A switch asks the next switch towards the publisher,
+A reader's claim and each known publisher of its topic make a tree; so do a server's with each client, and a client's
+with each server, which are called reader and publisher here. A switch asks the next switch towards the publisher,
 again and again while a branch stands, and asks another one at once when the way changes. A join says the smallest MTU
 below, so it is said anew at once when that changes: a reader came or left, or a link got narrower or wider.
 """
@@ -28,14 +29,14 @@ from gdp.switch.table import Table
 from gdp.switch.trees import At, Branch, Tree, Trees
 from gdp.trust.claim import Claim
 from gdp.trust.domain import Policy
-from gdp.trust.right import Right
+from gdp.trust.right import HEARS, Right
 
 __all__ = ["Planter"]
 
 
 @dataclass(slots=True)
 class _Reader:
-    """A node attached here that reads a topic."""
+    """A node attached here that reads a topic, serves or calls."""
 
     claim: Claim
     expires_s: float
@@ -69,9 +70,9 @@ class Planter:
         self.trees = Trees()
         self.drops: Counter[DropReason] = Counter()
 
-    def readers(self, topic: Name) -> list[At]:
-        """Return where the readers of a topic are attached."""
-        return list(self._readers.get(topic, {}))
+    def readers(self, topic: Name) -> list[tuple[At, Right]]:
+        """Return where the readers of a topic are attached, and by which right they read."""
+        return [(at, reader.claim.right) for at, reader in self._readers.get(topic, {}).items()]
 
     def claim_of(self, topic: Name, at: At) -> Claim | None:
         """Return the claim of a reader attached there, or None."""
@@ -79,7 +80,7 @@ class Planter:
         return None if reader is None else reader.claim
 
     def add_reader(self, claim: Claim, at: At, places: list[Place], now_s: float) -> bool:
-        """Take a verified READ claim of an attached node; return whether it is the topic's first reader here."""
+        """Take the verified claim of an attached node that hears others; return whether it is the name's first here."""
         readers = self._readers.setdefault(claim.name, {})
         is_first = not readers
         readers[at] = _Reader(claim, now_s + claim.lease_s)
@@ -100,10 +101,8 @@ class Planter:
 
     def publisher_found(self, place: Place, now_s: float) -> None:
         """Join, or follow, a publisher of a topic that has readers here."""
-        if place.right is not Right.PUBLISH:
-            return
         for at, reader in self._readers.get(place.name, {}).items():
-            if reader.claim.node == place.advertiser:
+            if reader.claim.node == place.advertiser or HEARS[reader.claim.right] is not place.right:
                 continue  # one's own messages do not come back
             allowed = (self._policy.transit & place.transit) | {self._policy.own, place.domain}
             tree = self._tree(place.name, place.advertiser, allowed)

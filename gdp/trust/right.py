@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from enum import Enum
+from types import MappingProxyType
 from typing import Final
 
 from gdp.crypto.fields import Fields
 from gdp.errors import DropReason, LocalError, StatementError
 
-__all__ = ["DELEGABLE", "Right", "rights_from_fields", "rights_to_wire"]
+__all__ = ["DELEGABLE", "HEARS", "Right", "rights_from_fields", "rights_to_wire"]
 
 
 class Right(str, Enum):
@@ -20,6 +21,7 @@ class Right(str, Enum):
 
     PUBLISH = "publish"
     SERVE = "serve"
+    CALL = "call"
     READ = "read"
     ATTACH = "attach"
 
@@ -36,7 +38,9 @@ class Right(str, Enum):
             raise StatementError(DropReason.MALFORMED, "an unknown right") from error
 
 
-DELEGABLE: Final = frozenset({Right.PUBLISH, Right.SERVE, Right.READ})
+DELEGABLE: Final = frozenset({Right.PUBLISH, Right.SERVE, Right.CALL, Right.READ})
+HEARS: Final = MappingProxyType({Right.READ: Right.PUBLISH, Right.SERVE: Right.CALL, Right.CALL: Right.SERVE})
+"""Who hears whom on one name: a node that claims the first gets what those that claim the second send to it."""
 
 
 def rights_to_wire(rights: Collection[Right]) -> list[str]:
@@ -46,7 +50,7 @@ def rights_to_wire(rights: Collection[Right]) -> list[str]:
         LocalError: none, or one that cannot be delegated.
     """
     if not rights or not DELEGABLE.issuperset(rights):
-        raise LocalError("the rights to delegate are one or more of publish, serve and read")
+        raise LocalError("the rights to delegate are one or more of publish, serve, call and read")
     return sorted({right.value for right in rights})
 
 

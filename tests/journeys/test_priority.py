@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gdp.client.member import BYTES_BESIDE_URGENT
+from gdp.client.turns import BYTES_BESIDE_URGENT
 from gdp.frame.codec import decode
 from gdp.frame.kinds import Flag, Kind
 from tests.journeys.flows import ROBOT, SERVER, advertise, flowing, ring

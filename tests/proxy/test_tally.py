@@ -30,3 +30,10 @@ def test_a_message_that_comes_again_is_counted_and_a_restarted_publisher_is_not(
     for incarnation, number in ((1, 1), (1, 2), (1, 2), (1, 1), (2, 1), (1, 3)):
         tally.count_number(b"p" * 32, incarnation, number)
     assert tally.to_fields()["duplicated"] == 2
+
+
+def test_messages_of_one_bundle_share_a_number_and_are_not_counted_as_come_again() -> None:
+    tally = Tally("/t", "std_msgs/msg/String")
+    for number, place in ((1, 0), (1, 1), (1, 2), (2, 0), (1, 2), (2, 0), (2, 1)):
+        tally.count_number(b"p" * 32, 1, number, place)
+    assert tally.to_fields()["duplicated"] == 2

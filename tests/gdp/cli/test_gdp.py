@@ -145,7 +145,7 @@ def test_files_with_secrets_are_private(gdp: Run, keys: None) -> None:
         (f"{DELEGATE} --epochs 65536", "--epochs"),
         (f"{DELEGATE} --epochs x", "--epochs"),
         (f"{DELEGATE} --right fly", "--right"),
-        (f"{DELEGATE} --right attach", "publish, serve and read"),
+        (f"{DELEGATE} --right attach", "publish, serve, call and read"),
         (f"{DELEGATE} --card robot/node.crt", "node.crt"),
         ("delegate install robot/node.json --node robot", "node.json"),
         ("delegate route --node robot --switch 12 --out x", "64 hex digits"),
@@ -155,6 +155,17 @@ def test_wrong_input_is_named_and_exits_with_2(gdp: Run, keys: None, line: str, 
     done = gdp(line)
     assert (done.code, done.out) == (2, "")
     assert re.search(rf"^gdp: .*{re.escape(complaint)}", done.err, re.MULTILINE), done.err
+
+
+@pytest.mark.parametrize("right", ["serve", "call"])
+@pytest.mark.parametrize("kind", ["service", "action"])
+def test_a_service_or_an_action_is_delegated_to_serve_or_to_call(gdp: Run, keys: None, right: str, kind: str) -> None:
+    done = gdp(
+        f"delegate name --owner lab --card robot/node.card --right {right} --kind {kind} --name /plan"
+        " --out p.delegation --json"
+    )
+    assert (done.code, json.loads(done.out)["rights"]) == (0, [right])
+    assert gdp("delegate install p.delegation --node robot").code == 0
 
 
 @pytest.mark.parametrize("line", ["name --kind", "name --kind topic --pin x", "nonsense", "keygen node x --role king"])

@@ -15,7 +15,7 @@ def test_rights_come_back() -> None:
     assert rights_from_fields(Fields({"r": wire}), "r") == DELEGABLE
 
 
-@pytest.mark.parametrize("wire", [[], ["attach"], ["fly"], ["read", "attach"], [1], ["read"] * 4], ids=repr)
+@pytest.mark.parametrize("wire", [[], ["attach"], ["fly"], ["read", "attach"], [1], ["read"] * 5], ids=repr)
 def test_rights_that_cannot_be_delegated_are_malformed(wire: list[Value]) -> None:
     with pytest.raises(StatementError) as caught:
         rights_from_fields(Fields({"r": wire}), "r")

@@ -1,0 +1,61 @@
+"""The messages of a best-effort topic that have not left yet.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+from gdp.crypto.envelope import Sealed
+from gdp.limits import WINDOW_BYTES
+
+__all__ = ["Unsent"]
+
+
+class Unsent:
+    """A queue of sealed messages, each with how many are in it; the oldest go when nobody takes them."""
+
+    def __init__(self) -> None:
+        self._queue = deque[tuple[Sealed, int]]()
+        self._held_bytes = 0
+        self._part = 0  # of the oldest: the first that has not left
+
+    def __len__(self) -> int:
+        return len(self._queue)
+
+    def add(self, frames: Sealed, messages: int) -> int:
+        """Queue a message, or a bundle; return how many messages went for it."""
+        self._queue.append((frames, messages))
+        self._held_bytes += frames.size_bytes
+        gone = 0
+        while self._held_bytes > WINDOW_BYTES and len(self._queue) > 1:
+            gone += self._let_oldest_go()
+        return gone
+
+    def take(self, limit: int) -> list[bytes]:
+        """Return at most so many frames, in order, sealed as they are taken."""
+        frames: list[bytes] = []
+        while self._queue and len(frames) < limit:
+            oldest, first = self._queue[0][0], self._part
+            taken = oldest[first : first + limit - len(frames)]
+            frames += taken
+            self._part += len(taken)
+            if self._part == len(oldest):
+                self._let_oldest_go()
+        return frames
+
+    def take_back(self, mtu: int) -> list[tuple[bytes, int]]:
+        """Return everything, to be sealed anew, if something is too large for its path; else nothing."""
+        if all(frames.largest <= mtu for frames, _ in self._queue):
+            return []
+        taken = [(frames.message(), messages) for frames, messages in self._queue]
+        self._queue.clear()
+        self._held_bytes = self._part = 0
+        return taken
+
+    def _let_oldest_go(self) -> int:
+        frames, messages = self._queue.popleft()
+        self._held_bytes -= frames.size_bytes
+        self._part = 0
+        return messages

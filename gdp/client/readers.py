@@ -1,0 +1,119 @@
+"""Who reads a topic, as its publisher knows them by their notes: in which life, and since when they are silent.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds).
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+from gdp.client.source import Secrets, Source
+from gdp.crypto.note import NoteOpener
+from gdp.errors import DropReason, EnvelopeError, FrameError
+from gdp.frame.codec import Header
+from gdp.frame.kinds import Kind
+from gdp.limits import READER_LEASE_S
+from gdp.message.report import Report, ReportFlag
+from gdp.names import Name
+
+__all__ = ["Reading", "Readers"]
+
+READERS_MAX: Final = 1_024
+_LIVES_MAX: Final = 4_096  # incarnations of readers whose old notes are known as such
+_PENANCE_MIN_S: Final = 2 * READER_LEASE_S
+_PENANCE_MAX_S: Final = 16 * READER_LEASE_S
+
+
+@dataclass(slots=True)
+class Reading:
+    """One reader, in one life of its process."""
+
+    incarnation: int
+    heard_s: float
+    start: int | None = None  # its first message; None once it has begun to confirm
+    out_until_s: float = 0.0  # it may not hold the window before
+    penance_s: float = _PENANCE_MIN_S
+
+    def do_penance(self, now_s: float) -> None:
+        """Hold no window for a while, each time for longer."""
+        self.out_until_s = now_s + self.penance_s
+        self.penance_s = min(2 * self.penance_s, _PENANCE_MAX_S)
+
+
+class Readers:
+    """The readers of one publisher, by name."""
+
+    def __init__(self, topic: Name, source: Source) -> None:
+        self._topic = topic
+        self._source = source
+        self._readers: dict[bytes, Reading] = {}
+        self._lives: OrderedDict[tuple[bytes, int, int], NoteOpener] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._readers)
+
+    def __contains__(self, name: bytes) -> bool:
+        return name in self._readers
+
+    def __getitem__(self, name: bytes) -> Reading:
+        return self._readers[name]
+
+    def __iter__(self) -> Iterator[bytes]:
+        return iter(list(self._readers))
+
+    def readings(self) -> Iterator[Reading]:
+        """Return all of them."""
+        return iter(self._readers.values())
+
+    def silent(self, now_s: float) -> list[bytes]:
+        """Return those that have not been heard for ``READER_LEASE_S``."""
+        return [name for name, reading in self._readers.items() if now_s - reading.heard_s > READER_LEASE_S]
+
+    def next_silent(self) -> float | None:
+        """Return the monotonic second at which ``silent`` has somebody to return, or None."""
+        heard_s = min((reading.heard_s for reading in self._readers.values()), default=None)
+        return None if heard_s is None else heard_s + READER_LEASE_S + 0.001
+
+    def admit(self, name: bytes, incarnation: int, now_s: float) -> Reading:
+        """Take somebody for a reader, in place of a former life of his."""
+        reading = self._readers[name] = Reading(incarnation, now_s)
+        return reading
+
+    def forget(self, name: bytes) -> bool:
+        """Let a reader go; return whether it was one."""
+        return self._readers.pop(name, None) is not None
+
+    def open(self, header: Header, frame: bytes, secrets: Secrets, now_s: float) -> tuple[Report, bool]:
+        """Return what a reader's sealed report says, and whether that reader, or this life of his, is new.
+
+        Raises:
+            RemoteError: it does not open, is a replay, or of a life that never began or is over.
+        """
+        name, life = header.source, (header.source, header.incarnation, header.epoch)
+        opener = self._lives.get(life)
+        is_known = opener is not None
+        if opener is None:
+            secret = secrets.get(header.epoch)
+            if secret is None:
+                raise EnvelopeError(DropReason.UNKNOWN_EPOCH)
+            source, topic = self._source, self._topic
+            opener = NoteOpener(secret, Kind.REPORT, name, header.incarnation, source.name, topic, source.incarnation)
+        report = Report.from_wire(opener.open(header, frame))
+        reading = self._readers.get(name)
+        if reading is None and len(self._readers) >= READERS_MAX:
+            raise EnvelopeError(DropReason.QUOTA, "readers")
+        is_current = is_known if reading is None else reading.incarnation == header.incarnation
+        if not is_current and ReportFlag.NEW not in report.flags:
+            raise FrameError(DropReason.UNKNOWN_SENDER, "a report of a life that never began, or is over")
+        self._lives[life] = opener
+        self._lives.move_to_end(life)
+        if len(self._lives) > _LIVES_MAX:
+            self._lives.popitem(last=False)
+        if reading is not None and reading.incarnation == header.incarnation:
+            reading.heard_s = now_s
+            return report, False
+        self.admit(name, header.incarnation, now_s)
+        return report, True

@@ -1,0 +1,222 @@
+"""What a member hears on its names, and from whom: a feed for each party whose claim holds.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds).
+
+Whose word counts is decided here, by the claim that the switch hands on and this member verifies itself: a reader hears
+who publishes, a server who calls, a client who serves. A client has a second feed from each server, of its answers.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+from gdp.client.feed import Delivered, Ended, Feed, FeedState, Reader
+from gdp.client.private import AnswerFeed, Life, private_name
+from gdp.client.publisher import Secrets
+from gdp.control.query import Answer
+from gdp.effects import Instant
+from gdp.errors import DropReason, StatementError
+from gdp.frame.codec import Header
+from gdp.message.memory import Budget
+from gdp.names import Name
+from gdp.trust.claim import Claim
+from gdp.trust.delegation import Delegation
+from gdp.trust.lru import Lru
+from gdp.trust.right import HEARS, Right
+from gdp.trust.verifier import ClaimVerifier
+
+__all__ = ["Change", "Message", "Subscription", "Subscriptions", "Topic"]
+
+ENDED_MAX: Final = 4_096  # closed feeds whose end is remembered
+_NOWHERE: Final = Ended()
+
+
+class Message(NamedTuple):
+    """A message that arrived, and what its publisher says the topic's messages are.
+
+    ``private``: a server's answer, for nobody else.
+    """
+
+    topic: Name
+    delivered: Delivered
+    description: bytes
+    private: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A name with what this member may do with it, and the topic's secrets by epoch."""
+
+    delegation: Delegation
+    secrets: Secrets
+
+    @property
+    def name(self) -> Name:
+        """Return the topic's name."""
+        return self.delegation.name
+
+
+@dataclass(slots=True)
+class Subscription:
+    """One name that is heard, by which right, and the feeds of it."""
+
+    topic: Topic
+    right: Right
+    feeds: dict[Name, Feed] = field(default_factory=dict)
+    answers: dict[Name, AnswerFeed] = field(default_factory=dict)  # by server
+
+    def all(self) -> list[Feed]:
+        """Return every feed."""
+        return [*self.feeds.values(), *self.answers.values()]
+
+    def take(self, source: Name) -> list[Message]:
+        """Return, once, the messages of one source; answers not before it has said what they are."""
+        feed, topic = self.feeds.get(source), self.topic.name
+        if feed is None:
+            return []
+        messages = [Message(topic, each, feed.description) for each in feed.take_delivered()]
+        answers = self.answers.get(source)
+        if answers is not None and feed.state is FeedState.LIVE:
+            messages += [Message(topic, each, feed.description, True) for each in answers.take_delivered()]
+        return messages
+
+
+class Change(NamedTuple):
+    """Feeds that began, and that are to be closed: no frame finds them any more."""
+
+    opened: list[Feed]
+    ended: list[Feed]
+
+
+class Subscriptions:
+    """All that one member hears.
+
+    Args:
+        reader: the member.
+    """
+
+    def __init__(self, reader: Reader, verifier: ClaimVerifier) -> None:
+        self._reader = reader
+        self._verifier = verifier
+        self._budget = Budget()
+        self._by_name: dict[Name, Subscription] = {}
+        self._answers: dict[tuple[bytes, int], Subscription] = {}  # by server and incarnation, as headers have them
+        self._ended: Lru[Ended] = Lru(ENDED_MAX)
+        self.drops: Counter[DropReason] = Counter()  # of feeds that are gone, and of claims
+
+    def __iter__(self) -> Iterator[Subscription]:
+        return iter(self._by_name.values())
+
+    @property
+    def held_bytes(self) -> int:
+        """Return how much memory unfinished messages hold."""
+        return self._budget.held_bytes
+
+    def get(self, name: Name) -> Subscription | None:
+        """Return what is heard on a name, or None."""
+        return self._by_name.get(name)
+
+    def add(self, topic: Topic, right: Right) -> None:
+        """Hear others on a name from now on."""
+        self._by_name[topic.name] = Subscription(topic, right)
+
+    def remove(self, name: Name) -> list[Feed]:
+        """Hear nobody on a name any more; return the feeds that are to be closed."""
+        subscription = self._by_name.pop(name, None)
+        return [] if subscription is None else self._end_all(subscription)
+
+    def find(self, header: Header) -> tuple[Subscription, Feed] | None:
+        """Return whose frame this is, if it is anybody's."""
+        subscription = self._by_name.get(header.destination)  # type: ignore[call-overload]
+        if subscription is not None:
+            feed = subscription.feeds.get(header.source)
+        elif header.destination == self._reader.name:
+            subscription = self._answers.get((header.source, header.incarnation))
+            feed = None if subscription is None else subscription.answers.get(header.source)  # type: ignore[call-overload]
+        else:
+            return None
+        return None if subscription is None or feed is None else (subscription, feed)
+
+    def take(self, answer: Answer, now: Instant) -> Change:
+        """Take what the switch says of somebody: its claim, or that it is gone.
+
+        Raises:
+            StatementError: the claim does not hold, or is about something else.
+        """
+        subscription, change = self._by_name.get(answer.name), Change([], [])
+        if subscription is None or answer.advertiser == self._reader.name:
+            return change
+        feed = subscription.feeds.get(answer.advertiser)
+        if not answer.claim:
+            return change if feed is None else Change([], self._end(subscription, answer.advertiser))
+        claim = self._verifier.verify(answer.claim, now.unix_s)
+        is_heard = HEARS[subscription.right] is claim.right
+        if not is_heard or claim.name != answer.name or claim.node != answer.advertiser:
+            raise StatementError(DropReason.WRONG_NAME, "a claim about something else")
+        if feed is not None:
+            if claim.sequence <= feed.claim_sequence:
+                return change
+            if feed.incarnation == claim.incarnation:
+                feed.claim_sequence, feed.claim = claim.sequence, claim.wire
+                return change
+            change = Change([], self._end(subscription, claim.node))
+        return Change(self._open(subscription, claim, now.mono_s), change.ended)
+
+    def recheck(self, unix_s: float) -> list[Feed]:
+        """Return the feeds that are to be closed, for their party's claim holds no more."""
+        ended: list[Feed] = []
+        for subscription in self._by_name.values():
+            for feed in list(subscription.feeds.values()):
+                try:
+                    self._verifier.verify(feed.claim, unix_s)
+                except StatementError as error:
+                    self.drops[error.reason] += 1
+                    ended += self._end(subscription, feed.publisher)
+        return ended
+
+    def leave(self) -> list[Feed]:
+        """Return all feeds, which are to be closed."""
+        return [feed for subscription in self._by_name.values() for feed in self._end_all(subscription)]
+
+    def _open(self, subscription: Subscription, claim: Claim, now_s: float) -> list[Feed]:
+        topic, reader, server = subscription.topic, self._reader, claim.node
+        ended = self._ended.get(topic.name + _key(server, claim.incarnation)) or _NOWHERE
+        feed = Feed(
+            topic.name, reader, server, claim.incarnation, claim.member.key, topic.secrets, self._budget, now_s, ended
+        )
+        feed.claim_sequence, feed.claim = claim.sequence, claim.wire
+        subscription.feeds[server] = feed
+        if subscription.right is not Right.CALL:
+            return [feed]
+        name = private_name(topic.name, Life(server, claim.incarnation), Life(reader.name, reader.incarnation))
+        ended = self._ended.get(name) or _NOWHERE
+        answers = AnswerFeed(
+            name, reader, server, claim.member.key, topic.secrets, self._budget, now_s, ended
+        )
+        subscription.answers[server] = answers
+        self._answers[server, answers.incarnation] = subscription
+        return [feed, answers]
+
+    def _end_all(self, subscription: Subscription) -> list[Feed]:
+        return [feed for party in list(subscription.feeds) for feed in self._end(subscription, party)]
+
+    def _end(self, subscription: Subscription, party: Name) -> list[Feed]:
+        feed = subscription.feeds.pop(party)
+        self._remember(subscription.topic.name + _key(party, feed.incarnation), feed)
+        answers = subscription.answers.pop(party, None)
+        if answers is None:
+            return [feed]
+        del self._answers[party, answers.incarnation]
+        self._remember(answers.topic, answers)
+        return [feed, answers]
+
+    def _remember(self, key: bytes, feed: Feed) -> None:
+        self._ended.put(key, feed.ended)
+        self.drops += feed.drops
+
+
+def _key(name: Name, incarnation: int) -> bytes:
+    return name + incarnation.to_bytes(8, "big")

@@ -1,0 +1,114 @@
+"""Several small messages of one topic under one seal and one signature.
+
+Place: pure. Source: DESIGN section 4: natural batching, never an added delay: what goes together is what waits together
+when frames are asked for.
+
+Wire form, big-endian: for each message ``length (4) | message``; at least one message, nothing behind the last.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from collections.abc import Iterable
+from typing import Final
+
+from gdp.errors import DropReason, FrameError
+from gdp.message.move import Move
+
+__all__ = ["BUNDLE_BYTES", "BUNDLE_MAX_BYTES", "Counts", "Gathered", "pack", "unpack"]
+
+BUNDLE_BYTES: Final = 48 << 10  # what a publisher makes; larger ones save hardly more, and the first in it waits longer
+BUNDLE_MAX_BYTES: Final = 64 << 10  # what a reader takes: it bounds how many messages one frame may turn into
+_LENGTH: Final = struct.Struct("!I")
+_SMALL: Final = 4  # so many of them, or more, go into one bundle
+_ALONE_BYTES: Final = 176  # what sealing it alone would add: what waits is not to weigh less than what is sealed
+
+
+def pack(messages: Iterable[bytes]) -> bytes:
+    """Return the wire form."""
+    return b"".join([each for message in messages for each in (_LENGTH.pack(len(message)), message)])
+
+
+def unpack(wire: bytes) -> list[bytes]:
+    """Read the wire form.
+
+    Raises:
+        FrameError: not exactly that; nothing of it counts.
+    """
+    if not 0 < len(wire) <= BUNDLE_MAX_BYTES:
+        raise FrameError(DropReason.MALFORMED, "bundle")
+    messages, at, end = [], 0, len(wire)
+    while at < end:
+        begin = at + _LENGTH.size
+        if begin > end:
+            raise FrameError(DropReason.TRUNCATED, "bundle")
+        at = begin + _LENGTH.unpack_from(wire, at)[0]
+        if at > end:
+            raise FrameError(DropReason.TRUNCATED, "bundle")
+        messages.append(wire[begin:at])
+    return messages
+
+
+class Counts:
+    """How many messages went under each number, for what a publisher still keeps."""
+
+    def __init__(self) -> None:
+        self._of: dict[int, int] = {}  # bundles alone; numbers rise
+        self._forgotten = 0
+
+    def __contains__(self, number: int) -> bool:
+        return number in self._of
+
+    def note(self, number: int, messages: int) -> None:
+        """Note how many messages are in the newest number."""
+        if messages > 1:
+            self._of[number] = messages
+
+    def beyond_one(self, number: int) -> int:
+        """Return by how much messages outnumber numbers, up to this one; which is not before what was forgotten."""
+        return self._forgotten + sum(messages - 1 for each, messages in self._of.items() if each <= number)
+
+    def forget(self, below: int) -> int:
+        """Keep nothing of numbers under ``below``; return by how much their messages outnumber them."""
+        more = 0
+        while self._of and (first := next(iter(self._of))) < below:
+            more += self._of.pop(first) - 1
+        self._forgotten += more
+        return more
+
+    def move(self, move: Move) -> None:
+        """Go on under new numbers."""
+        self._of = {move.of(number): messages for number, messages in self._of.items()}
+
+
+class Gathered:
+    """Small messages that wait for their seal, oldest first."""
+
+    def __init__(self) -> None:
+        self._messages = deque[bytes]()
+        self.held_bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._messages)
+
+    @staticmethod
+    def is_small(message: bytes, room: int) -> bool:
+        """Return whether several messages of this size go into a bundle of ``room`` bytes."""
+        return _SMALL * (len(message) + _LENGTH.size) <= room
+
+    def add(self, message: bytes) -> None:
+        """Let a message wait."""
+        self._messages.append(message)
+        self.held_bytes += len(message) + _ALONE_BYTES
+
+    def take(self, room: int) -> list[bytes]:
+        """Return the oldest, and what follows it as far as ``room`` bytes of wire form hold it."""
+        together: list[bytes] = []
+        while self._messages:
+            room -= len(self._messages[0]) + _LENGTH.size
+            if together and room < 0:
+                break
+            together.append(self._messages.popleft())
+            self.held_bytes -= len(together[-1]) + _ALONE_BYTES
+        return together

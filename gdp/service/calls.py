@@ -1,0 +1,97 @@
+"""The calls of one service that are under way: who waits for which answer, and until when.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Source: DESIGN section 6: the first answer wins. A call ends once: by its first answer, by its time running out, or
+with all others; whatever comes for it later finds nobody.
+"""
+
+from __future__ import annotations
+
+import heapq
+from typing import Final, Generic, TypeVar
+
+from gdp.errors import LocalError
+
+__all__ = ["Calls"]
+
+T = TypeVar("T")
+
+_NUMBERS: Final = 1 << 64
+_SPARE: Final = 64  # timers of ended calls that are worth no clearing
+
+
+class Calls(Generic[T]):
+    """Calls under way, each with what its caller wants to find again.
+
+    Args:
+        limit: of calls at once.
+        start: the first call's number, random in 64 bits: no number of an earlier life is met again.
+
+    Attributes:
+        unmatched: answers that came for no call, or for one that had ended.
+    """
+
+    def __init__(self, limit: int, start: int) -> None:
+        self._limit = limit
+        self._next = start % _NUMBERS
+        self._contexts: dict[int, T] = {}  # in the order of their beginning
+        self._timers: list[tuple[float, int]] = []  # a heap; of ended calls, too
+        self.unmatched = 0
+
+    def __len__(self) -> int:
+        return len(self._contexts)
+
+    def __contains__(self, number: int) -> bool:
+        return number in self._contexts
+
+    def begin(self, now_s: float, timeout_s: float | None, context: T) -> int:
+        """Return the number of a new call; none comes twice.
+
+        Args:
+            now_s: the present moment.
+            timeout_s: how long it may take; None: as long as it likes.
+            context: what ``answered``, ``expired`` or ``fail_all`` gives back.
+
+        Raises:
+            LocalError: as many as there may be are under way.
+        """
+        if len(self._contexts) >= self._limit:
+            raise LocalError(f"{self._limit} calls are under way: no more at once")
+        number = self._next
+        self._next = (number + 1) % _NUMBERS
+        self._contexts[number] = context
+        if timeout_s is not None:
+            heapq.heappush(self._timers, (now_s + timeout_s, number))
+        return number
+
+    def answered(self, number: int) -> T | None:
+        """End a call with its first answer; return its context, or None where nobody waits."""
+        context = self._contexts.pop(number, None)
+        if context is None:
+            self.unmatched += 1
+        elif len(self._timers) > 2 * len(self._contexts) + _SPARE:
+            self._timers = [timer for timer in self._timers if timer[1] in self._contexts]
+            heapq.heapify(self._timers)
+        return context
+
+    def expired(self, now_s: float) -> list[tuple[int, T]]:
+        """End the calls whose time has run out; return their numbers and contexts, the longest overdue first."""
+        ended = []
+        while self._timers and self._timers[0][0] <= now_s:
+            number = heapq.heappop(self._timers)[1]
+            if number in self._contexts:
+                ended.append((number, self._contexts.pop(number)))
+        return ended
+
+    def next_timeout(self) -> float | None:
+        """Return the monotonic second at which a call's time runs out, or None."""
+        while self._timers and self._timers[0][1] not in self._contexts:
+            heapq.heappop(self._timers)
+        return self._timers[0][0] if self._timers else None
+
+    def fail_all(self) -> list[tuple[int, T]]:
+        """End every call, since nobody is left to answer; return their numbers and contexts, the oldest first."""
+        ended = list(self._contexts.items())
+        self._contexts.clear()
+        self._timers.clear()
+        return ended

@@ -1,0 +1,88 @@
+"""Several messages under one seal: exact, or refused whole; and how many messages went under each number."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gdp.errors import FrameError
+from gdp.message.bundle import BUNDLE_MAX_BYTES, Counts, Gathered, pack, unpack
+from gdp.message.move import Move
+
+
+@given(st.lists(st.binary(max_size=40), min_size=1, max_size=20))
+def test_what_was_packed_comes_out_in_order(messages: list[bytes]) -> None:
+    assert unpack(pack(messages)) == messages
+
+
+@given(st.binary(max_size=80))
+def test_arbitrary_bytes_are_a_bundle_to_the_last_byte_or_refused(wire: bytes) -> None:
+    try:
+        messages = unpack(wire)
+    except FrameError:
+        return
+    assert messages
+    assert pack(messages) == wire
+
+
+@pytest.mark.parametrize(
+    "wire",
+    [
+        b"",
+        b"\0\0\0",
+        pack([b"one"]) + b"\0",
+        pack([b"one", b"two"])[:-1],
+        pack([b"one"]) + b"\xff\xff\xff\xff",
+        bytes(BUNDLE_MAX_BYTES + 4),
+    ],
+    ids=["empty", "half a length", "trailing byte", "cut", "a length beyond the end", "above the limit"],
+)
+def test_what_is_not_exact_is_refused(wire: bytes) -> None:
+    with pytest.raises(FrameError):
+        unpack(wire)
+
+
+def test_what_waits_goes_together_in_order_as_far_as_there_is_room() -> None:
+    gathered = Gathered()
+    messages = [bytes([at]) * 100 for at in range(10)]
+    for message in messages:
+        gathered.add(message)
+    first, second = gathered.take(4 * 104), gathered.take(4 * 104 + 50)
+    assert [*first, *second] == messages[:8]
+    assert len(gathered) == 2
+
+
+def test_a_message_for_which_there_is_no_room_any_more_goes_alone() -> None:
+    gathered = Gathered()
+    gathered.add(bytes(100))
+    gathered.add(bytes(100))
+    assert gathered.take(50) == [bytes(100)]
+
+
+def test_all_that_was_held_is_given_back() -> None:
+    gathered = Gathered()
+    for size in (0, 1, 1_000):
+        gathered.add(bytes(size))
+    held_bytes = gathered.held_bytes
+    while gathered:
+        gathered.take(0)
+    assert held_bytes > 1_001
+    assert gathered.held_bytes == 0
+
+
+def test_messages_are_counted_up_to_any_number_that_is_kept() -> None:
+    counts = Counts()
+    for number, messages in ((1, 1), (2, 5), (3, 1), (4, 10)):
+        counts.note(number, messages)
+    assert [number + counts.beyond_one(number) for number in (1, 2, 3, 4)] == [1, 6, 7, 17]
+    assert counts.forget(4) == 4
+    assert 4 + counts.beyond_one(4) == 17
+
+
+def test_a_bundle_is_one_under_its_new_number_too() -> None:
+    counts = Counts()
+    counts.note(3, 5)
+    counts.move(Move(2, 4, 10))
+    assert 11 in counts
+    assert 3 not in counts

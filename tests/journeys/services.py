@@ -1,0 +1,96 @@
+"""Servers and clients of one name in a world, and what came of their calls."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from gdp.client.member import Member, Message
+from gdp.client.publisher import Publisher
+from gdp.names import Name
+from gdp.testbed.world import World
+from gdp.trust.right import Right
+
+SERVICE = "/add_two_ints"
+
+
+@dataclass(slots=True)
+class Party:
+    """One member that serves or calls a name: a server answers each request at once, by what it got and its label."""
+
+    world: World
+    label: str
+    right: Right
+    name: str = SERVICE
+    stream: Publisher = field(init=False)
+    service: Name = field(init=False)
+    got: list[Message] = field(default_factory=list)
+    answers: bool = True
+
+    def __post_init__(self) -> None:
+        self.begin()
+
+    @property
+    def member(self) -> Member:
+        """Return the member, in its present life."""
+        return self.world.members[self.label]
+
+    def begin(self) -> None:
+        """Serve or call from now on."""
+        topic = self.world.topic(self.name, self.member, [self.right], kind="service")
+        self.service = topic.name
+        take_part = self.member.serve if self.right is Right.SERVE else self.member.call
+        self.stream = take_part(topic, f"{self.right.value} by {self.label}".encode())
+        self.world.network.touch(self.label)
+
+    def publish(self, message: bytes) -> None:
+        """Send a request to all servers, or news to all clients."""
+        self.stream.publish(message)
+        self._flush()
+
+    def answer(self, client: Name, message: bytes) -> None:
+        """Answer one client."""
+        self.member.answer(self.service, client, message)
+        self._flush()
+
+    def collect(self) -> list[Message]:
+        """Take, and answer, what has come; return all that came yet."""
+        messages = self.member.take_messages()
+        self.got += messages
+        if self.right is Right.SERVE and self.answers:
+            for each in messages:
+                if Name(each.delivered.publisher) in {feed.publisher for feed in self.member.feeds_of(self.service)}:
+                    self.answer(Name(each.delivered.publisher), each.delivered.message + b" by " + self.label.encode())
+        return self.got
+
+    def bodies(self) -> list[bytes]:
+        """Return the messages that have come."""
+        return [each.delivered.message for each in self.collect()]
+
+    def _flush(self) -> None:
+        self.member.flush(self.world.network.now.mono_s)
+        self.world.network.touch(self.label)
+
+
+def meet(world: World, *parties: Party, within_s: float = 5.0) -> bool:
+    """Let time go on until every client has met every server; return whether that came true."""
+    servers = sum(party.right is Right.SERVE for party in parties)
+    clients = len(parties) - servers
+
+    def have_met() -> bool:
+        return all(
+            len(party.member.peers(party.service)) == (clients if party.right is Right.SERVE else servers)
+            for party in parties
+        )
+
+    return world.network.run(within_s, have_met)
+
+
+def work(world: World, *parties: Party, until_s: float, have: int = 0) -> bool:
+    """Let servers answer for a while; return whether so many messages have come to the last party."""
+
+    def is_done() -> bool:
+        for party in parties:
+            party.collect()
+        return 0 < have <= len(parties[-1].got)
+
+    return world.network.run(until_s, is_done)

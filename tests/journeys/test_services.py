@@ -1,0 +1,324 @@
+"""Calls across the ring of five: requests to every server by a tree, each answer to the one that asked."""
+
+from __future__ import annotations
+
+import pytest
+
+from gdp.client.private import IDLE_S
+from gdp.crypto.statements import parse
+from gdp.effects import Arrival
+from gdp.errors import DropReason, LocalError
+from gdp.frame.kinds import Kind
+from gdp.limits import READER_LEASE_S
+from gdp.testbed.world import World
+from gdp.trust.adcert import AdCert
+from gdp.trust.right import Right
+from tests.journeys.flows import ROBOT, SERVER, Tap, ring
+from tests.journeys.services import SERVICE, Party, meet, work
+
+OTHER = "nuc4/other"
+
+
+def ring_of_three() -> World:
+    """Return the ring with a third member."""
+    world = ring()
+    world.add_member(OTHER, "nuc4")
+    assert world.settle()
+    return world
+
+
+def pair(world: World) -> tuple[Party, Party]:
+    server, client = Party(world, SERVER, Right.SERVE), Party(world, ROBOT, Right.CALL)
+    assert meet(world, server, client)
+    return server, client
+
+
+def test_a_call_is_answered_across_domains() -> None:
+    world = ring()
+    server, client = pair(world)
+    client.publish(b"1+2")
+    assert work(world, server, client, until_s=2, have=1)
+    (answer,) = client.got
+    assert (answer.topic, answer.private, answer.delivered.message) == (client.service, True, b"1+2 by nuc5/server")
+    assert (answer.description, answer.delivered.hops) == (b"serve by nuc5/server", 5)
+    assert [(each.private, each.description) for each in server.got] == [(False, b"call by nuc1/robot")]
+
+
+@pytest.mark.parametrize("first", [Right.SERVE, Right.CALL])
+def test_the_first_call_is_answered_as_soon_as_a_server_is_known(first: Right) -> None:
+    world = ring()
+    order = sorted((Right.SERVE, Right.CALL), key=lambda right: right is not first)
+    parties = {right: Party(world, SERVER if right is Right.SERVE else ROBOT, right) for right in order}
+    client, server = parties[Right.CALL], parties[Right.SERVE]
+    assert world.network.run(2, lambda: bool(client.member.peers(client.service)))
+    client.publish(b"first")
+    assert work(world, server, client, until_s=0.1, have=1)
+    assert client.stream.drops[DropReason.NO_READER] == 0
+
+
+def test_two_servers_both_answer() -> None:
+    world = ring_of_three()
+    servers = [Party(world, SERVER, Right.SERVE), Party(world, OTHER, Right.SERVE)]
+    client = Party(world, ROBOT, Right.CALL)
+    assert meet(world, *servers, client)
+    client.publish(b"?")
+    assert work(world, *servers, client, until_s=2, have=2)
+    assert sorted(client.bodies()) == [b"? by nuc4/other", b"? by nuc5/server"]
+
+
+def test_an_answer_goes_to_the_client_that_asked_alone() -> None:
+    world = ring_of_three()
+    server = Party(world, SERVER, Right.SERVE)
+    asks, idle = Party(world, ROBOT, Right.CALL), Party(world, OTHER, Right.CALL)
+    assert meet(world, server, asks, idle)
+    tap = Tap("nuc4", OTHER)
+    world.network.taps.append(tap)
+    asks.publish(b"?")
+    assert work(world, server, idle, asks, until_s=2, have=1)
+    assert (idle.got, tap.count(Kind.DATA)) == ([], 0)
+
+
+def test_news_of_a_server_reaches_all_its_clients() -> None:
+    world = ring_of_three()
+    server = Party(world, SERVER, Right.SERVE)
+    clients = [Party(world, ROBOT, Right.CALL), Party(world, OTHER, Right.CALL)]
+    assert meet(world, server, *clients)
+    server.publish(b"feedback")
+    for client in clients:
+        assert work(world, client, until_s=2, have=1)
+        assert [(each.private, each.delivered.message) for each in client.got] == [(False, b"feedback")]
+
+
+def test_a_server_that_dies_is_no_peer_any_more_and_its_private_stream_ends() -> None:
+    world = ring()
+    _, client = pair(world)
+    world.network.stop(SERVER)
+    assert world.network.run(READER_LEASE_S + 2, lambda: not client.member.peers(client.service))
+    assert world.network.run(40, lambda: not list(client.member.feeds()))
+
+
+def test_a_server_that_withdraws_is_no_peer_at_once() -> None:
+    world = ring()
+    server, client = pair(world)
+    server.member.withdraw(server.service)
+    world.network.touch(SERVER)
+    assert world.network.run(1, lambda: not list(client.member.feeds()))
+    assert client.member.peers(client.service) == []
+    with pytest.raises(LocalError):
+        server.member.answer(server.service, client.member.name, b"too late")
+
+
+def test_answers_to_a_former_life_do_not_reach_the_new_one() -> None:
+    world = ring()
+    server, client = pair(world)
+    server.answers = False
+    client.publish(b"asked in the first life")
+    assert work(world, client, server, until_s=2, have=1)
+    world.restart_member(ROBOT)
+    server.answer(client.member.name, b"for the first life")
+    client.begin()
+    assert meet(world, server, client)
+    server.answer(client.member.name, b"for the second life")
+    assert work(world, client, until_s=2, have=1)
+    assert client.bodies() == [b"for the second life"]
+
+
+def test_a_server_that_starts_anew_answers_again() -> None:
+    world = ring()
+    server, client = pair(world)
+    client.publish(b"1")
+    assert work(world, server, client, until_s=2, have=1)
+    world.restart_member(SERVER)
+    server.begin()
+    assert world.network.run(30, lambda: client.stream.readers == 1 and len(server.member.peers(server.service)) == 1)
+    world.network.run(1)
+    client.publish(b"2")
+    assert work(world, server, client, until_s=2, have=2)
+    assert client.bodies() == [b"1 by nuc5/server", b"2 by nuc5/server"]
+
+
+def test_a_lost_part_of_an_answer_is_repaired() -> None:
+    world = ring()
+    server, client = pair(world)
+    server.answers = False
+    for cable in world.cables.values():
+        cable.loss = 0.1
+    large = bytes(range(256)) * 400
+    for _ in range(20):
+        server.answer(client.member.name, large)
+    assert work(world, client, until_s=20, have=20)
+    assert client.bodies() == [large] * 20
+
+
+def test_a_lost_answer_alone_is_asked_for_and_repaired() -> None:
+    world = ring()
+    server, client = pair(world)
+    world.leads[ROBOT].loss = 1.0
+    server.answer(client.member.name, b"lost at first")
+    world.network.run(0.5)
+    world.leads[ROBOT].loss = 0.0
+    assert work(world, client, until_s=2, have=1)
+
+
+def test_replayed_answers_are_dropped() -> None:
+    world = ring()
+    server, client = pair(world)
+    tap = Tap("nuc1", ROBOT)
+    world.network.taps.append(tap)
+    for _ in range(3):
+        client.publish(b"?")
+    assert work(world, server, client, until_s=2, have=3)
+    neighbour = client.member.attachment.switch
+    assert neighbour is not None
+    frames = [frame for header, frame in zip(tap.headers, tap.frames, strict=True) if header.kind == Kind.DATA]
+    assert frames
+    dropped = client.member.drops()[DropReason.LATE]
+    client.member.receive([Arrival(neighbour.port, neighbour.mac, frame) for frame in frames], world.network.now)
+    assert client.member.take_messages() == []
+    assert client.member.drops()[DropReason.LATE] > dropped
+
+
+def test_a_node_without_the_right_to_serve_or_call_does_neither() -> None:
+    world = ring()
+    member = world.members[ROBOT]
+    caller = world.topic(SERVICE, member, [Right.CALL], kind="service")
+    with pytest.raises(LocalError, match="no delegation to serve"):
+        member.serve(caller, b"")
+    with pytest.raises(LocalError, match="is no client"):
+        member.answer(caller.name, world.members[SERVER].name, b"")
+    with pytest.raises(LocalError, match="no delegation to call"):
+        member.call(world.topic(SERVICE, member, [Right.SERVE], kind="service"), b"")
+
+
+def test_who_may_only_call_is_heard_by_no_client_however_it_claims() -> None:
+    world = ring()
+    server, client = pair(world)
+    world.add_member(OTHER, "nuc4")
+    liar = world.members[OTHER]
+    assert world.settle()
+    topic = world.topic(SERVICE, liar, [Right.CALL], kind="service")
+    liar.attachment.claim(topic.delegation.subject, Right.SERVE, topic.delegation.chain, is_global=True)
+    world.network.touch(OTHER)
+    world.network.run(2)
+    assert liar.attachment.refusals[DropReason.NOT_DELEGATED] >= 1
+    assert client.member.peers(client.service) == [server.member.name]
+
+
+def test_a_node_serves_or_calls_a_name_not_both() -> None:
+    world = ring()
+    member = world.members[ROBOT]
+    topic = world.topic(SERVICE, member, [Right.CALL, Right.SERVE], kind="service")
+    member.serve(topic, b"")
+    with pytest.raises(LocalError, match="in use"):
+        member.call(topic, b"")
+    member.withdraw(topic.name)
+    member.call(topic, b"")
+
+
+def test_two_hundred_calls_at_once_are_all_answered_once() -> None:
+    world = ring()
+    server, client = pair(world)
+    for number in range(200):
+        client.stream.publish(b"%d" % number)
+    client.publish(b"last")
+    assert work(world, server, client, until_s=5, have=201)
+    world.network.run(1)
+    answered = sorted(client.bodies())
+    assert answered == sorted([b"%d by nuc5/server" % number for number in range(200)] + [b"last by nuc5/server"])
+
+
+def test_a_client_that_was_cut_off_goes_on_and_counts_what_it_lost() -> None:
+    world = ring()
+    server, client = pair(world)
+    server.answer(client.member.name, b"before")
+    assert work(world, client, until_s=2, have=1)
+    world.leads[ROBOT].loss = 1.0
+    server.answer(client.member.name, b"meanwhile")
+    world.network.run(READER_LEASE_S + 3)
+    world.leads[ROBOT].loss = 0.0
+    assert meet(world, server, client)
+    server.answer(client.member.name, b"after")
+    assert work(world, client, until_s=3, have=2)
+    assert client.bodies() == [b"before", b"after"]
+    assert sum(feed.lost for feed in client.member.feeds()) == 1
+
+
+def test_a_narrower_path_lets_answers_go_in_smaller_frames() -> None:
+    world = ring()
+    server, client = pair(world)
+    world.network.set_mtu(world.leads[ROBOT], 900)
+    world.network.run(1)
+    server.answer(client.member.name, bytes(5_000))
+    assert work(world, client, until_s=2, have=1)
+
+
+def test_a_private_stream_that_nobody_uses_is_forgotten_and_goes_on_above_its_numbers() -> None:
+    world = ring()
+    server, client = pair(world)
+    server.answer(client.member.name, b"1")
+    assert work(world, client, until_s=2, have=1)
+    answering = server.member._publications._answering[server.service]
+    assert len(answering) == 1
+    world.network.run(1)
+    (feed,) = [feed for feed in client.member.feeds() if feed not in client.member.feeds_of(client.service)]
+    feed._report_at_s = float("inf")  # it says nothing any more
+    world.network.run(READER_LEASE_S + 1.5 * IDLE_S)
+    assert len(answering) == 0
+    server.answer(client.member.name, b"2")
+    assert work(world, client, until_s=2, have=2)
+    assert [each.delivered.number for each in client.got] == [1, 2]
+
+
+def test_withdrawn_and_served_again_goes_on_above_all_numbers_with_another_description() -> None:
+    world = ring()
+    server, client = pair(world)
+    server.publish(b"news 1")
+    server.answer(client.member.name, b"answer 1")
+    assert work(world, client, until_s=2, have=2)
+    server.member.withdraw(server.service)
+    topic = world.topic(SERVICE, server.member, [Right.SERVE], kind="service")
+    server.stream = server.member.serve(topic, b"another description")
+    assert meet(world, server, client)
+    world.network.run(1)
+    server.publish(b"news 2")
+    server.answer(client.member.name, b"answer 2")
+    assert work(world, client, until_s=2, have=4)
+    news = [each.delivered.number for each in client.got if not each.private]
+    answers = [each.delivered.number for each in client.got if each.private]
+    assert (news, answers) == ([1, 2], [1, 2])
+    assert {each.description for each in client.got[2:]} == {b"another description"}
+
+
+def test_a_change_of_secrets_reaches_private_streams() -> None:
+    world = ring()
+    server, client = pair(world)
+    for party in (server, client):
+        topic = world.topic(SERVICE, party.member, [party.right], kind="service")
+        party.member.renew(type(topic)(topic.delegation, {1: topic.secrets[1], 2: bytes(32)}))
+    client.publish(b"?")
+    assert work(world, server, client, until_s=2, have=1)
+
+
+def test_calls_go_on_while_the_client_roams() -> None:
+    world = ring()
+    server, client = pair(world)
+    for number in range(40):
+        world.network.call(0.1 * number, lambda: client.publish(b"?"))
+    world.network.call(1.55, lambda: world.roam(ROBOT, "nuc3"))
+    assert work(world, server, client, until_s=20, have=40)
+    assert len(client.bodies()) == 40
+
+
+def test_a_client_whose_delegation_is_revoked_is_answered_no_more() -> None:
+    world = ring()
+    server, client = pair(world)
+    delegation = world.topic(SERVICE, client.member, [Right.CALL], kind="service").delegation
+    claimed = next(each for each in client.member.attachment.claims if each.right is Right.CALL)
+    link = AdCert.from_statement(parse(claimed.chain[0]))
+    world.switches["nuc5"].revoke(
+        world.owner.revoke(delegation.subject, link.fingerprint, link.validity.not_after_unix_s), world.network.now
+    )
+    world.network.touch("nuc5")
+    assert world.network.run(1, lambda: not server.member.peers(server.service))
+    with pytest.raises(LocalError, match="is no client"):
+        server.answer(client.member.name, b"?")
