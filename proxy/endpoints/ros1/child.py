@@ -1,0 +1,36 @@
+"""The process that speaks rospy: ``python -m proxy.endpoints.ros1.child FD MASTER NODE LIFE DELAY_S``.
+
+Place: a shell. FD is its end of the link; it ends when that does. LIFE counts such processes of one endpoint; DELAY_S
+is how long this one stays off the graph, because an earlier one has failed.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+
+from gdp.errors import LocalError
+from proxy.endpoints.ros1.install import rospy_folder
+from proxy.endpoints.ros1.link import Kind, Link
+
+
+def main() -> None:
+    """Serve the link, until it ends."""
+    descriptor, master, node, life, delay_s = sys.argv[1:]
+    woken = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+    link = Link(socket.socket(fileno=int(descriptor)), lambda: os.eventfd_write(woken, 1))
+    try:
+        # First: a ROS 2 of this interpreter has packages of the same names.
+        sys.path.insert(0, rospy_folder())
+        from proxy.endpoints.ros1.node import Node
+    except (ImportError, LocalError) as error:
+        version = f"{sys.version_info.major}.{sys.version_info.minor}"
+        reason = error if isinstance(error, LocalError) else f"rospy does not load in this Python {version}: {error}"
+        link.send(Kind.ENDING, payload=str(reason).encode())
+        sys.exit(1)
+    Node(link, woken, master, node, int(life), float(delay_s)).run()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,393 @@
+"""One ROS 1 graph, as the proxy sees it: every word goes to a rospy process, and comes from it.
+
+Place: I/O; a process and a socket pair. When the process ends, or its master is started anew, another one is started
+and everything is established again; until then the handles are faulted.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import select
+import socket
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import cbor2
+
+from gdp.errors import LocalError, RemoteError
+from proxy.endpoints.endpoint import (
+    Answered,
+    Asked,
+    Described,
+    End,
+    Event,
+    Failed,
+    Faulted,
+    Graph,
+    GraphChanged,
+    Heard,
+    Role,
+)
+from proxy.endpoints.ros1.install import rospy_folder
+from proxy.endpoints.ros1.link import Frame, Kind, Link, LinkEndedError
+from proxy.serial.channel import Channel, Qos, RosVersion
+from proxy.serial.service import Service
+
+__all__ = ["Ros1Endpoint"]
+
+_ANSWER_S: Final = 1.0
+_START_S: Final = 4.0  # a process that has just been started answers later
+_FAREWELL_S: Final = 2.0
+_DELAY_MAX_S: Final = 5.0
+_SOUND_S: Final = 10.0  # a process that lasted that long had not failed at once
+_ROOT: Final = Path(__file__).resolve().parents[3]
+
+
+@dataclass(slots=True)
+class _Held:
+    """What a handle is, enough to establish it anew.
+
+    Args:
+        kind: of the frame that establishes it, with ``payload``.
+        kept: last messages of a latched publisher.
+        calls: under way.
+    """
+
+    kind: Kind
+    payload: bytes
+    kept: deque[bytes] | None = None
+    subscribers: int = 0
+    calls: set[int] = field(default_factory=set)
+
+
+class Ros1Endpoint:
+    """One ROS 1 graph, with one virtual node in it."""
+
+    def __init__(self, master_uri: str, node: str) -> None:
+        """Start the rospy process; it joins the graph as soon as the master answers.
+
+        Raises:
+            LocalError: there is no rospy.
+        """
+        rospy_folder()
+        self._master_uri = master_uri
+        self._node = node
+        self._numbers = itertools.count(1)
+        self._held: dict[int, _Held] = {}
+        self._events: list[Event] = []
+        self._graph: Graph = frozenset()
+        self._is_graph_old = True  # the next one is news, whatever it shows
+        self._trouble = ""  # why nothing works now; told to handles made meanwhile
+        self._answers: dict[int, bytes | None] = {}
+        self._known: dict[tuple[Kind, str, str], bytes] = {}
+        self._life = 0
+        self._failures = 0
+        self._lost = 0
+        self._lost_before = 0
+        self._woken = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._epoll = select.epoll()
+        self._epoll.register(self._woken, select.EPOLLIN)
+        self._ended: list[subprocess.Popen[bytes]] = []
+        self._start(0.0)
+
+    @property
+    def ros(self) -> RosVersion:
+        """Return 1."""
+        return 1
+
+    @property
+    def label(self) -> str:
+        """Return ``ros1`` and the master's URI."""
+        return f"ros1 {self._master_uri}"
+
+    @property
+    def dropped(self) -> int:
+        """Return how many messages were dropped on the way between the two processes, oldest of a topic first."""
+        return self._lost_before + self._link.dropped + self._lost
+
+    def fileno(self) -> int:
+        """Return a descriptor that is readable while ``take`` has something."""
+        return self._epoll.fileno()
+
+    def take(self) -> Sequence[Event]:
+        """Return, once, what happened, in order."""
+        self._pump()
+        if self._events:
+            self._drain_woken()
+        events, self._events = self._events, []
+        return events
+
+    def graph(self) -> Graph:
+        """Return who is there."""
+        return self._graph
+
+    def channel(self, topic: str, type_name: str) -> Channel:
+        """Return what an installed ROS 1 package says of a type; may wait, up to a second."""
+        wire = self._ask(Kind.ASK_CHANNEL, topic, type_name)
+        if wire is None:
+            raise LocalError(f"{type_name} is not known here as a ROS 1 type: install its ROS 1 package")
+        return Channel.from_wire(wire)
+
+    def service(self, name: str, type_name: str) -> Service:
+        """Return what an installed package says of a type, or, without definitions, what a live server does."""
+        wire = self._ask(Kind.ASK_SERVICE, name, type_name)
+        if wire is None:
+            raise LocalError(f"{type_name} is not known here as a ROS 1 service type: install its ROS 1 package")
+        return Service.from_wire(wire)
+
+    def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:  # noqa: ARG002  # of any type and QoS
+        """Hear a topic from now on, whatever its publishers' type."""
+        return self._hold(_Held(Kind.SUBSCRIBE, topic.encode()))
+
+    def advertise(self, channel: Channel) -> int:
+        """Be a publisher; if something local contradicts, ``Faulted`` follows."""
+        if channel.ros != 1 or not (channel.hash or channel.definition):
+            here = self.channel(channel.topic, channel.type_name)
+            channel = Channel(
+                channel.topic, channel.type_name, 1, here.hash, here.definition, here.definition_format,
+                channel.qos, channel.latched, channel.callerid,
+            )  # fmt: skip
+        depth = max(1, channel.qos[0].depth) if channel.qos else 1
+        kept: deque[bytes] | None = deque(maxlen=depth) if channel.latched else None
+        return self._hold(_Held(Kind.ADVERTISE, channel.to_wire(), kept))
+
+    def publish(self, handle: int, raw: bytes) -> None:
+        """Publish one message."""
+        held = self._held[handle]
+        if held.kept is not None:
+            held.kept.append(raw)
+        self._link.send(Kind.PUBLISH, handle, 0, raw)
+
+    def subscribers(self, handle: int) -> int:
+        """Return how many local subscriptions a publisher of ours has now."""
+        return self._held[handle].subscribers
+
+    def serve(self, service: Service) -> int:
+        """Be a server; if something local contradicts, ``Faulted`` follows."""
+        if service.ros != 1:
+            service = self.service(service.name, service.type_name)
+        return self._hold(_Held(Kind.SERVE, service.to_wire()))
+
+    def answer(self, handle: int, ticket: int, raw: bytes) -> None:
+        """Answer a request."""
+        self._link.send(Kind.ANSWER, handle, ticket, raw)
+
+    def refuse(self, handle: int, ticket: int, reason: str) -> None:
+        """Fail a request: its client gets a ``ServiceException`` with the reason."""
+        self._link.send(Kind.REFUSE, handle, ticket, reason.encode())
+
+    def dial(self, name: str, type_name: str) -> int:
+        """Be a client of a local service; nothing but its type's name need be known."""
+        return self._hold(_Held(Kind.DIAL, cbor2.dumps([name, type_name])))
+
+    def call(self, handle: int, call: int, raw: bytes) -> None:
+        """Send a request."""
+        self._held[handle].calls.add(call)
+        if not self._link.send(Kind.CALL, handle, call, raw):
+            self._fail(handle, call, "too much waits for the rospy process")
+
+    def drop(self, handle: int, call: int) -> None:
+        """Forget a call."""
+        held = self._held.get(handle)
+        if held is not None and call in held.calls:
+            held.calls.discard(call)
+            self._link.send(Kind.DROP, handle, call)
+
+    def close(self, handle: int) -> None:
+        """End a subscription, publisher, server or client."""
+        if self._held.pop(handle, None) is not None:
+            self._link.send(Kind.CLOSE, handle)
+            self._events = [event for event in self._events if getattr(event, "handle", None) != handle]
+
+    def shut(self) -> None:
+        """Leave the graph; may wait two seconds for the process to say farewell to the master."""
+        self._link.close()
+        self._ended.append(self._process)
+        until_s = time.monotonic() + _FAREWELL_S
+        for process in self._ended:
+            try:
+                process.wait(max(0.0, until_s - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        self._epoll.close()
+        os.close(self._woken)
+
+    # the process
+
+    def _start(self, delay_s: float) -> None:
+        ours, its = socket.socketpair()
+        self._life += 1
+        self._started_s = time.monotonic()
+        self._is_answering = False
+        environment = {key: value for key, value in os.environ.items() if key != "ROS_NAMESPACE"}
+        environment["ROS_MASTER_URI"] = self._master_uri
+        environment["PYTHONPATH"] = os.pathsep.join(filter(None, (os.environ.get("PYTHONPATH"), str(_ROOT))))
+        arguments = (its.fileno(), self._master_uri, self._node, self._life, delay_s)
+        with its:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "proxy.endpoints.ros1.child", *map(str, arguments)],
+                pass_fds=[its.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,  # rospy prints there
+                env=environment,
+                start_new_session=True,  # Ctrl-C is for the proxy, which then closes the link
+            )
+        self._link = Link(ours, self._watch_room)
+        self._epoll.register(ours, select.EPOLLIN)
+        for handle, held in self._held.items():
+            self._establish(handle, held)
+
+    def _establish(self, handle: int, held: _Held) -> None:
+        self._link.send(held.kind, handle, 0, held.payload)
+        for raw in held.kept or ():
+            self._link.send(Kind.PUBLISH, handle, 0, raw)
+
+    def _restart(self) -> None:
+        """The process has ended: fail what was under way, and start another, later each time."""
+        self._process.kill()
+        self._ended = [process for process in (*self._ended, self._process) if process.poll() is None]
+        self._lost_before += self._link.dropped + self._lost
+        self._lost = 0
+        self._epoll.unregister(self._link)
+        self._link.close()
+        if not self._trouble:
+            self._suffer("the rospy process has ended")
+        for handle, held in self._held.items():
+            held.subscribers = 0
+            for call in sorted(held.calls):
+                self._fail(handle, call, self._trouble)
+        self._is_graph_old = True
+        self._failures = 0 if time.monotonic() - self._started_s > _SOUND_S else self._failures + 1
+        self._start(min(0.25 * 2 ** (self._failures - 1), _DELAY_MAX_S) if self._failures else 0.0)
+
+    def _watch_room(self) -> None:
+        self._epoll.modify(self._link, select.EPOLLIN | select.EPOLLOUT)
+
+    def _pump(self) -> None:
+        """Move what can be moved on the link, without waiting."""
+        if self._link.is_behind:
+            self._link.flush()
+            if not self._link.is_behind:
+                self._epoll.modify(self._link, select.EPOLLIN)
+        try:
+            frames = self._link.receive()
+        except LinkEndedError:
+            self._restart()
+            return
+        for frame in frames:
+            self._arrive(frame)
+
+    def _arrive(self, frame: Frame) -> None:
+        kind, handle, number, payload = frame
+        self._is_answering = True
+        if kind in (Kind.KNOWN, Kind.UNKNOWN):
+            self._answers[number] = payload if kind is Kind.KNOWN else None
+        elif kind is Kind.GRAPH:
+            self._look(payload)
+        elif kind is Kind.LOST:
+            self._lost = number
+        elif kind is Kind.ENDING or (kind is Kind.FAULTED and not handle):
+            self._suffer(payload.decode())
+        elif handle in self._held:
+            self._happen(kind, handle, number, payload)
+
+    def _happen(self, kind: Kind, handle: int, number: int, payload: bytes) -> None:
+        held = self._held[handle]
+        if kind is Kind.HEARD:
+            self._events.append(Heard(handle, number, payload))
+        elif kind is Kind.ASKED:
+            self._events.append(Asked(handle, number, payload))
+        elif kind is Kind.ANSWERED and number in held.calls:
+            held.calls.discard(number)
+            self._events.append(Answered(handle, number, payload))
+        elif kind is Kind.FAILED:
+            self._fail(handle, number, payload.decode())
+        elif kind is Kind.FAULTED:
+            self._events.append(Faulted(handle, payload.decode()))
+        elif kind is Kind.COUNTED:
+            held.subscribers = number
+        elif kind is Kind.DESCRIBED:
+            try:
+                self._events.append(Described(handle, Channel.from_wire(payload)))
+            except RemoteError as error:
+                self._events.append(Faulted(handle, f"its publisher describes it badly: {error}"))
+
+    def _look(self, payload: bytes) -> None:
+        ends = frozenset(
+            End(Role(role), name, type_name, node, node, md5)
+            for role, name, type_name, node, md5 in cbor2.loads(payload)
+        )
+        if ends != self._graph or self._is_graph_old:
+            self._events.append(GraphChanged())
+        self._graph = ends
+        self._is_graph_old = False
+        self._trouble = ""
+
+    # handles
+
+    def _hold(self, held: _Held) -> int:
+        handle = next(self._numbers)
+        self._held[handle] = held
+        self._establish(handle, held)
+        if self._trouble:
+            self._tell(Faulted(handle, self._trouble))
+        return handle
+
+    def _suffer(self, reason: str) -> None:
+        if not self._trouble:
+            self._events += [Faulted(handle, reason) for handle in self._held]
+        self._trouble = reason
+
+    def _fail(self, handle: int, call: int, reason: str) -> None:
+        if call in self._held[handle].calls:
+            self._held[handle].calls.discard(call)
+            self._tell(Failed(handle, call, reason))
+
+    def _tell(self, event: Event) -> None:
+        self._events.append(event)
+        os.eventfd_write(self._woken, 1)
+
+    def _drain_woken(self) -> None:
+        try:
+            os.eventfd_read(self._woken)
+        except BlockingIOError:
+            return  # nobody had to wake
+
+    def _ask(self, kind: Kind, name: str, type_name: str) -> bytes | None:
+        """Ask the process, wait for its answer, and keep what happens meanwhile for ``take``.
+
+        Raises:
+            LocalError: it does not answer in time.
+        """
+        known = self._known.get((kind, name, type_name))
+        if known is not None:
+            return known
+        question = next(self._numbers)
+        self._link.send(kind, 0, question, cbor2.dumps([name, type_name]))
+        until_s = max(time.monotonic() + _ANSWER_S, 0.0 if self._is_answering else self._started_s + _START_S)
+        while question not in self._answers:
+            left_s = until_s - time.monotonic()
+            if left_s <= 0:
+                raise LocalError(f"{type_name}: the rospy process does not answer")
+            _wait(self._link, left_s)
+            self._pump()
+        if self._events:
+            os.eventfd_write(self._woken, 1)
+        answer = self._answers.pop(question)
+        if answer is not None:
+            self._known[kind, name, type_name] = answer
+        return answer
+
+
+def _wait(link: Link, patience_s: float) -> None:
+    poller = select.poll()
+    poller.register(link, select.POLLIN | (select.POLLOUT if link.is_behind else 0))
+    poller.poll(patience_s * 1000)

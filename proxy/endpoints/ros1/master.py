@@ -1,0 +1,268 @@
+"""Looking at a ROS 1 graph: a master tells nobody what is new, so it is asked twice a second.
+
+Place: I/O; XML-RPC to the master, TCP to nodes and servers. Runs in the rospy process, on its own thread, yet needs
+nothing of rospy.
+Source: ROS wiki, Master API and TCPROS header. A master keeps nodes that died without a farewell, and knows no service
+types: a node whose port refuses is left out until it answers again, and a server is asked for its type with a probe.
+"""
+
+from __future__ import annotations
+
+import http.client
+import socket
+import struct
+import threading
+import time
+import xmlrpc.client
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+from urllib.parse import urlsplit
+
+__all__ = ["LocalEnd", "Look", "Master", "MasterError", "Watch"]
+
+PERIOD_S: Final = 0.4
+_PATIENCE_S: Final = 2.0
+_CONNECT_S: Final = 0.5
+_LIVENESS_PERIOD_S: Final = 2.0
+_HIDDEN_TOPICS: Final = frozenset({"/rosout", "/rosout_agg"})
+_HIDDEN_SERVICES: Final = ("/get_loggers", "/set_logger_level")
+_LENGTH: Final = struct.Struct("<I")
+_HEADER_MAX: Final = 1 << 20
+
+
+class MasterError(Exception):
+    """The master, a node or a server does not answer, or not as it should."""
+
+
+class LocalEnd(NamedTuple):
+    """One end, in the words of ROS 1; ``role`` is a value of ``Role``."""
+
+    role: str
+    name: str
+    type_name: str
+    node: str
+    md5: str
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What one look at the master showed.
+
+    Args:
+        ends: of all nodes but ours that are alive, with a known type.
+        servers: of all services but ours, service to node.
+        is_ours_known: the master knows our node.
+    """
+
+    ends: frozenset[LocalEnd]
+    servers: dict[str, str]
+    is_ours_known: bool
+
+
+class _Transport(xmlrpc.client.Transport):
+    def make_connection(self, host: tuple[str, dict[str, str]] | str) -> http.client.HTTPConnection:
+        connection = super().make_connection(host)
+        connection.timeout = _PATIENCE_S
+        return connection
+
+
+class Master:
+    """A master's slow, careful caller. Used from one thread."""
+
+    def __init__(self, uri: str, node: str) -> None:
+        self._proxy = xmlrpc.client.ServerProxy(uri, transport=_Transport())
+        self._node = node
+
+    def ask(self, *calls: tuple[str, ...]) -> list[object]:
+        """Return the answers to several calls, each (method, argument...), asked in one go; None where one is refused.
+
+        Raises:
+            MasterError: no answer at all.
+        """
+        several = xmlrpc.client.MultiCall(self._proxy)
+        for method, *arguments in calls:
+            getattr(several, method)(self._node, *arguments)
+        try:
+            answers = several()
+            return [_value(answers[index]) for index in range(len(calls))]
+        except (OSError, xmlrpc.client.Error, http.client.HTTPException, ValueError, LookupError, TypeError) as error:
+            self._proxy("close")()
+            raise MasterError(str(error) or type(error).__name__) from error
+
+
+class Watch:
+    """The graph, looked at again and again."""
+
+    def __init__(self, uri: str, node: str) -> None:
+        self._master = Master(uri, node)
+        self._node = node
+        self._probes = ThreadPoolExecutor(8, "probe")
+        self._services: dict[tuple[str, str], _Server] = {}
+        self._dead: frozenset[str] = frozenset()
+        self._next_liveness_s = 0.0
+
+    def look(self) -> Look:
+        """Ask the master, and new servers for their types.
+
+        Raises:
+            MasterError: the master does not answer.
+        """
+        state, named = self._master.ask(("getSystemState",), ("getTopicTypes",))
+        publishers, subscribers, servers = _state(state)
+        types = dict(_pairs(named))
+        ours = any(self._node in nodes for _, nodes in servers)
+        self._check_alive({node for _, nodes in (*publishers, *subscribers, *servers) for node in nodes} - {self._node})
+        ends = []
+        for role, topics in (("publishes", publishers), ("subscribes", subscribers)):
+            for topic, nodes in topics:
+                type_name = types.get(topic, "*")
+                if topic not in _HIDDEN_TOPICS and type_name != "*":
+                    ends += [LocalEnd(role, topic, type_name, node, "") for node in nodes if self._is_seen(node)]
+        offered = {
+            (service, node)
+            for service, nodes in servers
+            if not service.endswith(_HIDDEN_SERVICES)
+            for node in nodes
+            if self._is_seen(node)
+        }
+        self._probe(offered)
+        for service, node in offered:
+            server = self._services.get((service, node))
+            if server is not None and server.type_name:
+                ends.append(LocalEnd("serves", service, server.type_name, node, server.md5))
+        return Look(frozenset(ends), dict(offered), ours)
+
+    def run(self, stopped: threading.Event, seen: Callable[[Look], None], failed: Callable[[str], None]) -> None:
+        """Look until ``stopped``; ``failed`` is told once of every silence."""
+        is_silent = False
+        while not stopped.is_set():
+            try:
+                look = self.look()
+            except MasterError as error:
+                if not is_silent:
+                    failed(str(error))
+                is_silent = True
+            else:
+                is_silent = False
+                seen(look)
+            stopped.wait(PERIOD_S)
+
+    def _is_seen(self, node: str) -> bool:
+        return node != self._node and node not in self._dead
+
+    def _check_alive(self, nodes: set[str]) -> None:
+        """Knock at every node now and then, and at the dead each time: a node that was started anew has a new door."""
+        dead = self._dead & nodes
+        doubtful = dead
+        if time.monotonic() >= self._next_liveness_s:
+            self._next_liveness_s = time.monotonic() + _LIVENESS_PERIOD_S
+            doubtful = frozenset(nodes)
+        if doubtful:
+            order = sorted(doubtful)
+            uris = self._master.ask(*(("lookupNode", node) for node in order))
+            refused = self._probes.map(_refuses, uris)
+            dead = frozenset(node for node, is_refused in zip(order, refused, strict=True) if is_refused)
+        self._dead = dead
+
+    def _probe(self, offered: set[tuple[str, str]]) -> None:
+        self._services = {key: server for key, server in self._services.items() if key in offered}
+        now_s = time.monotonic()
+        order = sorted(key for key in offered if key not in self._services or now_s >= self._services[key].next_probe_s)
+        if order:
+            uris = self._master.ask(*(("lookupService", service) for service, _ in order))
+            for key, server in zip(order, self._probes.map(_probed, (name for name, _ in order), uris), strict=True):
+                self._services[key] = server
+
+
+@dataclass(frozen=True, slots=True)
+class _Server:
+    type_name: str
+    md5: str
+    next_probe_s: float  # monotonic
+
+
+def _probed(service: str, uri: object) -> _Server:
+    """Ask a server what it serves; what does not answer is asked again at the next look, what does in ten seconds."""
+    now_s = time.monotonic()
+    fields = {"probe": "1", "md5sum": "*", "callerid": "/gdp_probe", "service": service}
+    try:
+        with _connected(uri) as sock:
+            sock.sendall(_header(fields))
+            answer = _read_header(sock)
+    except (OSError, MasterError):
+        return _Server("", "", now_s)
+    return _Server(answer.get("type", ""), answer.get("md5sum", ""), now_s + 10.0)
+
+
+def _refuses(uri: object) -> bool:
+    try:
+        with _connected(uri):
+            return False
+    except ConnectionRefusedError:
+        return True
+    except (OSError, MasterError):
+        return False  # far away, or busy: not known to be dead
+
+
+def _connected(uri: object) -> socket.socket:
+    """Connect to ``http://host:port/`` or ``rosrpc://host:port``."""
+    try:
+        parts = urlsplit(str(uri))
+        if uri is None or parts.hostname is None or parts.port is None:
+            raise MasterError("no address")
+        return socket.create_connection((parts.hostname, parts.port), timeout=_CONNECT_S)
+    except ValueError as error:
+        raise MasterError("no address") from error
+
+
+def _header(fields: dict[str, str]) -> bytes:
+    lines = [f"{key}={value}".encode() for key, value in fields.items()]
+    body = b"".join(_LENGTH.pack(len(line)) + line for line in lines)
+    return _LENGTH.pack(len(body)) + body
+
+
+def _read_header(sock: socket.socket) -> dict[str, str]:
+    (length,) = _LENGTH.unpack(_exactly(sock, 4))
+    if length > _HEADER_MAX:
+        raise MasterError("a header of absurd length")
+    body = _exactly(sock, length)
+    fields = {}
+    at = 0
+    while at + 4 <= length:
+        (size,) = _LENGTH.unpack_from(body, at)
+        key, _, value = body[at + 4 : at + 4 + size].decode("utf-8", "replace").partition("=")
+        fields[key] = value
+        at += 4 + size
+    return fields
+
+
+def _exactly(sock: socket.socket, count: int) -> bytes:
+    data = b""
+    while len(data) < count:
+        piece = sock.recv(count - len(data))
+        if not piece:
+            raise MasterError("the connection ended")
+        data += piece
+    return data
+
+
+def _value(answer: object) -> object:
+    """Return what a call gave: an answer is (code, text, value)."""
+    if not isinstance(answer, list) or len(answer) != 3:
+        raise MasterError("an answer that is none")
+    return answer[2] if answer[0] == 1 else None
+
+
+def _state(state: object) -> tuple[list[tuple[str, list[str]]], ...]:
+    """Return publishers, subscribers, servers: each (name, nodes)."""
+    if not isinstance(state, list) or len(state) != 3:
+        raise MasterError("a state that is none")
+    return tuple([(str(name), [str(node) for node in nodes]) for name, nodes in part] for part in state)
+
+
+def _pairs(named: object) -> Iterable[tuple[str, str]]:
+    if not isinstance(named, list):
+        raise MasterError("topic types that are none")
+    return ((str(topic), str(type_name)) for topic, type_name in named)

@@ -1,0 +1,293 @@
+"""The rospy node: does what the link says, and tells what happens.
+
+Place: imports rospy. Three threads: the main one serves the link and never waits for ROS; the registrar puts things on
+the graph and takes them off, which waits for the master; the watch looks at the graph. rospy adds its own.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+import select
+import threading
+from collections.abc import Callable
+from typing import Final, TypeAlias
+
+import cbor2
+import rospy
+import rospy.core
+from rospy.impl import masterslave, tcpros_base
+from rospy.impl.registration import get_service_manager, get_topic_manager
+
+from gdp.errors import LocalError, RemoteError
+from proxy.endpoints.ros1.link import Frame, Kind, Link, LinkEndedError
+from proxy.endpoints.ros1.master import LocalEnd, Look, Master, MasterError, Watch
+from proxy.endpoints.ros1.raw import (
+    installed_message,
+    installed_service,
+    known_message,
+    known_service,
+    ros1_name,
+    ros2_name,
+)
+from proxy.endpoints.ros1.services import Dial, Server, tickets
+from proxy.endpoints.ros1.topics import Inlet, Outlet
+from proxy.serial.channel import Channel
+from proxy.serial.service import Service
+
+__all__ = ["Node"]
+
+_Connected: TypeAlias = tuple[int, str, int]
+
+_RETRY_S: Final = 0.4
+_FAREWELL_S: Final = 1.0
+_BACKLOG: Final = 128
+
+
+class Node:
+    """One node on one master."""
+
+    def __init__(self, link: Link, woken: int, master: str, node: str, life: int, delay_s: float) -> None:
+        self._link = link
+        self._woken = woken
+        self._master = master
+        self._name = node
+        self._id = f"/{node}"
+        self._delay_s = delay_s
+        self._tickets = tickets(life)
+        self._inlets: dict[int, Inlet] = {}
+        self._outlets: dict[int, Outlet] = {}
+        self._servers: dict[int, Server] = {}
+        self._dials: dict[int, Dial] = {}
+        self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._refused: dict[int, str] = {}  # not on the graph, and why; the registrar's
+        self._look: Look | None = None
+        self._stopped = threading.Event()
+        self._lost = 0
+
+    def run(self) -> None:
+        """Serve the link until it ends; does not return."""
+        logging.getLogger().addHandler(logging.NullHandler())
+        rospy.core.configure_logging = lambda *_: None  # no log files of ours in ~/.ros
+        threading.excepthook = self._broke
+        threading.Thread(target=self._register, name="registrar", daemon=True).start()
+        poller = select.poll()
+        poller.register(self._woken, select.POLLIN)
+        while True:
+            poller.register(self._link, select.POLLIN | (select.POLLOUT if self._link.is_behind else 0))
+            for descriptor, _ in poller.poll():
+                if descriptor == self._woken:
+                    os.eventfd_read(self._woken)
+            self._link.flush()
+            try:
+                frames = self._link.receive()
+            except LinkEndedError:
+                self._leave()
+            for frame in frames:
+                self._take(frame)
+
+    # the link
+
+    def _take(self, frame: Frame) -> None:
+        kind, handle, number, payload = frame
+        if kind is Kind.PUBLISH:
+            if handle in self._outlets:
+                self._outlets[handle].publish(payload)
+        elif kind is Kind.CALL:
+            self._dials[handle].call(number, payload)
+        elif kind is Kind.DROP:
+            self._dials[handle].drop(number)
+        elif kind in (Kind.ANSWER, Kind.REFUSE):
+            if handle in self._servers:
+                self._servers[handle].reply(number, payload if kind is Kind.ANSWER else payload.decode())
+        elif kind is Kind.CLOSE:
+            self._close(handle)
+        elif kind in (Kind.ASK_CHANNEL, Kind.ASK_SERVICE):
+            self._tell(kind, number, payload)
+        else:
+            try:
+                self._make(kind, handle, payload)
+            except (LocalError, RemoteError) as error:
+                self._link.send(Kind.FAULTED, handle, 0, str(error).encode())
+
+    def _make(self, kind: Kind, handle: int, payload: bytes) -> None:
+        if kind is Kind.SUBSCRIBE:
+            inlet = self._inlets[handle] = Inlet(self._link, handle, payload.decode(), self._id)
+            self._todo.put(inlet.register)
+        elif kind is Kind.DIAL:
+            name, type_name = cbor2.loads(payload)
+            self._dials[handle] = Dial(self._link, handle, name, type_name)
+        elif kind is Kind.ADVERTISE:
+            channel = Channel.from_wire(payload)
+            self._outlets[handle] = Outlet(self._link, handle, channel, known_message(channel), self._id)
+            self._todo.put(lambda: self._join(handle))
+        elif kind is Kind.SERVE:
+            service = Service.from_wire(payload)
+            known = known_service(service)
+            self._servers[handle] = Server(self._link, handle, service.name, known, self._tickets)
+            self._todo.put(lambda: self._join(handle))
+
+    def _close(self, handle: int) -> None:
+        dial = self._dials.pop(handle, None)
+        if dial is not None:
+            dial.close()
+        ended = self._inlets.pop(handle, None) or self._outlets.pop(handle, None) or self._servers.pop(handle, None)
+        if ended is not None:
+            self._todo.put(ended.close)
+            self._todo.put(lambda: self._forget(handle))
+
+    def _tell(self, kind: Kind, question: int, payload: bytes) -> None:
+        """Answer what is known of a type here."""
+        name, type_name = cbor2.loads(payload)
+        known = self._channel(name, type_name) if kind is Kind.ASK_CHANNEL else self._service(name, type_name)
+        if known is None:
+            self._link.send(Kind.UNKNOWN, 0, question)
+        else:
+            self._link.send(Kind.KNOWN, 0, question, known)
+
+    def _channel(self, topic: str, type_name: str) -> bytes | None:
+        known = installed_message(type_name)
+        return None if known is None else _channel(topic, type_name, known.md5, known.text).to_wire()
+
+    def _service(self, name: str, type_name: str) -> bytes | None:
+        request, response = f"{type_name}_Request", f"{type_name}_Response"
+        known = installed_service(type_name)
+        if known is not None:
+            parts = (
+                _channel(name, request, known.request.md5, known.request.text),
+                _channel(name, response, known.response.md5, known.response.text),
+            )
+            return Service(name, type_name, known.md5, *parts).to_wire()
+        for end in self._look.ends if self._look is not None else ():
+            if (end.role, end.name, end.type_name) == ("serves", name, ros1_name(type_name)):
+                parts = _channel(name, request, "", ""), _channel(name, response, "", "")
+                return Service(name, type_name, end.md5, *parts).to_wire()
+        return None
+
+    # the registrar
+
+    def _register(self) -> None:
+        self._stopped.wait(self._delay_s)
+        self._await_master()
+        if self._stopped.is_set():
+            return
+        masterslave.ROSHandler._connect_topic = _to_others(masterslave.ROSHandler._connect_topic)
+        rospy.init_node(self._name, argv=["gdp"], disable_rosout=True, disable_rostime=True, disable_signals=True)
+        # 50 clients may come at once, and rospy lets five queue.
+        tcpros_base._tcpros_server.tcp_ros_server.server_sock.listen(_BACKLOG)
+        watch = Watch(self._master, self._id)
+        threading.Thread(
+            target=watch.run, args=(self._stopped, self._seen, self._silent), name="watch", daemon=True
+        ).start()
+        while True:
+            self._todo.get()()
+
+    def _await_master(self) -> None:
+        master = Master(self._master, self._id)
+        is_told = False
+        while not self._stopped.is_set():
+            try:
+                master.ask(("getPid",))
+                return
+            except MasterError as error:
+                if not is_told:
+                    self._silent(str(error))
+                is_told = True
+            self._stopped.wait(_RETRY_S)
+
+    def _join(self, handle: int) -> None:
+        """Put a publisher or server on the graph, unless something there speaks against it."""
+        subject = self._outlets.get(handle) or self._servers.get(handle)
+        if subject is None:
+            return
+        reason = self._against(subject)
+        if not reason:
+            self._refused.pop(handle, None)
+            subject.register()
+        elif self._refused.get(handle) != reason:
+            self._refused[handle] = reason
+            self._link.send(Kind.FAULTED, handle, 0, reason.encode())
+
+    def _forget(self, handle: int) -> None:
+        self._refused.pop(handle, None)
+
+    def _against(self, subject: Outlet | Server) -> str:
+        look = self._look
+        if isinstance(subject, Server):
+            other = look.servers.get(subject.name) if look is not None else None
+            if other is not None:
+                return f"{subject.name} is served here by {other}"
+            if get_service_manager().get_service(subject.name) is not None:
+                return f"{subject.name} is served by this proxy already"
+            return ""
+        for end in look.ends if look is not None else ():
+            if end.name == subject.topic and end.role != "serves" and end.type_name != subject.known.name:
+                return f"{subject.topic} is a {end.type_name} here ({end.node}), not a {subject.known.name}"
+        ours = get_topic_manager().get_publisher_impl(subject.topic)
+        if ours is not None and ours.data_class._md5sum != subject.known.md5:
+            return f"{subject.topic} is published by this proxy as {ours.type} with another definition"
+        return ""
+
+    # the watch
+
+    def _seen(self, look: Look) -> None:
+        if rospy.is_shutdown():
+            self._end("the node was shut down from outside")
+        if not look.is_ours_known:
+            self._end(f"the ROS 1 master at {self._master} was restarted")
+        if self._look is None or look.ends != self._look.ends:
+            self._link.send(Kind.GRAPH, payload=cbor2.dumps([_end(end) for end in look.ends]))
+        is_news = self._look is None or (look.ends, look.servers) != (self._look.ends, self._look.servers)
+        self._look = look
+        if is_news:
+            self._todo.put(self._retry)
+        if self._link.dropped != self._lost:
+            self._lost = self._link.dropped
+            self._link.send(Kind.LOST, number=self._lost)
+
+    def _retry(self) -> None:
+        for handle in list(self._refused):
+            self._join(handle)
+
+    def _silent(self, error: str) -> None:
+        reason = f"the ROS 1 master at {self._master} does not answer: {error}"
+        self._link.send(Kind.FAULTED, payload=reason.encode())
+
+    # the end
+
+    def _broke(self, broken: threading.ExceptHookArgs) -> None:
+        """A thread of ours must not end; one of rospy's ends like this when a peer goes at a bad moment."""
+        name = "" if broken.thread is None else broken.thread.name
+        if name in ("registrar", "watch", "call") and not self._stopped.is_set():
+            self._end(f"{name}: {broken.exc_type.__name__}: {broken.exc_value}")
+
+    def _end(self, reason: str) -> None:
+        self._link.send(Kind.ENDING, payload=reason.encode())
+        os._exit(1)  # rospy's threads would keep it alive
+
+    def _leave(self) -> None:
+        """Tell the master, if it listens, and end."""
+        self._stopped.set()
+        farewell = threading.Thread(target=rospy.signal_shutdown, args=("the proxy has ended",), daemon=True)
+        farewell.start()
+        farewell.join(_FAREWELL_S)
+        os._exit(0)
+
+
+def _to_others(connect: Callable[[object, str, str], _Connected]) -> Callable[[object, str, str], _Connected]:
+    """rospy would send what this node publishes to itself, over TCP, if it also subscribes."""
+
+    def connect_topic(handler: object, topic: str, publisher: str) -> _Connected:
+        return (1, "ours", 0) if publisher == rospy.core.get_node_uri() else connect(handler, topic, publisher)
+
+    return connect_topic
+
+
+def _channel(topic: str, type_name: str, md5: str, text: str) -> Channel:
+    return Channel(topic, type_name, 1, md5, text, "msg" if text else "")
+
+
+def _end(end: LocalEnd) -> list[str]:
+    kind = "srv" if end.role == "serves" else "msg"
+    return [end.role, end.name, ros2_name(end.type_name, kind), end.node, end.md5]

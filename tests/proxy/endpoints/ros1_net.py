@@ -1,0 +1,217 @@
+"""A ROS 1 master on loopback with real rospy nodes, and an endpoint whose events are awaited, never slept for."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import select
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+import pytest
+
+from gdp.errors import LocalError
+from proxy.endpoints.endpoint import Event
+from proxy.endpoints.ros1 import Ros1Endpoint
+from proxy.endpoints.ros1.install import rospy_folder
+
+NODE = "gdp_proxy_0123456789ab"
+PATIENCE_S = 15.0
+
+_PREAMBLE = """
+import os, rospy
+def print(*words):  # whole lines, whatever the threads
+    os.write(1, (" ".join(map(str, words)) + "\\n").encode())
+"""
+
+_Event = TypeVar("_Event", bound=Event)
+
+
+def need_ros1() -> str:
+    """Return the folder of rospy, or skip."""
+    try:
+        folder = rospy_folder()
+    except LocalError as error:
+        pytest.skip(str(error))
+    if not (Path(folder) / "rosmaster").is_dir() and importlib.util.find_spec("rosmaster") is None:
+        pytest.skip("there is no rosmaster here: run sudo scripts/setup_ros1.sh")
+    return folder
+
+
+class Peer:
+    """A process running rospy code; it says ``ready`` first, and its lines are read with patience."""
+
+    def __init__(self, code: str, environment: dict[str, str]) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", _PREAMBLE + code],
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+        )
+        self._text = b""
+
+    def line(self) -> str:
+        assert self.process.stdout is not None
+        until_s = time.monotonic() + PATIENCE_S
+        while b"\n" not in self._text:
+            ready, _, _ = select.select([self.process.stdout], [], [], max(0.0, until_s - time.monotonic()))
+            piece = os.read(self.process.stdout.fileno(), 65536) if ready else b""
+            if not piece:
+                raise AssertionError(f"the peer said no more; so far {self._text!r}, exit {self.process.poll()}")
+            self._text += piece
+        line, _, self._text = self._text.partition(b"\n")
+        return line.decode()
+
+    def until(self, line: str) -> None:
+        while self.line() != line:
+            pass
+
+    def tell(self, line: str) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(line.encode() + b"\n")
+        self.process.stdin.flush()
+
+    def end(self, *, kindly: bool = True) -> None:
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        if not self.process.stdin.closed:
+            self.process.stdin.close()
+        self.process.terminate() if kindly else self.process.kill()
+        try:
+            self.process.wait(5)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        self.process.stdout.close()
+
+
+class Ear:
+    """An endpoint and what it said."""
+
+    def __init__(self, endpoint: Ros1Endpoint) -> None:
+        self.endpoint = endpoint
+        self.events: list[Event] = []
+
+    def until(self, found: Callable[[], bool], patience_s: float = PATIENCE_S) -> None:
+        until_s = time.monotonic() + patience_s
+        while not found():
+            left_s = until_s - time.monotonic()
+            if left_s <= 0:
+                raise AssertionError(f"it did not come; events: {str(self.events)[-2000:]}, {self.endpoint.graph()}")
+            # What is counted, not told (subscribers), wakes too, but a look now and then costs nothing.
+            select.select([self.endpoint], [], [], min(left_s, 0.5))
+            self.events += self.endpoint.take()
+
+    def of(self, kind: type[_Event], handle: int | None = None) -> list[_Event]:
+        return [
+            event
+            for event in self.events
+            if isinstance(event, kind) and (handle is None or getattr(event, "handle", None) == handle)
+        ]
+
+    def wait(self, kind: type[_Event], count: int = 1, handle: int | None = None) -> list[_Event]:
+        self.until(lambda: len(self.of(kind, handle)) >= count)
+        return self.of(kind, handle)
+
+    def wait_end(self, name: str, node: str | None = None, *, gone: bool = False) -> None:
+        def is_there() -> bool:
+            return any(end.name == name and node in (None, end.node) for end in self.endpoint.graph())
+
+        self.until(lambda: is_there() != gone)
+
+
+class Net:
+    """A master and its peers."""
+
+    def __init__(self, folder: str, logs: Path) -> None:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.port = probe.getsockname()[1]
+        self.uri = f"http://127.0.0.1:{self.port}"
+        self.environment = {
+            **os.environ,
+            "ROS_MASTER_URI": self.uri,
+            "ROS_IP": "127.0.0.1",
+            "ROS_LOG_DIR": str(logs),
+            "PYTHONPATH": folder,
+            "PYTHONUNBUFFERED": "1",
+        }
+        self._peers: list[Peer] = []
+        self.endpoints: list[Ros1Endpoint] = []
+        self._master: subprocess.Popen[bytes] | None = None
+
+    def start_master(self) -> None:
+        code = "import rosmaster.main; rosmaster.main.rosmaster_main()"
+        self._master = subprocess.Popen(
+            [sys.executable, "-c", code, "--core", "-p", str(self.port)],
+            env=self.environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        until_s = time.monotonic() + PATIENCE_S
+        while time.monotonic() < until_s:
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", self.port)) == 0:
+                    return
+            time.sleep(0.02)  # a port that opens tells nobody
+        raise AssertionError("the master did not come up")
+
+    def stop_master(self) -> None:
+        if self._master is not None:
+            self._master.kill()
+            self._master.wait()
+            self._master = None
+
+    def peer(self, code: str) -> Peer:
+        peer = Peer(code, self.environment)
+        self._peers.append(peer)
+        peer.until("ready")
+        return peer
+
+    def endpoint(self, node: str = NODE) -> Ear:
+        endpoint = Ros1Endpoint(self.uri, node)
+        self.endpoints.append(endpoint)
+        return Ear(endpoint)
+
+    def end_peers(self) -> None:
+        """End the peers."""
+        for peer in self._peers:
+            peer.end(kindly=False)
+        self._peers.clear()
+
+    def leave(self) -> None:
+        """End the peers and endpoints."""
+        for endpoint in self.endpoints:
+            endpoint.shut()
+        self.endpoints.clear()
+        self.end_peers()
+
+    def stop(self) -> None:
+        """End everything."""
+        self.leave()
+        self.stop_master()
+
+
+@contextmanager
+def ros1_net(logs: Path) -> Iterator[Net]:
+    """A master that runs; everything is stopped at the end."""
+    folder = need_ros1()
+    net = Net(folder, logs)
+    earlier = os.environ.get("ROS_IP")
+    os.environ["ROS_IP"] = "127.0.0.1"
+    try:
+        net.start_master()
+        yield net
+    finally:
+        net.stop()
+        if earlier is None:
+            del os.environ["ROS_IP"]
+        else:
+            os.environ["ROS_IP"] = earlier
