@@ -6,6 +6,7 @@ Place: shell.
 from __future__ import annotations
 
 import logging
+import sys
 import time
 from pathlib import Path
 from typing import Final
@@ -28,6 +29,7 @@ __all__ = ["carry"]
 log = logging.getLogger(__name__)
 
 TICK_S: Final = 0.5
+_TURN_S: Final = 0.0002  # what an endpoint's thread may have to wait for the interpreter; Python's own is 5 ms
 
 
 def carry(path: Path, settings: ProxyConfig, *, json: bool) -> None:
@@ -39,6 +41,7 @@ def carry(path: Path, settings: ProxyConfig, *, json: bool) -> None:
     Raises:
         LocalError: keys, delegations or the device are not as the configuration says, or an endpoint cannot be had.
     """
+    sys.setswitchinterval(_TURN_S)
     with run_node(settings) as node:
         name = proxy_node_name(node.identity.name.to_text())
         with open_endpoints(settings.ros, name) as endpoints:

@@ -1,0 +1,24 @@
+"""An endpoint in a process of its own, as proxies are: it says on /back what it hears on /out, until its input ends.
+
+python -m netns_tests.ros2_child DOMAIN NODE
+
+Fast DDS looks for network interfaces once in a process, so one process cannot be in two namespaces.
+"""
+
+from __future__ import annotations
+
+import select
+import sys
+
+from proxy.endpoints.endpoint import Heard
+from proxy.endpoints.ros2 import Ros2Endpoint
+
+if __name__ == "__main__":
+    endpoint = Ros2Endpoint(int(sys.argv[1]), sys.argv[2])
+    endpoint.subscribe("/out", "std_msgs/msg/String", None)
+    back = endpoint.advertise(endpoint.channel("/back", "std_msgs/msg/String"))
+    while sys.stdin not in (ready := select.select([endpoint, sys.stdin], [], [])[0]):
+        for event in endpoint.take() if ready else ():
+            if isinstance(event, Heard):
+                endpoint.publish(back, event.raw)
+    endpoint.shut()

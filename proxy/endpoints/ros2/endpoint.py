@@ -1,0 +1,247 @@
+"""The ``ros2`` endpoint: one virtual node in one domain, spoken through rclpy.
+
+Place: I/O; what the proxy's thread calls. A thread of its own hears (``waiting``).
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import Final, cast
+
+from gdp.errors import LocalError
+from proxy.endpoints.endpoint import Event, Failed, Graph, Role
+from proxy.endpoints.ros2.ends import Dialling, Hearing, Publishing, Serving
+from proxy.endpoints.ros2.own import OwnMessages
+from proxy.endpoints.ros2.qos import conflict, filled, service_profile, to_profile
+from proxy.endpoints.ros2.session import (
+    ClientHandle,
+    PublisherHandle,
+    ServiceHandle,
+    ServiceType,
+    SubscriptionHandle,
+    open_session,
+    translated,
+)
+from proxy.endpoints.ros2.types import channel_of, class_of, service_of
+from proxy.endpoints.ros2.waiting import Waiting
+from proxy.serial.channel import Channel, Qos, RosVersion
+from proxy.serial.service import Service
+from proxy.serial.standard import type_hash
+
+__all__ = ["Ros2Endpoint"]
+
+
+class Ros2Endpoint:
+    """A node of a ROS 2 graph.
+
+    Args:
+        domain: ROS domain id, 0 to 232.
+        node: name of the virtual node (``proxy_node_name``).
+
+    Raises:
+        LocalError: ROS 2 is not installed, or does not start; the text says what to do.
+    """
+
+    ros: Final[RosVersion] = 2
+
+    def __init__(self, domain: int, node: str) -> None:
+        self.label = f"ros2 domain {domain}"
+        self._session = open_session(domain, node)
+        self._node = self._session.node
+        self._waiting = Waiting(self._session)
+        self._numbers = 0
+        self._hearing: dict[int, Hearing] = {}
+        self._publishing: dict[int, Publishing] = {}
+        self._serving: dict[int, Serving] = {}
+        self._dialling: dict[int, Dialling] = {}
+
+    def fileno(self) -> int:
+        return self._waiting.fileno()
+
+    def take(self) -> Sequence[Event]:
+        return self._waiting.take()
+
+    def graph(self) -> Graph:
+        return self._waiting.graph
+
+    def channel(self, topic: str, type_name: str) -> Channel:
+        return channel_of(topic, type_name)
+
+    def service(self, name: str, type_name: str) -> Service:
+        return service_of(name, type_name)
+
+    def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
+        message = class_of(type_name)
+        requested = filled(qos)
+        channel = channel_of(topic, type_name)
+        with translated(f"{topic}: cannot be subscribed to"):
+            entity = self._node.create_subscription(
+                message,
+                topic,
+                _ignore,
+                to_profile(requested),
+                callback_group=self._session.group(),
+                raw=True,
+                event_callbacks=self._session.silence(publisher=False),
+            )
+        handle = cast("SubscriptionHandle", entity.handle)
+        hearing = Hearing(self._number(), topic, message, requested, channel, entity, handle)
+        self._hearing[hearing.number] = hearing
+        self._tell_apart(topic)
+        self._waiting.add(hearing)
+        return hearing.number
+
+    def advertise(self, channel: Channel) -> int:
+        known = self._checked(channel)
+        offered = filled(channel.qos[0] if channel.qos else None, latched=channel.latched)
+        with translated(f"{channel.topic}: cannot be advertised"):
+            entity = self._node.create_publisher(
+                class_of(channel.type_name),
+                channel.topic,
+                to_profile(offered),
+                event_callbacks=self._session.silence(publisher=True),
+            )
+        handle = cast("PublisherHandle", entity.handle)
+        publishing = Publishing(self._number(), channel.topic, offered, known, entity, handle)
+        if offered.durability == "transient_local":
+            publishing.kept = deque(maxlen=offered.depth)
+        self._publishing[publishing.number] = publishing
+        self._tell_apart(channel.topic)
+        self._waiting.add(publishing)
+        return publishing.number
+
+    def publish(self, handle: int, raw: bytes) -> None:
+        self._publishing[handle].publish(raw)
+
+    def subscribers(self, handle: int) -> int:
+        publishing = self._publishing[handle]
+        ours = sum(
+            hearing.topic == publishing.topic and not conflict(publishing.qos, hearing.qos)
+            for hearing in self._hearing.values()
+        )
+        return max(0, publishing.handle.get_subscription_count() - ours)
+
+    def serve(self, service: Service) -> int:
+        known = service_of(service.name, service.type_name)
+        if service.hash and known.hash and service.ros == 2 and service.hash != known.hash:
+            raise LocalError(f"{service.name}: this machine has another definition of {service.type_name}")
+        kind = class_of(service.type_name)
+        with translated(f"{service.name}: cannot be served"):
+            entity = self._node.create_service(
+                kind, service.name, _ignore, qos_profile=service_profile(), callback_group=self._session.group()
+            )
+        serving = Serving(self._number(), cast("ServiceType", kind), entity, cast("ServiceHandle", entity.handle))
+        self._serving[serving.number] = serving
+        self._waiting.add(serving)
+        return serving.number
+
+    def answer(self, handle: int, ticket: int, raw: bytes) -> None:
+        from rclpy.serialization import deserialize_message
+
+        serving = self._serving[handle]
+        try:
+            response = deserialize_message(raw, serving.response)
+        except (RuntimeError, ValueError) as error:
+            self.refuse(handle, ticket, f"a response that cannot be read: {error}")
+            return
+        serving.send(ticket, response)
+
+    def refuse(self, handle: int, ticket: int, reason: str) -> None:
+        """Answer {success: false, message: reason} where the response has these; ROS 2 knows no other way."""
+        serving = self._serving[handle]
+        refusal = _refusal(serving.response, reason)
+        if refusal is None:
+            serving.forget(ticket)
+        else:
+            serving.send(ticket, refusal)
+
+    def dial(self, name: str, type_name: str) -> int:
+        service_of(name, type_name)
+        kind = class_of(type_name)
+        with translated(f"{name}: cannot be dialled"):
+            entity = self._node.create_client(
+                kind, name, qos_profile=service_profile(), callback_group=self._session.group()
+            )
+        handle = cast("ClientHandle", entity.handle)
+        dialling = Dialling(self._number(), name, cast("ServiceType", kind), entity, handle)
+        self._dialling[dialling.number] = dialling
+        self._waiting.add(dialling)
+        return dialling.number
+
+    def call(self, handle: int, call: int, raw: bytes) -> None:
+        from rclpy.serialization import deserialize_message
+
+        dialling = self._dialling[handle]
+        try:
+            request = deserialize_message(raw, dialling.request)
+        except (RuntimeError, ValueError) as error:
+            self._waiting.tell(Failed(handle, call, f"a request that cannot be read: {error}"))
+            return
+        is_there = any(end.role is Role.SERVES and end.name == dialling.name for end in self.graph())
+        failed = dialling.begin(call, request, is_there=is_there, now_s=time.monotonic())
+        if failed is not None:
+            self._waiting.tell(failed)
+        elif dialling.is_holding:
+            self._waiting.wake()
+
+    def drop(self, handle: int, call: int) -> None:
+        self._dialling[handle].drop(call)
+
+    def close(self, handle: int) -> None:
+        self._waiting.remove(handle)
+        if hearing := self._hearing.pop(handle, None):
+            self._node.destroy_subscription(hearing.entity)
+            self._tell_apart(hearing.topic)
+        elif publishing := self._publishing.pop(handle, None):
+            self._node.destroy_publisher(publishing.entity)
+        elif serving := self._serving.pop(handle, None):
+            self._node.destroy_service(serving.entity)
+        elif dialling := self._dialling.pop(handle, None):
+            self._node.destroy_client(dialling.entity)
+
+    def shut(self) -> None:
+        self._waiting.close()
+        self._session.close()
+
+    def _number(self) -> int:
+        self._numbers += 1
+        return self._numbers
+
+    def _checked(self, channel: Channel) -> Channel:
+        """Return how this machine knows the channel's type, after making sure that it means the same."""
+        known = channel_of(channel.topic, channel.type_name)
+        if channel.ros != 2:
+            raise LocalError(f"{channel.topic}: its messages are in ROS 1's form")
+        theirs = channel.hash or type_hash(channel.type_name, channel.definition, channel.definition_format)
+        if theirs and theirs != known.hash:
+            raise LocalError(
+                f"{channel.topic}: this machine has another definition of {channel.type_name} "
+                f"({known.hash[:15]}, the publisher's is {theirs[:15]})"
+            )
+        return known
+
+    def _tell_apart(self, topic: str) -> None:
+        """Have our publishers of a topic leave word with our subscriptions to it, so that these skip what they hear."""
+        publishing = [end for end in self._publishing.values() if end.topic == topic]
+        hearing = [end for end in self._hearing.values() if end.topic == topic]
+        for ear in hearing if publishing else ():
+            if ear.own is None:
+                ear.own = OwnMessages()
+                for raw in (raw for end in publishing for raw in end.kept):
+                    ear.own.add(raw, time.monotonic())
+        echoes = tuple(ear.own for ear in hearing if ear.own is not None)
+        for end in publishing:
+            end.echoes = echoes
+
+
+def _ignore(*_: object) -> None:
+    """rclpy wants a callback; the waiting thread takes what comes before any could be called."""
+
+
+def _refusal(response: type, reason: str) -> object | None:
+    fields = cast("dict[str, str]", getattr(response, "get_fields_and_field_types", dict)())
+    if (fields.get("success"), fields.get("message")) != ("boolean", "string"):
+        return None
+    return cast("object", response(success=False, message=reason))

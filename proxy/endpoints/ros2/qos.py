@@ -1,0 +1,115 @@
+"""QoS profiles: ours filled in, rclpy's translated, and which offer cannot meet which request.
+
+Place: pure; the enumerations of rclpy are imported where they are used.
+Source: DDS 1.4, section 2.2.3 (request against offer); rmw/types.h (the words).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+from proxy.serial.channel import Qos
+
+if TYPE_CHECKING:
+    from rclpy.qos import QoSProfile
+
+__all__ = ["conflict", "filled", "from_profile", "service_profile", "to_profile"]
+
+_INFINITE: Final = (9_223_372_036, 854_775_807)  # RMW_DURATION_INFINITE
+_DEPTH: Final = 10
+_DEPTH_OF_ALL: Final = 1_000
+_INFINITE_FROM_S: Final = 2_147_483_647  # what DDS itself calls infinite
+_LIVELINESS: Final = ("automatic", "manual_by_topic")
+
+
+def filled(qos: Qos | None, *, latched: bool = False) -> Qos:
+    """Return a profile that an endpoint can have: every policy a definite word, the depth finite.
+
+    "Keep all" becomes a depth of 1,000: one stalled reader must not block the publisher that serves all others.
+
+    Args:
+        qos: None: reliable, and transient local with a depth of one if ``latched``.
+    """
+    if qos is None:
+        durability, depth = ("transient_local", 1) if latched else ("volatile", _DEPTH)
+        return Qos("keep_last", depth, "reliable", durability, (0, 0), (0, 0), "automatic", (0, 0), plain_names=False)
+    return Qos(
+        history="keep_last",
+        depth=_DEPTH_OF_ALL if qos.history == "keep_all" else qos.depth or _DEPTH,
+        reliability="best_effort" if qos.reliability == "best_effort" else "reliable",
+        durability="transient_local" if qos.durability == "transient_local" else "volatile",
+        deadline=_duration(qos.deadline),
+        lifespan=_duration(qos.lifespan),
+        liveliness="manual_by_topic" if qos.liveliness == "manual_by_topic" else "automatic",
+        lease=_duration(qos.lease),
+        plain_names=qos.plain_names,
+    )
+
+
+def conflict(offered: Qos, requested: Qos) -> str:
+    """Return why a publisher's offer does not meet a subscription's request, empty where it does."""
+    if (offered.reliability, requested.reliability) == ("best_effort", "reliable"):
+        return "reliability: best effort offered, reliable requested"
+    if (offered.durability, requested.durability) == ("volatile", "transient_local"):
+        return "durability: volatile offered, transient local requested"
+    if _limit(offered.deadline) > _limit(requested.deadline):
+        return "deadline: a longer one offered than requested"
+    if offered.liveliness in _LIVELINESS and requested.liveliness in _LIVELINESS:
+        if _LIVELINESS.index(offered.liveliness) < _LIVELINESS.index(requested.liveliness):
+            return "liveliness: automatic offered, manual by topic requested"
+        if _limit(offered.lease) > _limit(requested.lease):
+            return "liveliness: a longer lease offered than requested"
+    return ""
+
+
+def from_profile(profile: QoSProfile) -> Qos:
+    """Return rclpy's profile in our words."""
+    return Qos(
+        history=profile.history.name.lower(),
+        depth=profile.depth,
+        reliability=profile.reliability.name.lower(),
+        durability=profile.durability.name.lower(),
+        deadline=_seconds(profile.deadline.nanoseconds),
+        lifespan=_seconds(profile.lifespan.nanoseconds),
+        liveliness=profile.liveliness.name.lower(),
+        lease=_seconds(profile.liveliness_lease_duration.nanoseconds),
+        plain_names=profile.avoid_ros_namespace_conventions,
+    )
+
+
+def to_profile(qos: Qos) -> QoSProfile:
+    """Return rclpy's form of a ``filled`` profile."""
+    from rclpy.duration import Duration
+    from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
+
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=qos.depth,
+        reliability=ReliabilityPolicy[qos.reliability.upper()],
+        durability=DurabilityPolicy[qos.durability.upper()],
+        deadline=Duration(seconds=qos.deadline[0], nanoseconds=qos.deadline[1]),
+        lifespan=Duration(seconds=qos.lifespan[0], nanoseconds=qos.lifespan[1]),
+        liveliness=LivelinessPolicy[qos.liveliness.upper()],
+        liveliness_lease_duration=Duration(seconds=qos.lease[0], nanoseconds=qos.lease[1]),
+        avoid_ros_namespace_conventions=qos.plain_names,
+    )
+
+
+def service_profile() -> QoSProfile:
+    """Return the default profile of services, but deep: a burst of calls must find room."""
+    return to_profile(replace(filled(None), depth=_DEPTH_OF_ALL))
+
+
+def _duration(duration: tuple[int, int]) -> tuple[int, int]:
+    return (0, 0) if duration[0] >= _INFINITE_FROM_S else duration
+
+
+def _limit(duration: tuple[int, int]) -> tuple[int, int]:
+    """Zero is "not said", which is infinite."""
+    return _INFINITE if duration == (0, 0) or duration[0] >= _INFINITE_FROM_S else duration
+
+
+def _seconds(nanoseconds: int) -> tuple[int, int]:
+    seconds, rest = divmod(nanoseconds, 1_000_000_000)
+    return seconds, rest

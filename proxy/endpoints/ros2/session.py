@@ -1,0 +1,282 @@
+"""One node of ours in one ROS 2 domain, and the part of rclpy that we use, with types.
+
+Place: the only module here that starts rclpy. rclpy's executors take 100 µs and more a callback, and its experimental
+``EventsExecutor`` delivered nothing to raw subscriptions when tried (7.1.6); so the handles beneath its publishers and
+subscriptions are used directly, as its executors do.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Protocol, cast
+
+from gdp.errors import LocalError
+
+if TYPE_CHECKING:
+    from rclpy.qos import QoSProfile
+
+__all__ = [
+    "ClientHandle",
+    "Entity",
+    "GuardCondition",
+    "Handle",
+    "Node",
+    "PublisherHandle",
+    "RequestInfo",
+    "ServiceHandle",
+    "ServiceType",
+    "Session",
+    "SubscriptionHandle",
+    "TopicEnd",
+    "WaitSet",
+    "open_session",
+    "translated",
+]
+
+
+class Handle(Protocol):
+    """An rcl object; alive at least while entered."""
+
+    pointer: int
+
+    def __enter__(self) -> object: ...
+    def __exit__(self, kind: object, error: object, trace: object) -> None: ...
+
+
+class GuardCondition(Handle, Protocol):
+    """What wakes a wait set."""
+
+    def trigger_guard_condition(self) -> None: ...
+    def destroy_when_not_in_use(self) -> None: ...
+
+
+class SubscriptionHandle(Handle, Protocol):
+    """A subscription of rcl."""
+
+    def take_message(self, kind: type, raw: bool, /) -> tuple[bytes, object] | None: ...
+
+
+class PublisherHandle(Handle, Protocol):
+    """A publisher of rcl."""
+
+    def publish_raw(self, raw: bytes, /) -> None: ...
+    def get_subscription_count(self) -> int: ...
+
+
+class RequestId(Protocol):
+    """Which request of its client."""
+
+    sequence_number: int
+
+
+class RequestInfo(Protocol):
+    """What comes with a request or a response."""
+
+    request_id: RequestId
+
+
+class ServiceHandle(Handle, Protocol):
+    """A server of rcl."""
+
+    def service_take_request(self, kind: type, /) -> tuple[object, RequestInfo] | tuple[None, None]: ...
+    def service_send_response(self, response: object, request: RequestId, /) -> None: ...
+
+
+class ClientHandle(Handle, Protocol):
+    """A client of rcl."""
+
+    def send_request(self, request: object, /) -> int: ...
+    def take_response(self, kind: type, /) -> tuple[RequestInfo | None, object]: ...
+    def service_server_is_available(self) -> bool: ...
+
+
+class ServiceType(Protocol):
+    """The generated class of a service."""
+
+    Request: type
+    Response: type
+
+
+class WaitSet(Handle, Protocol):
+    """What waits; emptied by every wait."""
+
+    def clear_entities(self) -> None: ...
+    def add_guard_condition(self, guard: GuardCondition, /) -> int: ...
+    def add_subscription(self, subscription: SubscriptionHandle, /) -> int: ...
+    def add_service(self, service: ServiceHandle, /) -> int: ...
+    def add_client(self, client: ClientHandle, /) -> int: ...
+    def wait(self, timeout_ns: int, /) -> None: ...
+    def get_ready_entities(self, kind: str, /) -> list[int]: ...
+    def destroy_when_not_in_use(self) -> None: ...
+
+
+class Entity(Protocol):
+    """rclpy's object around a handle."""
+
+    handle: object
+
+
+class TopicEnd(Protocol):
+    """A publisher or subscription in the graph."""
+
+    node_name: str
+    node_namespace: str
+    topic_type: str
+    endpoint_gid: Sequence[int]
+    qos_profile: QoSProfile
+
+
+class NodeHandle(Handle, Protocol):
+    """A node of rcl."""
+
+    def get_count_publishers(self, topic: str, /) -> int: ...
+    def get_count_subscribers(self, topic: str, /) -> int: ...
+
+
+class Node(Protocol):
+    """rclpy's node."""
+
+    handle: NodeHandle
+
+    def get_name(self) -> str: ...
+    def get_topic_names_and_types(self, no_demangle: bool = ...) -> list[tuple[str, list[str]]]: ...
+    def get_service_names_and_types(self) -> list[tuple[str, list[str]]]: ...
+    def get_node_names_and_namespaces(self) -> list[tuple[str, str]]: ...
+    def get_publishers_info_by_topic(self, topic: str) -> list[TopicEnd]: ...
+    def get_subscriptions_info_by_topic(self, topic: str) -> list[TopicEnd]: ...
+    def get_service_names_and_types_by_node(self, node: str, space: str) -> list[tuple[str, list[str]]]: ...
+    def get_client_names_and_types_by_node(self, node: str, space: str) -> list[tuple[str, list[str]]]: ...
+    def create_publisher(self, kind: type, topic: str, qos: object, *, event_callbacks: object) -> Entity: ...
+    def create_subscription(
+        self, kind: type, topic: str, callback: object, qos: object, *, callback_group: object, raw: bool,
+        event_callbacks: object,
+    ) -> Entity: ...  # fmt: skip
+    def create_service(
+        self, kind: type, name: str, callback: object, *, qos_profile: object, callback_group: object
+    ) -> Entity: ...
+    def create_client(self, kind: type, name: str, *, qos_profile: object, callback_group: object) -> Entity: ...
+    def destroy_publisher(self, entity: Entity) -> bool: ...
+    def destroy_subscription(self, entity: Entity) -> bool: ...
+    def destroy_service(self, entity: Entity) -> bool: ...
+    def destroy_client(self, entity: Entity) -> bool: ...
+    def destroy_node(self) -> None: ...
+
+
+class _Context(Protocol):
+    handle: Handle
+
+    def try_shutdown(self) -> None: ...
+    def destroy(self) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """A node in a context of its own."""
+
+    node: Node
+    context: _Context
+    rcl: ModuleType
+
+    def guard(self) -> GuardCondition:
+        """Return a new guard condition."""
+        with self.context.handle:
+            return cast("GuardCondition", self.rcl.GuardCondition(self.context.handle))
+
+    def wait_set(self, subscriptions: int, services: int, clients: int) -> WaitSet:
+        """Return a wait set with room for one guard condition and these."""
+        with self.context.handle:
+            return cast("WaitSet", self.rcl.WaitSet(subscriptions, 1, 0, clients, services, 0, self.context.handle))
+
+    def group(self) -> object:
+        """Return a callback group for one entity: a node's default group would remember every entity for ever."""
+        from rclpy.callback_groups import ReentrantCallbackGroup
+
+        return ReentrantCallbackGroup()
+
+    def silence(self, *, publisher: bool) -> object:
+        """Return event callbacks that do nothing; what does not fit is seen in the graph instead."""
+        try:
+            from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+        except ImportError:  # before Iron
+            from rclpy.qos_event import PublisherEventCallbacks, SubscriptionEventCallbacks
+        kind = PublisherEventCallbacks if publisher else SubscriptionEventCallbacks
+        return cast("object", kind(use_default_callbacks=False))
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self.node.destroy_node()
+        self.context.try_shutdown()
+        self.context.destroy()
+
+
+def open_session(domain: int, name: str) -> Session:
+    """Join a domain as a node without parameters, log topic or type service.
+
+    Raises:
+        LocalError: ROS 2 is not installed, or does not start; the text says what to do.
+    """
+    _check_rmw()
+    try:
+        import rclpy
+        from rclpy.context import Context
+        from rclpy.impl.implementation_singleton import rclpy_implementation
+        from rclpy.parameter import Parameter
+        from rclpy.signals import SignalHandlerOptions
+    except ImportError as error:
+        raise LocalError(
+            "rclpy cannot be imported: source your ROS 2 (. /opt/ros/<distribution>/setup.sh), "
+            f"or pip install 'gdp-ros[ros2]' ({_first_line(error)})"
+        ) from error
+    try:
+        context = Context()
+        rclpy.init(args=[], context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+        node = rclpy.create_node(
+            name,
+            context=context,
+            enable_rosout=False,
+            start_parameter_services=False,
+            use_global_arguments=False,
+            parameter_overrides=[Parameter("start_type_description_service", value=False)],
+        )
+    except (RuntimeError, OSError, ImportError) as error:  # rclpy's own errors are RuntimeErrors
+        raise LocalError(
+            f"ROS 2 does not start in domain {domain}: {_first_line(error)}; is the RMW library installed that "
+            "RMW_IMPLEMENTATION names? (pip install 'gdp-ros[ros2]' brings rmw_fastrtps_cpp)"
+        ) from error
+    return Session(cast("Node", node), cast("_Context", context), cast("ModuleType", rclpy_implementation))
+
+
+def _check_rmw() -> None:
+    """Refuse an RMW that is not installed: rcl would end the process over it, with exit status 102."""
+    wanted = os.environ.get("RMW_IMPLEMENTATION", "")
+    prefixes = [*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
+    folders = [*os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep), *(f"{prefix}/lib" for prefix in prefixes)]
+    libraries = {path.stem[3:] for folder in folders if folder for path in Path(folder).glob("librmw_*.so")}
+    known = sorted(name for name in libraries if not re.search(r"__|_shared_|_common|_implementation", name))
+    if wanted and known and wanted not in known:
+        raise LocalError(
+            f"RMW_IMPLEMENTATION names {wanted}, but this machine has only {', '.join(known)}: "
+            f"install ros-<distribution>-{wanted.replace('_', '-')}, or unset it"
+        )
+
+
+@contextmanager
+def translated(what: str) -> Iterator[None]:
+    """Turn what rclpy raises for a name, a type or a profile that it refuses into a LocalError."""
+    from rclpy.exceptions import NameValidationException, NoTypeSupportImportedException
+
+    try:
+        yield
+    except (RuntimeError, ValueError, NameValidationException, NoTypeSupportImportedException) as error:
+        raise LocalError(f"{what}: {_first_line(error)}") from error
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]

@@ -1,0 +1,149 @@
+"""A ROS 2 domain on loopback for one test: an endpoint of ours, and real rclpy peers in processes of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+import pytest
+
+from proxy.endpoints.endpoint import Answered, Asked, Event, Failed, Heard, proxy_node_name
+from proxy.endpoints.ros2 import Ros2Endpoint
+
+DOMAIN = 100 + os.getpid() % 100
+NODE = proxy_node_name("0123456789abcdef" * 4)
+PATIENCE_S = 10.0
+_Found = TypeVar("_Found", bound=Event)
+
+# loopback, and no shared memory: it would cross network namespaces
+CONFINED = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+
+
+class Peer:
+    """A real node elsewhere; see ``ros2_peer`` for what it can be told.
+
+    Args:
+        words: in front of the command, such as those of ``nsenter``.
+        environment: beside that of this process.
+    """
+
+    def __init__(self, name: str, words: Sequence[str] = (), environment: Mapping[str, str] = CONFINED) -> None:
+        self._process = subprocess.Popen(
+            [*words, sys.executable, str(Path(__file__).with_name("ros2_peer.py")), name],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, **environment, "ROS_DOMAIN_ID": str(DOMAIN)},
+        )
+
+    def tell(self, line: str) -> object:
+        """Return the value of an expression there; a line after ``!`` is executed."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(line.replace("\n", "\\n") + "\n")
+        self._process.stdin.flush()
+        answer: object = json.loads(self._process.stdout.readline())
+        assert not str(answer).startswith("ERROR"), answer
+        return answer
+
+    def waits_for(self, line: str, wanted: object) -> None:
+        """Wait until an expression there has a value."""
+        until = time.monotonic() + PATIENCE_S
+        while (answer := self.tell(line)) != wanted:
+            assert time.monotonic() < until, f"{line} is {answer!r}, not {wanted!r}"
+            time.sleep(0.02)
+
+    def end(self, *, kill: bool = False) -> None:
+        """Stop it; idempotent."""
+        if kill:
+            self._process.kill()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None and not pipe.closed:
+                pipe.close()
+        try:
+            self._process.wait(8)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+class Ears:
+    """Takes an endpoint's events and keeps them."""
+
+    def __init__(self, endpoint: Ros2Endpoint) -> None:
+        self.endpoint = endpoint
+        self.events: list[Event] = []
+
+    def until(self, is_met: Callable[[], object], what: str = "") -> None:
+        """Take events until a condition holds."""
+        end = time.monotonic() + PATIENCE_S
+        while not is_met():
+            assert time.monotonic() < end, f"{what} did not happen; {self.events[-5:]}"
+            select.select([self.endpoint], [], [], 0.02)
+            self.events += self.endpoint.take()
+
+    def for_s(self, seconds: float) -> None:
+        """Take events for a time: for what must not happen."""
+        end = time.monotonic() + seconds
+        while (rest := end - time.monotonic()) > 0:
+            select.select([self.endpoint], [], [], rest)
+            self.events += self.endpoint.take()
+
+    def of(self, kind: type[_Found], handle: int) -> list[_Found]:
+        """Return the events of a kind of a handle so far."""
+        return [event for event in self.events if isinstance(event, kind) and event[0] == handle]
+
+    def heard(self, handle: int) -> list[bytes]:
+        return [event.raw for event in self.of(Heard, handle)]
+
+    def next_asked(self, handle: int, count: int = 1) -> list[Asked]:
+        self.until(lambda: len(self.of(Asked, handle)) >= count, "a request")
+        return self.of(Asked, handle)
+
+    def outcome(self, handle: int, call: int) -> Answered | Failed:
+        def found() -> list[Answered | Failed]:
+            return [event for event in (*self.of(Answered, handle), *self.of(Failed, handle)) if event.call == call]
+
+        self.until(found, f"the outcome of call {call}")
+        return found()[0]
+
+
+def needs(*packages: str) -> None:
+    """Skip where rclpy or an interface package is not installed."""
+    for package in ("rclpy", *packages):
+        pytest.importorskip(package, reason=f"{package} is not installed: pip install 'gdp-ros[ros2]', or source ROS 2")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of the parser that rosidl uses
+        pytest.importorskip("rosidl_generator_py")
+
+
+@contextmanager
+def endpoint_of_ours(node: str = NODE) -> Iterator[Ears]:
+    """An endpoint in the domain."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in CONFINED.items():
+            patch.setenv(name, value)
+        endpoint = Ros2Endpoint(DOMAIN, node)
+        try:
+            yield Ears(endpoint)
+        finally:
+            endpoint.shut()
+
+
+@contextmanager
+def peer_of(name: str, words: Sequence[str] = (), environment: Mapping[str, str] = CONFINED) -> Iterator[Peer]:
+    """A real node in the domain."""
+    peer = Peer(name, words, environment)
+    try:
+        yield peer
+    finally:
+        peer.end()

@@ -1,0 +1,91 @@
+"""The parts of the ros2 endpoint that only think: profiles, verdicts, and telling one's own messages apart."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from proxy.endpoints.endpoint import End, Role
+from proxy.endpoints.ros2.own import OwnMessages
+from proxy.endpoints.ros2.qos import conflict, filled
+from proxy.endpoints.ros2.verdict import verdict
+from proxy.serial.channel import Channel, Qos
+
+RELIABLE = filled(None)
+STRING = Channel("/a", "std_msgs/msg/String", 2, "RIHS01_" + "a" * 64)
+
+
+@pytest.mark.parametrize(
+    ("offered", "requested", "policy"),
+    [
+        (RELIABLE, RELIABLE, ""),
+        (RELIABLE, replace(RELIABLE, reliability="best_effort"), ""),
+        (replace(RELIABLE, reliability="best_effort"), RELIABLE, "reliability"),
+        (RELIABLE, replace(RELIABLE, durability="transient_local"), "durability"),
+        (replace(RELIABLE, durability="transient_local"), RELIABLE, ""),
+        (RELIABLE, replace(RELIABLE, deadline=(1, 0)), "deadline"),
+        (replace(RELIABLE, deadline=(1, 0)), replace(RELIABLE, deadline=(2, 0)), ""),
+        (replace(RELIABLE, deadline=(2, 0)), replace(RELIABLE, deadline=(1, 0)), "deadline"),
+        (RELIABLE, replace(RELIABLE, liveliness="manual_by_topic"), "liveliness"),
+        (replace(RELIABLE, liveliness="manual_by_topic"), RELIABLE, ""),
+        (replace(RELIABLE, lease=(3, 0)), replace(RELIABLE, lease=(2, 0)), "liveliness"),
+        (replace(RELIABLE, reliability="unknown"), RELIABLE, ""),
+    ],
+)
+def test_an_offer_that_does_not_meet_the_request_names_its_policy(offered: Qos, requested: Qos, policy: str) -> None:
+    assert conflict(offered, requested).partition(":")[0] == policy
+
+
+def test_unknown_words_and_no_depth_become_the_defaults() -> None:
+    unknown = Qos("unknown", 0, "unknown", "unknown", (0, 0), (0, 0), "unknown", (0, 0), plain_names=False)
+    assert filled(unknown) == RELIABLE
+
+
+def test_keep_all_becomes_a_long_but_finite_queue() -> None:
+    assert filled(replace(RELIABLE, history="keep_all")) == replace(RELIABLE, depth=1_000)
+
+
+@pytest.mark.parametrize("infinite", [(2_147_483_647, 4_294_967_295), (9_223_372_036, 854_775_807)])
+def test_every_way_to_say_infinite_is_left_unsaid(infinite: tuple[int, int]) -> None:
+    assert filled(replace(RELIABLE, deadline=infinite, lifespan=infinite, lease=infinite)) == RELIABLE
+
+
+def test_a_verdict_names_the_node_and_what_differs() -> None:
+    end = End(Role.PUBLISHES, "/a", "std_msgs/msg/String", "/talker", "01", STRING.hash, RELIABLE)
+    assert verdict(Role.SUBSCRIBES, STRING, RELIABLE, frozenset({end})) == ""
+    other = replace(end, hash="RIHS01_" + "b" * 64)
+    assert "another definition of std_msgs/msg/String" in verdict(
+        Role.SUBSCRIBES, STRING, RELIABLE, frozenset({end, other})
+    )
+    typed = replace(end, type_name="std_msgs/msg/Bool")
+    assert "/talker publishes it with another type" in verdict(Role.SUBSCRIBES, STRING, RELIABLE, frozenset({typed}))
+    assert verdict(Role.PUBLISHES, STRING, RELIABLE, frozenset({typed})) == ""  # it publishes too
+
+
+def test_as_many_copies_are_taken_out_as_were_published() -> None:
+    own = OwnMessages()
+    own.add(b"\0\1\0\0same", 0.0)
+    own.add(b"\0\1\0\0same", 0.1)
+    assert own.take(b"\0\1\0\3same", 0.2)  # the encapsulation may say how much padding there is
+    assert not own.take(b"\0\1\0\0other", 0.2)
+    assert own.take(b"\0\1\0\0same", 0.3)
+    assert not own.take(b"\0\1\0\0same", 0.3)
+
+
+def test_what_was_not_heard_soon_is_forgotten() -> None:
+    own = OwnMessages()
+    own.add(b"\0\1\0\0a", 0.0)
+    own.take(b"\0\1\0\0a", 0.1)
+    own.add(b"\0\1\0\0a", 1.0)
+    assert own.take(b"\0\1\0\0a", 2.5)  # the first copy's time is over, not the second's
+    own.add(b"\0\1\0\0a", 3.0)
+    assert not own.take(b"\0\1\0\0a", 5.1)
+
+
+def test_memory_is_bounded() -> None:
+    own = OwnMessages()
+    for number in range(10_000):
+        own.add(b"\0\1\0\0%d" % number, 0.0)
+    assert not own.take(b"\0\1\0\0" + b"1", 0.1)
+    assert own.take(b"\0\1\0\0" + b"9999", 0.1)
