@@ -35,7 +35,7 @@ app = typer.Typer(no_args_is_help=True, help="Let a node act on a name, or a swi
 
 OwnerDir = Annotated[Path, typer.Option("--owner", metavar="DIR", help="the owner's directory")]
 CardFile = Annotated[Path, typer.Option("--card", metavar="FILE", help="the node's card (node.card)")]
-Rights = Annotated[list[str], typer.Option("--right", help="publish, serve or read; may be repeated")]
+Rights = Annotated[list[str], typer.Option("--right", help="publish, read, serve or call; may be repeated")]
 Epochs = Annotated[str, typer.Option("--epochs", help="whose secrets it gets, such as 0 or 0-3")]
 MayDelegate = Annotated[bool, typer.Option("--may-delegate", help="the node may pass the rights on")]
 TrustedRoot = Annotated[
@@ -67,12 +67,14 @@ def name(
     force: options.Force = False,
     as_json: options.Json = False,
 ) -> None:
-    """Let a node publish, serve or read a name (AdCert), with the secrets it needs (grants).
+    """Let a node publish, read, serve or call a name (AdCert), with the secrets it needs (grants).
 
     \b
     Example:
       gdp delegate name --owner keys/lab --card robot.card --right publish --kind topic --name /camera/image \\
           --type sensor_msgs/msg/Image --author lab --epochs 0-3 --out camera.delegation
+      gdp delegate name --owner keys/lab --card server.card --right serve --kind service --name /plan \\
+          --type nav_msgs/srv/GetPlan --out plan.delegation
     """
     metadata = metadata_from_options(
         kind=kind,

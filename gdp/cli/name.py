@@ -40,6 +40,7 @@ def name(
     \b
     Example:
       gdp name --kind topic --name /camera/image --type sensor_msgs/msg/Image --author lab --owner owner.pub
+      gdp name --kind action --name /navigate --type nav2_msgs/action/NavigateToPose --owner owner.pub
     """
     metadata = metadata_from_options(
         kind=kind,

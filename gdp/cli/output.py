@@ -101,7 +101,7 @@ def rights_from_text(texts: Iterable[str]) -> frozenset[Right]:
     known = {right.value: right for right in Right}
     for text in texts:
         if text not in known:
-            raise LocalError(f"--right {text!r}: expected publish, serve or read")
+            raise LocalError(f"--right {text!r}: expected publish, serve, call or read")
     return frozenset(known[text] for text in texts)
 
 

@@ -11,7 +11,8 @@ from typing import Final
 
 from gdp.client.pasts import Pasts
 from gdp.client.private import IDLE_S, AnswerStream, Life, private_name
-from gdp.client.publisher import Publisher, Secrets, Source
+from gdp.client.publisher import Publisher
+from gdp.client.source import Secrets, Source
 from gdp.errors import DropReason, LocalError
 from gdp.names import Name
 

@@ -9,13 +9,12 @@ delivers: a reliable topic in order and complete, a best-effort one in order and
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from enum import Enum
-from itertools import count
-from typing import Final, NamedTuple
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
 
-from gdp.client.publisher import Secrets
+from gdp.client.reading import Delivered, Ended, FeedState, Reader
+from gdp.client.source import Secrets
 from gdp.crypto.envelope import Opener
 from gdp.crypto.note import NoteSealer
 from gdp.effects import Arrival
@@ -49,43 +48,6 @@ _READY_OVERHEAD_BYTES: Final = 256  # what a message that waits for others costs
 _BUNDLE: Final = int(Flag.BUNDLE)
 _LATCHED: Final = int(Flag.LATCHED)
 _WAITING: Final = int(Flag.RELIABLE | Flag.LATCHED)  # topics whose readers wait for what is missing
-
-
-class FeedState(Enum):
-    """How far a feed is."""
-
-    NEW = "new"
-    LIVE = "live"
-
-
-@dataclass(frozen=True, slots=True)
-class Reader:
-    """Who reads, in this life of its process: one for all its feeds, since they share its numbers for notes."""
-
-    name: Name
-    incarnation: int
-    note_numbers: Iterator[int] = field(default_factory=lambda: count(1), compare=False)
-
-
-class Delivered(NamedTuple):
-    """One message, opened, verified and in its place."""
-
-    publisher: bytes
-    incarnation: int  # of the publisher, within which numbers rise
-    number: int
-    message: bytes
-    parts: int
-    hops: int
-    place: int = 0  # among the messages of one number: several come in one bundle
-
-
-class Ended(NamedTuple):
-    """Where a feed ended, for another one of the same: what came before is not opened again."""
-
-    number: int = 0  # of the next message
-    status: int = 0  # the highest seen
-
-
 _NOWHERE: Final = Ended()
 
 

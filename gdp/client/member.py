@@ -18,7 +18,8 @@ from gdp.client.attachment import Attachment
 from gdp.client.feed import Feed, FeedState, Reader
 from gdp.client.private import Life
 from gdp.client.publications import Publications
-from gdp.client.publisher import Publisher, Source
+from gdp.client.publisher import Publisher
+from gdp.client.source import Source
 from gdp.client.subscription import Message, Subscription, Subscriptions, Topic
 from gdp.control.join import Join
 from gdp.control.query import Answer

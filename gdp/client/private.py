@@ -87,9 +87,12 @@ class AnswerStream(Publisher):
         self.tree_stands(MTU_MIN_BYTES if mtu is None else mtu)
 
     def touch(self, now_s: float) -> None:
-        """Note that there is something to say, or to hear; a client that was silent is a reader again."""
+        """Note that there is something to say, or to hear; a client that was silent is a reader again, from now on."""
         self._touched_s = now_s
-        self.admit(*self.client, now_s)
+        name, incarnation = self.client
+        if name not in self._readers:
+            self._readers.admit(name, incarnation, now_s)
+            self._window.add_reader(name, self._next_number, now_s)
 
     def is_idle(self, now_s: float) -> bool:
         """Return whether it may be forgotten."""

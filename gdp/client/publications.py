@@ -12,7 +12,8 @@ from gdp.client.agenda import Agenda
 from gdp.client.answering import Answering
 from gdp.client.pasts import Pasts
 from gdp.client.private import Life
-from gdp.client.publisher import Publisher, Secrets, Source
+from gdp.client.publisher import Publisher
+from gdp.client.source import Secrets, Source
 from gdp.client.turns import Turns
 from gdp.control.join import Join
 from gdp.crypto.note import topic_of

@@ -22,10 +22,10 @@ from typing import Final
 
 from gdp.client.best_effort import Unsent
 from gdp.client.kept import Kept
-from gdp.client.notice import Notice
 from gdp.client.pasts import FIRST, Past
 from gdp.client.readers import Readers
 from gdp.client.source import Secrets, Source
+from gdp.client.statuses import Statuses
 from gdp.crypto.envelope import SIGNATURE_BYTES, Sealed, Sealer, part_room
 from gdp.errors import DropReason, LocalError, RemoteError
 from gdp.frame.codec import Header
@@ -34,19 +34,12 @@ from gdp.limits import MTU_MIN_BYTES, WINDOW_BYTES
 from gdp.message.bundle import BUNDLE_BYTES, Counts, Gathered, pack
 from gdp.message.move import MOVES_MAX, Move
 from gdp.message.report import Report, ReportFlag
-from gdp.message.status import STARTS_MAX, Status
 from gdp.names import Name
 
 __all__ = ["Publisher", "Secrets", "Source"]
 
 _ALL: Final = 1 << 30
-_STATUS_GAP_S: Final = 0.02  # between two statuses
-_STATUS_BYTES_PER_S: Final = 8 << 20  # ... and longer after a large one
 _BUNDLE: Final = int(Flag.BUNDLE)
-
-
-def _told_nobody(_: Publisher) -> None:
-    return None
 
 
 class Publisher:
@@ -77,24 +70,21 @@ class Publisher:
         self.topic = topic
         self._source = source
         self._secrets = secrets
-        self._notice = Notice(description)
+        self._statuses = Statuses(description, past.status_number)
         self._is_reliable = reliable
         self._repairs_wanted = reliable or depth > 0
         self.is_urgent = urgent
         self.has_more = False  # ``take`` came to its limit
-        self.published: Callable[[Publisher], None] = _told_nobody  # called when something waits to be taken
+        self.published: Callable[[Publisher], None] = lambda _: None  # called when something waits to be taken
         self._window = Kept(depth, past.next_number - 1)
         self._depth = depth
         self._flags = self._flags_now()
         self._epoch = max(secrets)
         self._data = self._sealer(Kind.DATA)
         self._status = self._sealer(Kind.STATUS)
-        self._next_number, self._status_number = past
-        self._mtu: int | None = None  # unknown until a tree stands
+        self._next_number = past.next_number
+        self.mtu: int | None = None  # smallest on the tree; unknown until one stands
         self._readers = Readers(topic, source)
-        self._starts: dict[bytes, int] = {}
-        self._status_wanted = False
-        self._status_at_s = float("-inf")  # when the next one may go
         self._moves: deque[Move] = deque(maxlen=MOVES_MAX)
         self._skipped = past.next_number - 1  # numbers that its past used, or that moves left behind
         self.bundle_bytes = BUNDLE_BYTES  # 0: each message has a seal of its own
@@ -109,21 +99,16 @@ class Publisher:
     @property
     def readers(self) -> int:
         """Return how many readers have introduced themselves and are alive; none before a tree stands."""
-        return 0 if self._mtu is None else len(self._readers)
+        return 0 if self.mtu is None else len(self._readers)
 
     def has_reader(self, name: Name) -> bool:
         """Return whether a reader has introduced itself and is alive, and a tree stands."""
-        return self._mtu is not None and name in self._readers
-
-    @property
-    def mtu(self) -> int | None:
-        """Return the smallest MTU on the tree, or None before one stands."""
-        return self._mtu
+        return self.mtu is not None and name in self._readers
 
     @property
     def past(self) -> Past:
         """Return where it is, for another one that goes on with the same."""
-        return Past(self._next_number, self._status_number)
+        return Past(self._next_number, self._statuses.number)
 
     @property
     def repairs(self) -> int:
@@ -165,8 +150,7 @@ class Publisher:
 
         What is published right behind it may overtake the news, where a frame is lost.
         """
-        if self._notice.change(description):
-            self._status_wanted = True
+        if self._statuses.describe(description):
             self.published(self)
 
     def set_depth(self, depth: int) -> None:
@@ -184,7 +168,7 @@ class Publisher:
         if not self._repairs_wanted:
             for name in self._readers:
                 self._window.drop_reader(name)
-        self._status_wanted = True
+        self._statuses.wanted = True
         self.published(self)
 
     def close(self) -> None:
@@ -195,12 +179,12 @@ class Publisher:
         self._early.clear()
         self._gathered, self._unsent = Gathered(), Unsent()
         self.published(self)  # the last time: who waits for its frames finds none
-        self.published = _told_nobody
+        self.published = lambda _: None
 
     def tree_stands(self, mtu: int) -> None:
         """Learn that a tree reaches this publisher, and the smallest MTU on it (bytes after the Ethernet header)."""
-        self._mtu = max(mtu, MTU_MIN_BYTES)
-        self._split_anew(self._mtu)
+        self.mtu = max(mtu, MTU_MIN_BYTES)
+        self._split_anew(self.mtu)
 
     def publish(self, message: bytes) -> int | None:
         """Queue a message; return how many that makes, or None when nobody is there to read it.
@@ -210,7 +194,7 @@ class Publisher:
         Raises:
             LocalError: above the limits.
         """
-        if self._mtu is None or not self._readers:
+        if self.mtu is None or not self._readers:
             if self._depth:
                 self._early.append(message)
             else:
@@ -227,12 +211,6 @@ class Publisher:
         self.payload_bytes += len(message)
         self.published(self)
         return self.messages
-
-    def admit(self, name: Name, incarnation: int, now_s: float) -> None:
-        """Take for a reader who has not introduced itself, but is known all the same; its first message is the next."""
-        if name not in self._readers:
-            self._readers.admit(name, incarnation, now_s)
-            self._window.add_reader(name, self._next_number, now_s)
 
     def receive_report(self, header: Header, frame: bytes, now_s: float) -> None:
         """Take a reader's sealed report; what is wrong with it is counted."""
@@ -260,28 +238,27 @@ class Publisher:
         for name in self._window.laggards(now_s):
             self._readers[name].do_penance(now_s)
             self._window.drop_reader(name)
-            self._status_wanted = True
-        again_s = self._notice.due()
-        if self._window.probe_due(now_s) or (again_s is not None and again_s <= now_s):
-            self._status_wanted = True
+            self._statuses.wanted = True
+        self._statuses.wanted |= self._window.probe_due(now_s)
+        self._statuses.timeout(now_s)
 
     def next_timeout(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         times = [self._window.next_probe(), self._readers.next_silent()]
-        if self._readers and self._mtu is not None:
-            times.append(self._status_at_s if self._status_wanted else self._notice.due())
+        if self._readers and self.mtu is not None:
+            times.append(self._statuses.next_timeout())
         return min((time for time in times if time is not None), default=None)
 
     def take(self, now_s: float, limit_bytes: int = _ALL) -> list[bytes]:
         """Return frames that may go now, about ``limit_bytes`` at a time: the rest is sealed when it is asked for."""
         self.has_more = False
-        if self._mtu is None or not self._readers:
+        if self.mtu is None or not self._readers:
             return []
         while self._early:
             self.publish(self._early.popleft())
-        limit = max(limit_bytes // self._mtu, 1)
+        limit = max(limit_bytes // self.mtu, 1)
         frames = self._unsent.take(limit)
-        if self._status_wanted and now_s >= self._status_at_s:
+        if self._statuses.is_due(now_s):
             frames += self._seal_status(now_s)
         frames += self._window.take(now_s, max(limit - len(frames), 1))
         while self._gathered and len(frames) < limit and not self._has_unsent():
@@ -296,9 +273,9 @@ class Publisher:
 
     def _bundle_room(self) -> int:
         """Return how large a bundle may be: one frame of a best-effort topic, which loses all of it with one part."""
-        if self._repairs_wanted or self._mtu is None:
+        if self._repairs_wanted or self.mtu is None:
             return self.bundle_bytes
-        return min(self.bundle_bytes, part_room(self._mtu) - SIGNATURE_BYTES)
+        return min(self.bundle_bytes, part_room(self.mtu) - SIGNATURE_BYTES)
 
     def _seal_next(self) -> None:
         """Seal of what was gathered as much as goes together."""
@@ -314,9 +291,9 @@ class Publisher:
 
     def _queue(self, body: bytes, messages: int = 1) -> None:
         """Number and seal a message, or a bundle of several; what is too much of all that waits goes, oldest first."""
-        assert self._mtu is not None
+        assert self.mtu is not None
         number = self._next_number
-        frames = self._seal(number, body, self._mtu, is_bundle=messages > 1)
+        frames = self._seal(number, body, self.mtu, is_bundle=messages > 1)
         self._next_number += 1
         if not self._repairs_wanted:
             self.drops[DropReason.MEMORY_FULL] += self._unsent.add(frames, messages)
@@ -355,18 +332,18 @@ class Publisher:
         self._skipped += move.to - first
         self._moves.append(move)
         self._window.move(move, [(number, each, each.size_bytes) for number, each in moved])
-        self._starts = {name: move.of(start) for name, start in self._starts.items()}
+        self._statuses.starts = {name: move.of(start) for name, start in self._statuses.starts.items()}
         for reader in self._readers.readings():
             if reader.start is not None:
                 reader.start = move.of(reader.start)
-        self._status_wanted = True
+        self._statuses.wanted = True
 
     def _follow_moves(self, report: Report) -> Report:
         """Return a report as it would be under the present numbers; a reader that does not know them is told."""
         for move in self._moves:
             if move.is_before(report.next_number):
                 report = Report(report.flags, move.of(report.next_number), 0, ())
-                self._status_wanted = True
+                self._statuses.wanted = True
         return report
 
     def _sealer(self, kind: Kind) -> Sealer:
@@ -379,13 +356,13 @@ class Publisher:
             self._let_go(name)
 
     def _let_go(self, name: bytes) -> None:
-        self._starts.pop(name, None)
+        self._statuses.starts.pop(name, None)
         self._window.drop_reader(name)
 
     def _welcome(self, name: bytes, now_s: float) -> None:
         """Give a new reader its first message; one that asks again gets the same answer."""
         reader = self._readers[name]
-        if name not in self._starts and len(self._starts) < STARTS_MAX:
+        if name not in self._statuses.starts and not self._statuses.is_full:
             self._seal_gathered()  # it was published before this reader came
             oldest = self._window.oldest
             is_gone = oldest is not None and reader.start is not None and reader.start < oldest
@@ -395,8 +372,8 @@ class Publisher:
                     reader.start = max(oldest, self._next_number + len(self._early) - self._depth)
                 if self._repairs_wanted and now_s >= reader.out_until_s:
                     self._window.add_reader(name, reader.start, now_s)
-            self._starts[name] = reader.start
-        self._status_wanted = True
+            self._statuses.starts[name] = reader.start
+        self._statuses.wanted = True
 
     def _take_report(self, name: bytes, report: Report, now_s: float) -> None:
         reader, window = self._readers[name], self._window
@@ -407,22 +384,15 @@ class Publisher:
         if window.has_reader(name):
             window.report(name, report, now_s)
         if report.missing and (oldest is None or report.missing[0].number < oldest):
-            self._status_wanted = True  # it asks for what is gone
+            self._statuses.wanted = True  # it asks for what is gone
 
     def _flags_now(self) -> int:
         wanted = (self._is_reliable, Flag.RELIABLE), (self._depth, Flag.LATCHED), (self.is_urgent, Flag.URGENT)
         return sum(int(flag) for is_set, flag in wanted if is_set)
 
     def _seal_status(self, now_s: float) -> list[bytes]:
-        assert self._mtu is not None
+        assert self.mtu is not None
         oldest = self._window.oldest
-        about = self._notice.say(now_s, is_asked=bool(self._starts))
         sent = self._window.sent if self._repairs_wanted else (self._next_number, 0)
-        first = sent[0] if oldest is None else oldest
-        status = Status(first, *sent, dict(self._starts), about, tuple(self._moves))
-        self._starts.clear()
-        self._status_wanted = False
-        self._status_number += 1
-        wire = status.to_wire()
-        self._status_at_s = now_s + max(_STATUS_GAP_S, len(wire) / _STATUS_BYTES_PER_S)
-        return list(self._status.seal(self._status_number, self._flags, wire, self._mtu))
+        wire = self._statuses.take(sent[0] if oldest is None else oldest, sent, self._moves, now_s)
+        return list(self._status.seal(self._statuses.number, self._flags, wire, self.mtu))

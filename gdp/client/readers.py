@@ -19,7 +19,7 @@ from gdp.limits import READER_LEASE_S
 from gdp.message.report import Report, ReportFlag
 from gdp.names import Name
 
-__all__ = ["Reading", "Readers"]
+__all__ = ["Readers", "Reading"]
 
 READERS_MAX: Final = 1_024
 _LIVES_MAX: Final = 4_096  # incarnations of readers whose old notes are known as such

@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 
 from gdp.client.feed import Delivered, Ended, Feed, FeedState, Reader
 from gdp.client.private import AnswerFeed, Life, private_name
-from gdp.client.publisher import Secrets
+from gdp.client.source import Secrets
 from gdp.control.query import Answer
 from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError

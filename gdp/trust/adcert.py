@@ -71,7 +71,7 @@ class AdCert:
             issuer: the subject's own name, or the node that holds the link above.
             subject: the name.
             delegate: the node.
-            rights: of publish, serve and read.
+            rights: of publish, serve, call and read.
             validity: when.
             may_delegate: whether the node may issue further links.
 

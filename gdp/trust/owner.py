@@ -63,7 +63,7 @@ class Owner:
         Args:
             card: of the node.
             metadata: of the name; goes into the file in plain, for the node's operator.
-            rights: of publish, serve and read.
+            rights: of publish, serve, call and read.
             epochs: whose secrets the node gets.
             validity: how long it may act; the secrets, once known, stay known.
             may_delegate: whether the node may pass the rights on.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 
 from gdp.client.private import IDLE_S
@@ -322,3 +324,15 @@ def test_a_client_whose_delegation_is_revoked_is_answered_no_more() -> None:
     assert world.network.run(1, lambda: not server.member.peers(server.service))
     with pytest.raises(LocalError, match="is no client"):
         server.answer(client.member.name, b"?")
+
+
+def test_calls_over_links_that_lose_and_reorder_are_all_answered_once() -> None:
+    world = ring()
+    server, client = pair(world)
+    for cable in [*world.cables.values(), *world.leads.values()]:
+        cable.loss, cable.jitter_s = 0.03, 0.002
+    for number in range(100):
+        world.network.call(0.01 * number, partial(client.publish, b"%d" % number))
+    assert work(world, server, client, until_s=30, have=100)
+    world.network.run(1)
+    assert sorted(client.bodies()) == sorted(b"%d by nuc5/server" % number for number in range(100))

@@ -1,0 +1,51 @@
+"""Who reads, how far it is, and what comes of it: what a feed and its owner say to each other.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from enum import Enum
+from itertools import count
+from typing import NamedTuple
+
+from gdp.names import Name
+
+__all__ = ["Delivered", "Ended", "FeedState", "Reader"]
+
+
+class FeedState(Enum):
+    """How far a feed is."""
+
+    NEW = "new"
+    LIVE = "live"
+
+
+@dataclass(frozen=True, slots=True)
+class Reader:
+    """Who reads, in this life of its process: one for all its feeds, since they share its numbers for notes."""
+
+    name: Name
+    incarnation: int
+    note_numbers: Iterator[int] = field(default_factory=lambda: count(1), compare=False)
+
+
+class Delivered(NamedTuple):
+    """One message, opened, verified and in its place."""
+
+    publisher: bytes
+    incarnation: int  # of the publisher, within which numbers rise
+    number: int
+    message: bytes
+    parts: int
+    hops: int
+    place: int = 0  # among the messages of one number: several come in one bundle
+
+
+class Ended(NamedTuple):
+    """Where a feed ended, for another one of the same: what came before is not opened again."""
+
+    number: int = 0  # of the next message
+    status: int = 0  # the highest seen
