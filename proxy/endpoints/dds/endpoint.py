@@ -1,0 +1,207 @@
+"""The endpoint ``dds``: a ROS 2 graph through Cyclone DDS, with no ROS installed.
+
+Place: I/O, through its parts.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from itertools import count
+from typing import TypeVar
+
+from gdp.errors import LocalError
+from proxy.endpoints.dds.discovery import Discovery
+from proxy.endpoints.dds.node import Node
+from proxy.endpoints.dds.services import Client, Server
+from proxy.endpoints.dds.survey import Survey
+from proxy.endpoints.dds.topics import Publication, Subscription
+from proxy.endpoints.dds.types import hash_of, known_channel
+from proxy.endpoints.endpoint import Event, Graph, GraphChanged, Role
+from proxy.serial.channel import Channel, Qos, RosVersion
+from proxy.serial.service import Service
+
+__all__ = ["DdsEndpoint"]
+
+_Open = Subscription | Publication | Server | Client
+_T = TypeVar("_T", Subscription, Publication, Server, Client)
+
+
+class DdsEndpoint:
+    """One node in a DDS domain, as peers see it.
+
+    CYCLONEDDS_URI configures the network, as it does for every user of Cyclone DDS.
+
+    Args:
+        domain: the domain id.
+        node: what it is called.
+
+    Raises:
+        LocalError: the domain cannot be joined.
+    """
+
+    def __init__(self, domain: int, node: str) -> None:
+        self._domain = domain
+        self._events = deque[Event]([GraphChanged()])
+        self._is_taking = False
+        self._open: dict[int, _Open] = {}
+        self._numbers = count(1)
+        self._survey = Survey()
+        self._shown: Graph = frozenset()
+        self._node = Node(domain, node)
+        self._discovery = Discovery(self._node, self._survey, self._follow)
+        self._node.watch.tell()
+
+    @property
+    def ros(self) -> RosVersion:
+        """Return which ROS it speaks."""
+        return 2
+
+    @property
+    def label(self) -> str:
+        """Return what people call it."""
+        return f"dds domain {self._domain}"
+
+    def fileno(self) -> int:
+        """Return a descriptor that is readable while ``take`` has something."""
+        return self._node.watch.fileno()
+
+    def take(self) -> Sequence[Event]:
+        """Return, once, what happened, in order."""
+        self._is_taking = True
+        self._node.watch.catch_up()
+        self._is_taking = False
+        events = [*self._events]
+        self._events.clear()
+        return [each for each in events if isinstance(each, GraphChanged) or each.handle in self._open]
+
+    def graph(self) -> Graph:
+        """Return who is there, as of the last ``take``."""
+        return self._survey.graph()
+
+    def channel(self, topic: str, type_name: str) -> Channel:
+        """Return a topic of a standard type, or one of the hidden topics of a local action, as bytes.
+
+        Raises:
+            LocalError: the type is neither.
+        """
+        known = known_channel(topic, type_name)
+        if known is not None:
+            return known
+        for peer in self._survey.peers(Role.PUBLISHES, topic, type_name):
+            if "/_action/" in topic:
+                return Channel(topic, type_name, 2, peer.hash)
+        raise LocalError(
+            f"{type_name} is not known here: endpoint dds knows the types of ROS 2's own packages;"
+            " use endpoint ros2, or publish it from a machine that has its package"
+        )
+
+    def service(self, name: str, type_name: str) -> Service:
+        """Return a service that is served here; its messages are known as bytes.
+
+        Raises:
+            LocalError: nobody serves it here.
+        """
+        for peer in self._survey.peers(Role.SERVES, name, type_name):
+            request, response = (Channel(name, f"{type_name}_{part}", 2) for part in ("Request", "Response"))
+            return Service(name, type_name, peer.hash, request, response)
+        raise LocalError(f"{type_name} is not known here: endpoint dds knows a service while a local node serves it")
+
+    def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
+        """Hear a topic from now on, whatever its type."""
+        handle = next(self._numbers)
+        return self._keep(
+            handle, Subscription(self._node, self._survey, handle, self._tell, topic, type_name, qos)
+        )
+
+    def advertise(self, channel: Channel) -> int:
+        """Be a publisher of a topic.
+
+        Raises:
+            LocalError: it is not ROS 2's, or local nodes know another type of that name.
+        """
+        if channel.ros != 2:
+            raise LocalError(f"{channel.topic}: messages of ROS {channel.ros} cannot be published in DDS")
+        handle = next(self._numbers)
+        publication = Publication(self._node, self._survey, handle, self._tell, channel, hash_of(channel))
+        return self._keep(handle, publication)
+
+    def publish(self, handle: int, raw: bytes) -> None:
+        """Publish one message."""
+        self._find(handle, Publication).publish(raw)
+
+    def subscribers(self, handle: int) -> int:
+        """Return how many local subscriptions a publisher of ours has now."""
+        return self._find(handle, Publication).subscribers
+
+    def serve(self, service: Service) -> int:
+        """Be a server for clients that speak Cyclone DDS; others are told of as ``Faulted``.
+
+        Raises:
+            LocalError: it is not ROS 2's.
+        """
+        if service.ros != 2:
+            raise LocalError(f"{service.name}: a service of ROS {service.ros} cannot be served in DDS")
+        handle, hashed = next(self._numbers), service.hash if service.hash.startswith("RIHS01_") else ""
+        what = (service.name, service.type_name, hashed)
+        server = Server(self._node, self._survey, handle, self._tell, *what, lambda: next(self._numbers))
+        return self._keep(handle, server)
+
+    def answer(self, handle: int, ticket: int, raw: bytes) -> None:
+        """Answer a request."""
+        self._find(handle, Server).answer(ticket, raw)
+
+    def refuse(self, handle: int, ticket: int, reason: str) -> None:
+        """Forget a request: ROS 2 services have no way to say a reason."""
+        del reason
+        self._find(handle, Server).refuse(ticket)
+
+    def dial(self, name: str, type_name: str) -> int:
+        """Be a client of a service of servers that speak Cyclone DDS; others are told of as ``Faulted``."""
+        handle = next(self._numbers)
+        hashed = next((peer.hash for peer in self._survey.peers(Role.SERVES, name, type_name)), "")
+        client = Client(self._node, self._survey, handle, self._tell, name, type_name, hashed)
+        return self._keep(handle, client)
+
+    def call(self, handle: int, call: int, raw: bytes) -> None:
+        """Send a request."""
+        self._find(handle, Client).call(call, raw)
+
+    def drop(self, handle: int, call: int) -> None:
+        """Forget a call."""
+        self._find(handle, Client).drop(call)
+
+    def close(self, handle: int) -> None:
+        """End a subscription, publisher, server or client."""
+        self._open.pop(handle).close()
+
+    def shut(self) -> None:
+        """Leave the graph and free everything."""
+        self._discovery.close()
+        self._open.clear()
+        self._node.leave()
+
+    def _keep(self, handle: int, opened: _Open) -> int:
+        self._open[handle] = opened
+        return handle
+
+    def _find(self, handle: int, kind: type[_T]) -> _T:
+        opened = self._open.get(handle)
+        if not isinstance(opened, kind):
+            raise LocalError(f"handle {handle} is no {kind.__name__.lower()}")
+        return opened
+
+    def _tell(self, event: Event) -> None:
+        if not self._events and not self._is_taking:
+            self._node.watch.tell()
+        self._events.append(event)
+
+    def _follow(self) -> None:
+        """Tell all who need to know that others have come or gone."""
+        for opened in self._open.values():
+            if not isinstance(opened, Publication):
+                opened.follow()
+        graph = self._survey.graph()
+        if graph != self._shown:
+            self._shown = graph
+            self._tell(GraphChanged())

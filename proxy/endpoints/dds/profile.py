@@ -1,0 +1,62 @@
+"""QoS profiles of our own readers and writers, as Cyclone DDS has them.
+
+Place: imports the binding; no other I/O.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from cyclonedds.core import Policy
+from cyclonedds.core import Qos as DdsQos
+
+from proxy.qos import NEVER
+from proxy.serial.channel import Qos
+
+__all__ = ["offered", "requested"]
+
+_SECOND: Final = 1_000_000_000
+_FOREVER: Final = (1 << 63) - 1
+_PATIENCE: Final = _SECOND // 10  # a writer whose readers do not keep up gives up so soon: nobody waits for long
+_LIVELINESS: Final = {
+    "automatic": Policy.Liveliness.Automatic,
+    "manual_by_participant": Policy.Liveliness.ManualByParticipant,
+    "manual_by_topic": Policy.Liveliness.ManualByTopic,
+}
+
+
+def requested(qos: Qos, user_data: bytes) -> DdsQos:
+    """Return what a reader of ours requests."""
+    return DdsQos(*_common(qos, user_data))
+
+
+def offered(qos: Qos, user_data: bytes) -> DdsQos:
+    """Return what a writer of ours offers."""
+    kept = Policy.History.KeepLast(max(qos.depth, 1))
+    return DdsQos(
+        *_common(qos, user_data),
+        Policy.Lifespan(_nanoseconds(qos.lifespan)),
+        Policy.WriterDataLifecycle(autodispose=False),
+        Policy.DurabilityService(0, kept, -1, -1, -1),
+    )
+
+
+def _common(qos: Qos, user_data: bytes) -> list[object]:
+    liveliness = _LIVELINESS.get(qos.liveliness, Policy.Liveliness.Automatic)
+    is_kept = qos.durability == "transient_local"
+    is_reliable = qos.reliability != "best_effort"
+    return [
+        Policy.Reliability.Reliable(_PATIENCE) if is_reliable else Policy.Reliability.BestEffort,
+        Policy.Durability.TransientLocal if is_kept else Policy.Durability.Volatile,
+        # never KeepAll: with a reader that stalls it would hold up the writer, and all that the process does
+        Policy.History.KeepLast(max(qos.depth, 1)),
+        Policy.Deadline(_nanoseconds(qos.deadline)),
+        liveliness(_nanoseconds(qos.lease)),
+        Policy.DataRepresentation(use_cdrv0_representation=True),
+        Policy.IgnoreLocal.Participant,
+        Policy.Userdata(user_data),
+    ]
+
+
+def _nanoseconds(duration: tuple[int, int]) -> int:
+    return _FOREVER if duration in (NEVER, (0, 0)) else duration[0] * _SECOND + duration[1]

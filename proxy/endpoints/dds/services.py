@@ -1,0 +1,266 @@
+"""A server and a client of the virtual node, as Cyclone DDS's peers have them.
+
+Place: I/O, through the node. rmw_cyclonedds puts the client (8 bytes) and a call's number (8 bytes) before the message.
+Fast DDS and others put them into the header of the RTPS sample, which the binding can neither write nor read: services
+with such peers are refused with a reason.
+Source: rmw_cyclonedds_cpp, ``cdds_request_header_t`` and ``clientid``/``serviceid`` in user data.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+from proxy.endpoints.dds import library
+from proxy.endpoints.dds.naming import CYCLONE, dds_type, identity, identity_in, user_data, vendor
+from proxy.endpoints.dds.node import Node, Sample
+from proxy.endpoints.dds.profile import offered, requested
+from proxy.endpoints.dds.survey import Survey
+from proxy.endpoints.endpoint import Answered, Asked, Event, Failed, Faulted, Role
+from proxy.qos import default
+
+__all__ = ["Client", "Server"]
+
+_PREFIX: Final = 4  # CDR encapsulation
+_HEADER: Final = 16
+_QOS: Final = default(depth=1_000)  # a thousand calls at once, and none pushes out another
+_WAITING_MAX: Final = 1_000
+
+
+class _Halves:
+    """The request and the reply of one service, on our side of it."""
+
+    def __init__(self, node: Node, name: str, type_name: str, role: Role, number: int, type_hash: str) -> None:
+        self._node = node
+        is_server = role is Role.SERVES
+        mark = identity("serviceid" if is_server else "clientid", node.gid, number)
+        self.identity = identity_in(mark)
+        data = user_data(type_hash, mark)
+        halves = [(f"rq{name}Request", f"{type_name}_Request"), (f"rr{name}Reply", f"{type_name}_Response")]
+        heard, said = halves if is_server else reversed(halves)
+        self.writer = node.write(said[0], dds_type(said[1]), offered(_QOS, data))
+        self.writer.tell_matches(self.matched)
+        self.reader = node.read(heard[0], dds_type(heard[1]), requested(_QOS, data), self.heard)
+
+    def matched(self) -> None:
+        """Learn that readers of our half have come or gone."""
+        raise NotImplementedError
+
+    def heard(self, samples: list[Sample]) -> None:
+        """Take what came."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Take part no more."""
+        self._node.close(self.reader, self.writer)
+
+
+class _Ask(NamedTuple):
+    header: bytes
+    client: int  # instance handle of the writer that it came from
+
+
+class Server(_Halves):
+    """Serves a name to local clients."""
+
+    def __init__(
+        self,
+        node: Node,
+        survey: Survey,
+        handle: int,
+        tell: Callable[[Event], None],
+        name: str,
+        type_name: str,
+        type_hash: str,
+        tickets: Callable[[], int],
+    ) -> None:
+        self._survey = survey
+        self._handle = handle
+        self._tell = tell
+        self._name = name
+        self._tickets = tickets
+        self._asks: dict[int, _Ask] = {}
+        self._early = deque[Sample](maxlen=_WAITING_MAX)  # of clients that are not known yet
+        self._late = deque[tuple[_Ask, bytes]](maxlen=_WAITING_MAX)  # whose clients cannot hear us yet
+        self._matched: frozenset[bytes] = frozenset()
+        self._fault = ""
+        super().__init__(node, name, type_name, Role.SERVES, handle, type_hash)
+        self.follow()
+
+    def follow(self) -> None:
+        """Learn who calls now."""
+        self._fault = _tell_fault(self._survey, Role.CALLS, self._name, self._fault, self._handle, self._tell)
+        gone = [ticket for ticket, ask in self._asks.items() if self._survey.peer(ask.client) is None]
+        for ticket in gone:
+            del self._asks[ticket]
+        for _ in range(len(self._early)):
+            self._ask(self._early.popleft())
+        self.matched()
+
+    def heard(self, samples: list[Sample]) -> None:
+        """Take requests."""
+        for sample in samples:
+            self._ask(sample)
+
+    def answer(self, ticket: int, raw: bytes) -> None:
+        """Answer a request, as soon as its client can hear that."""
+        ask = self._asks.pop(ticket, None)
+        if ask is None:
+            return
+        if self._can_hear(ask):
+            self._say(ask, raw)
+        else:
+            self._late.append((ask, raw))
+
+    def refuse(self, ticket: int) -> None:
+        """Forget a request: ROS 2 has no word for a failure, and the client's own patience must end it."""
+        self._asks.pop(ticket, None)
+
+    def matched(self) -> None:
+        """Answer those whose replies found nobody yet."""
+        peers = [self._survey.peer(handle) for handle in library.matched_readers(self.writer.ref)]
+        self._matched = frozenset(peer.identity for peer in peers if peer is not None)
+        for _ in range(len(self._late)):
+            ask, raw = self._late.popleft()
+            if self._can_hear(ask):
+                self._say(ask, raw)
+            elif self._survey.peer(ask.client) is not None:
+                self._late.append((ask, raw))
+
+    def _ask(self, sample: Sample) -> None:
+        raw, client = sample.raw, self._survey.peer(sample.writer)
+        if client is None:
+            self._early.append(sample)
+        elif client.gid.startswith(CYCLONE) and len(raw) >= _PREFIX + _HEADER:  # of others ``follow`` has told
+            ticket = self._tickets()
+            self._asks[ticket] = _Ask(raw[_PREFIX : _PREFIX + _HEADER], sample.writer)
+            self._tell(Asked(self._handle, ticket, raw[:_PREFIX] + raw[_PREFIX + _HEADER :]))
+
+    def _can_hear(self, ask: _Ask) -> bool:
+        client = self._survey.peer(ask.client)
+        return client is None or not client.identity or client.identity in self._matched
+
+    def _say(self, ask: _Ask, raw: bytes) -> None:
+        code = self.writer.write(raw[:_PREFIX] + ask.header + raw[_PREFIX:])
+        if code < 0:
+            self._tell(Faulted(self._handle, f"a response could not be sent (code {code})"))
+
+
+class _Call(NamedTuple):
+    number: int
+    servers: frozenset[bytes]
+
+
+class Client(_Halves):
+    """Calls a local service."""
+
+    def __init__(
+        self,
+        node: Node,
+        survey: Survey,
+        handle: int,
+        tell: Callable[[Event], None],
+        name: str,
+        type_name: str,
+        type_hash: str,
+    ) -> None:
+        self._survey = survey
+        self._handle = handle
+        self._tell = tell
+        self._name = name
+        self._calls: dict[int, _Call] = {}  # under way, by sequence number
+        self._sequence: dict[int, int] = {}  # of each call
+        self._early = deque[tuple[int, bytes]]()
+        self._last = 0
+        self._fault = ""
+        super().__init__(node, name, type_name, Role.CALLS, handle, type_hash)
+        self._me = self.writer.handle.to_bytes(8, "little")
+        self.follow()
+
+    def follow(self) -> None:
+        """Learn who serves now; calls whose servers are all gone have failed."""
+        self._fault = _tell_fault(self._survey, Role.SERVES, self._name, self._fault, self._handle, self._tell)
+        servers = self._servers()
+        for sequence, call in list(self._calls.items()):
+            if not call.servers & servers:
+                self._forget(sequence)
+                self._tell(Failed(self._handle, call.number, "the server is gone"))
+        self.matched()
+
+    def call(self, number: int, raw: bytes) -> None:
+        """Send a request, as soon as there is a server that can answer it.
+
+        Every server of a name gets every request: one of another vendor would take ours for something else.
+        """
+        servers = self._servers()
+        if self._fault or not servers:
+            self._tell(Failed(self._handle, number, self._fault or "no server"))
+            return
+        self._last += 1
+        self._calls[self._last] = _Call(number, servers)
+        self._sequence[number] = self._last
+        message = raw[:_PREFIX] + self._me + self._last.to_bytes(8, "little") + raw[_PREFIX:]
+        if self._early or not self._is_matched():
+            self._early.append((self._last, message))
+        else:
+            self._send(self._last, message)
+
+    def drop(self, number: int) -> None:
+        """Forget a call."""
+        sequence = self._sequence.get(number)
+        if sequence is not None:
+            self._forget(sequence)
+
+    def matched(self) -> None:
+        """Send what waited for a server."""
+        if self._early and self._is_matched():
+            while self._early:
+                self._send(*self._early.popleft())
+
+    def heard(self, samples: list[Sample]) -> None:
+        """Take responses; those of other clients come too."""
+        for raw, _, _ in samples:
+            if raw[_PREFIX : _PREFIX + 8] != self._me or len(raw) < _PREFIX + _HEADER:
+                continue
+            call = self._forget(int.from_bytes(raw[_PREFIX + 8 : _PREFIX + _HEADER], "little"))
+            if call is not None:
+                self._tell(Answered(self._handle, call.number, raw[:_PREFIX] + raw[_PREFIX + _HEADER :]))
+
+    def _send(self, sequence: int, message: bytes) -> None:
+        call = self._calls.get(sequence)
+        if call is None:
+            return  # dropped, or failed, while it waited
+        code = 0 if self._fault else self.writer.write(message)
+        if self._fault or code < 0:
+            self._forget(sequence)
+            reason = self._fault or f"the request could not be sent (code {code})"
+            self._tell(Failed(self._handle, call.number, reason))
+
+    def _forget(self, sequence: int) -> _Call | None:
+        call = self._calls.pop(sequence, None)
+        if call is not None:
+            self._sequence.pop(call.number, None)
+        return call
+
+    def _is_matched(self) -> bool:
+        return bool(library.count_readers(self.writer.ref) and library.count_writers(self.reader.ref))
+
+    def _servers(self) -> frozenset[bytes]:
+        peers = self._survey.peers(Role.SERVES, self._name)
+        return frozenset(peer.gid for peer in peers if peer.gid.startswith(CYCLONE))
+
+
+def _tell_fault(survey: Survey, role: Role, name: str, before: str, handle: int, tell: Callable[[Event], None]) -> str:
+    """Say once that a peer of another vendor is there; return what is wrong now."""
+    others = {vendor(peer.gid) for peer in survey.peers(role, name) if not peer.gid.startswith(CYCLONE)}
+    if not others:
+        return ""
+    who = "server" if role is Role.SERVES else "client"
+    fault = (
+        f"a {who} speaks {', '.join(sorted(others))}, whose way to mark requests endpoint dds does not have;"
+        " use endpoint ros2"
+    )
+    if fault != before:
+        tell(Faulted(handle, fault))
+    return fault

@@ -1,0 +1,117 @@
+"""A subscription and a publisher of the virtual node.
+
+Place: I/O, through the node.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from gdp.errors import LocalError
+from proxy.endpoints.dds import library
+from proxy.endpoints.dds.naming import dds_type, user_data
+from proxy.endpoints.dds.node import Node, Sample
+from proxy.endpoints.dds.profile import offered, requested
+from proxy.endpoints.dds.survey import Survey
+from proxy.endpoints.dds.types import known_channel
+from proxy.endpoints.endpoint import Described, Event, Faulted, Heard, Role
+from proxy.qos import default
+from proxy.serial.channel import Channel, Qos
+
+__all__ = ["Publication", "Subscription"]
+
+
+class Subscription:
+    """Hears a topic; its type need not be known here."""
+
+    def __init__(
+        self,
+        node: Node,
+        survey: Survey,
+        handle: int,
+        tell: Callable[[Event], None],
+        topic: str,
+        type_name: str,
+        qos: Qos | None,
+    ) -> None:
+        self._node = node
+        self._handle = handle
+        self._tell = tell
+        self._bare = Channel(topic, type_name, 2)
+        self._channel: Channel | None = None
+        self._fault = ""
+        self._survey = survey
+        self.follow()
+        shown = self._channel.hash if self._channel is not None else ""
+        profile = requested(qos or default(), user_data(shown))
+        self._reader = node.read(f"rt{topic}", dds_type(type_name), profile, self._hear)
+
+    def follow(self) -> None:
+        """Learn who publishes now, and so what the messages are."""
+        topic, type_name = self._bare.topic, self._bare.type_name
+        hashes = sorted({peer.hash for peer in self._survey.peers(Role.PUBLISHES, topic, type_name)} - {""})
+        # what was described stays so while there are publishers of that hash
+        if self._channel is None or (hashes and self._channel.hash not in hashes):
+            self._describe(hashes[0] if hashes else "")
+        fault = f"publishers disagree about {type_name}: {', '.join(hashes)}" if len(hashes) > 1 else ""
+        if fault and fault != self._fault:
+            self._tell(Faulted(self._handle, fault))
+        self._fault = fault
+
+    def close(self) -> None:
+        """Hear no more."""
+        self._node.close(self._reader)
+
+    def _describe(self, peers_hash: str) -> None:
+        known = known_channel(self._bare.topic, self._bare.type_name)
+        if known is None or (peers_hash and known.hash != peers_hash):
+            known = replace(self._bare, hash=peers_hash)
+        if known != self._channel:
+            self._channel = known
+            self._tell(Described(self._handle, known))
+
+    def _hear(self, samples: list[Sample]) -> None:
+        for raw, _, stamp_ns in samples:
+            self._tell(Heard(self._handle, stamp_ns, raw))
+
+
+class Publication:
+    """Publishes a topic.
+
+    Raises:
+        LocalError: it is of another type here, or not ROS 2's.
+    """
+
+    def __init__(
+        self, node: Node, survey: Survey, handle: int, tell: Callable[[Event], None], channel: Channel, type_hash: str
+    ) -> None:
+        topic, type_name = channel.topic, channel.type_name
+        roles = (Role.PUBLISHES, Role.SUBSCRIBES)
+        theirs = {peer.hash for role in roles for peer in survey.peers(role, topic, type_name)} - {""}
+        if type_hash and theirs and type_hash not in theirs:
+            raise LocalError(f"{topic}: {type_name} is {', '.join(sorted(theirs))} on this machine, not {type_hash}")
+        self._node = node
+        self._handle = handle
+        self._tell = tell
+        self._is_late = False
+        qos = channel.qos[0] if channel.qos else default(latched=channel.latched, depth=1 if channel.latched else 10)
+        profile = offered(qos, user_data(type_hash))
+        self._writer = node.write(f"rt{topic}", dds_type(type_name), profile)
+
+    @property
+    def subscribers(self) -> int:
+        """Return how many readers it has now."""
+        return library.count_readers(self._writer.ref)
+
+    def publish(self, raw: bytes) -> None:
+        """Publish one message."""
+        code = self._writer.write(raw)
+        if code < 0 and not self._is_late:
+            why = "its readers do not keep up" if code == library.TIMED_OUT else f"Cyclone DDS refuses it (code {code})"
+            self._tell(Faulted(self._handle, f"a message of {len(raw)} bytes was not published: {why}"))
+        self._is_late = code < 0
+
+    def close(self) -> None:
+        """Publish no more."""
+        self._node.close(self._writer)
