@@ -20,6 +20,7 @@ class Traffic:
     Attributes:
         unread: messages that nobody was there to read.
         thinned: messages left out because their rule limits the rate.
+        dropped: messages that endpoints let go because somebody local did not keep up.
         latency: one-way, from the far proxy's stamp until handed over here.
     """
 
@@ -29,6 +30,7 @@ class Traffic:
     bytes_in: int = 0
     unread: int = 0
     thinned: int = 0
+    dropped: int = 0
     latency: Histogram = field(default_factory=Histogram)
 
     def sent(self, size: int) -> None:
@@ -43,7 +45,13 @@ class Traffic:
 
     def messages(self) -> Mapping[str, int]:
         """Return the counts of messages by what became of them."""
-        return {"in": self.messages_in, "out": self.messages_out, "unread": self.unread, "thinned": self.thinned}
+        return {
+            "in": self.messages_in,
+            "out": self.messages_out,
+            "unread": self.unread,
+            "thinned": self.thinned,
+            "dropped": self.dropped,
+        }
 
     def message_bytes(self) -> Mapping[str, int]:
         """Return the bytes carried, before sealing, by direction."""

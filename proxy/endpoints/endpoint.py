@@ -145,6 +145,10 @@ class Endpoint(Protocol):
     def label(self) -> str:
         """Return what people call it, such as ``ros2 domain 0`` or ``ros1 http://localhost:11311``."""
 
+    @property
+    def dropped(self) -> int:
+        """Return how many messages it let go for want of room; what a middleware drops by its QoS is not known."""
+
     def fileno(self) -> int:
         """Return a descriptor that is readable while ``take`` has something."""
 

@@ -197,6 +197,11 @@ class FakeEndpoint:
         return f"fake ros{self._graph.ros}"
 
     @property
+    def dropped(self) -> int:
+        """Return 0: nothing waits here."""
+        return 0
+
+    @property
     def handles(self) -> int:
         """Return how many handles are open."""
         return len(self._open)

@@ -62,6 +62,10 @@ class DdsEndpoint:
         """Return what people call it."""
         return f"dds domain {self._domain}"
 
+    @property
+    def dropped(self) -> int:
+        return 0  # what waits too long waits in the middleware, by its QoS
+
     def fileno(self) -> int:
         """Return a descriptor that is readable while ``take`` has something."""
         return self._node.watch.fileno()

@@ -57,6 +57,10 @@ class Ros2Endpoint:
         self._serving: dict[int, Serving] = {}
         self._dialling: dict[int, Dialling] = {}
 
+    @property
+    def dropped(self) -> int:
+        return 0  # what waits too long waits in the middleware, by its QoS
+
     def fileno(self) -> int:
         return self._waiting.fileno()
 
