@@ -19,7 +19,7 @@ from gdp.crypto.keys import SigningKey
 from gdp.errors import ConfigError
 from gdp.nodes.config import RibConfig, SwitchConfig
 from gdp.nodes.schema import Section
-from proxy import cli, replay_cli
+from proxy import cli, delegate_cli, replay_cli
 from proxy.config import ProxyConfig, Rule
 from proxy.ring import cli as ring
 from tests.machines import Machines
@@ -34,6 +34,7 @@ APPS = {
     "gdp-switch": switch.app,
     "gdp-rib": rib.app,
     "gdp-proxy": cli.app,
+    "gdp-delegate": delegate_cli.app,
     "gdp-replay": replay_cli.app,
     "scripts/ring_topology.sh": ring.app,
 }

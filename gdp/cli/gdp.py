@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import typer
 
 from gdp.cli import cert, delegate, domain, keygen
+from gdp.cli.lab import lab
 from gdp.cli.name import name
 from gdp.errors import GdpError
 
@@ -24,6 +25,7 @@ app = typer.Typer(
     add_completion=False,
 )
 app.command("name", no_args_is_help=True)(name)
+app.command("lab", no_args_is_help=True)(lab)
 app.add_typer(keygen.app, name="keygen")
 app.add_typer(domain.app, name="domain")
 app.add_typer(cert.app, name="cert")

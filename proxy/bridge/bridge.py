@@ -93,11 +93,12 @@ class Bridge:
         self._inbound: dict[Name, Flow] = {}  # who takes the overlay's messages of a name
         self._timed: list[ExposedService | ImportedService] = []
         self._since: dict[_Key, float] = {}  # wished, and waiting for other proxies to begin
-        self._failed: set[_Key] = set()  # could not begin in this graph
+        self._failed: dict[_Key, Complaint] = {}  # could not begin in this graph as it is
         self._complaints: set[Complaint] = set()
         self._ended = deque[Tally](maxlen=_ENDED_MAX)
         self._is_stale = True
         self._tick_at_s = 0.0
+        self._now_s = 0.0
         self.unknown_names = 0
         for seat in self._seats:
             try:
@@ -127,6 +128,7 @@ class Bridge:
 
     def work(self, now_s: float) -> None:
         """Take what endpoints and the overlay have, and do what is due."""
+        self._now_s = now_s
         for seat in self._seats:
             if seat.deliver(now_s):
                 self._is_stale = True
@@ -139,6 +141,7 @@ class Bridge:
             self._tick_at_s = now_s + TICK_S
             for flow in self._timed:
                 flow.tick(now_s)
+            self._site.traffic.dropped = sum(seat.endpoint.dropped for seat in self._seats)
 
     def next_timeout(self) -> float | None:
         """Return the monotonic second at which there is something to do, or None."""
@@ -147,11 +150,13 @@ class Bridge:
         return self._tick_at_s if self._timed or self._since else None
 
     def reload(self, config: ProxyConfig, held: Held) -> None:
-        """Take rules and delegations anew; flows whose rule is the same go on undisturbed."""
+        """Take rules and delegations anew; flows whose rule is the same go on undisturbed while it is delegated."""
         self._config, self._held = config, held
-        for wish, flow in self._flows.values():
+        for key, (wish, flow) in list(self._flows.items()):
             topic = held.find(wish.name, _right(wish))
-            if topic is not None:
+            if topic is None:
+                self._end(key)
+            else:
                 flow.renew(topic)
         self._failed.clear()
         self._is_stale = True
@@ -185,14 +190,13 @@ class Bridge:
                 if key in self._flows and self._flows[key][0].rule != wish.rule:
                     self._end(key)
                 if key not in self._flows and key not in self._failed and self._is_our_turn(key, view, now_s):
-                    complaint = self._begin(key, wish, view)
-                    complaints += [] if complaint is None else [complaint]
+                    self._begin(key, wish, view)
                 try:
                     self._follow(key, wish, view)
                 except LocalError as error:
                     self._end(key)
-                    self._failed.add(key)
-                    complaints.append(Complaint(wish.local, Fault.NO_GRAPH, str(error)))
+                    self._failed[key] = Complaint(wish.local, Fault.NO_GRAPH, str(error))
+                complaints += [self._failed[key]] if key in self._failed else []
         for key in [key for key in self._flows if key not in wished]:
             self._end(key)
         self._since = {key: since for key, since in self._since.items() if key in wished}
@@ -217,26 +221,25 @@ class Bridge:
         yield from exposed([rule for rule in config.expose if config.endpoint_of(rule) == at], graph, complaints)
         rules = [rule for rule in config.imports if config.endpoint_of(rule) == at]
         held = [*self._held.described(Right.READ), *self._held.described(Right.CALL)]
-        yield from imported(rules, graph, held)
+        yield from imported(rules, graph, held, complaints)
 
-    def _begin(self, key: _Key, wish: Wish, view: _View) -> Complaint | None:
-        """Begin a flow; return why it cannot be begun in this graph."""
+    def _begin(self, key: _Key, wish: Wish, view: _View) -> None:
+        """Begin a flow, or note why it cannot be begun in this graph."""
         topic = self._held.find(wish.name, _right(wish))
         if topic is None:
-            self._failed.add(key)
-            return Complaint(wish.local, Fault.NO_DELEGATION, self._how_to_delegate(wish))
+            self._failed[key] = Complaint(wish.local, Fault.NO_DELEGATION, self._how_to_delegate(wish))
+            return
         try:
             flow = self._make(self._seats[key.seat], wish, topic, view)
         except LocalError as error:
-            self._failed.add(key)
-            return Complaint(wish.local, Fault.UNKNOWN_TYPE, str(error))
+            self._failed[key] = Complaint(wish.local, Fault.UNKNOWN_TYPE, str(error))
+            return
         self._flows[key] = wish, flow
         if not isinstance(flow, ExposedTopic):
             self._inbound[wish.name] = flow
         if isinstance(flow, ExposedService | ImportedService):
             self._timed.append(flow)
         log.debug("flow begun name=%s exposed=%s", wish.name.short, wish.is_exposed)
-        return None
 
     def _make(self, seat: Seat, wish: Wish, topic: Topic, view: _View) -> Flow:
         site = self._site
@@ -255,7 +258,7 @@ class Bridge:
             self._timed.remove(flow)
         if isinstance(flow, ImportedTopic):
             self._ended.append(flow.tally)
-        flow.close()
+        flow.close(self._now_s)
         log.debug("flow ended name=%s exposed=%s", wish.name.short, wish.is_exposed)
 
     def _how_to_delegate(self, wish: Wish) -> str:

@@ -13,15 +13,14 @@ from gdp.errors import LocalError, RemoteError
 from gdp.names import Name
 from gdp.service.calls import Calls
 from proxy.bridge.incoming import Incoming
-from proxy.bridge.parts import Parts
+from proxy.bridge.parts import PROFILES, Parts
 from proxy.bridge.rivals import mark_of, sign
 from proxy.bridge.seat import Seat
 from proxy.bridge.site import Site
 from proxy.bridge.wishes import Wish
 from proxy.endpoints.endpoint import Answered, Described, Event, Failed, Faulted, Heard
-from proxy.exchange import Answer, Exchange, News, Outcome, Request
+from proxy.exchange import Answer, Exchange, News, Outcome, Request, too_large
 from proxy.faults import Fault
-from proxy.qos import default
 from proxy.serial.schema import DefinitionError
 from proxy.serial.serializer import Serializer
 
@@ -67,7 +66,9 @@ class ExposedService:
         self._news = [Serializer(each, rule.encoding) for each in topics]
         self._mark = seat.advertise(self, sign(mark_of(wish.local), endpoint.ros))
         self._servers = [seat.dial(self, *part) for part in parts.services]
-        self._topics = [seat.subscribe(self, *part, default(depth=100)) for part in parts.topics]
+        self._topics = [
+            seat.subscribe(self, *part, profile) for part, profile in zip(parts.topics, PROFILES, strict=False)
+        ]
         self._publisher = site.member.serve(
             topic, self._exchange.to_wire(), is_global=rule.is_global, urgent=rule.priority == "urgent"
         )
@@ -88,8 +89,7 @@ class ExposedService:
         if isinstance(event, Answered):
             asked = self._calls.answered(event.call)
             if asked is not None:
-                body = self._answers[asked.part].encode(event.raw)
-                self._answer(asked, Answer(asked.part, asked.call, Outcome.ANSWERED, body))
+                self._answer(asked, event.raw)
         elif isinstance(event, Failed):
             asked = self._calls.answered(event.call)
             if asked is not None:
@@ -113,12 +113,13 @@ class ExposedService:
         """Return the monotonic second of the next timer, or None."""
         return self._calls.next_timeout()
 
-    def close(self) -> None:
+    def close(self, now_s: float) -> None:
         """Serve nobody any more; calls under way fail."""
         for _, asked in self._calls.fail_all():
             self._fail(asked, Fault.NO_SERVER, "the server is gone")
         for handle in [self._mark, *self._servers, *self._topics]:
             self._seat.close(handle)
+        self._site.member.flush(now_s)  # what was said last must not wait: it would go with its stream
         self._site.member.withdraw(self._topic.name)
 
     def renew(self, topic: Topic) -> None:
@@ -149,6 +150,9 @@ class ExposedService:
         except LocalError as error:
             self._fail(asked, Fault.OTHER_TYPE, str(error))
             return
+        except RemoteError as error:
+            self._fail(asked, Fault.MALFORMED, str(error))
+            return
         self._seat.endpoint.call(self._servers[request.part], number, raw)
 
     def _incoming(self, message: Message) -> tuple[Incoming, ...]:
@@ -168,11 +172,18 @@ class ExposedService:
                 del self._clients[next(iter(self._clients))]
         return self._clients[key]
 
+    def _answer(self, asked: _Asked, raw: bytes) -> None:
+        body = self._answers[asked.part].encode(raw)
+        if reason := too_large("an answer", len(raw), self._wish.rule.max_bytes, len(body)):
+            self._fail(asked, Fault.TOO_LARGE, reason)
+        else:
+            self._send(asked, Answer(asked.part, asked.call, Outcome.ANSWERED, body))
+
     def _fail(self, asked: _Asked, fault: Fault, reason: str) -> None:
         self._site.faults.tell(self._wish.local, fault, reason)
-        self._answer(asked, Answer.failed(asked.part, asked.call, reason))
+        self._send(asked, Answer.failed(asked.part, asked.call, reason))
 
-    def _answer(self, asked: _Asked, answer: Answer) -> None:
+    def _send(self, asked: _Asked, answer: Answer) -> None:
         wire = answer.to_wire()
         try:
             self._site.member.answer(self._topic.name, asked.client, wire)
@@ -183,11 +194,17 @@ class ExposedService:
 
     def _publish(self, event: Heard) -> None:
         """Tell all clients what an action's topic says."""
-        at = self._topics.index(event.handle)
+        at, what = self._topics.index(event.handle), self._wish.local
         if not self._publisher.readers:
             self._site.traffic.unread += 1
             return
+        if not self._publisher.has_room():
+            self._site.faults.tell(what, Fault.TOO_FAST, "news come faster than clients confirm them")
+            return
         body = self._news[at].encode(event.raw)
+        if reason := too_large("news", len(event.raw), self._wish.rule.max_bytes, len(body)):
+            self._site.faults.tell(what, Fault.TOO_LARGE, reason)
+            return
         wire = News(len(self._exchange.services) + at, event.stamp_ns, body).to_wire()
         self._publisher.publish(wire)
         self._site.traffic.sent(len(wire))

@@ -11,13 +11,14 @@ from dataclasses import replace
 from gdp.client.member import Topic
 from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
+from proxy.bridge.pace import Pace
 from proxy.bridge.seat import Seat
 from proxy.bridge.site import Site
 from proxy.bridge.wishes import Wish
 from proxy.endpoints.endpoint import Described, End, Event, Faulted, Heard
 from proxy.faults import Fault
 from proxy.parcel import Description, Parcel
-from proxy.qos import kept, request
+from proxy.qos import DEPTH_MAX, default, kept, request
 from proxy.serial.channel import Channel, Qos
 from proxy.serial.serializer import Serializer
 
@@ -36,11 +37,11 @@ class ExposedTopic:
         self._seat = seat
         self._wish = wish
         self._topic = topic
-        self._offers = _offers(ends)
+        self._ends, self._offers = len(ends), _offers(ends)
         self._publisher: Publisher | None = None
         self._serializer: Serializer | None = None
         self._is_latched = False
-        self._next_s = 0.0  # when the next message may go, where the rule limits the rate
+        self._pace = Pace(wish.rule.max_hz)
         self._handle = self._subscribe()
         try:
             self._describe(seat.endpoint.channel(wish.local, wish.type_name))  # far readers may come before a message
@@ -49,10 +50,11 @@ class ExposedTopic:
 
     def follow(self, ends: Sequence[End]) -> None:
         """Learn who publishes now."""
-        before, self._offers = self._offers, _offers(ends)
-        if before == self._offers:
+        before = self._ends, self._offers
+        self._ends, self._offers = len(ends), _offers(ends)
+        if before == (self._ends, self._offers):
             return
-        if request(before) != request(self._offers):
+        if request(before[1]) != request(self._offers):
             self._seat.close(self._handle)
             self._handle = self._subscribe()
         if self._publisher is not None:
@@ -67,10 +69,11 @@ class ExposedTopic:
         elif isinstance(event, Faulted):
             self._site.faults.tell(self._wish.local, Fault.QOS, event.reason)
 
-    def close(self) -> None:
+    def close(self, now_s: float) -> None:
         """Carry nothing any more."""
         self._seat.close(self._handle)
         if self._publisher is not None:
+            self._site.member.flush(now_s)  # what was said last must not wait: it would go with its stream
             self._site.member.withdraw(self._topic.name)
 
     def renew(self, topic: Topic) -> None:
@@ -88,8 +91,9 @@ class ExposedTopic:
         self._is_latched = channel.latched
         latched = bool(self._depth())
         offers = (request(self._offers),) if self._offers else channel.qos
-        if offers:
-            offers = (replace(offers[0], depth=self._depth() or offers[0].depth),)
+        if offers or latched:
+            profile = offers[0] if offers else default(latched=True)
+            offers = (replace(profile, depth=self._depth() or profile.depth),)
         described = replace(channel, topic=rule.global_name_of(self._wish.local), latched=latched, qos=offers)
         self._serializer = Serializer(described, rule.encoding)
         if self._serializer.opaque and rule.encoding != "cdr":
@@ -118,19 +122,17 @@ class ExposedTopic:
         """Return how many messages late joiners get."""
         if self._wish.rule.wants_latched is False:
             return 0
-        depth = kept(self._offers)
-        return max(depth, 1) if self._wish.rule.latched or self._is_latched else depth
+        if self._wish.rule.latched or self._is_latched:
+            return max(kept(self._offers), DEPTH_MAX if self._is_latched and self._ends > 1 else 1)
+        return kept(self._offers)
 
     def _publish(self, event: Heard, now_s: float) -> None:
         rule, publisher, serializer, traffic = self._wish.rule, self._publisher, self._serializer, self._site.traffic
         if publisher is None or serializer is None:
             return  # described first, always: what comes before is of a subscription that was replaced
-        if rule.max_hz is not None:
-            if now_s < self._next_s:
-                traffic.thinned += 1
-                return
-            period_s = 1 / rule.max_hz
-            self._next_s = max(self._next_s + period_s, now_s + period_s / 2)
+        if not self._pace.may_pass(now_s):
+            traffic.thinned += 1
+            return
         if len(event.raw) > rule.max_bytes:
             detail = f"a message of {len(event.raw)} bytes; the rule's max_bytes is {rule.max_bytes}"
             self._site.faults.tell(self._wish.local, Fault.TOO_LARGE, detail)

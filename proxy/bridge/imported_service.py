@@ -15,14 +15,13 @@ from gdp.errors import GdpError, LocalError, RemoteError
 from gdp.names import Name
 from gdp.service.calls import Calls
 from proxy.bridge.incoming import Incoming
-from proxy.bridge.parts import RESULT, Parts
+from proxy.bridge.parts import PROFILES, RESULT, Parts
 from proxy.bridge.seat import Seat
 from proxy.bridge.site import Site
 from proxy.bridge.wishes import Wish
 from proxy.endpoints.endpoint import Asked, Event, Faulted
-from proxy.exchange import PATIENCE_MAX_MS, Answer, Exchange, News, Outcome, Request
+from proxy.exchange import PATIENCE_MAX_MS, Answer, Exchange, News, Outcome, Request, too_large
 from proxy.faults import Fault
-from proxy.qos import default
 from proxy.serial.channel import Channel
 from proxy.serial.serializer import Serializer
 from proxy.serial.service import Service
@@ -32,6 +31,7 @@ from proxy.serial.twin import twin_channel
 __all__ = ["ImportedService"]
 
 _CALLS_MAX = 65_536  # under way from this machine
+_GONE = "the far server is gone"
 
 
 class _Waiting(NamedTuple):
@@ -44,6 +44,7 @@ class _Waiting(NamedTuple):
 class _Server(NamedTuple):
     """A far server's dialect, by part."""
 
+    description: bytes
     answers: tuple[Incoming, ...]
     news: tuple[Incoming, ...]
 
@@ -62,7 +63,7 @@ class ImportedService:
         self._topic = topic
         self._parts = Parts.of(wish.rule.kind, wish.local, wish.type_name)
         self._calls: Calls[_Waiting] = Calls(_CALLS_MAX, random_start)
-        self._refusals: dict[int, int] = {}  # call -> servers that could not
+        self._left: dict[int, set[Name]] = {}  # call -> servers that may still answer it
         self._servers: dict[Name, _Server] = {}
         self._requests: tuple[Serializer, ...] = ()
         self._handles: list[int] = []
@@ -94,15 +95,16 @@ class ImportedService:
         """Open or close the virtual server as far ones come and go; fail what waited too long."""
         self._follow()
         for number, waiting in self._calls.expired(now_s):
-            self._refusals.pop(number, None)
+            self._left.pop(number, None)
             self._refuse(waiting, Fault.TIMED_OUT, f"no answer within {self._wish.rule.timeout_s:g} s")
 
     def next_timeout(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         return self._calls.next_timeout()
 
-    def close(self) -> None:
+    def close(self, now_s: float) -> None:
         """Call nobody any more; calls under way fail."""
+        del now_s
         self._shut("the proxy no longer carries this service")
         self._site.member.withdraw(self._topic.name)
 
@@ -115,34 +117,40 @@ class ImportedService:
         peers = self._site.member.peers(self._topic.name)
         feeds = self._site.member.feeds_of(self._topic.name) if peers else []
         descriptions = {feed.publisher: feed.description for feed in feeds if feed.publisher in peers}
-        for name in [name for name in self._servers if name not in descriptions]:
+        for name in [name for name, each in self._servers.items() if descriptions.get(name) != each.description]:
             del self._servers[name]
+            for call in [call for call, left in self._left.items() if name in left]:
+                self._rule_out(name, call, Fault.NO_SERVER, _GONE)
         for name, description in descriptions.items():
             if name not in self._servers:
                 self._learn(name, description)
         if not self._servers and self._handles:
-            self._shut("the far server is gone")
+            self._shut(_GONE)
 
     def _learn(self, name: Name, description: bytes) -> None:
         """Make ready for a server's answers; the first one opens the virtual server here."""
         what, ros = self._wish.local, self._seat.endpoint.ros
         try:
             theirs = Exchange.from_wire(description)
-            if (len(theirs.services), len(theirs.topics)) != (len(self._parts.services), len(self._parts.topics)):
-                raise LocalError("the far side serves something else under this name")
+            types = [*(each.type_name for each in theirs.services), *(each.type_name for each in theirs.topics)]
+            if types != [type_name for _, type_name in (*self._parts.services, *self._parts.topics)]:
+                raise LocalError(f"the far side serves something else under this name: {', '.join(types)}")
             ours = self._ours(theirs)
             services, topics = zip(theirs.services, ours.services, strict=True), zip(
                 theirs.topics, ours.topics, strict=True
             )
             server = _Server(
+                description,
                 tuple(Incoming.ready(a.response, theirs.encoding, b.response, ros) for a, b in services),
                 tuple(Incoming.ready(a, theirs.encoding, b, ros) for a, b in topics),
             )
+            for our, their in zip(ours.services, theirs.services, strict=True):
+                Incoming.ready(our.request, ours.encoding, their.request, theirs.services[0].ros)  # or it says why not
             if not self._handles:
                 self._open(ours)
         except GdpError as error:
             self._site.faults.tell(what, Fault.OTHER_TYPE, str(error))
-            server = _Server((), ())
+            server = _Server(description, (), ())
         self._servers[name] = server
 
     def _description(self) -> bytes:
@@ -181,14 +189,16 @@ class ImportedService:
     def _open(self, ours: Exchange) -> None:
         self._publisher.describe(ours.to_wire())
         self._requests = tuple(Serializer(each.request, ours.encoding) for each in ours.services)
-        profile = (default(depth=100),)
-        self._topics = [self._seat.advertise(self, replace(each, qos=profile)) for each in ours.topics]
+        self._topics = [
+            self._seat.advertise(self, replace(each, qos=(profile,), latched=profile.durability == "transient_local"))
+            for each, profile in zip(ours.topics, PROFILES, strict=False)
+        ]
         self._handles = [self._seat.serve(self, each) for each in ours.services]
 
     def _shut(self, reason: str) -> None:
         for _, waiting in self._calls.fail_all():
             self._refuse(waiting, Fault.NO_SERVER, reason)
-        self._refusals.clear()
+        self._left.clear()
         for handle in [*self._handles, *self._topics]:
             self._seat.close(handle)
         self._handles, self._topics = [], []
@@ -199,42 +209,52 @@ class ImportedService:
         timeout_s = self._wish.rule.timeout_s
         if part == RESULT and self._wish.rule.kind == "action":
             timeout_s = None
-        try:
-            body = self._requests[part].encode(event.raw)
-            number = self._calls.begin(now_s, timeout_s, waiting)
-            patience_ms = 0 if timeout_s is None else min(max(int(timeout_s * 1e3), 1), PATIENCE_MAX_MS)
-            wire = Request(part, number, patience_ms, body).to_wire()
-            self._publisher.publish(wire)
-        except LocalError as error:
-            self._refuse(waiting, Fault.TOO_LARGE, str(error))
+        body = self._requests[part].encode(event.raw)
+        if reason := too_large("a request", len(event.raw), self._wish.rule.max_bytes, len(body)):
+            self._refuse(waiting, Fault.TOO_LARGE, reason)
             return
+        if not self._publisher.has_room():
+            self._refuse(waiting, Fault.TOO_FAST, "requests come faster than far servers confirm them")
+            return
+        try:
+            number = self._calls.begin(now_s, timeout_s, waiting)
+        except LocalError as error:
+            self._refuse(waiting, Fault.TOO_FAST, str(error))
+            return
+        self._left[number] = {name for name, server in self._servers.items() if server.answers}
+        patience_ms = 0 if timeout_s is None else min(max(int(timeout_s * 1e3), 1), PATIENCE_MAX_MS)
+        wire = Request(part, number, patience_ms, body).to_wire()
+        self._publisher.publish(wire)
         self._site.traffic.sent(len(wire))
 
     def _take_answer(self, message: Message) -> None:
-        answer = Answer.from_wire(message.delivered.message)
-        server = self._servers.get(Name(message.delivered.publisher))
+        answer, name = Answer.from_wire(message.delivered.message), Name(message.delivered.publisher)
+        server = self._servers.get(name)
         if server is None or answer.part >= len(server.answers):
             return  # of a server that is gone, or that cannot be understood here: that was told
         if answer.outcome is Outcome.FAILED:
-            self._take_refusal(answer)
+            self._rule_out(name, answer.call, Fault.REFUSED, answer.reason)
             return
-        raw = server.answers[answer.part].decode(answer.body)
+        try:
+            raw = server.answers[answer.part].decode(answer.body)
+        except RemoteError as error:
+            self._rule_out(name, answer.call, Fault.MALFORMED, str(error))
+            return
         waiting = self._calls.answered(answer.call)
-        self._refusals.pop(answer.call, None)
+        self._left.pop(answer.call, None)
         if waiting is not None:
             self._seat.endpoint.answer(self._handles[waiting.part], waiting.ticket, raw)
 
-    def _take_refusal(self, answer: Answer) -> None:
-        """Fail a call when every server has said that it cannot."""
-        refused = self._refusals.get(answer.call, 0) + 1
-        if refused < len(self._servers):
-            if answer.call in self._calls:
-                self._refusals[answer.call] = refused
+    def _rule_out(self, name: Name, call: int, fault: Fault, reason: str) -> None:
+        """Learn that a server will not answer a call, which fails if no other may."""
+        left = self._left.get(call, set())
+        left.discard(name)
+        if left:
             return
-        self._refusals.pop(answer.call, None)
-        waiting = self._calls.answered(answer.call)
+        self._left.pop(call, None)
+        waiting = self._calls.answered(call)
         if waiting is not None:
-            self._refuse(waiting, Fault.REFUSED, answer.reason)
+            self._refuse(waiting, fault, reason)
 
     def _take_news(self, message: Message) -> None:
         news = News.from_wire(message.delivered.message)

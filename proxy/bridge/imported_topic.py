@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import replace
 
 from gdp.client.member import Message, Topic
 from gdp.errors import LocalError, RemoteError
 from proxy.bridge.incoming import Incoming
+from proxy.bridge.pace import Pace
 from proxy.bridge.seat import Seat
 from proxy.bridge.site import Site
 from proxy.bridge.wishes import Wish
@@ -32,7 +33,11 @@ _SOURCES_MAX = 1_024  # descriptions kept ready; the oldest go
 
 
 class ImportedTopic:
-    """Carries one far topic in."""
+    """Carries one far topic in.
+
+    Raises:
+        LocalError: this graph does not take a publisher of it.
+    """
 
     def __init__(self, site: Site, seat: Seat, wish: Wish, topic: Topic) -> None:
         self._site = site
@@ -40,38 +45,36 @@ class ImportedTopic:
         self._wish = wish
         self._topic = topic
         self._wants: tuple[Qos, ...] = ()
+        self._unmatched: Set[str] = frozenset()  # keys of readers that want what cannot be had
         self._handle: int | None = None
         self._channel: Channel | None = None  # as it is offered here
         self._source: Channel | None = None
         self._sources: dict[tuple[bytes, bytes], Incoming | None] = {}
         self._is_joined = False
+        self._pace = Pace(wish.rule.max_hz)
         self.tally = Tally(wish.local, wish.type_name, latencies_ms=deque(maxlen=_SAMPLES_MAX))
-        try:
-            self._offer(seat.endpoint.channel(wish.local, wish.type_name))
-        except LocalError:
-            self._channel = None  # the far side's own definition may do
+        if (known := self._known()) is not None:  # else the far side's own definition may do
+            self._offer(known)
 
     def follow(self, ends: Sequence[End]) -> None:
         """Learn who reads here now."""
-        if bool(ends) != self._is_joined:
-            self._is_joined = bool(ends)
-            if ends:
-                self._site.member.subscribe(self._topic)
-            else:
-                self._site.member.unsubscribe(self._topic.name)
         self._wants = tuple(end.qos for end in sorted(ends, key=lambda end: end.key) if end.qos is not None)
-        for end in ends:
-            if end.qos is not None and (policy := unmatched(end.qos)):
-                detail = f"{end.node or 'a node'} will get nothing: {policy}, which no network can promise"
-                self._site.faults.tell(self._wish.local, Fault.QOS, detail)
+        self._tell_unmatched(ends)
+        if ends and not self._is_joined:
+            self._is_joined = True
+            self._site.member.subscribe(self._topic)
+        elif not ends and self._is_joined:
+            self._leave()
+            if self._channel is not None and self._channel.latched:
+                self._shut()  # what it keeps grows old, and comes again with the next reader
         if self._channel is not None:
             self._offer(self._channel)
+        self._sources = {key: incoming for key, incoming in self._sources.items() if incoming}  # others may do now
 
     def receive(self, message: Message, now_s: float) -> None:
         """Take a message from the overlay."""
-        del now_s
         try:
-            self._receive(message)
+            self._receive(message, now_s)
         except RemoteError as error:
             self.tally.refused += 1
             self._site.faults.tell(self._wish.local, Fault.MALFORMED, str(error))
@@ -82,11 +85,12 @@ class ImportedTopic:
         if isinstance(event, Faulted):
             self._site.faults.tell(self._wish.local, Fault.QOS, event.reason)
 
-    def close(self) -> None:
+    def close(self, now_s: float) -> None:
         """Carry nothing any more."""
-        self.follow(())
-        if self._handle is not None:
-            self._seat.close(self._handle)
+        del now_s
+        if self._is_joined:
+            self._leave()
+        self._shut()
 
     def renew(self, topic: Topic) -> None:
         """Take the delegation anew."""
@@ -94,8 +98,27 @@ class ImportedTopic:
         if self._is_joined:
             self._site.member.renew(topic)
 
-    def _receive(self, message: Message) -> None:
-        delivered, traffic = message.delivered, self._site.traffic
+    def _leave(self) -> None:
+        self._is_joined = False
+        self._site.member.unsubscribe(self._topic.name)
+
+    def _shut(self) -> None:
+        if self._handle is not None:
+            self._seat.close(self._handle)
+            self._handle = None
+
+    def _tell_unmatched(self, ends: Sequence[End]) -> None:
+        """Tell, once, of each reader that wants what cannot be had."""
+        odd = {end.key: (end.node or "a node", policy) for end in ends if end.qos and (policy := unmatched(end.qos))}
+        for key in odd.keys() - self._unmatched:
+            detail = "{} will get nothing: {}, which no network can promise".format(*odd[key])
+            self._site.faults.tell(self._wish.local, Fault.QOS, detail)
+        if self._unmatched and not odd:
+            self._site.faults.over(self._wish.local, Fault.QOS)
+        self._unmatched = odd.keys()
+
+    def _receive(self, message: Message, now_s: float) -> None:
+        delivered, traffic, rule = message.delivered, self._site.traffic, self._wish.rule
         key = (delivered.publisher, message.description)
         if key not in self._sources:
             self._sources[key] = self._describe(Description.from_wire(message.description))
@@ -105,8 +128,17 @@ class ImportedTopic:
         if incoming is None or self._handle is None:
             self.tally.refused += 1
             return
+        if not self._pace.may_pass(now_s):
+            traffic.thinned += 1
+            return
         parcel = Parcel.from_wire(delivered.message)
-        self._seat.endpoint.publish(self._handle, incoming.decode(parcel.body))
+        raw = incoming.decode(parcel.body)
+        if len(raw) > rule.max_bytes:
+            self.tally.refused += 1
+            detail = f"a message of {len(raw)} bytes; the rule's max_bytes is {rule.max_bytes}"
+            self._site.faults.tell(self._wish.local, Fault.TOO_LARGE, detail)
+            return
+        self._seat.endpoint.publish(self._handle, raw)
         latency_ms = (time.time_ns() - parcel.stamp_ns) / 1e6
         self.tally.count_number(delivered.publisher, delivered.incarnation, delivered.number, delivered.place)
         self.tally.add(latency_ms, delivered.parts, delivered.hops)
@@ -140,19 +172,18 @@ class ImportedTopic:
 
     def _offer(self, channel: Channel) -> None:
         """Be the publisher that the far one is, as far as local readers allow; again where that has changed."""
-        if self._source is None:
-            latched = bool(self._wish.rule.latched)
-            profile = offer(default(latched=latched), self._wants)
-        else:
-            source = self._source.qos[0] if self._source.qos else None
-            profile = offer(source, self._wants, is_latched=self._source.latched)
+        source, is_latched = default(), False
+        if self._source is not None:
+            source = self._source.qos[0] if self._source.qos else source
+            is_latched = self._source.latched or source.durability == "transient_local"
+        if self._wish.rule.wants_latched is not None:
+            is_latched = self._wish.rule.wants_latched
+        profile = offer(source, self._wants, is_latched=is_latched)
         latched = profile.durability == "transient_local"
         offered = replace(channel, topic=self._wish.local, qos=(profile,), latched=latched, callerid=None)
         if self._handle is not None and self._channel is not None and _is_served(self._channel, offered):
             return
-        if self._handle is not None:
-            self._seat.close(self._handle)
-            self._handle = None
+        self._shut()
         self._handle = self._seat.advertise(self, offered)
         self._channel = offered
 

@@ -10,10 +10,12 @@ from dataclasses import dataclass
 from typing import Final
 
 from proxy.endpoints.endpoint import End
+from proxy.qos import default
 
-__all__ = ["RESULT", "Parts", "action_of", "is_part"]
+__all__ = ["PROFILES", "RESULT", "Parts", "action_of", "is_part"]
 
 RESULT: Final = 2  # the part of an action that answers when the goal has ended, however long that takes
+PROFILES: Final = (default(depth=100), default(latched=True, depth=1))  # of feedback and status, as rcl_action has them
 _INFIX: Final = "/_action/"
 _GOAL: Final = "_SendGoal"
 

@@ -58,16 +58,28 @@ def exposed(rules: Sequence[Rule], graph: Graph, complaints: list[Complaint]) ->
             yield Wish(True, local, type_name, rule.overlay_name_of(local, type_name), rule)
 
 
-def imported(rules: Sequence[Rule], graph: Graph, held: Iterable[tuple[Metadata, Name]]) -> Iterator[Wish]:
+def imported(
+    rules: Sequence[Rule], graph: Graph, held: Iterable[tuple[Metadata, Name]], complaints: list[Complaint]
+) -> Iterator[Wish]:
     """Yield what is to be had from elsewhere: by concrete rules, by delegations held, by what local nodes ask for."""
     seen: set[Name] = set()
-    for wish in _imported(rules, graph, held):
+    wanted = _shown(graph, _WANTS)
+    had: dict[tuple[Kind, str], set[str]] = {}
+    for wish in _imported(rules, wanted, held):
+        had.setdefault((wish.rule.kind, wish.local), set()).add(wish.type_name)
         if wish.name not in seen:
             seen.add(wish.name)
             yield wish
+    for (kind, local), types in wanted.items():
+        if has := had.get((kind, local)):
+            for other in sorted(types - has):
+                detail = f"local nodes ask for {other}; what comes is {', '.join(sorted(has))}"
+                complaints.append(Complaint(local, Fault.OTHER_TYPE, detail))
 
 
-def _imported(rules: Sequence[Rule], graph: Graph, held: Iterable[tuple[Metadata, Name]]) -> Iterator[Wish]:
+def _imported(
+    rules: Sequence[Rule], wanted: Mapping[tuple[Kind, str], set[str]], held: Iterable[tuple[Metadata, Name]]
+) -> Iterator[Wish]:
     for rule in rules:
         if not rule.is_pattern and rule.type_name:
             yield Wish(False, rule.local, rule.type_name, rule.overlay_name, rule)
@@ -75,7 +87,7 @@ def _imported(rules: Sequence[Rule], graph: Graph, held: Iterable[tuple[Metadata
         found = choice.imported(rules, name, metadata)
         if found is not None:
             yield Wish(False, found[1], str(metadata["type"]), name, found[0])
-    for (kind, local), types in _shown(graph, _WANTS).items():
+    for (kind, local), types in wanted.items():
         for type_name in sorted(types):
             asked = choose(rules, kind, local, type_name)
             if asked is not None:

@@ -1,0 +1,98 @@
+"""``gdp lab``: everything of a small lab but what crosses: keys, memberships, and the files of its switches and RIB.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from gdp.cli import options
+from gdp.cli.output import show
+from gdp.crypto.certificates import Role
+from gdp.errors import LocalError
+from gdp.stores.files import public, write_all
+from gdp.stores.issue import make_domain, make_node, make_owner
+from gdp.stores.keyring import DELEGATIONS, OWNER_PUBLIC, load_domain, load_owner
+
+__all__ = ["lab"]
+
+_SWITCH: Final = """\
+identity: switch
+domain: {{root: switch/root.crt}}
+ports: [{{iface: {iface}}}]
+attach: [{attach}]
+"""
+_RIB: Final = """\
+identity: rib
+domain: {root: rib/root.crt}
+iface: rib0
+"""
+
+Hosts = Annotated[list[Path], typer.Argument(metavar="HOST...", help="a directory to make for each machine")]
+DomainDir = Annotated[Path, typer.Option("--domain", metavar="DIR", help="the trust domain; made if it is not there")]
+OwnerDir = Annotated[Path, typer.Option("--owner", metavar="DIR", help="the owner of names; made if it is not there")]
+Iface = Annotated[str, typer.Option("--iface", help="what joins the machines")]
+
+
+def lab(
+    hosts: Hosts,
+    domain: DomainDir = Path("lab"),
+    owner: OwnerDir = Path("owner"),
+    iface: Iface = "eth0",
+    as_json: options.Json = False,
+) -> None:
+    """Make a small lab: one trust domain, one owner, and for each machine a directory with a switch and a proxy.
+
+    A new domain's RIB is on the first machine. Where the domain is there already, machines are added to it.
+
+    \b
+    Example:
+      gdp lab robot server --iface eth0
+    """
+    _refuse_what_is_there(hosts)
+    is_new = not domain.exists()
+    if is_new:
+        make_domain(domain, domain.name)
+    else:
+        load_domain(domain)
+    if owner.exists():
+        load_owner(owner)
+    else:
+        make_owner(owner)
+    for index, host in enumerate(hosts):
+        _make_host(host, domain, (owner / OWNER_PUBLIC).read_bytes(), iface, has_rib=is_new and index == 0)
+    result = {
+        "domain": f"{domain} ({'made' if is_new else 'was there'})",
+        "owner": str(owner),
+        "machines": [str(host) for host in hosts],
+        "rib": str(hosts[0]) if is_new else None,
+    }
+    show(result, as_json=as_json)
+
+
+def _refuse_what_is_there(hosts: Sequence[Path]) -> None:
+    """Raise ``LocalError`` before anything is made, if not everything can be."""
+    for index, host in enumerate(hosts):
+        if host.exists() or host in hosts[:index]:
+            raise LocalError(f"{host} is there already")
+
+
+def _make_host(host: Path, domain: Path, owner_key: bytes, iface: str, *, has_rib: bool) -> None:
+    roles = [Role.SWITCH, *([Role.RIB] if has_rib else []), Role.PROXY]
+    for role in roles:
+        make_node(host / role.value, role, host.name, domain)
+    (host / Role.PROXY.value / DELEGATIONS).mkdir(mode=0o700)
+    attach = ", ".join(f"{role.value}0" for role in roles[1:])
+    files = {
+        OWNER_PUBLIC: public(owner_key),
+        "switch.yaml": public(_SWITCH.format(iface=json.dumps(iface), attach=attach).encode()),
+    }
+    if has_rib:
+        files["rib.yaml"] = public(_RIB.encode())
+    write_all(host, files)

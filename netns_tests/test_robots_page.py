@@ -1,0 +1,196 @@
+"""What the page on robots promises, done by its own commands on two machines, with real nodes as robot and server.
+
+``pkill`` and what a person types between two commands is done by process number: a namespace shares its processes.
+"""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from netns_tests.cable import Terminals, cable
+from netns_tests.spaces import Space
+from tests.machines import Machines
+from tests.pages import ROOT, Block, blocks_between
+from tests.proxy.endpoints.ros1_net import need_ros1
+from tests.proxy.endpoints.ros2_net import CONFINED, DOMAIN, Peer, needs, peer_of
+
+needs("sensor_msgs", "nav_msgs", "geometry_msgs", "std_srvs", "test_msgs")
+if shutil.which("nsenter") is None:
+    pytest.skip("nsenter is not installed (util-linux)", allow_module_level=True)
+
+pytestmark = pytest.mark.netns
+
+PAGE = ROOT / "docs/robots.md"
+_RUN_ON = ("gdp-switch ", "gdp-rib ", "gdp-proxy ", "roscore")
+_ROS2 = ", with ros2"
+_ROBOT = """
+from rclpy.action import ActionServer
+from geometry_msgs.msg import Twist
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import Image, LaserScan
+from std_srvs.srv import SetBool
+from test_msgs.action import Fibonacci
+camera, scan, odom = talk(Image, '/camera/left'), talk(LaserScan, '/scan', 'best_effort'), talk(Odometry, '/odom')
+picture = Image(height=2, width=2, encoding='rgb8', step=6, data=bytes(range(12)))
+sweep = LaserScan(ranges=[1.0, 2.0])
+sweep.header.frame_id = 'laser'
+listen(Twist, '/cmd_vel')
+def tick():
+    camera.publish(picture)
+    scan.publish(sweep)
+    odom.publish(Odometry(child_frame_id='base'))
+def switch(request, response):
+    response.success, response.message = True, f'the lamp is {request.data}'
+    return response
+def drive(goal):
+    goal.publish_feedback(Fibonacci.Feedback(sequence=[1]))
+    goal.succeed()
+    return Fibonacci.Result(sequence=[1] * goal.request.order)
+kept += [node.create_timer(0.05, tick), node.create_service(SetBool, '/lamp', switch)]
+kept.append(ActionServer(node, Fibonacci, '/navigate', drive))
+"""
+_DESK = """
+from rclpy.action import ActionClient
+from geometry_msgs.msg import Twist
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import Image
+from test_msgs.action import Fibonacci
+listen(Image, '/camera/left')
+steering, client = talk(Twist, '/cmd_vel'), ActionClient(node, Fibonacci, '/navigate')
+kept.append(node.create_timer(0.1, lambda: steering.publish(Twist())))
+results = []
+def arrived(future):
+    results.append(len(future.result().result.sequence))
+def begun(future):
+    future.result().get_result_async().add_done_callback(arrived)
+"""
+
+
+@pytest.fixture
+def machines(tmp_path: Path) -> Machines:
+    """Two machines with a ROS 2 each, whose graphs do not leave them."""
+    two = Machines(tmp_path)
+    ros1 = {"ROS_HOSTNAME": "localhost", "ROS_MASTER_URI": "http://localhost:11311", "ROS_HOME": str(tmp_path / "ros")}
+    two.environment |= {**CONFINED, **ros1, "ROS_DOMAIN_ID": str(DOMAIN)}
+    return two
+
+
+@pytest.fixture
+def into_server(space: Space) -> Iterator[list[str]]:
+    with cable(space) as words:
+        yield words
+
+
+@pytest.fixture
+def terminals(machines: Machines, into_server: list[str]) -> Iterator[Terminals]:
+    opened = Terminals(machines, into_server)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def robot(into_server: list[str]) -> Iterator[Peer]:
+    """A robot's own node: the thread is on the robot."""
+    with peer_of("robot") as peer:
+        peer.tell("!" + _ROBOT)
+        yield peer
+
+
+@pytest.fixture
+def desk(into_server: list[str]) -> Iterator[Peer]:
+    """An application on the server."""
+    with peer_of("desk", into_server) as peer:
+        peer.tell("!" + _DESK)
+        yield peer
+
+
+class Reader:
+    """Does what the page says, section by section."""
+
+    def __init__(self, machines: Machines, terminals: Terminals) -> None:
+        self._machines = machines
+        self._terminals = terminals
+        self.passed_over: list[str] = []
+
+    def follow(self, heading: str) -> str:
+        """Run every command of a section; return what was printed."""
+        return "".join(self._do(block) for block in blocks_between(PAGE, heading) if block.title)
+
+    def _do(self, block: Block) -> str:
+        if block.language == "yaml":
+            self._machines.write(block)
+            return ""
+        home = {"on the robot": self._machines.robot, "on the server": self._machines.server}[
+            block.title.removesuffix(_ROS2)
+        ]
+        if block.title.endswith(_ROS2) and shutil.which("ros2") is None:
+            self.passed_over += block.lines
+            return ""
+        return "".join(self._run(line, home) for line in block.lines)
+
+    def _run(self, line: str, home: Path) -> str:
+        if line.startswith(_RUN_ON) and "--check" not in line:
+            self._terminals.start(line, home)
+            return ""
+        if line.startswith("pkill -HUP -f "):
+            self._terminals.signal(line.rsplit(maxsplit=1)[-1], signal.SIGHUP)
+            return ""
+        words = [*self._terminals.words(home), "bash", "-ec", line]
+        done = subprocess.run(
+            words, cwd=home, env=self._machines.environment, capture_output=True, text=True, check=False, timeout=60
+        )
+        assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
+        return done.stdout
+
+
+@pytest.fixture
+def reader(machines: Machines, terminals: Terminals, robot: Peer, desk: Peer) -> Reader:
+    """Somebody who has followed the page up to the start."""
+    made = Reader(machines, terminals)
+    for heading in ("What you need", "Keys", "The two files"):
+        printed = made.follow(heading)
+    for file, right in (("robot", "publish"), ("server", "read")):
+        assert f"{file}/proxy.yaml: + {right} topic /camera/left [sensor_msgs/msg/Image]" in printed
+    made.follow("Start")
+    return made
+
+
+def test_a_robot_and_a_server_meet_by_the_commands_of_the_page(
+    reader: Reader, terminals: Terminals, robot: Peer, desk: Peer
+) -> None:
+    desk.waits_for("len(heard['/camera/left']) > 0", True)
+    robot.waits_for("len(heard['/cmd_vel']) > 0", True)
+    desk.waits_for("client.wait_for_server(0.1)", True)
+    desk.tell("!client.send_goal_async(Fibonacci.Goal(order=7)).add_done_callback(begun)")
+    desk.waits_for("results", [7])
+
+    looked = reader.follow("Look")
+    assert "('/camera/left', ['sensor_msgs/msg/Image'])" in looked
+    assert "frame_id='laser'" in looked
+    assert "message='the lamp is True'" in looked
+    assert "configuration good" in looked
+    assert 'gdp_messages_total{direction="in"}' in looked
+
+    desk.tell("listen(Odometry, '/odom')")
+    assert "+ publish topic /odom" in reader.follow("Change")
+    desk.waits_for("len(heard['/odom']) > 0", True)
+
+    said = terminals.end()
+    assert sorted(said) == [f"gdp-{each}, exit 0" for each in ("proxy", "rib", "switch")]
+    assert " 0 faults" in said["gdp-proxy, exit 0"]
+
+
+def test_a_ros_1_server_sees_a_ros_2_robot_by_the_commands_of_the_page(reader: Reader, terminals: Terminals) -> None:
+    need_ros1()
+    terminals.end("gdp-proxy --config server")
+    looked = reader.follow("ROS 1")
+    assert "/camera/left" in looked
+    assert "Type: sensor_msgs/LaserScan" in looked
+    assert 'frame_id: "laser"' in looked
+    assert "the lamp is True" in looked

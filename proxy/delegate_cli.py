@@ -1,0 +1,109 @@
+"""The ``gdp-delegate`` command: an owner gives proxies what the rules of their files need.
+
+Place: command.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gdp.cli.node import Json, emit, failing_clearly
+from gdp.errors import StatementError
+from gdp.limits import CHAIN_MAX
+from gdp.stores.issue import DELEGATION_DAYS, delegate
+from gdp.stores.keyring import CARD, load_card, load_delegations, load_owner, save_delegation
+from gdp.trust.adcert import AdCertCache, Chain
+from gdp.trust.card import Card
+from gdp.trust.delegation import Delegation
+from proxy.config import ProxyConfig
+from proxy.endpoints.endpoint import Graph
+from proxy.looking import look
+from proxy.needs import Machine, Need, needs, unmet
+
+__all__ = ["app", "main"]
+
+
+Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="the proxy.yaml of each machine")]
+OwnerDir = Annotated[Path, typer.Option("--owner", metavar="DIR", help="the owner's directory")]
+Live = Annotated[bool, typer.Option("--live", help="for patterns and missing types: what the first file's ROS has now")]
+Days = Annotated[float, typer.Option("--days", min=0.001, help="how long a delegation is valid")]
+Renew = Annotated[bool, typer.Option("--renew", help="make those again that are there")]
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+@app.command(epilog="Example: gdp-delegate --owner owner --live robot/proxy.yaml server/proxy.yaml")
+def delegate_what_is_needed(
+    files: Files,
+    owner: OwnerDir,
+    live: Live = False,
+    days: Days = DELEGATION_DAYS,
+    renew: Renew = False,
+    json: Json = False,
+) -> None:
+    """Let each proxy publish, read, serve or call what its rules say; what it may already is left as it is."""
+    with failing_clearly():
+        key = load_owner(owner).key.public
+        configs = [ProxyConfig.load(file) for file in files]
+        cards = [load_card(config.identity / CARD) for config in configs]
+        machines = [
+            Machine(config, load_delegations(config.delegations), _graphs(config, card) if live and not index else ())
+            for index, (config, card) in enumerate(zip(configs, cards, strict=True))
+        ]
+        for file, machine, card, found in zip(files, machines, cards, needs(machines, key), strict=True):
+            for need in found:
+                held = _held(machine.held, card, need)
+                is_new = renew or held is None or not need.rights <= held.rights
+                if is_new:
+                    save_delegation(machine.config.delegations, _made(owner, card, need, held, days), force=True)
+                _tell(file, need, is_new=is_new, json=json)
+            for rule in unmet([*machine.config.expose, *machine.config.imports], key, found):
+                typer.echo(f"{file}: {rule.name}: nothing is known yet that it means; try --live", err=True)
+
+
+def main() -> None:
+    """Run the command."""
+    app()
+
+
+def _graphs(config: ProxyConfig, card: Card) -> list[Graph]:
+    return [graph for _, graph in look(config.ros, card.name.to_text(), "delegate")]
+
+
+def _held(delegations: Iterable[Delegation], card: Card, need: Need) -> Delegation | None:
+    """Return what the node has of a name, if it holds now."""
+    for delegation in delegations:
+        if delegation.name == need.name:
+            try:
+                chain = Chain.walk(delegation.chain, delegation.subject, card.subject, AdCertCache(CHAIN_MAX))
+                for right in delegation.rights:
+                    chain.check(right, time.time())
+            except StatementError:
+                return None  # run out, or of a node that was here before: a new one takes its place
+            return delegation
+    return None
+
+
+def _made(owner: Path, card: Card, need: Need, held: Delegation | None, days: float) -> Delegation:
+    """Return a delegation of what is needed; what was given before is in it as well."""
+    rights, epochs = (held.rights, held.grants.keys()) if held is not None else (frozenset(), (0,))
+    return delegate(owner, card, need.metadata, need.rights | rights, epochs, days=days)
+
+
+def _tell(file: Path, need: Need, *, is_new: bool, json: bool) -> None:
+    rights = sorted(right.value for right in need.rights)
+    if json:
+        fields = {"name": need.name.to_text(), "rights": rights, "metadata": dict(need.metadata)}
+        emit("delegated" if is_new else "held", file=str(file), **fields)
+        return
+    kind, name, type_name = (need.metadata[key] for key in ("kind", "name", "type"))
+    typer.echo(f"{file}: {'+' if is_new else '='} {', '.join(rights)} {kind} {name} [{type_name}]")
+
+
+if __name__ == "__main__":
+    main()

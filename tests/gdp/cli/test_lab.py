@@ -1,0 +1,65 @@
+"""``gdp lab``, as a person calls it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gdp.cli.gdp import main
+from gdp.crypto.certificates import Role
+from gdp.nodes.config import RibConfig, SwitchConfig
+from gdp.nodes.membership import load_member
+
+
+@pytest.fixture(autouse=True)
+def _in_an_empty_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def _lab(line: str) -> int:
+    try:
+        main(["lab", *line.split()])
+    except SystemExit as leaving:
+        return int(leaving.code or 0)
+    return 0
+
+
+def _switch(host: str) -> SwitchConfig:
+    return SwitchConfig.load(Path(host, "switch.yaml"))
+
+
+def test_two_machines_get_files_that_their_nodes_accept() -> None:
+    assert _lab("robot server --iface eth0.7") == 0
+    assert [(port.iface, port.cost) for port in _switch("server").ports] == [("eth0.7", 10)]
+    assert (_switch("robot").attach, _switch("server").attach) == (("rib0", "proxy0"), ("proxy0",))
+    rib = RibConfig.load(Path("robot/rib.yaml"))
+    load_member(rib.identity, rib.domain, Role.RIB)
+    load_member(_switch("server").identity, _switch("server").domain, Role.SWITCH)
+
+
+def test_a_proxy_finds_a_place_for_delegations_and_the_owner_whose_rules_it_will_have() -> None:
+    assert _lab("robot --owner boss") == 0
+    assert Path("robot/proxy/delegations").is_dir()
+    assert Path("robot/owner.pub").read_bytes() == Path("boss/owner.pub").read_bytes()
+
+
+def test_a_machine_that_comes_later_is_of_the_same_domain_and_has_no_rib() -> None:
+    assert _lab("robot") == 0
+    assert _lab("arm") == 0
+    assert Path("arm/switch/root.crt").read_bytes() == Path("robot/switch/root.crt").read_bytes()
+    assert Path("arm/owner.pub").read_bytes() == Path("robot/owner.pub").read_bytes()
+    assert not Path("arm/rib.yaml").exists()
+
+
+@pytest.mark.parametrize("line", ["server robot", "server server"])
+def test_nothing_is_made_where_a_machine_is_there_already(line: str) -> None:
+    Path("robot").mkdir()
+    assert _lab(line) == 2
+    assert [path.name for path in Path().iterdir()] == ["robot"]
+
+
+def test_a_directory_that_is_no_domain_is_refused() -> None:
+    Path("lab").mkdir()
+    assert _lab("robot") == 2
+    assert not Path("robot").exists()

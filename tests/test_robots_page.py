@@ -1,0 +1,17 @@
+"""What the page on robots says without commands holds; its commands are run by ``netns_tests/test_robots_page.py``."""
+
+from __future__ import annotations
+
+from proxy.faults import Fault
+from tests.pages import ROOT, rows
+
+PAGE = ROOT / "docs/robots.md"
+
+
+def test_every_fault_is_explained() -> None:
+    told = PAGE.read_text().partition("## What a warning means")[2].partition("\n## ")[0]
+    assert [name for name, _ in rows(told)] == [fault.value for fault in Fault]
+
+
+def test_it_can_be_read_in_ten_minutes() -> None:
+    assert len(PAGE.read_text().splitlines()) <= 250
