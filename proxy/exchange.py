@@ -17,11 +17,12 @@ from typing import Final, NamedTuple
 
 from gdp.crypto.cbor import decode, encode
 from gdp.errors import DropReason, RemoteError
+from gdp.limits import MESSAGE_MAX_BYTES
 from proxy.serial.channel import CHANNEL_MAX_BYTES, Channel
 from proxy.serial.serializer import Encoding
 from proxy.serial.service import Service
 
-__all__ = ["Answer", "Exchange", "News", "Outcome", "Request"]
+__all__ = ["Answer", "Exchange", "News", "Outcome", "Request", "too_large"]
 
 VERSION: Final = 1
 PARTS_MAX: Final = 8
@@ -30,6 +31,7 @@ _REASON_MAX_BYTES: Final = 1_024
 _REQUEST: Final = struct.Struct("!BBQI")
 _ANSWER: Final = struct.Struct("!BBQB")
 _NEWS: Final = struct.Struct("!BBQ")
+_HEAD_MAX_BYTES: Final = max(_REQUEST.size, _ANSWER.size, _NEWS.size)
 _ENCODINGS: Final[dict[object, Encoding]] = {"json": "json", "cbor": "cbor", "cdr": "cdr"}
 
 
@@ -118,6 +120,15 @@ class News(NamedTuple):
         """
         part, stamp_ns = _head(_NEWS, wire)
         return cls(part, stamp_ns, wire[_NEWS.size :])
+
+
+def too_large(what: str, raw_bytes: int, max_bytes: int, body_bytes: int) -> str:
+    """Return why something cannot travel: above its rule's limit, or in its encoding above everyone's; else nothing."""
+    if raw_bytes > max_bytes:
+        return f"{what} of {raw_bytes} bytes; the rule's max_bytes is {max_bytes}"
+    if body_bytes > MESSAGE_MAX_BYTES - _HEAD_MAX_BYTES:
+        return f"{what} of {body_bytes} bytes as it travels; at most {MESSAGE_MAX_BYTES - _HEAD_MAX_BYTES} can"
+    return ""
 
 
 def _head(form: struct.Struct, wire: bytes) -> tuple[int, ...]:

@@ -61,6 +61,9 @@ def carry(path: Path, settings: ProxyConfig, *, json: bool) -> None:
         if json:
             emit("done", topics=[tally.to_fields() for tally in bridge.tallies], faults=dict(node.faults.counts))
         else:
+            for tally in bridge.tallies:
+                median_ms = tally.to_fields()["latency_ms"]
+                typer.echo(f"  {tally.topic}: {tally.received} received, latency in ms {median_ms}")
             carried = f"{node.traffic.messages_out} messages sent, {node.traffic.messages_in} received"
             typer.echo(f"{carried}, {node.faults.total} faults")
 

@@ -6,7 +6,7 @@ Source: DDS 1.4, section 2.2.3: a reader and a writer match if what is offered i
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 from proxy.serial.channel import Qos
@@ -16,6 +16,7 @@ __all__ = ["DEPTH_MAX", "NEVER", "default", "depth_of", "kept", "offer", "reques
 NEVER: Final = (9_223_372_036, 854_775_807)  # how ROS 2 writes an infinite duration
 DEPTH_MAX: Final = 64  # messages kept for late joiners of one topic
 _DEPTH: Final = 10  # where none is known; ROS 2's own default
+_OFFERED_MAX: Final = 1_000  # of our own publishers, whatever a far one says of itself
 _READER_DEPTH: Final = 1_000  # of our own subscriptions: a burst waits here, not at its publisher
 
 
@@ -54,15 +55,22 @@ def kept(offers: Sequence[Qos]) -> int:
     return DEPTH_MAX if len(latched) > 1 else min(depth_of(latched[0]), DEPTH_MAX)
 
 
-def offer(source: Qos | None, wants: Iterable[Qos], *, is_latched: bool = False) -> Qos:
-    """Return what to offer: what the far publisher does, and more where a local reader insists."""
-    reliable = source is None or source.reliability != "best_effort"
-    latched = is_latched or (source is not None and source.durability == "transient_local")
-    depth = _DEPTH if source is None else depth_of(source)
-    for want in wants:
-        reliable = reliable or want.reliability == "reliable"
-        latched = latched or want.durability == "transient_local"
-    return default(reliable=reliable, latched=latched, depth=max(depth, 1))
+def offer(sources: Sequence[Qos], wants: Sequence[Qos], *, is_latched: bool | None) -> Qos:
+    """Return what to offer: what far publishers do, as far as they are known, and more where a local reader insists.
+
+    Args:
+        is_latched: what a rule says about it; None: nothing.
+    """
+    latched = [each for each in sources if each.durability == "transient_local"]
+    insisting = [each for each in wants if each.durability == "transient_local"]
+    is_latched = bool(latched) if is_latched is None else is_latched
+    depth = DEPTH_MAX if len(latched) > 1 else max(map(depth_of, sources or insisting), default=_DEPTH)
+    is_reliable = not sources or any(each.reliability != "best_effort" for each in sources)
+    return default(
+        reliable=is_reliable or any(each.reliability == "reliable" for each in wants),
+        latched=is_latched or bool(insisting),
+        depth=min(max(depth, 1), _OFFERED_MAX),
+    )
 
 
 def unmatched(want: Qos) -> str:

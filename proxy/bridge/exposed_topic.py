@@ -39,6 +39,7 @@ class ExposedTopic:
         self._topic = topic
         self._ends, self._offers = len(ends), _offers(ends)
         self._publisher: Publisher | None = None
+        self._channel: Channel | None = None  # as the endpoint describes it
         self._serializer: Serializer | None = None
         self._is_latched = False
         self._pace = Pace(wish.rule.max_hz)
@@ -57,8 +58,8 @@ class ExposedTopic:
         if request(before[1]) != request(self._offers):
             self._seat.close(self._handle)
             self._handle = self._subscribe()
-        if self._publisher is not None:
-            self._publisher.set_depth(self._depth())
+        if self._channel is not None:
+            self._describe(self._channel)
 
     def take(self, event: Event, now_s: float) -> None:
         """Take what the endpoint says of the subscription."""
@@ -88,7 +89,7 @@ class ExposedTopic:
 
     def _describe(self, channel: Channel) -> None:
         rule = self._wish.rule
-        self._is_latched = channel.latched
+        self._channel, self._is_latched = channel, channel.latched
         latched = bool(self._depth())
         offers = (request(self._offers),) if self._offers else channel.qos
         if offers or latched:

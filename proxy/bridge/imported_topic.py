@@ -1,7 +1,8 @@
 """A topic of far publishers on its way in: joined while somebody local reads it, decoded, converted, published here.
 
 Place: shell; endpoint and member do the I/O. The virtual publisher stands as long as the rule does, so that local
-tools see the topic; the overlay's tree stands while a local reader does.
+tools see the topic; the overlay's tree stands while a local reader does. Where another one must take its place, to
+promise more, that one has what a latched topic keeps: readers get it again, as from any publisher that restarts.
 """
 
 from __future__ import annotations
@@ -48,7 +49,8 @@ class ImportedTopic:
         self._unmatched: Set[str] = frozenset()  # keys of readers that want what cannot be had
         self._handle: int | None = None
         self._channel: Channel | None = None  # as it is offered here
-        self._source: Channel | None = None
+        self._far: dict[bytes, Qos] = {}  # what publishers offer, by name
+        self._kept = deque[bytes]()  # what the virtual publisher keeps for late joiners, for another one in its place
         self._sources: dict[tuple[bytes, bytes], Incoming | None] = {}
         self._is_joined = False
         self._pace = Pace(wish.rule.max_hz)
@@ -66,6 +68,7 @@ class ImportedTopic:
         elif not ends and self._is_joined:
             self._leave()
             if self._channel is not None and self._channel.latched:
+                self._kept.clear()
                 self._shut()  # what it keeps grows old, and comes again with the next reader
         if self._channel is not None:
             self._offer(self._channel)
@@ -121,7 +124,7 @@ class ImportedTopic:
         delivered, traffic, rule = message.delivered, self._site.traffic, self._wish.rule
         key = (delivered.publisher, message.description)
         if key not in self._sources:
-            self._sources[key] = self._describe(Description.from_wire(message.description))
+            self._sources[key] = self._describe(delivered.publisher, Description.from_wire(message.description))
             while len(self._sources) > _SOURCES_MAX:
                 del self._sources[next(iter(self._sources))]
         incoming = self._sources[key]
@@ -139,13 +142,14 @@ class ImportedTopic:
             self._site.faults.tell(self._wish.local, Fault.TOO_LARGE, detail)
             return
         self._seat.endpoint.publish(self._handle, raw)
+        self._kept.append(raw)
         latency_ms = (time.time_ns() - parcel.stamp_ns) / 1e6
         self.tally.count_number(delivered.publisher, delivered.incarnation, delivered.number, delivered.place)
         self.tally.add(latency_ms, delivered.parts, delivered.hops)
         traffic.latency.observe(latency_ms / 1e3)
         traffic.received(len(delivered.message))
 
-    def _describe(self, description: Description) -> Incoming | None:
+    def _describe(self, publisher: bytes, description: Description) -> Incoming | None:
         """Make ready for a publisher's messages; None if they cannot be had here."""
         source, what = description.channels[0], self._wish.local
         if source.type_name != self._wish.type_name:
@@ -156,7 +160,9 @@ class ImportedTopic:
         except DefinitionError as error:
             self._site.faults.tell(what, Fault.OTHER_TYPE, f"the far side's definition does not fit: {error}")
             return None
-        self._source = source
+        self._far[publisher] = source.qos[0] if source.qos else default(latched=source.latched)
+        while len(self._far) > _SOURCES_MAX:
+            del self._far[next(iter(self._far))]
         try:
             self._offer(incoming.target)
         except LocalError as error:
@@ -172,13 +178,7 @@ class ImportedTopic:
 
     def _offer(self, channel: Channel) -> None:
         """Be the publisher that the far one is, as far as local readers allow; again where that has changed."""
-        source, is_latched = default(), False
-        if self._source is not None:
-            source = self._source.qos[0] if self._source.qos else source
-            is_latched = self._source.latched or source.durability == "transient_local"
-        if self._wish.rule.wants_latched is not None:
-            is_latched = self._wish.rule.wants_latched
-        profile = offer(source, self._wants, is_latched=is_latched)
+        profile = offer(tuple(self._far.values()), self._wants, is_latched=self._wish.rule.wants_latched)
         latched = profile.durability == "transient_local"
         offered = replace(channel, topic=self._wish.local, qos=(profile,), latched=latched, callerid=None)
         if self._handle is not None and self._channel is not None and _is_served(self._channel, offered):
@@ -186,6 +186,9 @@ class ImportedTopic:
         self._shut()
         self._handle = self._seat.advertise(self, offered)
         self._channel = offered
+        self._kept = deque(self._kept if latched else (), maxlen=profile.depth if latched else 0)
+        for raw in self._kept:  # who joins late finds them at the new one, too
+            self._seat.endpoint.publish(self._handle, raw)
 
 
 def _is_served(standing: Channel, wanted: Channel) -> bool:

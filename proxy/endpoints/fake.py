@@ -46,7 +46,7 @@ class Publication:
         if self.qos.durability == "transient_local":
             self.kept.append(raw)
         for subscription in self.graph.subscriptions(self.end.name, self.end.type_name):
-            if subscription.end.node != self.end.node and _match(self.qos, subscription.qos):
+            if subscription.end.node != self.end.node and self.graph.match(self.qos, subscription.qos):
                 subscription.hear(raw)
 
     def close(self) -> None:
@@ -63,6 +63,7 @@ class Subscription:
     end: End
     qos: Qos
     hear: Callable[[bytes], None]
+    described: Callable[[], None]  # what the topic's messages are may have changed
 
     def close(self) -> None:
         """Leave the graph."""
@@ -112,22 +113,43 @@ class FakeGraph:
         publication = Publication(self, end, qos, deque(maxlen=depth_of(qos)))
         self.publications.append(publication)
         self.changed()
+        for subscription in self.subscriptions(topic, type_name):
+            subscription.described()
         return publication
 
     def subscribe(
-        self, node: str, topic: str, type_name: str, hear: Callable[[bytes], None], qos: Qos | None = None
+        self,
+        node: str,
+        topic: str,
+        type_name: str,
+        hear: Callable[[bytes], None],
+        qos: Qos | None = None,
+        described: Callable[[], None] = lambda: None,
     ) -> Subscription:
         """Add a node's subscription."""
         qos = qos or default()
-        subscription = Subscription(self, self._end(Role.SUBSCRIBES, node, topic, type_name, qos), qos, hear)
+        end = self._end(Role.SUBSCRIBES, node, topic, type_name, qos)
+        subscription = Subscription(self, end, qos, hear, described)
         self.readers.append(subscription)
         self.changed()
         for publication in self.publications:
             same = (publication.end.name, publication.end.type_name) == (topic, type_name)
-            if same and qos.durability == "transient_local" and _match(publication.qos, qos):
+            wants_old = self.ros == 1 or qos.durability == "transient_local"
+            if same and wants_old and publication.end.node != node and self.match(publication.qos, qos):
                 for raw in publication.kept:
                     hear(raw)
         return subscription
+
+    def match(self, offered: Qos, wanted: Qos) -> bool:
+        """Return whether a publisher and a subscription have to do with each other."""
+        return self.ros == 1 or _match(offered, wanted)
+
+    def is_latched(self, topic: str, type_name: str) -> bool:
+        """Return whether a ROS 1 subscription is told so by a publisher; ROS 2 has QoS instead."""
+        return self.ros == 1 and any(
+            (each.end.name, each.end.type_name, each.qos.durability) == (topic, type_name, "transient_local")
+            for each in self.publications
+        )
 
     def serve(
         self, node: str, name: str, type_name: str, ask: Callable[[bytes, Callable[[bytes | str], None]], None]
@@ -161,7 +183,7 @@ class FakeGraph:
             endpoint.tell(GraphChanged())
 
     def _end(self, role: Role, node: str, name: str, type_name: str, qos: Qos | None) -> End:
-        return End(role, name, type_name, node, str(next(self._keys)), qos=qos)
+        return End(role, name, type_name, node, str(next(self._keys)), qos=qos if self.ros == 2 else None)
 
 
 @dataclass(slots=True)
@@ -247,9 +269,13 @@ class FakeEndpoint:
         """Hear a topic."""
         channel, handle = self.channel(topic, type_name), next(self._numbers)
         self._open[handle] = _Open(lambda: None)
-        self.tell(Described(handle, channel))
+
+        def describe() -> None:
+            self.tell(Described(handle, replace(channel, latched=self._graph.is_latched(topic, type_name))))
+
+        describe()
         subscription = self._graph.subscribe(
-            self._node, topic, type_name, lambda raw: self.tell(Heard(handle, 0, raw)), qos
+            self._node, topic, type_name, lambda raw: self.tell(Heard(handle, 0, raw)), qos, describe
         )
         self._open[handle].close = subscription.close
         return handle

@@ -1,0 +1,117 @@
+"""What the machines of these tests know of types, and messages of some of them in either ROS's wire form."""
+
+from __future__ import annotations
+
+import struct
+from functools import cache
+from typing import Final
+
+from rosbags.typesys import Stores, get_typestore
+
+from proxy.serial.channel import Channel, RosVersion
+from proxy.serial.service import Service
+from proxy.serial.service_twin import twin_service
+from proxy.serial.standard import type_hash
+
+__all__ = [
+    "FIBONACCI",
+    "IMAGE",
+    "SET_BOOL",
+    "STRING",
+    "channel",
+    "channels",
+    "image",
+    "service",
+    "services",
+    "string",
+    "switch",
+    "switched",
+    "text_of",
+]
+
+STRING: Final = "std_msgs/msg/String"
+IMAGE: Final = "sensor_msgs/msg/Image"
+SET_BOOL: Final = "std_srvs/srv/SetBool"
+FIBONACCI: Final = "test_msgs/action/Fibonacci"
+_CDR: Final = b"\x00\x01\x00\x00"
+_UUID: Final = "=" * 80 + "\nMSG: unique_identifier_msgs/UUID\nuint8[16] uuid\n"
+_SERVICES: Final = {
+    SET_BOOL: ("bool data\n", "bool success\nstring message\n"),
+    "test_msgs/action/Fibonacci_SendGoal": ("uint8[16] goal_id\nint32 order\n", "bool accepted\n"),
+    "action_msgs/srv/CancelGoal": ("uint8[16] goal_id\n", "int8 return_code\n"),
+    "test_msgs/action/Fibonacci_GetResult": ("uint8[16] goal_id\n", "int8 status\nint32[] sequence\n"),
+}
+_TOPICS: Final = {
+    "test_msgs/action/Fibonacci_FeedbackMessage": "uint8[16] goal_id\nint32[] sequence\n",
+    "action_msgs/msg/GoalStatusArray": "int8[] status\n",
+}
+
+
+@cache
+def channel(type_name: str, ros: RosVersion = 2) -> Channel:
+    """Return how a machine with the standard types of a ROS knows one of them."""
+    store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_JAZZY)
+    text, md5 = store.generate_msgdef(type_name, ros)
+    digest = md5 if ros == 1 else type_hash(type_name, text, "msg")
+    return Channel("", type_name, ros, digest, text, "msg")
+
+
+def custom(type_name: str, text: str, ros: RosVersion = 2) -> Channel:
+    """Return a type by its definition text."""
+    return Channel("", type_name, ros, type_hash(type_name, text, "msg") if ros == 2 else "", text, "msg")
+
+
+@cache
+def channels(ros: RosVersion = 2) -> dict[str, Channel]:
+    """Return the types that a machine knows if nothing else is said."""
+    known = {name: channel(name, ros) for name in (STRING, IMAGE, "std_msgs/msg/Int32")}
+    return known if ros == 1 else known | {name: custom(name, text) for name, text in _TOPICS.items()}
+
+
+def service(type_name: str, request: str, response: str, ros: RosVersion = 2) -> Service:
+    """Return a service type by its definition texts."""
+    halves = (
+        Channel("", f"{type_name}_{half}", ros, "", text, "msg")
+        for half, text in (("Request", request), ("Response", response))
+    )
+    known = Service("", type_name, "", *halves)
+    other: RosVersion = 2 if ros == 1 else 1
+    return twin_service(twin_service(known, other), ros)
+
+
+@cache
+def services(ros: RosVersion = 2) -> dict[str, Service]:
+    """Return the service types that a machine knows if nothing else is said."""
+    return {name: service(name, *texts, ros) for name, texts in _SERVICES.items() if ros == 2 or name == SET_BOOL}
+
+
+def string(text: str, ros: RosVersion = 2) -> bytes:
+    """Return a ``std_msgs/String``."""
+    data = text.encode()
+    return struct.pack("<I", len(data)) + data if ros == 1 else _CDR + struct.pack("<I", len(data) + 1) + data + b"\0"
+
+
+def text_of(raw: bytes, ros: RosVersion = 2) -> str:
+    """Return the text of a ``std_msgs/String``."""
+    return raw[4:].decode() if ros == 1 else raw[8:].split(b"\0")[0].decode()
+
+
+def switch(*, on: bool, ros: RosVersion = 2) -> bytes:
+    """Return a request of ``std_srvs/SetBool``."""
+    return bytes([on]) if ros == 1 else _CDR + bytes([on])
+
+
+def switched(message: str, ros: RosVersion = 2) -> bytes:
+    """Return a response of ``std_srvs/SetBool`` that says yes."""
+    if ros == 1:
+        return b"\1" + string(message, 1)
+    return _CDR + b"\1\0\0\0" + string(message)[4:]
+
+
+def image(pixels: bytes, ros: RosVersion = 2) -> bytes:
+    """Return a ``sensor_msgs/Image`` of one row, from frame ``cam`` at 1.5 s."""
+    if ros == 1:
+        head = struct.pack("<IiiI3sIII4sBI", 0, 1, 500_000_000, 3, b"cam", 1, len(pixels), 4, b"mono", 0, len(pixels))
+        return head + struct.pack("<I", len(pixels)) + pixels
+    head = struct.pack("<iI I4s II I5s B2x I I", 1, 500_000_000, 4, b"cam\0", 1, len(pixels), 5, b"mono\0", 0, 0, 0)
+    return _CDR + head[:-8] + struct.pack("<II", len(pixels), len(pixels)) + pixels

@@ -1,0 +1,280 @@
+"""Machines with a ROS graph, a proxy and its bridge each, on the ring of five in memory, whose clock jumps.
+
+Place: shell, without I/O. A bridge is driven as the proxy's loop does it: after what its graph or the overlay brought,
+and when its own timer is due; not more often.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from gdp.client.member import Member, Topic
+from gdp.client.publisher import Publisher
+from gdp.crypto.certificates import Role
+from gdp.metadata import Metadata
+from gdp.names import Name
+from gdp.testbed.topology import ring5
+from gdp.testbed.world import World
+from gdp.trust.owner import Owner
+from gdp.trust.right import Right
+from proxy.bridge.bridge import Bridge
+from proxy.bridge.site import Site
+from proxy.config import ProxyConfig, Rule
+from proxy.endpoints.endpoint import proxy_node_name
+from proxy.endpoints.fake import FakeEndpoint, FakeGraph
+from proxy.faults import Faults
+from proxy.held import Held
+from proxy.rules.rule import Kind
+from proxy.serial.channel import Qos, RosVersion
+from proxy.traffic import Traffic
+from tests.proxy.bridge import known
+from tests.proxy.rule_files import OWNER, furnish, proxy, rules
+
+ROBOT: Final = "nuc1/robot"
+SERVER: Final = "nuc5/server"
+_LOOK_S: Final = 0.002
+_GRAPHS: Final = {1: "{endpoint: ros1}", 2: "{endpoint: ros2, domain: 0}"}
+_TICK_S: Final = 0.5  # of the proxy's loop
+_RIGHTS: Final[dict[tuple[Kind, bool], Right]] = {
+    ("topic", True): Right.PUBLISH,
+    ("topic", False): Right.READ,
+    ("service", True): Right.SERVE,
+    ("service", False): Right.CALL,
+    ("action", True): Right.SERVE,
+    ("action", False): Right.CALL,
+}
+
+
+class Granted(Held):
+    """Delegations that lie in no file."""
+
+    def __init__(self, directory: Path, topics: Sequence[Topic]) -> None:
+        self.directory = directory
+        self._topics = {topic.name: topic for topic in topics}
+
+
+@dataclass(slots=True, eq=False)
+class Machine:
+    """One machine: its graph, and the proxy in it."""
+
+    label: str
+    member: Member
+    graph: FakeGraph
+    endpoints: list[FakeEndpoint]
+    site: Site
+    bridge: Bridge
+    tick_at_s: float = 0.0
+
+    def is_due(self, now_s: float) -> bool:
+        """Return whether the proxy's loop would wake up now."""
+        due_s = self.bridge.next_timeout()
+        has_news = bool(self.member._messages) or any(endpoint._events for endpoint in self.endpoints)
+        return has_news or now_s >= self.tick_at_s or (due_s is not None and due_s <= now_s)
+
+    @property
+    def endpoint(self) -> FakeEndpoint:
+        """Return the endpoint in the machine's graph, the first of two."""
+        return self.endpoints[0]
+
+    @property
+    def faults(self) -> dict[str, int]:
+        """Return the faults that there were."""
+        return {label: count for label, count in self.site.faults.counts.items() if count}
+
+    @property
+    def carried(self) -> set[tuple[str, bool]]:
+        """Return the local names that are carried, and whether out of here."""
+        return {(wish.local, wish.is_exposed) for wish, _ in self.bridge.flows}
+
+    @property
+    def stream(self) -> Publisher:
+        """Return the one publisher on the overlay."""
+        (publisher,) = self.member.publishers()
+        return publisher
+
+    def is_read(self, readers: int = 1) -> bool:
+        """Return whether everything that it publishes has so many readers."""
+        streams = self.member.publishers()
+        return bool(streams) and all(stream.readers == readers for stream in streams)
+
+
+@dataclass(slots=True, eq=False)
+class Ear:
+    """A local subscriber, and what it heard."""
+
+    graph: FakeGraph
+    topic: str
+    type_name: str = known.STRING
+    qos: Qos | None = None
+    node: str = "/listener"
+    heard: list[bytes] = field(default_factory=list)
+    leave: Callable[[], None] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.leave = self.graph.subscribe(self.node, self.topic, self.type_name, self.heard.append, self.qos).close
+
+    @property
+    def texts(self) -> list[str]:
+        """Return what it heard, as texts."""
+        return [known.text_of(raw, self.graph.ros) for raw in self.heard]
+
+
+class Sites:
+    """The network, and the machines at its edge.
+
+    Args:
+        folder: an empty one, for the files that rules name.
+    """
+
+    def __init__(self, folder: Path, seed: int = 1) -> None:
+        self.world = World(ring5(), seed)
+        self.world.owner = Owner(OWNER, bytes(range(32)))
+        self.machines: list[Machine] = []
+        self._folder = folder
+        furnish(folder)
+        assert self.world.settle()
+        self._look()
+
+    @property
+    def now_s(self) -> float:
+        """Return the virtual monotonic second."""
+        return self.world.network.now.mono_s
+
+    def add(
+        self,
+        label: str,
+        *,
+        expose: Sequence[str] = (),
+        imports: Sequence[str] = (),
+        graph: FakeGraph | None = None,
+        ros: RosVersion = 2,
+        more: FakeGraph | None = None,
+        holds: Sequence[Metadata] | None = None,
+    ) -> Machine:
+        """Start a machine.
+
+        Args:
+            label: of its member, ``switch/device``.
+            expose: rules, each as in ``proxy.yaml`` between its braces, without the owner.
+            imports: likewise.
+            graph: None: one of its own, where the usual types are known.
+            ros: of that graph.
+            more: a second graph, of the other ROS; rules then say which ``ros`` they are about.
+            holds: what it has delegations for; None: for whatever its rules name in full.
+        """
+        if label not in self.world.members:
+            self.world.add_member(label, label.partition("/")[0])
+            assert self.world.settle()
+        graph = graph or FakeGraph(ros, known.channels(ros), known.services(ros))
+        graphs = [graph] if more is None else [graph, more]
+        machine = self._start(label, graphs, self.config(expose, imports, *(each.ros for each in graphs)), holds)
+        self.machines.append(machine)
+        return machine
+
+    def restart(self, machine: Machine) -> Machine:
+        """Start a machine's proxy anew with nothing remembered; its graph stays."""
+        self.kill(machine)
+        self.world.restart_member(machine.label)
+        assert self.world.settle()
+        again = self._start(machine.label, [machine.graph], machine.bridge._config, None)
+        self.machines.append(again)
+        return again
+
+    def leave(self, machine: Machine) -> None:
+        """End a proxy as its command does, with a goodbye."""
+        machine.bridge.close()
+        machine.member.leave()
+        self.world.network.touch(machine.label)
+        for endpoint in machine.endpoints:
+            endpoint.shut()
+        self.machines.remove(machine)
+
+    def kill(self, machine: Machine) -> None:
+        """End a proxy without a goodbye to the overlay."""
+        for endpoint in machine.endpoints:
+            endpoint.shut()
+        self.machines.remove(machine)
+        self.world.network.stop(machine.label)
+
+    def name(self, label: str) -> Name:
+        """Return the name of a member, there already or not."""
+        domain = self.world.topology.domain_of(label.partition("/")[0]).label
+        return self.world.identity(Role.PROXY, label, domain).name
+
+    def config(self, expose: Sequence[str], imports: Sequence[str], *graphs: RosVersion) -> ProxyConfig:
+        """Return a configuration, as read from a file; of one ROS 2 graph if nothing else is said."""
+        text = "ros: [" + ", ".join(_GRAPHS[ros] for ros in graphs or (2,)) + "]\n"
+        text += f"expose:\n{rules(*expose)}" if expose else ""
+        text += f"import:\n{rules(*imports)}" if imports else ""
+        return proxy(self._folder, text)
+
+    def held(self, member: Member, config: ProxyConfig, holds: Sequence[Metadata] | None = None) -> Granted:
+        """Return delegations for what the rules name in full, or for ``holds``."""
+        given: dict[Name, tuple[Metadata, set[Right]]] = {}
+        for is_exposed, listed in ((True, config.expose), (False, config.imports)):
+            for rule in listed:
+                for metadata in _named(rule) if holds is None else _meant(rule, holds):
+                    _, rights = given.setdefault(metadata.name(OWNER.public.compressed), (metadata, set()))
+                    rights.add(_RIGHTS[rule.kind, is_exposed])
+        return Granted(self._folder, [self._topic(member, *each) for each in given.values()])
+
+    def reload(
+        self,
+        machine: Machine,
+        *,
+        expose: Sequence[str] = (),
+        imports: Sequence[str] = (),
+        holds: Sequence[Metadata] | None = None,
+    ) -> None:
+        """Give a proxy other rules, and all delegations anew."""
+        config = self.config(expose, imports, machine.graph.ros)
+        machine.bridge.reload(config, self.held(machine.member, config, holds))
+        machine.tick_at_s = 0.0
+
+    def run(self, duration_s: float, until: Callable[[], bool] | None = None) -> bool:
+        """Let time go on; return whether ``until`` came true (True without one)."""
+        return self.world.network.run(duration_s, until)
+
+    def every(self, period_s: float, count: int, act: Callable[[int], None]) -> None:
+        """Do something again and again, from now on, with its number."""
+        for number in range(count):
+            self.world.network.call(number * period_s, partial(act, number))
+
+    def _start(
+        self, label: str, graphs: Sequence[FakeGraph], config: ProxyConfig, holds: Sequence[Metadata] | None
+    ) -> Machine:
+        member = self.world.members[label]
+        endpoints = [FakeEndpoint(graph, f"/{proxy_node_name(member.name.to_text())}") for graph in graphs]
+        site = Site(member, Traffic(), Faults())
+        bridge = Bridge(site, config, endpoints, self.held(member, config, holds))
+        return Machine(label, member, graphs[0], endpoints, site, bridge)
+
+    def _topic(self, member: Member, metadata: Metadata, rights: set[Right]) -> Topic:
+        told = {key: str(value) for key, value in metadata.items() if key != "name"}
+        return self.world.topic(str(metadata["name"]), member, rights, **told)
+
+    def _look(self) -> None:
+        for machine in self.machines:
+            if machine.is_due(self.now_s):
+                machine.tick_at_s = self.now_s + _TICK_S
+                machine.bridge.work(self.now_s)
+                machine.member.flush(self.now_s)
+                self.world.network.touch(machine.label)
+        self.world.network.call(_LOOK_S, self._look)
+
+
+def named(name: str, type_name: str = known.STRING, kind: str = "topic") -> Metadata:
+    """Return what a delegation is about."""
+    return Metadata({"kind": kind, "name": name, "type": type_name})
+
+
+def _named(rule: Rule) -> list[Metadata]:
+    return [] if rule.is_pattern or not rule.type_name else [rule.overlay_metadata]
+
+
+def _meant(rule: Rule, holds: Sequence[Metadata]) -> list[Metadata]:
+    return [metadata for metadata in holds if rule.local_of(metadata) is not None]

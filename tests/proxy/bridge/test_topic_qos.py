@@ -1,0 +1,268 @@
+"""QoS from end to end: what a publisher promises reaches far readers, and what nobody can promise is told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from proxy.endpoints.fake import FakeGraph
+from proxy.qos import default
+from proxy.serial.channel import Qos, RosVersion
+from tests.proxy.bridge import known
+from tests.proxy.bridge.known import STRING, string
+from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
+
+CHATTER = f"name: /chatter, type: {STRING}"
+LATCHED = default(latched=True, depth=1)
+BEST_EFFORT = default(reliable=False)
+
+
+@pytest.fixture
+def sites(tmp_path: Path) -> Sites:
+    return Sites(tmp_path)
+
+
+def pair(sites: Sites, more: str = "") -> tuple[Machine, Machine]:
+    return sites.add(ROBOT, expose=[CHATTER + more]), sites.add(SERVER, imports=[CHATTER])
+
+
+def offered(machine: Machine) -> Qos:
+    """Return what the virtual publisher offers."""
+    (qos,) = (each.qos for each in machine.graph.publications if each.end.name == "/chatter")
+    return qos
+
+
+@pytest.mark.parametrize("qos", [default(), BEST_EFFORT], ids=["reliable", "best effort"])
+def test_the_virtual_publisher_offers_what_the_far_one_does(sites: Sites, qos: Qos) -> None:
+    robot, server = pair(sites)
+    ear, talker = Ear(server.graph, "/chatter", qos=qos), robot.graph.publish("/talker", "/chatter", STRING, qos)
+    assert sites.run(3, robot.is_read)
+    talker.publish(string("hello"))
+    assert sites.run(1, lambda: ear.texts == ["hello"])
+    assert offered(server).reliability == qos.reliability
+
+
+def test_what_is_lost_is_repaired_for_a_reliable_publisher_only(sites: Sites) -> None:
+    robot, server = pair(sites)
+    other = f"name: /other, type: {STRING}"
+    sites.reload(robot, expose=[CHATTER, other])
+    sites.reload(server, imports=[CHATTER, other])
+    ears = [Ear(server.graph, "/chatter"), Ear(server.graph, "/other", qos=BEST_EFFORT)]
+    talkers = [
+        robot.graph.publish("/talker", "/chatter", STRING),
+        robot.graph.publish("/talker", "/other", STRING, BEST_EFFORT),
+    ]
+    assert sites.run(3, lambda: robot.is_read() and len(robot.member.publishers()) == 2)
+    sites.world.leads[SERVER].loss = 0.2
+    for talker in talkers:
+        sites.every(0.01, 100, lambda number, talker=talker: talker.publish(string(str(number))))  # type: ignore[misc]
+    sites.run(10)
+    assert ears[0].texts == [str(number) for number in range(100)]
+    assert 40 < len(ears[1].heard) < 100
+    assert len(set(ears[1].heard)) == len(ears[1].heard)
+
+
+def test_a_reliable_reader_matches_a_best_effort_source_and_the_others_still_hear(sites: Sites) -> None:
+    robot, server = pair(sites)
+    easy = Ear(server.graph, "/chatter", qos=BEST_EFFORT)
+    talker = robot.graph.publish("/talker", "/chatter", STRING, BEST_EFFORT)
+    assert sites.run(3, robot.is_read)
+    talker.publish(string("1"))
+    assert sites.run(1, lambda: easy.texts == ["1"])
+    strict = Ear(server.graph, "/chatter", node="/strict")
+    sites.run(1)
+    talker.publish(string("2"))
+    assert sites.run(1, lambda: strict.texts == ["2"] and easy.texts == ["1", "2"])
+    strict.leave()
+    sites.run(1)
+    talker.publish(string("3"))
+    assert sites.run(1, lambda: easy.texts == ["1", "2", "3"])
+
+
+def test_a_rule_may_say_otherwise_than_the_publisher(sites: Sites) -> None:
+    robot, server = pair(sites, ", reliable: false")
+    ear, talker = Ear(server.graph, "/chatter"), robot.graph.publish("/talker", "/chatter", STRING)
+    assert sites.run(3, robot.is_read)
+    sites.world.leads[SERVER].loss = 0.3
+    sites.every(0.01, 50, lambda number: talker.publish(string(str(number))))
+    sites.run(5)
+    assert 10 < len(ear.heard) < 50
+
+
+def test_a_latched_message_reaches_who_joins_later_on_the_far_side(sites: Sites) -> None:
+    robot, server = pair(sites)
+    robot.graph.publish("/talker", "/chatter", STRING, LATCHED).publish(string("map"))
+    sites.run(5)
+    first = Ear(server.graph, "/chatter", qos=LATCHED)
+    assert sites.run(2, lambda: first.texts == ["map"])
+    second = Ear(server.graph, "/chatter", qos=LATCHED, node="/second")
+    sites.run(2)
+    assert (first.texts, second.texts) == (["map"], ["map"])
+
+
+def test_a_latched_topic_reaches_the_same_reader_again_after_it_left(sites: Sites) -> None:
+    robot, server = pair(sites)
+    robot.graph.publish("/talker", "/chatter", STRING, LATCHED).publish(string("map"))
+    ear = Ear(server.graph, "/chatter", qos=LATCHED)
+    assert sites.run(3, lambda: ear.texts == ["map"])
+    ear.leave()
+    sites.run(3)
+    again = Ear(server.graph, "/chatter", qos=LATCHED)
+    sites.run(3)
+    assert again.texts == ["map"]
+
+
+def test_what_two_publishers_latched_reaches_a_late_joiner_from_both(sites: Sites) -> None:
+    robot, server = pair(sites)
+    talkers = [robot.graph.publish(f"/talker{n}", "/chatter", STRING, LATCHED) for n in range(2)]
+    sites.run(1)
+    for n, talker in enumerate(talkers):
+        talker.publish(string(f"from {n}"))
+    sites.run(2)
+    ear = Ear(server.graph, "/chatter", qos=LATCHED)
+    assert sites.run(3, lambda: sorted(ear.texts) == ["from 0", "from 1"])
+    second = Ear(server.graph, "/chatter", qos=LATCHED, node="/second")
+    sites.run(1)
+    assert sorted(second.texts) == ["from 0", "from 1"]
+
+
+def test_what_a_later_publisher_latches_pushes_nothing_of_the_first_out(sites: Sites) -> None:
+    robot, server = pair(sites)
+    ear = Ear(server.graph, "/chatter", qos=LATCHED)
+    robot.graph.publish("/first", "/chatter", STRING, LATCHED).publish(string("first"))
+    assert sites.run(3, lambda: ear.texts == ["first"])
+    later = robot.graph.publish("/later", "/chatter", STRING, LATCHED)
+    sites.run(1)
+    later.publish(string("later"))
+    assert sites.run(3, lambda: ear.texts[-1] == "later")
+    assert ear.texts == ["first", "first", "later"]  # a new virtual publisher, which keeps more, has it again
+    second = Ear(server.graph, "/chatter", qos=LATCHED, node="/second")
+    sites.run(1)
+    assert second.texts == ["first", "later"]
+
+
+def test_what_publishers_on_two_machines_latched_reaches_a_late_joiner_from_both(sites: Sites) -> None:
+    robot, server = pair(sites)
+    third = sites.add("nuc2/third", expose=[CHATTER])
+    for machine, text in ((robot, "robot"), (third, "third")):
+        machine.graph.publish("/talker", "/chatter", STRING, LATCHED).publish(string(text))
+    sites.run(2)
+    ear = Ear(server.graph, "/chatter", qos=LATCHED)
+    assert sites.run(3, lambda: sorted(set(ear.texts)) == ["robot", "third"])
+    second = Ear(server.graph, "/chatter", qos=LATCHED, node="/second")
+    sites.run(1)
+    assert sorted(second.texts) == ["robot", "third"]
+
+
+@pytest.mark.parametrize("ros", [1, 2])
+@pytest.mark.parametrize("is_early", [True, False], ids=["before the proxy", "after it"])
+def test_what_ros_1_publishers_latched_reaches_late_joiners_from_all(
+    sites: Sites, ros: RosVersion, *, is_early: bool
+) -> None:
+    graph = FakeGraph(1, known.channels(1))
+    server = sites.add(SERVER, imports=[CHATTER], ros=ros)
+
+    def publish() -> None:
+        for n in range(3):
+            graph.publish(f"/talker{n}", "/chatter", STRING, LATCHED).publish(string(f"from {n}", 1))
+
+    if is_early:
+        publish()
+    sites.add(ROBOT, expose=[CHATTER], graph=graph)
+    sites.run(1)
+    if not is_early:
+        publish()
+    sites.run(2)
+    ear = Ear(server.graph, "/chatter", qos=LATCHED)
+    assert sites.run(3, lambda: sorted(ear.texts) == ["from 0", "from 1", "from 2"])
+    second = Ear(server.graph, "/chatter", qos=LATCHED, node="/second")
+    sites.run(1)
+    assert sorted(second.texts) == ["from 0", "from 1", "from 2"]
+
+
+def test_a_ros_1_topic_that_is_not_latched_gives_late_joiners_nothing_old(sites: Sites) -> None:
+    robot, server = sites.add(ROBOT, expose=[CHATTER], ros=1), sites.add(SERVER, imports=[CHATTER], ros=1)
+    talker, first = robot.graph.publish("/talker", "/chatter", STRING), Ear(server.graph, "/chatter")
+    assert sites.run(3, robot.is_read)
+    talker.publish(string("old", 1))
+    sites.run(1)
+    second = Ear(server.graph, "/chatter", node="/second")
+    sites.run(1)
+    assert (first.texts, second.texts) == (["old"], [])
+
+
+@pytest.mark.parametrize("latched", [True, False])
+def test_the_importing_rule_may_latch_what_is_not_or_not_what_is(sites: Sites, *, latched: bool) -> None:
+    robot = sites.add(ROBOT, expose=[CHATTER])
+    server = sites.add(SERVER, imports=[f"{CHATTER}, latched: {str(latched).lower()}"])
+    talker = robot.graph.publish("/talker", "/chatter", STRING, default() if latched else LATCHED)
+    Ear(server.graph, "/chatter")
+    assert sites.run(3, robot.is_read)
+    talker.publish(string("map"))
+    sites.run(1)
+    assert (offered(server).durability == "transient_local") is latched
+
+
+def test_a_volatile_reader_gets_only_what_is_new(sites: Sites) -> None:
+    robot, server = pair(sites)
+    talker = robot.graph.publish("/talker", "/chatter", STRING)
+    first = Ear(server.graph, "/chatter")
+    assert sites.run(3, robot.is_read)
+    talker.publish(string("old"))
+    sites.run(1)
+    second = Ear(server.graph, "/chatter", node="/second")
+    sites.run(1)
+    talker.publish(string("new"))
+    sites.run(1)
+    assert (first.texts, second.texts) == (["old", "new"], ["new"])
+
+
+def test_a_publisher_that_comes_back_latched_is_latched_from_then_on(sites: Sites) -> None:
+    robot, server = pair(sites)
+    ear = Ear(server.graph, "/chatter")
+    talker = robot.graph.publish("/talker", "/chatter", STRING)
+    assert sites.run(3, robot.is_read)
+    talker.publish(string("1"))
+    assert sites.run(1, lambda: ear.texts == ["1"])
+    talker.close()
+    again = robot.graph.publish("/talker", "/chatter", STRING, LATCHED)
+    sites.run(1)
+    again.publish(string("2"))
+    assert sites.run(2, lambda: ear.texts == ["1", "2"])
+    late = Ear(server.graph, "/chatter", qos=LATCHED, node="/late")
+    sites.run(1)
+    assert late.texts[-1:] == ["2"]
+    assert ear.texts == ["1", "2"]
+
+
+def test_a_reader_that_requests_more_than_the_source_offers_hears_what_is_new(sites: Sites) -> None:
+    robot, server = pair(sites)
+    talker = robot.graph.publish("/talker", "/chatter", STRING, BEST_EFFORT)
+    ear = Ear(server.graph, "/chatter", qos=LATCHED)
+    assert sites.run(3, robot.is_read)
+    talker.publish(string("1"))
+    assert sites.run(1, lambda: ear.texts == ["1"])
+
+
+@pytest.mark.parametrize(
+    "qos",
+    [replace(default(), deadline=(1, 0)), replace(default(), liveliness="manual_by_topic")],
+    ids=["deadline", "liveliness"],
+)
+def test_what_no_network_can_promise_is_told_once_and_the_others_hear(
+    sites: Sites, qos: Qos, caplog: pytest.LogCaptureFixture
+) -> None:
+    robot, server = pair(sites)
+    Ear(server.graph, "/chatter", qos=qos, node="/strict")
+    ear, talker = Ear(server.graph, "/chatter"), robot.graph.publish("/talker", "/chatter", STRING)
+    assert sites.run(3, robot.is_read)
+    for n in range(5):
+        Ear(server.graph, f"/unrelated{n}")  # the graph changes, and is looked at anew
+        sites.run(0.2)
+    talker.publish(string("hello"))
+    assert sites.run(1, lambda: ear.texts == ["hello"])
+    (told,) = caplog.messages
+    assert told.startswith("/chatter: qos: /strict will get nothing: it requests ")
+    assert server.faults["qos"] == 1
