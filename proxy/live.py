@@ -23,6 +23,7 @@ from proxy.endpoints.live import open_endpoints
 from proxy.held import Held
 from proxy.node import ProxyNode, run_node
 from proxy.recording import GOODBYE_S, tell_refusals
+from proxy.tally import percentile
 
 __all__ = ["carry"]
 
@@ -62,8 +63,8 @@ def carry(path: Path, settings: ProxyConfig, *, json: bool) -> None:
             emit("done", topics=[tally.to_fields() for tally in bridge.tallies], faults=dict(node.faults.counts))
         else:
             for tally in bridge.tallies:
-                median_ms = tally.to_fields()["latency_ms"]
-                typer.echo(f"  {tally.topic}: {tally.received} received, latency in ms {median_ms}")
+                if median_ms := percentile(sorted(tally.latencies_ms), 0.5):
+                    typer.echo(f"  {tally.topic}: {tally.received} received, median {median_ms:.1f} ms")
             carried = f"{node.traffic.messages_out} messages sent, {node.traffic.messages_in} received"
             typer.echo(f"{carried}, {node.faults.total} faults")
 
