@@ -7,7 +7,7 @@ Order is promised per publisher: where several publish one topic, each publisher
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from pathlib import Path
@@ -17,7 +17,7 @@ from proxy.endpoints.bag import BagReader
 from proxy.serial.channel import Channel
 from proxy.serial.serializer import canonical
 
-__all__ = ["TopicComparison", "compare"]
+__all__ = ["TopicComparison", "compare", "compare_digests"]
 
 _DIGEST_BYTES: Final = 16
 _Publisher: TypeAlias = "str | None"
@@ -88,6 +88,14 @@ def compare(sent: Path | str, received: Path | str, *, exact: bool) -> list[Topi
             after.update(_read(received, unlike, as_is=False))
     topics = [*before, *(topic for topic in after if topic not in before)]
     return [_judge(topic, before.get(topic, _Side()), after.get(topic, _Side())) for topic in topics]
+
+
+def compare_digests(
+    topic: str, type_name: str, size: int, sent: Iterable[bytes], arrived: Iterable[bytes]
+) -> TopicComparison:
+    """Compare what one publisher sent, ``size`` bytes in all, with what arrived; each message is given by a digest."""
+    before = _Side(type_name, size, [(None, digest) for digest in sent])
+    return _judge(topic, before, _Side(type_name, 0, [(None, digest) for digest in arrived]))
 
 
 def _read(path: Path | str, only: Collection[str] | None, *, as_is: bool) -> dict[str, _Side]:

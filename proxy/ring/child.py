@@ -95,6 +95,11 @@ class Child:
         if not self.ended.done():
             self._process.send_signal(signal.SIGINT)
 
+    def go(self) -> None:
+        """Tell a node of a live run to begin, or to go on after its report."""
+        if not self.ended.done():
+            self._process.send_signal(signal.SIGUSR1)
+
     def failed(self, how: str) -> ChildError:
         """Return the error that says how this process failed, with the last lines of its log."""
         with self.log.open(encoding="utf-8", errors="replace") as file:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import sys
-from collections.abc import Coroutine, Iterable, Sequence
+from collections.abc import Coroutine, Iterable, Mapping, Sequence
 from typing import Final, TypeVar
 
 from gdp.testbed.namespaces import Namespaces
@@ -44,10 +44,18 @@ class Children:
         return child
 
     def start_in(
-        self, namespaces: Namespaces, node: str, role: str, arguments: Sequence[str], *, heard: bool = True
+        self,
+        namespaces: Namespaces,
+        node: str,
+        role: str,
+        arguments: Sequence[str],
+        *,
+        heard: bool = True,
+        environment: Mapping[str, str] | None = None,
     ) -> Child:
-        """Start Python with these arguments in the namespace of a switch."""
-        argv = namespaces.command(node, [sys.executable, *arguments], dies_with_us=not self._kept)
+        """Start Python with these arguments in the namespace of a switch; ``environment``: beside that of ours."""
+        told = ["env", *(f"{name}={value}" for name, value in environment.items())] if environment else []
+        argv = namespaces.command(node, [*told, sys.executable, *arguments], dies_with_us=not self._kept)
         return self.start(f"{role} {node}", argv, heard=heard)
 
     async def ready(self, children: Sequence[Child]) -> list[Event]:

@@ -9,6 +9,9 @@ import asyncio
 import json
 import os
 import signal
+import sys
+from collections.abc import Iterator, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Annotated, Final, TypeVar, get_args
 
@@ -21,17 +24,19 @@ from gdp.testbed.runs import Run, Runs
 from gdp.testbed.topology import MTU_BYTES
 from proxy.config import Encoding
 from proxy.ring.child import ChildError
-from proxy.ring.hints import hints
-from proxy.ring.options import Cut, Options, RingPlane
+from proxy.ring.hints import hints, live_hints
+from proxy.ring.live_run import LiveRing
+from proxy.ring.options import LIVE_S, Cut, Live, Options, RingPlane
 from proxy.ring.progress import Teller
 from proxy.ring.result import Result
 from proxy.ring.run import Ring, make_demo
 from proxy.ring.table import table, verdict
 
-__all__ = ["main"]
+__all__ = ["main", "spelled_out"]
 
 ENCODINGS: Final[tuple[Encoding, ...]] = get_args(Encoding)
 PLANES: Final[tuple[RingPlane, ...]] = get_args(RingPlane)
+LIVES: Final[tuple[Live, ...]] = get_args(Live)
 _PASSED: Final = 0
 _FAILED: Final = 1
 _WRONG_INPUT: Final = 2
@@ -42,6 +47,8 @@ _EXAMPLES: Final = """\b
 Examples:
   scripts/ring_topology.sh                           a generated robot drive
   scripts/ring_topology.sh my.bag --encoding cdr     the bytes as they are
+  scripts/ring_topology.sh --live                    real ROS 2 nodes at both ends
+  scripts/ring_topology.sh --live mixed              ROS 1 at the robot, ROS 2 at the server
   scripts/ring_topology.sh --rate 0 --json out.json  as fast as it goes
   scripts/ring_topology.sh --cut nuc2-nuc3@5         a link fails after 5 s
   scripts/ring_topology.sh --keep                    leave it up to look around
@@ -56,6 +63,10 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_mar
 @app.command(epilog=_EXAMPLES)
 def ring(
     bag: Annotated[Path | None, typer.Argument(metavar="[BAG]", help="A recording: .bag, .mcap, .db3, folder.")] = None,
+    live: Annotated[
+        str | None, typer.Option(metavar="[ROS]", help=f"Real nodes instead: {', '.join(LIVES)}; ros2 where not said.")
+    ] = None,
+    seconds: Annotated[float | None, typer.Option(help=f"Of live traffic; {LIVE_S:g} where not said.")] = None,
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON.")] = None,
     rate: Annotated[float, typer.Option(help="Pace of the replay; 0: as fast as it goes.")] = 1.0,
     encoding: Annotated[str, typer.Option(help=f"Of messages: {', '.join(ENCODINGS)}.")] = "json",
@@ -69,8 +80,9 @@ def ring(
 ) -> None:
     """Send a recording from a robot at nuc1 over a ring of five name-routed switches to a server at nuc5, and compare.
 
-    Switches, RIBs and proxies are processes in network namespaces; keys and certificates are made for the run. The
-    exit code is 0 only if every message came out identical and in order.
+    With --live it is real nodes that talk: a talker, a camera, a mapper and a service at nuc1, and at nuc5 those who
+    listen and call. Switches, RIBs and proxies are processes in network namespaces; keys and certificates are made for
+    the run. The exit code is 0 only if every message came out identical and in order.
     """
     errors = Console(stderr=True)
     try:
@@ -90,6 +102,8 @@ def ring(
             pcap=_absolute(pcap),
             cuts=tuple(Cut.from_text(text) for text in cut or ()),
             keep=keep,
+            live=None if live is None else _one_of("live", live, LIVES),
+            seconds=seconds,
         )
         for swept in runs.sweep():
             errors.print(f"took down what run {swept} had left behind", highlight=False)
@@ -105,7 +119,15 @@ def ring(
 
 def main() -> None:
     """Run the command; never returns."""
-    app(prog_name="ring_topology.sh")
+    app(list(spelled_out(sys.argv[1:])), prog_name="ring_topology.sh")
+
+
+def spelled_out(words: Sequence[str]) -> Iterator[str]:
+    """Yield the command line with ``ros2`` after each ``--live`` that stands without a word of its own."""
+    for word, following in zip_longest(words, words[1:], fillvalue="-"):
+        yield word
+        if word == "--live" and following.startswith("-"):
+            yield LIVES[0]
 
 
 def _run(options: Options, run: Run, errors: Console) -> int:
@@ -144,6 +166,8 @@ async def _interruptible(options: Options, run: Run, errors: Console) -> int:
 
 
 async def _go(options: Options, run: Run, errors: Console) -> int:
+    if options.live is not None:
+        return await _go_live(options, options.live, run, errors)
     with Teller(errors) as teller:
         bag = options.bag
         if bag is None:
@@ -159,12 +183,31 @@ async def _go(options: Options, run: Run, errors: Console) -> int:
     _show(result)
     _write(options, result, standing.recording)
     if options.keep:
-        again = standing.start_again()
-        errors.print(f"\nThe ring of run {run.id} stands. Try:", highlight=False)
-        for purpose, command in hints(standing, again):
-            errors.print(f"  [dim]# {escape(purpose)}[/dim]\n  {escape(command)}", highlight=False, soft_wrap=True)
+        _hint(run, hints(standing, standing.start_again()), errors)
         standing.forget()
     return _PASSED if result.passed else _FAILED
+
+
+async def _go_live(options: Options, live: Live, run: Run, errors: Console) -> int:
+    with Teller(errors) as teller:
+        standing = LiveRing(options, live, run, teller)
+        try:
+            result = await standing.result()
+        finally:
+            standing.forget()
+    _show(result)
+    _write(options, result)
+    if options.keep:
+        standing.go_on()
+        _hint(run, live_hints(standing), errors)
+        standing.forget()
+    return _PASSED if result.passed else _FAILED
+
+
+def _hint(run: Run, hinted: Sequence[tuple[str, str]], errors: Console) -> None:
+    errors.print(f"\nThe ring of run {run.id} stands. Try:", highlight=False)
+    for purpose, command in hinted:
+        errors.print(f"  [dim]# {escape(purpose)}[/dim]\n  {escape(command)}", highlight=False, soft_wrap=True)
 
 
 def _show(result: Result) -> None:
@@ -175,7 +218,7 @@ def _show(result: Result) -> None:
     output.print(verdict(result), highlight=False, soft_wrap=True)
 
 
-def _write(options: Options, result: Result, recording: Path) -> None:
+def _write(options: Options, result: Result, recording: Path | None = None) -> None:
     """Write the files that were asked for; under sudo they belong to the person who asked."""
     if options.json is not None:
         options.json.write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")

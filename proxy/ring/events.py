@@ -74,6 +74,13 @@ class Event:
             raise self._wrong(key, "a list of whole numbers")
         return value
 
+    def texts(self, key: str) -> list[str]:
+        """Return a list of texts."""
+        value = self.fields.get(key)
+        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+            raise self._wrong(key, "a list of texts")
+        return value
+
     def parts(self, key: str) -> list[Event]:
         """Return a list of objects."""
         value = self.fields.get(key)

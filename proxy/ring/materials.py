@@ -10,7 +10,7 @@ Place: shell. Every run has new keys; they go with the run::
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -24,6 +24,7 @@ from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
 from gdp.testbed.topology import Attachment, Topology
 from gdp.trust.right import Right
 from proxy.config import Encoding
+from proxy.ring.live_plan import Carried, Side
 from proxy.ring.plan import Credentials, Topic, Yaml, proxy_yaml, rib_yaml, rule_yaml, switch_yaml, upper_rib
 from proxy.serial.channel import RosVersion
 
@@ -78,6 +79,16 @@ class Materials:
         """Let a proxy read these topics, and write the ``proxy.yaml`` by which it records them; return the file."""
         return self._proxy(at, "import", topics, encoding, ros, record)
 
+    def live(self, at: Attachment, side: Side, carried: Sequence[Carried], encoding: Encoding, graph: Yaml) -> Path:
+        """Let a proxy carry its side of these, and write the ``proxy.yaml`` by which it does so in a graph."""
+        node = self._node(Role.PROXY, at.switch)
+        for each in carried:
+            self._delegate(node, each.metadata, each.right(side))
+        rules: dict[str, Sequence[Yaml]] = {side: [each.rule(self._owner / OWNER_PUBLIC, encoding) for each in carried]}
+        credentials = self._credentials(Role.PROXY, at.switch)
+        content = proxy_yaml(at, credentials, node / DELEGATIONS, 2, rules, None, metrics=self._metrics)
+        return self._write(Role.PROXY, at.switch, {**content, "ros": graph})
+
     def proxy_file(self, at: Attachment) -> Path:
         """Return where ``proxy.yaml`` of a proxy is written."""
         return self._directory / f"{_title(Role.PROXY, at.switch)}.yaml"
@@ -92,7 +103,8 @@ class Materials:
         record: Path | None,
     ) -> Path:
         node = self._node(Role.PROXY, at.switch)
-        self._delegate(node, topics, _SIDES[side])
+        for topic in topics:
+            self._delegate(node, Metadata(topic.metadata), _SIDES[side])
         rules: dict[str, Sequence[Yaml]] = {
             side: [rule_yaml(topic, self._owner / OWNER_PUBLIC, encoding) for topic in topics]
         }
@@ -100,10 +112,9 @@ class Materials:
         content = proxy_yaml(at, credentials, node / DELEGATIONS, ros, rules, record, metrics=self._metrics)
         return self._write(Role.PROXY, at.switch, content)
 
-    def _delegate(self, node: Path, topics: Iterable[Topic], right: Right) -> None:
-        for topic in topics:
-            given = delegate(self._owner, node / CARD, Metadata(topic.metadata), [right])
-            install_delegation(node, given, force=True)  # a kept receiver records a second time
+    def _delegate(self, node: Path, metadata: Metadata, right: Right) -> None:
+        given = delegate(self._owner, node / CARD, metadata, [right])
+        install_delegation(node, given, force=True)  # a kept proxy starts a second time
 
     def _admit(self, role: Role, switch: str) -> None:
         domain = self._domain(self._topology.domain_of(switch).label)

@@ -15,9 +15,13 @@ from gdp.errors import LocalError
 from gdp.testbed.topology import MTU_BYTES, Topology, ring5
 from proxy.config import Encoding
 
-__all__ = ["Cut", "Options", "RingPlane"]
+__all__ = ["LIVE_S", "Cut", "Live", "Options", "RingPlane"]
 
 RingPlane = Literal["auto", "kernel", "raw", "scapy"]
+Live = Literal["ros2", "ros1", "mixed"]
+
+LIVE_S: Final = 10.0
+_LIVE_MAX_S: Final = 3_600.0
 
 _CUT: Final = re.compile(r"([^@]+?)-([^@-]+)@(\d+(?:\.\d+)?)\Z")
 
@@ -62,9 +66,12 @@ class Options:
         keep: leave everything up afterwards.
         out: directory, made if need be, where the received recording stays; None: it goes with the run.
         pcap: where to write what passes through the middle of the ring.
+        live: real nodes instead of a recording; of which ROS. ``mixed``: ROS 1 at the robot, ROS 2 at the server.
+        seconds: of live traffic; None: ``LIVE_S``.
 
     Raises:
-        LocalError: a rate that is no pace, a cut of a link that is not there, a directory that is missing.
+        LocalError: a rate that is no pace, a cut of a link that is not there, a directory that is missing, a recording
+            for a live run.
     """
 
     bag: Path | None = None
@@ -77,8 +84,16 @@ class Options:
     pcap: Path | None = None
     cuts: tuple[Cut, ...] = ()
     keep: bool = False
+    live: Live | None = None
+    seconds: float | None = None
 
     def __post_init__(self) -> None:
+        if self.live is not None and (self.bag is not None or self.rate != 1 or self.out is not None):
+            raise LocalError("--live is without a recording: neither BAG nor --rate nor --out goes with it")
+        if self.live is None and self.seconds is not None:
+            raise LocalError("--seconds goes with --live; a recording takes its own time")
+        if not 1 <= self.live_s <= _LIVE_MAX_S:
+            raise LocalError(f"--seconds is 1 to {_LIVE_MAX_S:g}, not {self.live_s:g}")
         if not 0 <= self.rate < math.inf:
             raise LocalError(f"a rate is 0 or more, not {self.rate:g}")
         if self.bag is not None and not self.bag.exists():
@@ -94,6 +109,11 @@ class Options:
         for cut in self.cuts:
             topology.link(cut.a, cut.b)
 
+    @property
+    def live_s(self) -> float:
+        """Return how long live nodes talk."""
+        return LIVE_S if self.seconds is None else self.seconds
+
     def topology(self) -> Topology:
         """Return the ring with the wanted MTU.
 
@@ -104,9 +124,9 @@ class Options:
 
     def settings(self) -> dict[str, object]:
         """Return the options as the JSON result states them."""
+        recorded = {"recording": str(self.bag) if self.bag else "demo", "rate": self.rate}
         return {
-            "recording": str(self.bag) if self.bag else "demo",
-            "rate": self.rate,
+            **({"live": self.live, "seconds": self.live_s} if self.live else recorded),
             "encoding": self.encoding,
             "data_plane": self.data_plane,
             "mtu": self.mtu,

@@ -16,6 +16,7 @@ from proxy.config import Encoding
 from proxy.serial.channel import Channel
 
 __all__ = [
+    "AUTHOR",
     "METRICS_PORTS",
     "Credentials",
     "Topic",

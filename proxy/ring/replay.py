@@ -13,6 +13,7 @@ from typing import Final, TypeVar
 from gdp.testbed.namespaces import Namespaces
 from proxy.ring.child import Child, ChildError
 from proxy.ring.children import Children, cancel
+from proxy.ring.cutting import Cutting
 from proxy.ring.events import Event
 from proxy.ring.options import Cut
 from proxy.ring.progress import Teller, Traffic
@@ -68,7 +69,7 @@ class Replay:
         """
         self._teller.begin_traffic(self._traffic.total)
         heard = asyncio.ensure_future(self._listen(self._receiver))
-        cutting = [asyncio.ensure_future(self._cut(namespaces, cut)) for cut in cuts]
+        cutting = Cutting(namespaces, cuts, self._teller)
         try:
             sent = await self._children.guarded(self._unstalled(self._listen(self._sender)))
             sender_code = await self._sender.wait(ENDING_S)
@@ -77,9 +78,9 @@ class Replay:
             received, receiver_code = await self._finish(heard)
         finally:
             await cancel(heard)
-            await cancel(*cutting)
+            await cutting.stop()
             self._teller.end_traffic()
-        complaints = [f"the cut {cut} came too late" for cut, task in zip(cuts, cutting, strict=True) if _missed(task)]
+        complaints = cutting.complaints()
         complaints += [f"the sender ended with code {sender_code}"] if sender_code else []
         complaints += [f"the receiver ended with code {receiver_code}"] if receiver_code else []
         return Report(tuple(received.parts("topics")), sent.text_or_none("unread") or None, tuple(complaints))
@@ -135,20 +136,3 @@ class Replay:
             return task.result()
         finally:
             await cancel(task)
-
-    async def _cut(self, namespaces: Namespaces, cut: Cut) -> None:
-        await asyncio.sleep(cut.after_s)
-        await asyncio.to_thread(namespaces.cut, cut.a, cut.b)
-        self._teller.step(f"cut {cut.a}-{cut.b}")
-
-
-def _missed(task: asyncio.Future[None]) -> bool:
-    """Tell whether a cut's time never came.
-
-    Raises:
-        LocalError: its time came, and it failed.
-    """
-    if task.cancelled():
-        return True
-    task.result()
-    return False

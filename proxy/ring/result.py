@@ -49,10 +49,11 @@ class Journey:
 
 @dataclass(frozen=True, slots=True)
 class TopicResult:
-    """One row of the table."""
+    """One row of the table. Of a service the messages are calls, and those lost are without an answer."""
 
     comparison: TopicComparison
     journey: Journey
+    is_service: bool = False
 
     @property
     def duplicated(self) -> int:
@@ -65,11 +66,11 @@ class TopicResult:
         of = self.comparison
         found = []
         if of.lost:
-            found.append(f"{of.lost} lost")
+            found.append(f"{of.lost} {'calls without an answer' if self.is_service else 'lost'}")
         if self.duplicated:
-            found.append(f"{self.duplicated} duplicated")
+            found.append(f"{self.duplicated} {'served twice' if self.is_service else 'duplicated'}")
         if of.altered:
-            found.append(f"{of.altered} with other bytes than were sent")
+            found.append(f"{of.altered} {'wrong answers' if self.is_service else 'with other bytes than were sent'}")
         if not of.in_order:
             found.append("out of order")
         return found
@@ -79,6 +80,7 @@ class TopicResult:
         of, way = self.comparison, self.journey
         return {
             "topic": of.topic,
+            "kind": "service" if self.is_service else "topic",
             "type": of.type_name,
             "messages": of.messages,
             "bytes": of.bytes,

@@ -1,7 +1,6 @@
 """One run of the ring, from the recording to the result.
 
-Place: shell. Nothing is waited for by the clock: every stage begins when the one before has said that it is ready, and
-every process is watched, so that one which dies ends the run at once.
+Place: shell.
 """
 
 from __future__ import annotations
@@ -12,13 +11,12 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import ConfigError
-from gdp.testbed.namespaces import Namespaces
 from gdp.testbed.runs import Run
 from proxy.compare import compare
 from proxy.endpoints.bag import BagReader
 from proxy.ring.child import Child
 from proxy.ring.children import READY_S, Children
-from proxy.ring.materials import Materials
+from proxy.ring.fabric import Fabric
 from proxy.ring.options import Options
 from proxy.ring.plan import Topic, topics_of
 from proxy.ring.progress import Teller
@@ -29,7 +27,6 @@ from proxy.serial.channel import RosVersion
 __all__ = ["Ring", "make_demo"]
 
 _DEMO_S: Final = 120.0  # patience with the making of the demonstration recording
-_MIDDLE: Final = "nuc3"
 _DEMO_SCRIPT: Final = Path(__file__).parents[2] / "scripts" / "make_demo_bag.py"
 
 
@@ -54,20 +51,14 @@ class Ring:
             raise ConfigError(str(bag), "", "holds no topic")
         self.bag = bag
         self.options = options
-        self.topology = options.topology()
         self._run = run
         self._teller = teller
         self._ros: RosVersion = channels[0].ros
         self._topics: tuple[Topic, ...] = topics_of(channels)
-        self._robot, self._server = self.topology.attached("proxy")
         if self.recording.exists():
             raise ConfigError(str(self.recording), "", "exists already; choose another --out")
-        teller.step(f"run {run.id}: five namespaces, keys and certificates")
-        self.namespaces = Namespaces(self.topology, run)
-        self._materials = Materials(self.topology, run.directory, metrics=options.keep)
-        self._children = Children(run, kept=options.keep)
-        self.switches: dict[str, Child] = {}
-        self._planes: list[str] = []  # what the switches took
+        self.fabric = Fabric(options, run, teller)
+        self._children = self.fabric.children
 
     @property
     def recording(self) -> Path:
@@ -82,20 +73,19 @@ class Ring:
             ChildError: a process failed.
             LocalError: a link cannot be cut.
         """
-        await self._stand_up()
+        await self.fabric.stand_up()
         receiver = self._start_receiver(self.recording)
         await self._children.ready([receiver])
-        self._teller.step(f"replaying {self._total} messages at {self._robot.switch}")
+        self._teller.step(f"replaying {self._total} messages at {self.fabric.robot.switch}")
         sender = self._start_sender()
         await self._children.guarded(sender.wait_for("ready", READY_S))
         replay = Replay(self._children, sender, receiver, self._total, self._teller)
-        report = await replay.report(self.namespaces, self.options.cuts)
+        report = await replay.report(self.fabric.namespaces, self.options.cuts)
         self._teller.step("comparing what was sent with what was recorded")
         exact = self.options.encoding == "cdr"
         comparisons = await self._children.guarded(asyncio.to_thread(compare, self.bag, self.recording, exact=exact))
         topics = put_together(comparisons, report.topics)
-        settings = {**self.options.settings(), "data_plane": ", ".join(self._planes)}
-        return Result(topics, settings, report.unread, report.complaints)
+        return Result(topics, self.fabric.settings, report.unread, report.complaints)
 
     def start_again(self) -> Path:
         """Start a receiver that outlives us, in place of the one that has ended; return the file it records into."""
@@ -106,49 +96,23 @@ class Ring:
     @property
     def sender_config(self) -> Path:
         """Return the ``proxy.yaml`` of the robot."""
-        return self._materials.proxy_file(self._robot)
+        return self.fabric.materials.proxy_file(self.fabric.robot)
 
     def forget(self) -> None:
         """Close our ends of the processes; they are left as they are."""
-        self._children.forget()
-
-    async def _stand_up(self) -> None:
-        if self.options.pcap is not None:
-            ifaces = [f"--iface={link.other(_MIDDLE)}" for link in self.topology.links_of(_MIDDLE)]
-            await self._children.ready(
-                [self._start(_MIDDLE, "capture", ["-m", "gdp.ports.capture", *ifaces, str(self.options.pcap)])]
-            )
-        self._teller.step("starting a switch in each")
-        for node in self.topology.nodes:
-            config = self._materials.switch(node, self.options.data_plane)
-            argv = ["-m", "gdp.cli.switch", "--config", str(config), "--json"]
-            self.switches[node] = self._start(node, "switch", argv)
-        said = await self._children.ready(list(self.switches.values()))
-        self._planes = sorted({each.text("data_plane") for each in said})
-        for reason in sorted({each.text("reason") for each in said} - {""}):
-            self._teller.step(f"data plane {', '.join(self._planes)}: {reason}")
-        self._teller.step("starting the RIB of each domain")
-        configs = {at.switch: self._materials.rib(at) for at in self.topology.attached("rib")}
-        await self._children.ready(
-            [
-                self._start(node, "rib", ["-m", "gdp.cli.rib", "--config", str(config), "--json"])
-                for node, config in configs.items()
-            ]
-        )
-        self._teller.step(f"starting the proxies at {self._robot.switch} and {self._server.switch}")
+        self.fabric.forget()
 
     def _start_receiver(self, record: Path, *, heard: bool = True) -> Child:
-        config = self._materials.receiver(self._server, self._topics, self.options.encoding, self._ros, record)
+        at, encoding = self.fabric.server, self.options.encoding
+        config = self.fabric.materials.receiver(at, self._topics, encoding, self._ros, record)
         argv = ["-m", "proxy.cli", "--config", str(config), *(["--json"] if heard else [])]
-        return self._start(self._server.switch, "proxy", argv, heard=heard)
+        return self.fabric.start(at.switch, "proxy", argv, heard=heard)
 
     def _start_sender(self) -> Child:
-        config = self._materials.sender(self._robot, self._topics, self.options.encoding, self._ros)
+        at, encoding = self.fabric.robot, self.options.encoding
+        config = self.fabric.materials.sender(at, self._topics, encoding, self._ros)
         argv = ["-m", "proxy.replay_cli", str(self.bag), "--config", str(config), "--json"]
-        return self._start(self._robot.switch, "replay", [*argv, "--rate", str(self.options.rate)])
-
-    def _start(self, node: str, role: str, arguments: list[str], *, heard: bool = True) -> Child:
-        return self._children.start_in(self.namespaces, node, role, arguments, heard=heard)
+        return self.fabric.start(at.switch, "replay", [*argv, "--rate", str(self.options.rate)])
 
 
 async def make_demo(run: Run) -> Path:

@@ -19,6 +19,8 @@ def table(result: Result) -> Table:
     """Return one row per topic."""
     of = result.settings
     title = f"{of['encoding']}, {of['data_plane']}, MTU {of['mtu']}"
+    if "live" in of:
+        title = f"live {of['live']}, {title}"
     cuts = of["cuts"]
     if isinstance(cuts, list) and cuts:
         title += ", cut " + ", ".join(f"{cut} s" for cut in cuts)
@@ -39,9 +41,13 @@ def table(result: Result) -> Table:
 def verdict(result: Result) -> str:
     """Return the last line, with markup."""
     if result.passed:
-        count = sum(row.comparison.messages for row in result.topics)
+        topics = [row for row in result.topics if not row.is_service]
+        calls = sum(row.comparison.messages for row in result.topics if row.is_service)
+        count = sum(row.comparison.messages for row in topics)
+        what = f"{count} messages on {len(topics)} topics, all identical"
+        what += f"; {calls} calls, all answered" if calls else ""
         note = f" [yellow]Not all could be read: {escape(result.unread)}[/yellow]" if result.unread else ""
-        return f"[bold green]passed[/bold green]: {count} messages on {len(result.topics)} topics, all identical.{note}"
+        return f"[bold green]passed[/bold green]: {what}.{note}"
     return f"[bold red]failed[/bold red]: {escape('; '.join(result.faults))}"
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import LocalError
+from proxy.ring.cli import spelled_out
 from proxy.ring.options import Cut, Options
 
 
@@ -34,6 +35,12 @@ def test_a_cut_written_otherwise_is_refused(text: str) -> None:
         {"json": Path("/nowhere/result.json")},
         {"pcap": Path("/nowhere/seen.pcap")},
         {"cuts": (Cut("nuc1", "nuc3", 1.0),)},
+        {"seconds": 4.0},
+        {"live": "ros2", "seconds": 0.5},
+        {"live": "ros2", "seconds": float("nan")},
+        {"live": "ros2", "rate": 0.0},
+        {"live": "ros1", "bag": Path(__file__)},
+        {"live": "mixed", "out": Path("/tmp")},
     ],
 )
 def test_what_cannot_be_done_is_refused_before_anything_starts(options: dict[str, object]) -> None:
@@ -50,3 +57,24 @@ def test_settings_are_what_json_can_write() -> None:
         "mtu": 1_500,
         "cuts": ["nuc2-nuc3@5"],
     }
+
+
+def test_a_live_run_has_no_recording_in_its_settings() -> None:
+    settings = Options(live="mixed").settings()
+    assert settings["live"] == "mixed"
+    assert settings["seconds"] == 10
+    assert not {"recording", "rate"} & settings.keys()
+
+
+@pytest.mark.parametrize(
+    ("words", "spelled"),
+    [
+        (["--live"], ["--live", "ros2"]),
+        (["--live", "ros1"], ["--live", "ros1"]),
+        (["--live", "--keep"], ["--live", "ros2", "--keep"]),
+        (["--live=mixed", "--keep"], ["--live=mixed", "--keep"]),
+        ([], []),
+    ],
+)
+def test_live_alone_means_ros_2(words: list[str], spelled: list[str]) -> None:
+    assert list(spelled_out(words)) == spelled

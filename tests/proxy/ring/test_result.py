@@ -87,6 +87,7 @@ def test_json_has_a_row_for_each_topic() -> None:
     assert written["topics"] == [
         {
             "topic": "/imu",
+            "kind": "topic",
             "type": "sensor_msgs/msg/Imu",
             "messages": 1_000,
             "bytes": 324_000,

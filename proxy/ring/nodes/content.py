@@ -1,0 +1,192 @@
+"""What the nodes of a live ring say: messages that are never the same twice, and what is compared of them.
+
+Place: pure. A message is seen through its fields, so that ROS 1 and ROS 2 are one here.
+
+A talker's messages are numbered from 1. Number 0 is a greeting, said until the other end hears; it does not count.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from hashlib import sha256, shake_128
+from typing import Final, NamedTuple, TypeAlias
+
+__all__ = ["LAMP", "LAMP_HZ", "LAMP_TYPE", "TALKS", "Fit", "Mark", "Talk", "digest", "lamp_says", "talk_of"]
+
+Fit: TypeAlias = Callable[["array[int]"], object]  # makes an array what a ROS takes
+
+LAMP: Final = "/lamp"
+LAMP_TYPE: Final = "std_srvs/srv/SetBool"
+LAMP_HZ: Final = 5.0
+
+_WIDTH, _HEIGHT, _PIXEL = 640, 480, 3
+_PICTURE_BYTES: Final = _WIDTH * _HEIGHT * _PIXEL
+_NUMBER_BYTES: Final = 4  # the first of a picture, as some cameras write their frame's number
+_STEP_BYTES: Final = 977  # of the scene, from one picture to the next
+_STEPS: Final = 64
+_CELLS_X, _CELLS_Y = 96, 64
+_SECOND_NS: Final = 1_000_000_000
+
+
+class Mark(NamedTuple):
+    """What a listener reads off a message."""
+
+    number: int
+    stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Talk:
+    """A topic of the robot, and the node that publishes it. ``latched``: the newest message stays for late joiners."""
+
+    node: str
+    topic: str
+    type_name: str
+    hz: float
+    fill: Callable[[object, int, int, Fit], None]  # a new message; its number; the wall clock in ns
+    read: Callable[[object], Mark]
+    latched: bool = False
+
+
+def digest(message: object) -> str:
+    """Return 32 hex digits that tell messages of different content apart.
+
+    Both ROS give the same, save for the sequence number in a ROS 1 header, which does not cross.
+    """
+    sha = sha256()
+    for leaf in _leaves(message):
+        sha.update(leaf)
+        sha.update(b"\0")
+    return sha.hexdigest()[:32]
+
+
+def lamp_says(number: int, *, on: bool) -> str:
+    """Return what the lamp answers when it is switched for the ``number``-th time."""
+    return f"{'on' if on else 'off'}, switched {number} times"
+
+
+def talk_of(topic: str) -> Talk:
+    """Return what is said on a topic."""
+    return next(talk for talk in TALKS if talk.topic == topic)
+
+
+def _say(message: object, number: int, now_ns: int, fit: Fit) -> None:
+    del fit
+    _put(message, {"data": f"hello {number} at {now_ns}"})
+
+
+def _listen(message: object) -> Mark:
+    _, number, _, stamp_ns = str(_get(message, "data")).split()
+    return Mark(int(number), int(stamp_ns))
+
+
+def _take_picture(message: object, number: int, now_ns: int, fit: Fit) -> None:
+    size = _PICTURE_BYTES - _NUMBER_BYTES
+    at = number % _STEPS * _STEP_BYTES
+    pixels = _scene()[at : at + size] if number else bytes(size)  # a greeting is black
+    _put_time(_get(message, "header.stamp"), now_ns)
+    _put(
+        message,
+        {
+            "header.frame_id": "camera",
+            "height": _HEIGHT,
+            "width": _WIDTH,
+            "encoding": "rgb8",
+            "step": _WIDTH * _PIXEL,
+            "data": fit(array("B", number.to_bytes(_NUMBER_BYTES, "big") + pixels)),
+        },
+    )
+
+
+def _look_at_picture(message: object) -> Mark:
+    pixels = _get(message, "data")
+    number = bytes(pixels[:_NUMBER_BYTES]) if isinstance(pixels, bytes | array) else b""
+    return Mark(int.from_bytes(number, "big"), _time_ns(_get(message, "header.stamp")))
+
+
+def _draw_map(message: object, number: int, now_ns: int, fit: Fit) -> None:
+    cells = array("b", [-1]) * (_CELLS_X * _CELLS_Y)  # unknown
+    for at in range(min(number * _CELLS_X, len(cells))):  # each map knows one row more
+        cells[at] = 100 if at % 7 == number % 7 else 0
+    _put_time(_get(message, "header.stamp"), now_ns)
+    _put_time(_get(message, "info.map_load_time"), now_ns)
+    _put(
+        message,
+        {
+            "header.frame_id": "map",
+            "info.resolution": 0.125,
+            "info.width": _CELLS_X,
+            "info.height": _CELLS_Y,
+            "info.origin.position.x": -6.1,
+            "info.origin.orientation.w": 1.0,
+            "data": fit(cells),
+        },
+    )
+
+
+def _look_at_map(message: object) -> Mark:
+    return Mark(1, _time_ns(_get(message, "header.stamp")))  # there are no greetings among them
+
+
+TALKS: Final = (
+    Talk("talker", "/chatter", "std_msgs/msg/String", 10.0, _say, _listen),
+    Talk("camera", "/camera/image", "sensor_msgs/msg/Image", 15.0, _take_picture, _look_at_picture),
+    Talk("mapper", "/map", "nav_msgs/msg/OccupancyGrid", 1.0, _draw_map, _look_at_map, latched=True),
+)
+
+
+@cache
+def _scene() -> bytes:
+    return shake_128(b"scene").digest(_PICTURE_BYTES + _STEP_BYTES * _STEPS)
+
+
+def _get(value: object, path: str) -> object:
+    for name in path.split("."):
+        value = getattr(value, name)
+    return value
+
+
+def _put(message: object, fields: Mapping[str, object]) -> None:
+    for path, value in fields.items():
+        inside, _, name = path.rpartition(".")
+        setattr(_get(message, inside) if inside else message, name, value)
+
+
+def _time_names(stamp: object) -> tuple[str, str]:
+    return ("secs", "nsecs") if hasattr(stamp, "secs") else ("sec", "nanosec")
+
+
+def _put_time(stamp: object, ns: int) -> None:
+    for name, value in zip(_time_names(stamp), divmod(ns, _SECOND_NS), strict=True):
+        setattr(stamp, name, value)
+
+
+def _time_ns(stamp: object) -> int:
+    seconds, ns = (getattr(stamp, name) for name in _time_names(stamp))
+    return int(seconds) * _SECOND_NS + int(ns)
+
+
+def _leaves(value: object) -> Iterator[bytes]:
+    """Yield what a message holds, in the order of its definition."""
+    if isinstance(value, array) and value.typecode == "B":
+        yield value.tobytes()
+    elif isinstance(value, bytes):
+        yield value
+    elif isinstance(value, array | list | tuple):
+        yield str(len(value)).encode()
+        for item in value:
+            yield from _leaves(item)
+    elif names := _field_names(value):
+        for name in names:
+            yield from _leaves(getattr(value, name))
+    else:
+        yield repr(value).encode()
+
+
+def _field_names(value: object) -> list[str]:
+    described = getattr(value, "get_fields_and_field_types", None)  # ROS 2
+    names = described() if callable(described) else getattr(value, "__slots__", ())
+    return [name for name in names if name != "seq"]
