@@ -66,7 +66,7 @@ compile_own() {
 python=$(find_python)
 wanted=$({ cat pyproject.toml; "$python" --version; echo "$root"; } | sha256sum | cut -d' ' -f1)
 # What was installed for testing is enough for running.
-for stamp in "$venv/.installed$extras" "$venv/.installed$dev"; do
+for stamp in "$venv/.installed$extras" "$venv/.installed[ros2]" "$venv/.installed$dev"; do
     if [[ -f "$stamp" && $(<"$stamp") == "$wanted" ]] && "$venv/bin/python" -c '' 2>/dev/null; then
         compile_own
         exit 0

@@ -137,6 +137,8 @@ class Bridge:
             self._receive(message, now_s)
         if self._is_stale or (self._since and now_s >= self._tick_at_s):
             self._refresh(now_s)
+        for seat in self._seats:
+            seat.deliver_faults(now_s)
         if now_s >= self._tick_at_s:
             self._tick_at_s = now_s + TICK_S
             for flow in self._timed:

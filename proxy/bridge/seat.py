@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from proxy.endpoints.endpoint import Endpoint, Event, GraphChanged
+from proxy.endpoints.endpoint import Endpoint, Event, Faulted, GraphChanged
 from proxy.serial.channel import Channel, Qos
 from proxy.serial.service import Service
 
@@ -27,16 +27,26 @@ class Seat:
     def __init__(self, endpoint: Endpoint) -> None:
         self.endpoint = endpoint
         self._owners: dict[int, Owner] = {}
+        self._faulted: list[Faulted] = []
 
     def deliver(self, now_s: float) -> bool:
-        """Hand out what happened; return whether the graph changed."""
+        """Hand out what happened, but for faults; return whether the graph changed."""
         is_changed = False
         for event in self.endpoint.take():
             if isinstance(event, GraphChanged):
                 is_changed = True
+            elif isinstance(event, Faulted):
+                self._faulted.append(event)
             elif (owner := self._owners.get(event.handle)) is not None:
                 owner.take(event, now_s)
         return is_changed
+
+    def deliver_faults(self, now_s: float) -> None:
+        """Hand out faults, once the graph in which they arose was seen: what gave way to another is nobody's now."""
+        faulted, self._faulted = self._faulted, []
+        for event in faulted:
+            if (owner := self._owners.get(event.handle)) is not None:
+                owner.take(event, now_s)
 
     def subscribe(self, owner: Owner, topic: str, type_name: str, qos: Qos | None) -> int:
         """Hear a topic; as ``Endpoint.subscribe``."""
