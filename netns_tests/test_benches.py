@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib.util import find_spec
 
 import pytest
 
@@ -12,6 +13,7 @@ from tests.pages import ROOT
 pytestmark = pytest.mark.netns
 
 _PATIENCE_S = 300.0
+needs_ros2 = pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy is not installed: scripts/setup.sh --ros2")
 
 
 @pytest.mark.parametrize(
@@ -23,6 +25,9 @@ _PATIENCE_S = 300.0
         ["overlap.py", "--rounds", "1", "--count", "5"],
         ["priority.py", "--quick", "--no-save"],
         ["bundles.py", "--quick", "--no-save"],
+        pytest.param(["ros.py", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),
+        pytest.param(["services.py", "--quick", "--no-save"], marks=needs_ros2),
+        pytest.param(["fogros.py", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),
         ["serial.py", "--help"],
         ["claims.py", "--claims", "100"],
     ],
@@ -34,3 +39,4 @@ def test_a_bench_runs_to_its_table(command: list[str]) -> None:
     ran = subprocess.run(argv, capture_output=True, text=True, timeout=_PATIENCE_S, check=False)
     assert ran.returncode == 0, ran.stderr
     assert "not here" not in ran.stdout, ran.stdout
+    assert "FAILED" not in ran.stderr, ran.stderr

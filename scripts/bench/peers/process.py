@@ -74,6 +74,13 @@ class Started:
         Raises:
             FailedError: it ended, or printed nothing in time, or something else.
         """
+        said = json.loads(self.read_line(patience_s))
+        if not isinstance(said, dict):
+            raise FailedError(f"{self._what} said {said!r}")
+        return said
+
+    def read_line(self, patience_s: float) -> bytes:
+        """Return the next line that it prints, whatever it is; raises as ``read``."""
         assert self._process.stdout is not None
         deadline_s = time.monotonic() + patience_s
         while b"\n" not in self._unread:
@@ -85,10 +92,7 @@ class Started:
                 raise FailedError(f"{self._what} ended: {self._reason()}")
             self._unread += part
         line, _, self._unread = self._unread.partition(b"\n")
-        said = json.loads(line)
-        if not isinstance(said, dict):
-            raise FailedError(f"{self._what} said {said!r}")
-        return said
+        return line
 
     def _reason(self) -> str:
         lines = self._log.read_text(encoding="utf-8", errors="replace").split("\n")

@@ -1,0 +1,134 @@
+"""The client and the server of ``services.py``: ordinary rclpy nodes and ``std_srvs/srv/SetBool``.
+
+Place: process of its own, started by ``ros_row.py`` as ``serve``, ``call`` (one call at a time) or ``load`` (many
+clients, calls at a steady rate). The server answers with what it was asked, so that an answer to another call is seen.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable
+from typing import Final
+
+from peers.lines import say
+from rclpy.client import Client
+from rclpy.task import Future
+from report import percentile
+from ros_end import End, Settings, reliable, run_role
+from std_srvs.srv import SetBool
+
+_WARM_UP: Final = 100
+_TICK_S: Final = 0.001
+_PATIENCE_S: Final = 10.0
+_DEPTH: Final = 1_000  # every client hears the answers to all clients; ten places are soon taken
+
+
+def serve(end: End, settings: Settings) -> None:
+    """Answer until killed."""
+
+    def answer(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        response.success = request.data
+        return response
+
+    end.node.create_service(SetBool, str(settings["service"]), answer, qos_profile=reliable(_DEPTH))
+    say(event="ready")
+    end.run()
+
+
+class _Calls:
+    """Calls under way, and what came of them."""
+
+    def __init__(self) -> None:
+        self.sent = 0
+        self.answered = 0
+        self.wrong = 0
+        self.times_s: list[float] = []
+
+    def begin(self, client: Client, then: Callable[[], None]) -> None:
+        """Call; ``then`` when it is answered."""
+        data, begun_s = random.random() < 0.5, time.perf_counter()
+
+        def take(future: Future[SetBool.Response]) -> None:
+            self.times_s.append(time.perf_counter() - begun_s)
+            self.answered += 1
+            self.wrong += future.result().success != data
+            then()
+
+        self.sent += 1
+        client.call_async(SetBool.Request(data=data)).add_done_callback(take)
+
+    def report(self) -> None:
+        """Print the figures."""
+        figures = {f"p{at}_s": percentile(self.times_s, at / 100) for at in (50, 99) if self.times_s}
+        say(sent=self.sent, lost=self.sent - self.answered, wrong=self.wrong, **figures)
+
+
+def _warm_clients(end: End, settings: Settings, count: int) -> list[Client]:
+    """Return clients that have each called more than once."""
+    name, profile = str(settings["service"]), reliable(_DEPTH)
+    clients = [end.node.create_client(SetBool, name, qos_profile=profile) for _ in range(count)]
+    turns = iter(clients * max(_WARM_UP // count, 2))
+    calls = _Calls()
+
+    def go_on() -> None:
+        client = next(turns, None)
+        if client is None:
+            end.finish()
+        else:
+            calls.begin(client, go_on)
+
+    for client in clients:
+        if not client.wait_for_service(_PATIENCE_S):
+            raise TimeoutError("no server: the overlay did not come up")
+    go_on()
+    end.run()
+    say(event="begins")
+    return clients
+
+
+def call(end: End, settings: Settings) -> None:
+    """Call, one after the other, for so many seconds."""
+    (client,) = _warm_clients(end, settings, 1)
+    calls, until_s = _Calls(), time.monotonic() + float(str(settings["seconds"]))
+
+    def go_on() -> None:
+        if time.monotonic() < until_s:
+            calls.begin(client, go_on)
+        else:
+            end.finish()
+
+    def look() -> None:
+        if time.monotonic() > until_s + _PATIENCE_S:
+            end.finish()  # an answer did not come
+
+    end.every(1.0, look)
+    go_on()
+    end.run()
+    calls.report()
+
+
+def load(end: End, settings: Settings) -> None:
+    """Have ``clients`` call in turn, ``rate`` calls a second in all, each without waiting for the others' answers."""
+    clients = _warm_clients(end, settings, int(str(settings["clients"])))
+    calls, count, gap_s = _Calls(), int(str(settings["count"])), 1 / float(str(settings["rate"]))
+    begun_s = time.monotonic()
+
+    def tick() -> None:
+        now_s = time.monotonic()
+        while calls.sent < count and begun_s + calls.sent * gap_s <= now_s:
+            calls.begin(clients[calls.sent % len(clients)], finish_if_all)
+        if now_s > begun_s + count * gap_s + _PATIENCE_S:
+            end.finish()
+
+    def finish_if_all() -> None:
+        if calls.answered == count:
+            end.finish()
+
+    end.every(_TICK_S, tick)
+    end.run()
+    calls.report()
+
+
+if __name__ == "__main__":
+    run_role({"serve": serve, "call": call, "load": load})

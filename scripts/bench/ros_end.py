@@ -1,0 +1,85 @@
+"""What the ROS nodes of the benches share: a node with an executor, and two signs for whoever started it.
+
+Place: process of its own, started by ``ros_row.py``; the only importer of rclpy beside the nodes themselves. They know
+nothing of the overlay.
+
+The executor is rclpy's ``EventsExecutor`` where there is one: the ordinary one takes longer the more subscriptions a
+node has, and would be what is measured.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+from collections.abc import Callable, Mapping
+from types import FrameType
+from typing import Final
+
+import rclpy
+from peers.lines import say
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
+
+try:
+    from rclpy.experimental import EventsExecutor as BestExecutor
+except ImportError:  # before Kilted and late Jazzy
+    from rclpy.executors import SingleThreadedExecutor as BestExecutor
+
+__all__ = ["End", "Settings", "reliable", "run_role"]
+
+_STEP_S: Final = 60.0  # without a timeout, rclpy 7.1's EventsExecutor never looks at the future
+
+Settings = Mapping[str, object]
+
+
+class End:
+    """A node at A or B."""
+
+    def __init__(self, name: str) -> None:
+        self.node = Node(name)
+        self._executor = BestExecutor()
+        self._executor.add_node(self.node)
+        self._done: Future[None] = Future()
+        self._is_told_to_go = False
+        signal.signal(signal.SIGUSR1, self._go)
+
+    @property
+    def is_told_to_go(self) -> bool:
+        """Return whether a SIGUSR1 came: the other end hears, the measurement may begin."""
+        return self._is_told_to_go
+
+    def finish(self) -> None:
+        """End ``run``; called within it."""
+        if not self._done.done():
+            self._done.set_result(None)
+
+    def run(self) -> None:
+        """Work until ``finish``."""
+        while not self._done.done():
+            self._executor.spin_until_future_complete(self._done, timeout_sec=_STEP_S)
+        self._done = Future()
+
+    def every(self, seconds: float, work: Callable[[], None]) -> None:
+        """Do something at a steady rate; within ``run``."""
+        self.node.create_timer(seconds, work)
+
+    def _go(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        self._is_told_to_go = True
+
+
+def reliable(depth: int = 10) -> QoSProfile:
+    """Return the profile of all topics here: reliable, volatile, so many messages deep."""
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE)
+
+
+def run_role(roles: Mapping[str, Callable[[End, Settings], None]]) -> None:
+    """Be what the first argument says, with the settings of the second, until killed."""
+    role, settings = sys.argv[1], json.loads(sys.argv[2])
+    rclpy.init()
+    end = End(f"bench_{role}")
+    roles[role](end, settings)
+    say(event="over")
+    end.run()  # a reliable writer must stay to repair what was lost
