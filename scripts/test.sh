@@ -11,15 +11,33 @@ root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 cd "$root"
 scripts/setup.sh --dev
 scripts/check.sh
-if [[ $(id -u) -eq 0 ]]; then
-    exec .venv/bin/python -m pytest "$@"
+if [[ $(id -u) -ne 0 ]]; then
+    # Root of a user namespace would share pytest's folder with the machine's root, and be refused.
+    PYTEST_DEBUG_TEMPROOT=$(mktemp -d)
+    export PYTEST_DEBUG_TEMPROOT
 fi
-# Root of a user namespace would share pytest's folder with the machine's root, and be refused.
-PYTEST_DEBUG_TEMPROOT=$(mktemp -d)
-export PYTEST_DEBUG_TEMPROOT
-trap 'rm -rf "$PYTEST_DEBUG_TEMPROOT"' EXIT
-if scripts/privileged.sh --check; then
-    scripts/privileged.sh .venv/bin/python -m pytest "$@"
-else
-    .venv/bin/python -m pytest "$@"
+beside=$(mktemp)
+trap 'rm -rf "$beside" ${PYTEST_DEBUG_TEMPROOT:+"$PYTEST_DEBUG_TEMPROOT"}' EXIT
+
+# run <argument>...: pytest, as root of a user namespace where we are not root and that is allowed
+run() {
+    if [[ $(id -u) -ne 0 ]] && scripts/privileged.sh --check; then
+        scripts/privileged.sh .venv/bin/python -m pytest "$@"
+    else
+        .venv/bin/python -m pytest "$@"
+    fi
+}
+
+if [[ $# -gt 0 ]]; then
+    run "$@"
+    exit
 fi
+# Tests with namespaces mostly wait for processes; what runs in one process alone runs beside them.
+run tests >"$beside" 2>&1 &
+others=$!
+trap 'kill "$others" 2>/dev/null || true; exit 130' INT TERM
+passed=0
+run netns_tests || passed=$?
+wait "$others" || passed=$?
+cat "$beside"
+exit "$passed"
