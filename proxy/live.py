@@ -30,6 +30,7 @@ __all__ = ["carry"]
 log = logging.getLogger(__name__)
 
 TICK_S: Final = 0.5
+_LOOK_S: Final = 2.0  # who begins sooner may not see yet that another proxy of its graph carries the same
 _TURN_S: Final = 0.0002  # what an endpoint's thread may have to wait for the interpreter; Python's own is 5 ms
 
 
@@ -47,7 +48,7 @@ def carry(path: Path, settings: ProxyConfig, *, json: bool) -> None:
         name = proxy_node_name(node.identity.name.to_text())
         with open_endpoints(settings.ros, name) as endpoints:
             held = Held(settings.delegations, node.identity)
-            bridge = Bridge(Site(node.member, node.traffic, node.faults), settings, endpoints, held)
+            bridge = Bridge(Site(node.member, node.traffic, node.faults), settings, endpoints, held, look_s=_LOOK_S)
             node.on_reload = lambda: _reload(path, settings, node, bridge)
             for endpoint in endpoints:
                 node.runtime.watch(endpoint)

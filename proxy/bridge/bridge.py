@@ -81,9 +81,12 @@ class Bridge:
 
     Args:
         endpoints: in the order of the configuration's ``ros`` section.
+        look_s: seconds to look around before anything begins: what graphs take to show the other proxies in them.
     """
 
-    def __init__(self, site: Site, config: ProxyConfig, endpoints: Sequence[Endpoint], held: Held) -> None:
+    def __init__(
+        self, site: Site, config: ProxyConfig, endpoints: Sequence[Endpoint], held: Held, *, look_s: float = 0.0
+    ) -> None:
         self._site = site
         self._config = config
         self._held = held
@@ -97,6 +100,8 @@ class Bridge:
         self._complaints: set[Complaint] = set()
         self._ended = deque[Tally](maxlen=_ENDED_MAX)
         self._is_stale = True
+        self._look_s = look_s
+        self._begun_s: float | None = None  # when the first look was
         self._tick_at_s = 0.0
         self._now_s = 0.0
         self.unknown_names = 0
@@ -205,8 +210,10 @@ class Bridge:
         self._tell(complaints)
 
     def _is_our_turn(self, key: _Key, view: _View, now_s: float) -> bool:
-        """Return whether the proxies before us in this graph had time to begin."""
-        if now_s < self._since.setdefault(key, now_s) + view.rivals.patience_s:
+        """Return whether the proxies before us in this graph had time to show themselves, and to begin."""
+        self._begun_s = now_s if self._begun_s is None else self._begun_s
+        ours_s = self._since.setdefault(key, now_s) + view.rivals.patience_s
+        if now_s < max(ours_s, self._begun_s + self._look_s):
             return False
         del self._since[key]
         return True

@@ -97,7 +97,8 @@ class ExposedService:
         elif isinstance(event, Heard):
             self._publish(event)
         elif isinstance(event, Faulted):
-            self._site.faults.tell(self._wish.local, Fault.REFUSED, event.reason)
+            fault = Fault.NO_GRAPH if event.is_graph else Fault.REFUSED
+            self._site.faults.tell(self._wish.local, fault, event.reason)
         else:
             assert isinstance(event, Described)  # what an action's topics are was known before
 

@@ -51,11 +51,12 @@ class ExposedTopic:
 
     def follow(self, ends: Sequence[End]) -> None:
         """Learn who publishes now."""
-        before = self._ends, self._offers
+        before, depth = (self._ends, self._offers), self._depth()
         self._ends, self._offers = len(ends), _offers(ends)
         if before == (self._ends, self._offers):
             return
-        if request(before[1]) != request(self._offers):
+        # One that joins a latched topic may have spoken, and pushed out what another latched, before it was seen.
+        if request(before[1]) != request(self._offers) or 0 < depth < self._depth():
             self._seat.close(self._handle)
             self._handle = self._subscribe()
         if self._channel is not None:
@@ -68,7 +69,8 @@ class ExposedTopic:
         elif isinstance(event, Described):
             self._describe(event.channel)
         elif isinstance(event, Faulted):
-            self._site.faults.tell(self._wish.local, Fault.QOS, event.reason)
+            fault = Fault.NO_GRAPH if event.is_graph else Fault.QOS
+            self._site.faults.tell(self._wish.local, fault, event.reason)
 
     def close(self, now_s: float) -> None:
         """Carry nothing any more."""

@@ -89,7 +89,8 @@ class ImportedService:
         if isinstance(event, Asked):
             self._ask(event, now_s)
         elif isinstance(event, Faulted):
-            self._site.faults.tell(self._wish.local, Fault.REFUSED, event.reason)
+            fault = Fault.NO_GRAPH if event.is_graph else Fault.REFUSED
+            self._site.faults.tell(self._wish.local, fault, event.reason)
 
     def tick(self, now_s: float) -> None:
         """Open or close the virtual server as far ones come and go; fail what waited too long."""

@@ -86,7 +86,8 @@ class ImportedTopic:
         """Take what the endpoint says of the virtual publisher."""
         del now_s
         if isinstance(event, Faulted):
-            self._site.faults.tell(self._wish.local, Fault.QOS, event.reason)
+            fault = Fault.NO_GRAPH if event.is_graph else Fault.QOS
+            self._site.faults.tell(self._wish.local, fault, event.reason)
 
     def close(self, now_s: float) -> None:
         """Carry nothing any more."""

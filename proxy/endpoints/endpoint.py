@@ -129,6 +129,7 @@ class Faulted(NamedTuple):
 
     handle: int
     reason: str
+    is_graph: bool = False  # it is the whole graph that cannot be had
 
 
 Event: TypeAlias = GraphChanged | Described | Heard | Asked | Answered | Failed | Faulted

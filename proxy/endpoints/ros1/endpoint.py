@@ -338,12 +338,12 @@ class Ros1Endpoint:
         self._held[handle] = held
         self._establish(handle, held)
         if self._trouble:
-            self._tell(Faulted(handle, self._trouble))
+            self._tell(Faulted(handle, self._trouble, is_graph=True))
         return handle
 
     def _suffer(self, reason: str) -> None:
         if not self._trouble:
-            self._events += [Faulted(handle, reason) for handle in self._held]
+            self._events += [Faulted(handle, reason, is_graph=True) for handle in self._held]
         self._trouble = reason
 
     def _fail(self, handle: int, call: int, reason: str) -> None:

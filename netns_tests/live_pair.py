@@ -1,0 +1,382 @@
+"""Two machines joined by a cable, with switches, a RIB, real ROS graphs and a proxy for each graph; and their nodes.
+
+::
+
+    a: graph "a" (ROS 2)      [switch a, RIB] ---- [switch b]      graphs "b" (ROS 2), "one" (ROS 1), "dds" (ROS 2) :b
+
+Graph "b" has two proxies: "b" and "twin". Nodes keep to their machine: there is no IP address but loopback's, and
+Fast DDS uses no shared memory, which would cross. The domains differ, too.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import yaml
+
+from gdp.crypto.certificates import Role
+from gdp.metadata import Metadata
+from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
+from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE, load_identity
+from gdp.testbed import netns_files
+from gdp.testbed.namespaces import Namespaces
+from gdp.testbed.runs import Run, Runs
+from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
+from gdp.trust.right import Right
+from proxy.endpoints.endpoint import proxy_node_name
+from proxy.ring.plan import Credentials, rib_yaml, switch_yaml
+from tests.pages import ROOT
+from tests.proxy.endpoints.dds_peers import CYCLONE
+from tests.proxy.endpoints.ros1_net import need_ros1
+from tests.proxy.endpoints.ros2_net import DOMAIN, Peer
+
+__all__ = ["PATIENCE_S", "Crossing", "Pair", "Proxy", "pair_of", "until"]
+
+PATIENCE_S: Final = 30.0
+_MASTER: Final = "http://127.0.0.1:11311"
+_DOMAINS: Final = {"a": DOMAIN, "b": DOMAIN + 1, "twin": DOMAIN + 1, "dds": DOMAIN + 2}
+_GRAPHS: Final[dict[str, dict[str, object]]] = {
+    "a": {"endpoint": "ros2", "domain": _DOMAINS["a"]},
+    "b": {"endpoint": "ros2", "domain": _DOMAINS["b"]},
+    "twin": {"endpoint": "ros2", "domain": _DOMAINS["twin"]},
+    "dds": {"endpoint": "dds", "domain": _DOMAINS["dds"]},
+    "one": {"endpoint": "ros1", "master": _MASTER},
+}
+_RIGHTS: Final = {"topic": (Right.PUBLISH, Right.READ)}
+_ENVIRONMENT: Final = {
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",  # LOCALHOST would bring shared memory back
+    "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
+    "CYCLONEDDS_URI": CYCLONE,
+    "ROS_MASTER_URI": _MASTER,
+    "ROS_HOSTNAME": "127.0.0.1",
+    "PYTHONPATH": str(ROOT),
+}
+_TOPOLOGY: Final = Topology(
+    links=(Link("a", "b"),),
+    domains=(DomainPlan("pair", ("a", "b")),),
+    attachments=(
+        Attachment("a", "rib", "rib"),
+        *(Attachment("a" if label == "a" else "b", "proxy", f"to_{label}") for label in _GRAPHS),
+    ),
+)
+
+
+def until(is_met: Callable[[], object], what: str, patience_s: float = PATIENCE_S) -> None:
+    """Look until something holds that tells nobody when it does."""
+    end_s = time.monotonic() + patience_s
+    while not is_met():
+        assert time.monotonic() < end_s, f"{what}: not within {patience_s:g} s"
+        time.sleep(0.02)
+
+
+@dataclass(frozen=True, slots=True)
+class Crossing:
+    """What a rule of its source and one of each of its readers name; ``options``: further keys of them all."""
+
+    name: str
+    type_name: str
+    sources: str
+    readers: str
+    kind: str = "topic"
+    options: Mapping[str, object] = field(default_factory=dict)
+
+    @property
+    def metadata(self) -> Metadata:
+        """Return what its name in the overlay digests."""
+        return Metadata({"kind": self.kind, "name": self.name, "type": self.type_name})
+
+    def rights(self) -> Iterator[tuple[str, Right, str]]:
+        """Yield proxy, right and side of the file."""
+        give, take = _RIGHTS.get(self.kind, (Right.SERVE, Right.CALL))
+        yield from ((label, give, "expose") for label in self.sources.split())
+        yield from ((label, take, "import") for label in self.readers.split())
+
+    def rule(self, owner: Path) -> dict[str, object]:
+        """Return its rule."""
+        return {"name": self.name, "kind": self.kind, "type": self.type_name, "owner": str(owner), **self.options}
+
+
+class Ros1Node(Peer):
+    """A real rospy node; see ``live_nodes`` for what it can be told."""
+
+    def __init__(self, name: str, words: Sequence[str], environment: Mapping[str, str]) -> None:
+        self._process = subprocess.Popen(
+            [*words, sys.executable, str(Path(__file__).with_name("live_nodes.py")), name],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,  # what rospy thinks of a master that is away
+            text=True,
+            env={**os.environ, **environment},
+        )
+
+
+class Proxy:
+    """A ``gdp-proxy``; it can be killed and started again."""
+
+    def __init__(self, pair: Pair, label: str) -> None:
+        self._pair = pair
+        self._label = label
+        self._log = pair.folder / f"proxy-{label}.log"
+        self._process: subprocess.Popen[bytes] | None = None
+        self._port = 9_110 + list(_GRAPHS).index(label)
+
+    @property
+    def pid(self) -> int:
+        """Return its process number."""
+        assert self._process is not None
+        return self._process.pid
+
+    @property
+    def is_running(self) -> bool:
+        """Return whether it was started and not ended."""
+        return self._process is not None
+
+    @property
+    def machine(self) -> str:
+        """Return where it runs."""
+        return "a" if self._label == "a" else "b"
+
+    @property
+    def node_name(self) -> str:
+        """Return what its virtual node is called."""
+        return proxy_node_name(load_identity(self._pair.identity(self._label), time.time()).name.to_text())
+
+    @property
+    def said(self) -> str:
+        """Return its log, of all its lives."""
+        return self._log.read_text()
+
+    def start(self) -> None:
+        """Start it; return when it is attached."""
+        argv = ["proxy.cli", "--config", str(self._pair.write_proxy(self._label, self._port))]
+        self._process = self._pair.start(self.machine, argv, self._log, " is attached", self._label)
+
+    def end(self, how: signal.Signals = signal.SIGTERM) -> None:
+        """End it, kindly or not; idempotent."""
+        process, self._process = self._process, None
+        if process is not None:
+            process.send_signal(how)
+            process.communicate(timeout=PATIENCE_S)
+
+    def warnings(self, name: str) -> list[str]:
+        """Return what it warned of about a local name: fault and detail."""
+        return re.findall(rf" WARNING \S+ {re.escape(name)}: (.*)", self.said)
+
+    def faults(self, fault: str) -> int:
+        """Return what its metrics say of a fault."""
+        return int(self.metric(f'gdp_proxy_faults_total{{fault="{fault}"}}'))
+
+    def metric(self, name: str) -> float:
+        """Return the value of a metric, zero where it is not there."""
+        ask = partial(_metrics, self._port)
+        text = netns_files.inside(self._pair.spaces.path(self.machine), ask)
+        found = re.search(rf"^{re.escape(name)} (\S+)$", text, re.MULTILINE)
+        return float(found[1]) if found else 0.0
+
+    def descriptors(self) -> int:
+        """Return how many it has open."""
+        return len(os.listdir(f"/proc/{self.pid}/fd"))
+
+    def memory_kib(self) -> int:
+        """Return what it has resident."""
+        found = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{self.pid}/status").read_text())
+        assert found is not None
+        return int(found[1])
+
+
+class Pair:
+    """What runs. Proxies and the ROS 1 master start when first asked for."""
+
+    def __init__(self, run: Run, undo: ExitStack, crossings: Sequence[Crossing], hidden: Mapping[str, str]) -> None:
+        self.folder = run.directory
+        self.spaces = Namespaces(_TOPOLOGY, run)
+        self._undo = undo
+        self._run = run
+        self._crossings = crossings
+        self._hidden = hidden
+        self._proxies = {label: Proxy(self, label) for label in _GRAPHS}
+        self._master: subprocess.Popen[bytes] | None = None
+        self._nodes: dict[str, Peer] = {}
+        make_domain(self.folder / "pair", "pair")
+        make_owner(self.folder / "owner")
+        for machine in _TOPOLOGY.nodes:
+            credentials = self._credentials(Role.SWITCH, machine)
+            content = switch_yaml(_TOPOLOGY, machine, credentials, "auto", metrics=False)
+            self._start_node(machine, Role.SWITCH, content)
+        (rib,) = _TOPOLOGY.attached("rib")
+        content = rib_yaml(rib, self._credentials(Role.RIB, rib.switch), None, metrics=False)
+        self._start_node(rib.switch, Role.RIB, content)
+
+    def proxy(self, label: str) -> Proxy:
+        """Return a running proxy."""
+        proxy = self._proxies[label]
+        if not proxy.is_running:
+            if label == "one":
+                self.start_master()
+            proxy.start()
+        return proxy
+
+    def node(self, graph: str, name: str = "") -> Peer:
+        """Return a node of a graph, whose proxy runs; without a name always the same one."""
+        self.proxy(graph)
+        if name or graph not in self._nodes:
+            made = self._make_node(graph, name or f"node_{graph}")
+            if name:
+                return made
+            self._nodes[graph] = made
+        return self._nodes[graph]
+
+    def shape(self, rate: str) -> None:
+        """Bound what machine "a" sends to "b", such as ``20mbit``; empty: as much as it can again."""
+        words = ["add", "dev", "b", "root", "tbf", "rate", rate, "burst", "32kb", "latency", "50ms"]
+        change = words if rate else ["del", "dev", "b", "root"]
+        subprocess.run(self.spaces.command("a", ["tc", "qdisc", *change]), check=True)
+
+    def start_master(self) -> None:
+        """Start the ROS 1 master, if it does not run."""
+        if self._master is None:
+            need_ros1()
+            argv = ["proxy.ring.nodes.master", _MASTER.rpartition(":")[2]]
+            self._master = self.start("b", argv, self.folder / "master.log", "ready")
+
+    def stop_master(self) -> None:
+        """Kill the ROS 1 master."""
+        process, self._master = self._master, None
+        assert process is not None
+        process.kill()
+        process.communicate()
+
+    def start(
+        self, machine: str, argv: Sequence[str], log: Path, sign: str, graph: str = ""
+    ) -> subprocess.Popen[bytes]:
+        """Start a command of ours on a machine; return it when it has said that it is ready."""
+        words = [*self.spaces.command(machine, []), *self._environment(graph)]
+        if graph in self._hidden:
+            words.append(f"PYTHONPATH={self._hide(self._hidden[graph])}{os.pathsep}{ROOT}")
+        with log.open("ab") as errors:
+            process = subprocess.Popen(
+                [*words, sys.executable, "-m", *argv],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                env={**os.environ, **_ENVIRONMENT},
+                start_new_session=True,
+            )
+        self._run.note_process(process.pid)
+        self._undo.callback(_end, process)
+        _await(process, sign, log)
+        return process
+
+    def write_proxy(self, label: str, port: int) -> Path:
+        """Make a proxy's keys, delegations and file; return the file."""
+        title = f"proxy-{label}"
+        if (path := self.folder / f"{title}.yaml").exists():
+            return path
+        credentials = self._credentials(Role.PROXY, label)
+        owner = self.folder / "owner"
+        sides: dict[str, list[dict[str, object]]] = {"expose": [], "import": []}
+        for crossing in self._crossings:
+            for proxy, right, side in crossing.rights():
+                if proxy == label:
+                    given = delegate(owner, credentials.identity / CARD, crossing.metadata, [right])
+                    install_delegation(credentials.identity, given)
+                    sides[side].append(crossing.rule(owner / OWNER_PUBLIC))
+        content: dict[str, object] = {
+            **credentials.to_yaml(),
+            "iface": f"to_{label}",
+            "delegations": str(credentials.identity / DELEGATIONS),
+            "ros": _GRAPHS[label],
+            "metrics": {"port": port},
+            **sides,
+        }
+        (credentials.identity / DELEGATIONS).mkdir(exist_ok=True)
+        return self._write(title, content)
+
+    def identity(self, label: str, role: Role = Role.PROXY) -> Path:
+        """Return the directory of a node's keys."""
+        return self.folder / "nodes" / f"{role.value}-{label}"
+
+    def _start_node(self, machine: str, role: Role, content: Mapping[str, object]) -> None:
+        path = self._write(f"{role.value}-{machine}", content)
+        self.start(machine, [f"gdp.cli.{role.value}", "--config", str(path)], path.with_suffix(".log"), " is up")
+
+    def _credentials(self, role: Role, label: str) -> Credentials:
+        identity = self.identity(label, role)
+        make_node(identity, role, f"{role.value}-{label}", self.folder / "pair")
+        return Credentials(identity, self.folder / "pair" / ROOT_CERTIFICATE, ())
+
+    def _hide(self, package: str) -> Path:
+        """Return a folder at the front of the path in which there is nothing but an empty package of this name."""
+        (self.folder / "hidden" / package).mkdir(parents=True, exist_ok=True)
+        (self.folder / "hidden" / package / "__init__.py").touch()
+        return self.folder / "hidden"
+
+    def _write(self, name: str, content: Mapping[str, object]) -> Path:
+        path = self.folder / f"{name}.yaml"
+        path.write_text(yaml.safe_dump(content, sort_keys=False))
+        return path
+
+    def _make_node(self, graph: str, name: str) -> Peer:
+        machine = "a" if graph == "a" else "b"
+        words = [*self.spaces.command(machine, []), *self._environment(graph)]
+        if graph == "one":
+            logs = {"ROS_LOG_DIR": str(self.folder / "ros"), "PYTHONPATH": f"{need_ros1()}{os.pathsep}{ROOT}"}
+            node: Peer = Ros1Node(name, words, {**_ENVIRONMENT, **logs})
+        else:
+            node = Peer(name, words, _ENVIRONMENT)
+        self._undo.callback(node.end)
+        node.tell("!from netns_tests.live_nodes import values")
+        return node
+
+    def _environment(self, label: str) -> list[str]:
+        """Return the words that put a command into a graph, and keep what it must not know from it."""
+        domain = [f"ROS_DOMAIN_ID={_DOMAINS[label]}"] if label in _DOMAINS else []
+        return ["env", f"ROS_LOG_DIR={self.folder / 'ros'}", *domain]
+
+
+@contextmanager
+def pair_of(*crossings: Crossing, hidden: Mapping[str, str] | None = None) -> Iterator[Pair]:
+    """The two machines, with proxies that carry these; ``hidden``: a package that a proxy has not. All ends with it."""
+    run = Runs().start()
+    with ExitStack() as undo:
+        undo.callback(run.end)
+        yield Pair(run, undo, crossings, hidden or {})
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    if process.poll() is None:
+        process.terminate()
+    try:
+        process.communicate(timeout=PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
+
+
+def _await(process: subprocess.Popen[bytes], sign: str, log: Path) -> None:
+    """Return when a process has said this on its standard output."""
+    assert process.stdout is not None
+    said, end_s = b"", time.monotonic() + PATIENCE_S
+    while sign.encode() not in said:
+        ready = select.select([process.stdout], [], [], max(end_s - time.monotonic(), 0.0))[0]
+        piece = os.read(process.stdout.fileno(), 1 << 16) if ready else b""
+        assert piece, f"{sign!r} was not said, but {said!r}; {log.read_text()[-2_000:]}"
+        said += piece
+
+
+def _metrics(port: int) -> str:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=PATIENCE_S) as answer:
+        return str(answer.read(), "utf-8")
