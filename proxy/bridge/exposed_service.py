@@ -28,6 +28,7 @@ __all__ = ["ExposedService"]
 
 _CALLS_MAX = 65_536  # under way at one server
 _EARLY_MAX = 256  # requests of clients that are not described yet
+_GRACE_S = 0.5  # it is the client's side that ends a call; here it is only forgotten
 _CLIENTS_MAX = 1_024  # descriptions of clients kept ready; the oldest go
 
 
@@ -146,7 +147,7 @@ class ExposedService:
             if request.part >= len(incoming):
                 raise DefinitionError("the client asks for a part that this service has not")
             raw = incoming[request.part].decode(request.body)
-            patience_s = request.patience_ms / 1e3 if request.patience_ms else None
+            patience_s = request.patience_ms / 1e3 + _GRACE_S if request.patience_ms else None
             number = self._calls.begin(now_s, patience_s, asked)
         except LocalError as error:
             self._fail(asked, Fault.OTHER_TYPE, str(error))
