@@ -60,11 +60,9 @@ class ExposedService:
         self._early = deque[Message](maxlen=_EARLY_MAX)
         endpoint, rule = seat.endpoint, wish.rule
         parts = Parts.of(rule.kind, wish.local, wish.type_name)
-        services = tuple(endpoint.service(*part) for part in parts.services)
-        topics = tuple(endpoint.channel(*part) for part in parts.topics)
-        self._exchange = Exchange(rule.encoding, services, topics)
-        self._answers = [Serializer(each.response, rule.encoding) for each in services]
-        self._news = [Serializer(each, rule.encoding) for each in topics]
+        self._exchange = parts.known(endpoint, rule.encoding)
+        self._answers = [Serializer(each.response, rule.encoding) for each in self._exchange.services]
+        self._news = [Serializer(each, rule.encoding) for each in self._exchange.topics]
         self._mark = seat.advertise(self, sign(mark_of(wish.local), endpoint.ros))
         self._servers = [seat.dial(self, *part) for part in parts.services]
         self._topics = [
@@ -98,8 +96,7 @@ class ExposedService:
         elif isinstance(event, Heard):
             self._publish(event)
         elif isinstance(event, Faulted):
-            fault = Fault.NO_GRAPH if event.is_graph else Fault.REFUSED
-            self._site.faults.tell(self._wish.local, fault, event.reason)
+            self._site.tell(self._wish.local, event, Fault.REFUSED)
         else:
             assert isinstance(event, Described)  # what an action's topics are was known before
 

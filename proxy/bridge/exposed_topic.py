@@ -69,8 +69,7 @@ class ExposedTopic:
         elif isinstance(event, Described):
             self._describe(event.channel)
         elif isinstance(event, Faulted):
-            fault = Fault.NO_GRAPH if event.is_graph else Fault.QOS
-            self._site.faults.tell(self._wish.local, fault, event.reason)
+            self._site.tell(self._wish.local, event, Fault.QOS)
 
     def close(self, now_s: float) -> None:
         """Carry nothing any more."""

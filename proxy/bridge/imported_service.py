@@ -89,8 +89,7 @@ class ImportedService:
         if isinstance(event, Asked):
             self._ask(event, now_s)
         elif isinstance(event, Faulted):
-            fault = Fault.NO_GRAPH if event.is_graph else Fault.REFUSED
-            self._site.faults.tell(self._wish.local, fault, event.reason)
+            self._site.tell(self._wish.local, event, Fault.REFUSED)
 
     def tick(self, now_s: float) -> None:
         """Open or close the virtual server as far ones come and go; fail what waited too long."""
@@ -156,13 +155,11 @@ class ImportedService:
 
     def _description(self) -> bytes:
         """Return how this machine knows the service; empty where it must learn that from the far side."""
-        endpoint = self._seat.endpoint
         try:
-            services = tuple(endpoint.service(*part) for part in self._parts.services)
-            topics = tuple(endpoint.channel(*part) for part in self._parts.topics)
+            exchange = self._parts.known(self._seat.endpoint, self._wish.rule.encoding)
         except LocalError:
             return b""
-        return Exchange(self._wish.rule.encoding, services, topics).to_wire()
+        return exchange.to_wire()
 
     def _ours(self, theirs: Exchange) -> Exchange:
         """Return how this machine knows the service, from the far side's definitions where it does not by itself.

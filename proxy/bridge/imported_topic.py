@@ -86,8 +86,7 @@ class ImportedTopic:
         """Take what the endpoint says of the virtual publisher."""
         del now_s
         if isinstance(event, Faulted):
-            fault = Fault.NO_GRAPH if event.is_graph else Fault.QOS
-            self._site.faults.tell(self._wish.local, fault, event.reason)
+            self._site.tell(self._wish.local, event, Fault.QOS)
 
     def close(self, now_s: float) -> None:
         """Carry nothing any more."""

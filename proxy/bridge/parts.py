@@ -9,8 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from proxy.endpoints.endpoint import End
+from proxy.endpoints.endpoint import End, Endpoint
+from proxy.exchange import Exchange
 from proxy.qos import default
+from proxy.serial.serializer import Encoding
 
 __all__ = ["PROFILES", "RESULT", "Parts", "action_of", "is_part"]
 
@@ -43,6 +45,15 @@ class Parts:
             (f"{at}status", "action_msgs/msg/GoalStatusArray"),
         )
         return cls(services, topics)
+
+    def known(self, endpoint: Endpoint, encoding: Encoding) -> Exchange:
+        """Return how the endpoint's machine knows all parts.
+
+        Raises:
+            LocalError: it does not know one of them.
+        """
+        services = tuple(endpoint.service(*part) for part in self.services)
+        return Exchange(encoding, services, tuple(endpoint.channel(*part) for part in self.topics))
 
 
 def is_part(name: str) -> bool:

@@ -8,7 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gdp.client.member import Member
-from proxy.faults import Faults
+from proxy.endpoints.endpoint import Faulted
+from proxy.faults import Fault, Faults
 from proxy.traffic import Traffic
 
 __all__ = ["Site"]
@@ -21,3 +22,7 @@ class Site:
     member: Member
     traffic: Traffic
     faults: Faults
+
+    def tell(self, what: str, event: Faulted, fault: Fault) -> None:
+        """Tell what an endpoint says of a local name: ``fault``, unless it is the whole graph that cannot be had."""
+        self.faults.tell(what, Fault.NO_GRAPH if event.is_graph else fault, event.reason)
