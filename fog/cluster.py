@@ -1,0 +1,106 @@
+"""What is wanted of a cluster: which nodes, on which machines, known by which names; the supervisor's desired state.
+
+Place: pure. It is what a launch description comes to, and what the journal keeps as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Literal
+
+from fog.hardware import Hardware
+from gdp.errors import LocalError
+
+__all__ = ["Carried", "CloudNode", "ClusterPlan", "Wanted"]
+
+
+@dataclass(frozen=True, slots=True)
+class CloudNode:
+    """A ROS node that runs on every machine of the cluster.
+
+    Args:
+        package, executable: as ``ros2 run`` takes them; without such an installed package, the Python module
+            ``package.executable``.
+        arguments: after the executable; ``--ros-args`` (name, namespace, parameters, remappings) included.
+    """
+
+    package: str
+    executable: str
+    arguments: tuple[str, ...] = ()
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Carried:
+    """A service, action or topic that the cluster's nodes offer to the robot.
+
+    Args:
+        type_name: as ROS 2 writes it.
+        options: further keys of the rule on the robot's side, such as ``replication`` and ``timeout_s``.
+        served: further keys of the rule on the machines' side, such as ``stop`` and ``at_once``.
+    """
+
+    kind: Literal["topic", "service", "action"]
+    name: str
+    type_name: str
+    options: Mapping[str, object] = field(default_factory=dict)
+    served: Mapping[str, object] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """One replica's machine.
+
+    Args:
+        region: empty: chosen, a different one for each where that can be had.
+    """
+
+    hardware: Hardware
+    region: str = ""
+    is_spot: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ClusterPlan:
+    """A cluster.
+
+    Args:
+        idle_s: without a call for this long all machines are given back; None: never.
+        budget_usd: when its machines have cost this much, they are given back; None: no limit.
+    """
+
+    name: str
+    nodes: tuple[CloudNode, ...]
+    machines: tuple[Wanted, ...]
+    carried: tuple[Carried, ...] = ()
+    idle_s: float | None = None
+    budget_usd: float | None = None
+
+    def to_json(self) -> str:
+        """Return what ``from_json`` reads."""
+        return json.dumps(asdict(self), sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str) -> ClusterPlan:
+        """Read a plan.
+
+        Raises:
+            LocalError: it is none.
+        """
+        try:
+            items = json.loads(text)
+            nodes = [
+                CloudNode(each["package"], each["executable"], tuple(each["arguments"]), each["environment"])
+                for each in items["nodes"]
+            ]
+            machines = [
+                Wanted(Hardware(**each["hardware"]), each["region"], each["is_spot"]) for each in items["machines"]
+            ]
+            carried = [Carried(**each) for each in items["carried"]]
+            return cls(
+                items["name"], tuple(nodes), tuple(machines), tuple(carried), items["idle_s"], items["budget_usd"]
+            )
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise LocalError(f"not the plan of a cluster: {error!r}") from error

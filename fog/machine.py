@@ -1,0 +1,90 @@
+"""A machine of a cluster: what is asked of a provider, what it is to run, and what the provider says of it.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+
+from fog.offer import Offer
+
+__all__ = ["Boot", "Machine", "MachineSpec", "MachineState", "Program"]
+
+
+class MachineState(Enum):
+    """Where a machine is in its life."""
+
+    BOOTING = "booting"  # asked for; its programs may not be up
+    RUNNING = "running"  # its programs said that they are ready
+    LEAVING = "leaving"  # the provider gave notice, or it is being drained
+    GONE = "gone"
+
+
+@dataclass(frozen=True, slots=True)
+class MachineSpec:
+    """What a provider is asked for.
+
+    Args:
+        cluster: whose it is; providers tag machines with it, so that ``describe`` finds them without a journal.
+        name: unique within the cluster and never used again, such as ``m3``.
+        offer: which line of the price list: provider, region, type, spot or not.
+    """
+
+    cluster: str
+    name: str
+    offer: Offer
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """A process of a machine.
+
+    Args:
+        name: of its log, such as ``switch``.
+        argv: ``{home}`` in a word stands for the machine's folder, ``{python}`` for its Python.
+        ready: what a line of its output contains when it is up; empty: it is up when it runs.
+        environment: beside the machine's own.
+        restarts: whether it is started again when it ends; else its end ends the machine.
+    """
+
+    name: str
+    argv: tuple[str, ...]
+    ready: str = ""
+    environment: Mapping[str, str] = field(default_factory=dict)
+    restarts: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Boot:
+    """All that a machine needs to become what it is to be.
+
+    Args:
+        files: path below the machine's folder -> content. They hold private keys: mode 0600, folders 0700.
+        programs: started in this order, each when the one before is ready; ended in the reverse one.
+    """
+
+    files: Mapping[str, bytes]
+    programs: tuple[Program, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """What a provider says of a machine.
+
+    Args:
+        id: the provider's own name for it.
+        address: where people reach it; empty while there is none.
+        leaves_at_unix_s: when the provider will take it, once it has given notice.
+        reason: why it is leaving or gone, in a few words.
+    """
+
+    id: str
+    spec: MachineSpec
+    state: MachineState
+    started_unix_s: float
+    address: str = ""
+    leaves_at_unix_s: float | None = None
+    reason: str = ""

@@ -1,0 +1,31 @@
+"""What a provider sells: a type of machine, somewhere, at a price.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fog.hardware import Hardware
+
+__all__ = ["Offer"]
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """One line of a price list.
+
+    Args:
+        region: as the provider calls it.
+        type_name: of machine, as the provider calls it.
+        hardware: what it has.
+        is_spot: cheaper, and may be taken away.
+    """
+
+    provider: str
+    region: str
+    type_name: str
+    hardware: Hardware
+    is_spot: bool
+    usd_per_hour: float

@@ -1,0 +1,78 @@
+"""What the supervisor knows of a provider of machines.
+
+Place: interface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from fog.hardware import Hardware
+from fog.machine import Boot, Machine, MachineSpec
+from fog.offer import Offer
+
+__all__ = ["Provider"]
+
+
+class Provider(Protocol):
+    """Machines to be had somewhere. All calls may block for a while; none keeps state that a restart would miss.
+
+    Attributes:
+        name: as in offers and in ``fog.yaml``.
+        poll_s: how often ``describe`` is worth asking.
+    """
+
+    name: str
+    poll_s: float
+
+    def offers(self, hardware: Hardware, *, spot: bool) -> list[Offer]:
+        """Return the price list for what has enough, the cheapest first.
+
+        Raises:
+            StoreError: the provider cannot be asked now.
+        """
+        ...
+
+    def create(self, spec: MachineSpec, boot: Boot) -> str:
+        """Ask for a machine; return its id as soon as the provider has taken the request.
+
+        Raises:
+            StoreError: there is none to be had now; try again, or elsewhere.
+            LocalError: it will never be had this way: wrong credentials, quota, region.
+        """
+        ...
+
+    def describe(self, cluster: str) -> list[Machine]:
+        """Return all machines of a cluster that were not gone before, in any state: also those no journal knows.
+
+        A machine that ended is told as ``GONE`` for a while, or not at all.
+
+        Raises:
+            StoreError: the provider cannot be asked now.
+        """
+        ...
+
+    def terminate(self, ids: Sequence[str]) -> None:
+        """Give machines back; what is gone already is fine.
+
+        Raises:
+            StoreError: the provider cannot be asked now.
+        """
+        ...
+
+    def drain(self, machine: str) -> None:
+        """Let a machine's programs finish what is under way and take on nothing new."""
+        ...
+
+    def log(self, machine: str, program: str, lines: int) -> str:
+        """Return the last lines that a program of a machine wrote."""
+        ...
+
+    def shell(self, machine: str) -> list[str]:
+        """Return the command line that opens a shell on a machine."""
+        ...
+
+    def close(self) -> None:
+        """Let go of what the provider's adapter holds; machines stay."""
+        ...

@@ -1,0 +1,39 @@
+"""How a service's requests are spread over its replicas.
+
+Place: pure.
+Source: FogROS2-FT (all replicas, the first answer wins); hedged requests after Dean and Barroso, "The Tail at Scale",
+CACM 56(2), 2013.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final
+
+__all__ = ["ALL", "Mode", "Replication"]
+
+
+class Mode(Enum):
+    """Who gets a request at first."""
+
+    ALL = "all"  # every replica, by the tree: one copy on the client's link
+    SOME = "some"  # ``copies`` of them, those that answered fastest lately
+    HEDGED = "hedged"  # one; a second one after the 95th percentile of recent answers, within the budget
+
+
+@dataclass(frozen=True, slots=True)
+class Replication:
+    """What a rule says.
+
+    Args:
+        copies: with ``SOME``: how many replicas get each request.
+        budget: with ``HEDGED``: most second copies, as a share of requests.
+    """
+
+    mode: Mode = Mode.ALL
+    copies: int = 1
+    budget: float = 0.02
+
+
+ALL: Final = Replication()
