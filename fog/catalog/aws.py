@@ -1,0 +1,56 @@
+"""The price list of AWS EC2 for Linux, as shipped: on-demand list prices, and spot machines at their published savings.
+
+Place: reads one file of this package. ``scripts/make_catalog.py`` made it; the file says from what and of when.
+A price that was not known for sure is absent, not guessed.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import resources
+
+from fog.hardware import Hardware
+from fog.offer import Offer
+
+__all__ = ["AwsPrices", "aws_offers", "aws_prices"]
+
+
+@dataclass(frozen=True, slots=True)
+class AwsPrices:
+    """The list.
+
+    Args:
+        sources: what it was made from, and of when.
+        bands: what a machine's interruption band says in words, such as ``>20%`` of machines a month.
+        band: by region and type, an index into ``bands``.
+    """
+
+    offers: tuple[Offer, ...]
+    sources: tuple[str, ...]
+    bands: tuple[str, ...]
+    band: dict[tuple[str, str], int]
+
+
+@functools.cache
+def aws_prices() -> AwsPrices:
+    """Return the list; read once a process."""
+    items = json.loads(resources.files("fog.catalog").joinpath("aws.json").read_bytes())
+    types = {name: Hardware(*has) for name, has in items["types"].items()}
+    offers: list[Offer] = []
+    band: dict[tuple[str, str], int] = {}
+    for region, prices in items["regions"].items():
+        for name, (usd, savings_percent, interruptions) in prices.items():
+            offers.append(Offer("aws", region, name, types[name], False, usd))
+            if savings_percent is not None:
+                spot = round(usd * (1 - savings_percent / 100), 5)
+                offers.append(Offer("aws", region, name, types[name], True, spot))
+                band[region, name] = interruptions
+    return AwsPrices(tuple(offers), tuple(items["sources"]), tuple(items["bands"]), band)
+
+
+def aws_offers() -> Iterator[Offer]:
+    """Give every offer of the list."""
+    yield from aws_prices().offers

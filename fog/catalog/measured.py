@@ -1,0 +1,37 @@
+"""What was measured of spot machines, as shipped.
+
+Place: reads one file of this package, which ``scripts/make_catalog.py`` computed with ``fog.plan.trace``.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from importlib import resources
+
+from fog.plan.evidence import Measured, Pair
+
+__all__ = ["measured"]
+
+
+@functools.cache
+def measured() -> Measured:
+    """Return the measurements; read once a process."""
+    items = json.loads(resources.files("fog.catalog").joinpath("traces.json").read_bytes())
+    pairs = tuple(
+        Pair(
+            (each["zones"][0], each["zones"][1]),
+            each["free_together"],
+            each["taken_together"],
+            {int(span): ratio for span, ratio in each["outages_together"].items()},
+        )
+        for each in items["pairs"]
+    )
+    return Measured(
+        items["source"],
+        items["uptime_s"],
+        items["back_s"],
+        items["taken_share"],
+        pairs,
+        items["all_free_together"],
+    )

@@ -1,0 +1,171 @@
+"""What ``fog plan`` answers: pool, choice and price in one, with everything that was assumed on the way.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from fog.cluster import Wanted
+from fog.hardware import Hardware
+from fog.offer import Offer
+from fog.plan.choice import BY_BOTH, Choice, Weights, choose
+from fog.plan.correlation import joint_over_regions
+from fog.plan.duration import duration_text
+from fog.plan.evidence import Measured
+from fog.plan.failure import chance_down, joint
+from fog.plan.mix import Kind
+from fog.plan.pool import ON_DEMAND_DOWN, PAPER_RECOVERY_S, PAPER_UPTIME_S, Pool, Standing, pool_for
+
+__all__ = ["Answer", "Question", "answer"]
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """What is asked.
+
+    Args:
+        target: largest share of time without any replica.
+        uptime_s, recovery_s: None: the paper's worked example.
+        kinds: which machines may be added, of ``spot`` and ``on-demand``.
+        spot, on_demand: how many of each run already.
+        latency_ms: of regions, as measured from the robot.
+    """
+
+    target: float
+    hardware: Hardware
+    uptime_s: float | None = None
+    recovery_s: float | None = None
+    kinds: tuple[str, ...] = ("spot",)
+    spot: int = 0
+    on_demand: int = 0
+    latency_ms: Mapping[str, float] | None = None
+    weights: Weights = BY_BOTH
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The answer.
+
+    Args:
+        replicas: with those that run already.
+        p_vm: share of time for which one of the machines to be added is down; of a mixed pool, a spot machine.
+        p_system: share of time for which all replicas are down, placed as chosen: different regions are independent,
+            spot machines of one region are not.
+        factor: how often a pair of one region fails together, against independence.
+        choices: of the machines to be added.
+        independent: what the formula alone says.
+        as_recorded: the same, if machines stayed no longer than in the recorded traces.
+    """
+
+    replicas: int
+    p_vm: float
+    p_system: float
+    uptime_s: float
+    recovery_s: float
+    factor: float
+    choices: tuple[Choice, ...]
+    independent: Pool
+    as_recorded: Pool
+    assumptions: tuple[str, ...]
+
+    @property
+    def usd_per_hour(self) -> float:
+        """Of the machines to be added."""
+        return sum(choice.offer.usd_per_hour for choice in self.choices)
+
+
+def answer(question: Question, offers: Sequence[Offer], seen: Measured) -> Answer:
+    """Answer a question.
+
+    Raises:
+        LocalError: something asked for is out of bounds, or no machine of the list has enough.
+    """
+    uptime_s = question.uptime_s or PAPER_UPTIME_S
+    recovery_s = question.recovery_s or PAPER_RECOVERY_S
+    factor = seen.factors[1]
+    down = chance_down(uptime_s, recovery_s)
+    pool = _pool(question, offers, down, factor)
+    choices, p_system = _placed(question, offers, pool, down, factor)
+    assumptions = _assumptions(question, uptime_s, recovery_s, seen)
+    if p_system > question.target * (1 + 1e-9):
+        assumptions.append("the target is out of reach in so few regions, as far as those traces tell")
+    return Answer(
+        question.spot + question.on_demand + len(choices),
+        down if "spot" in question.kinds else ON_DEMAND_DOWN,
+        p_system,
+        uptime_s,
+        recovery_s,
+        factor,
+        tuple(choices),
+        pool,
+        _pool(question, offers, chance_down(seen.uptime_s, recovery_s), factor),
+        tuple(assumptions),
+    )
+
+
+def _placed(
+    question: Question, offers: Sequence[Offer], pool: Pool, down: float, factor: float
+) -> tuple[list[Choice], float]:
+    """Return where the pool goes, with further spot machines where it has to share regions, and what comes of it."""
+    more = dict(zip(question.kinds, pool.mix.more, strict=True))
+    steady = joint([down] * question.spot + [ON_DEMAND_DOWN] * (question.on_demand + more.get("on-demand", 0)))
+
+    def place(spots: int) -> tuple[list[Choice], float]:
+        wanted = [Wanted(question.hardware, is_spot=True)] * spots
+        wanted += [Wanted(question.hardware)] * more.get("on-demand", 0)
+        choices = choose(offers, wanted, question.latency_ms, question.weights)
+        regions: dict[str, list[float]] = {}
+        for choice in choices[:spots]:
+            regions.setdefault(choice.offer.region, []).append(down)
+        return choices, steady * joint_over_regions(regions, factor)
+
+    spots = more.get("spot", 0)
+    first = best = place(spots)
+    while best[1] > question.target * (1 + 1e-9) and "spot" in question.kinds:
+        spots += 1
+        one_more = place(spots)
+        if one_more[1] >= best[1]:
+            return first  # a further one in the same regions changes nothing
+        best = one_more
+    return best
+
+
+def _pool(question: Question, offers: Sequence[Offer], down: float, factor: float) -> Pool:
+    spot, on_demand = (
+        Kind(name, chance, _cheapest(question, offers, spot=name == "spot") if name in question.kinds else 0.0)
+        for name, chance in (("spot", down), ("on-demand", ON_DEMAND_DOWN))
+    )
+    standing = Standing((down,) * question.spot, (ON_DEMAND_DOWN,) * question.on_demand)
+    if question.kinds == ("on-demand",):
+        return pool_for(question.target, on_demand, None, 1.0, standing)
+    return pool_for(question.target, spot, on_demand if "on-demand" in question.kinds else None, factor, standing)
+
+
+def _cheapest(question: Question, offers: Sequence[Offer], *, spot: bool) -> float:
+    wanted = Wanted(question.hardware, is_spot=spot)
+    return choose(offers, [wanted], question.latency_ms, question.weights)[0].offer.usd_per_hour
+
+
+def _assumptions(question: Question, uptime_s: float, recovery_s: float, seen: Measured) -> list[str]:
+    paper = "the worked example of FogROS2-FT, which is not a measurement"
+    low, high = seen.factors
+    said = [
+        f"a spot machine serves for {duration_text(uptime_s)} on average" + ("" if question.uptime_s else f": {paper}"),
+        f"{duration_text(recovery_s)} after it is taken another one serves"
+        + ("" if question.recovery_s else f": {paper}"),
+        "machines in different regions fail independently: there are no data that say so, or otherwise",
+        f"machines in one region fail together {low:g} to {high:g} times as often as independent ones; counted with "
+        f"{high:g}; {seen.source}",
+        f"in those traces a spot machine stayed for {duration_text(seen.uptime_s)} on average",
+    ]
+    if "on-demand" in question.kinds or question.on_demand:
+        said.append(
+            f"an on-demand machine is down {ON_DEMAND_DOWN:.1%} of the time: all that AWS's service level agreement "
+            "promises for one; on-demand machines fail independently"
+        )
+    if question.spot:
+        said.append("spot machines that run already are in regions of their own")
+    return said

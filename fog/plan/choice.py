@@ -1,0 +1,149 @@
+"""Which offer for which replica: by price and measured latency, in different regions where that can be had.
+
+Place: pure. Money and milliseconds are made comparable by one number that people can set: what a millisecond is worth.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from fog.cluster import Wanted
+from fog.hardware import Hardware
+from fog.offer import Offer
+from gdp.errors import LocalError
+
+__all__ = ["BY_BOTH", "BY_PRICE", "Choice", "Weights", "choose"]
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """What counts.
+
+    Args:
+        usd_per_hour_per_ms: what a replica that is one millisecond nearer may cost more.
+        spreads: whether replicas go to different regions first of all, and then by price and latency.
+    """
+
+    usd_per_hour_per_ms: float = 0.001
+    spreads: bool = True
+
+
+BY_BOTH: Final = Weights()
+BY_PRICE: Final = Weights(usd_per_hour_per_ms=0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """An offer, and why this one.
+
+    Args:
+        score: the lower the better: USD an hour, with the latency's price.
+    """
+
+    offer: Offer
+    score: float
+    why: str
+
+
+def choose(
+    offers: Sequence[Offer],
+    wanted: Sequence[Wanted],
+    latency_ms: Mapping[str, float] | None = None,
+    weights: Weights = BY_BOTH,
+    used: Sequence[str] = (),
+    avoid: Sequence[str] = (),
+) -> list[Choice]:
+    """Return one choice for each machine wanted, in their order.
+
+    Args:
+        latency_ms: of regions as measured from the robot; one without a figure counts as the slowest measured one.
+        used: regions of replicas that stand already, one entry for each.
+        avoid: regions to take only where nothing else is to be had, as after a preemption there.
+
+    Raises:
+        LocalError: nothing fits; the text names what comes nearest.
+    """
+    regions = Counter(used)
+    choices: dict[int, Choice] = {}
+    # Those that may not choose go first, so that the others keep away from them.
+    for at in sorted(range(len(wanted)), key=lambda index: not wanted[index].region):
+        choice = _best(offers, wanted[at], latency_ms or {}, weights, regions, frozenset(avoid))
+        choices[at] = choice
+        regions[choice.offer.region] += 1
+    return [choices[at] for at in range(len(wanted))]
+
+
+def _best(
+    offers: Sequence[Offer],
+    wanted: Wanted,
+    latency_ms: Mapping[str, float],
+    weights: Weights,
+    regions: Counter[str],
+    avoid: frozenset[str],
+) -> Choice:
+    allowed = [offer for offer in offers if offer.is_spot == wanted.is_spot and wanted.region in ("", offer.region)]
+    fitting = [offer for offer in allowed if wanted.hardware.fits(offer.hardware)]
+    if not fitting:
+        raise LocalError(_nearest(wanted, allowed, offers))
+    slowest_ms = max(latency_ms.values(), default=0.0)
+
+    def score(offer: Offer) -> float:
+        return offer.usd_per_hour + weights.usd_per_hour_per_ms * latency_ms.get(offer.region, slowest_ms)
+
+    def order(offer: Offer) -> tuple[bool, int, float, str, str]:
+        taken = regions[offer.region] if weights.spreads else 0
+        return offer.region in avoid, taken, score(offer), offer.region, offer.type_name
+
+    best = min(fitting, key=order)
+    return Choice(best, score(best), _why(best, fitting, wanted, latency_ms, regions, avoid))
+
+
+def _why(
+    best: Offer,
+    fitting: Sequence[Offer],
+    wanted: Wanted,
+    latency_ms: Mapping[str, float],
+    regions: Counter[str],
+    avoid: frozenset[str],
+) -> str:
+    there = {offer.region for offer in fitting}
+    places = f"{len(there)} regions" if len(there) > 1 else best.region
+    words = [f"lowest of {len(fitting)} offers in {places} by price and latency"]
+    if wanted.region:
+        words = [f"lowest of {len(fitting)} offers in {wanted.region}, which was asked for"]
+    elif regions[best.region]:
+        words.append(f"{best.region} has {regions[best.region]} already, as has every other that fits")
+    elif taken := sorted(there & regions.keys()):
+        words.append(f"away from {', '.join(taken)}")
+    if kept := sorted(there & avoid - {best.region}):
+        words.append(f"not {', '.join(kept)}, to be avoided now")
+    if latency_ms:
+        known = latency_ms.get(best.region)
+        words.append("latency not measured" if known is None else f"{known:g} ms away")
+    if (cheapest := min(offer.usd_per_hour for offer in fitting)) < best.usd_per_hour:
+        words.append(f"{best.usd_per_hour - cheapest:.4f} USD an hour above the cheapest")
+    return "; ".join(words)
+
+
+def _nearest(wanted: Wanted, allowed: Sequence[Offer], offers: Sequence[Offer]) -> str:
+    kind = "spot" if wanted.is_spot else "on-demand"
+    asked = f"no {kind} machine with {wanted.hardware.to_text()}" + (f" in {wanted.region}" if wanted.region else "")
+    if elsewhere := sorted(
+        {o.region for o in offers if o.is_spot == wanted.is_spot and wanted.hardware.fits(o.hardware)}
+    ):
+        return f"{asked}; there is in {', '.join(elsewhere)}"
+    if not allowed:
+        return f"{asked}; nothing at all is offered like that"
+    near = min(allowed, key=lambda offer: (_lacks(wanted.hardware, offer.hardware), offer.usd_per_hour))
+    return f"{asked}; the nearest is {near.type_name} in {near.region} with {near.hardware.to_text()}"
+
+
+def _lacks(wanted: Hardware, has: Hardware) -> float:
+    """Return how far short it falls: the sum of what is missing, each as a share of what is wanted."""
+    gpus = has.gpus if has.gpu == wanted.gpu else has.gpus / 2  # another model is nearer than none
+    pairs = ((wanted.cpus, has.cpus), (wanted.memory_gib, has.memory_gib), (wanted.gpus, gpus))
+    return math.fsum(max(0.0, 1 - there / want) for want, there in pairs if want)

@@ -1,0 +1,45 @@
+"""What a set-up costs, by the hour and the month, beside others: the form of the paper's Table I.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from fog.offer import Offer
+
+__all__ = ["HOURS_A_MONTH", "Bill", "compared"]
+
+HOURS_A_MONTH: Final = 730.0  # 365 days of 24 hours, over 12
+
+
+@dataclass(frozen=True, slots=True)
+class Bill:
+    """A set-up and its price.
+
+    Args:
+        of_single: its price over that of a single on-demand machine.
+    """
+
+    what: str
+    usd_per_hour: float
+    of_single: float
+
+    @property
+    def usd_per_month(self) -> float:
+        """For a month of running all the time."""
+        return self.usd_per_hour * HOURS_A_MONTH
+
+
+def compared(on_demand: Offer, spot: Offer) -> tuple[Bill, Bill, Bill]:
+    """Return the bills of a single on-demand machine, of two of those, and of two spot machines."""
+    single = on_demand.usd_per_hour
+    rows = (
+        ("one on-demand machine", single),
+        ("two on-demand machines", 2 * single),
+        ("two spot machines", 2 * spot.usd_per_hour),
+    )
+    one, two, two_spot = (Bill(what, usd, usd / single if single else 1.0) for what, usd in rows)
+    return one, two, two_spot

@@ -1,0 +1,38 @@
+"""Spans of time as people write them: ``15h``, ``20min``, ``90s``.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+from gdp.errors import LocalError
+
+__all__ = ["duration_text", "seconds_from_text"]
+
+_UNITS_S: Final = {"d": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0}
+
+
+def seconds_from_text(text: str) -> float:
+    """Read one or more numbers with units, the larger unit first: ``1h30min``, ``0.5h``; a bare number is seconds.
+
+    Raises:
+        LocalError: anything else, or nothing at all.
+    """
+    if re.fullmatch(r"\d+(?:\.\d+)?", text):
+        return float(text)
+    pattern = "".join(rf"(?:(?P<{unit}>\d+(?:\.\d+)?){unit})?" for unit in _UNITS_S)
+    match = re.fullmatch(pattern, text)
+    if not match or not text:
+        raise LocalError(f"{text!r}: expected a span of time such as 15h, 20min, 90s or 1h30min")
+    return sum(float(number) * _UNITS_S[unit] for unit, number in match.groupdict().items() if number)
+
+
+def duration_text(seconds: float) -> str:
+    """Return a span in its largest unit that keeps it above one, with at most two decimals."""
+    for unit, unit_s in _UNITS_S.items():
+        if seconds >= unit_s:
+            return f"{round(seconds / unit_s, 2):g}{unit}"
+    return f"{seconds:g}s"

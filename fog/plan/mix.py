@@ -1,0 +1,86 @@
+"""Pools of different machines: how many of which kind reach a target for the least money, given some that run already.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from fog.plan.failure import joint, replicas_needed
+from gdp.errors import LocalError
+
+__all__ = ["Kind", "Mix", "cheapest_mix"]
+
+_MOST_MIXES: Final = 200_000
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of machine that a pool can have.
+
+    Args:
+        chance: that one is down, in (0, 1), independent of all others.
+        usd_per_hour: of one; not negative.
+    """
+
+    name: str
+    chance: float
+    usd_per_hour: float
+
+
+@dataclass(frozen=True, slots=True)
+class Mix:
+    """A pool.
+
+    Args:
+        more: how many of each kind to add, in the order of the kinds asked about.
+        chance: that all machines, old and new, are down at once.
+        usd_per_hour: of the new ones.
+    """
+
+    more: tuple[int, ...]
+    chance: float
+    usd_per_hour: float
+
+
+def cheapest_mix(kinds: Sequence[Kind], target: float, have: Sequence[float] = (), least: int = 1) -> Mix:
+    """Return what to add; of mixes with one price the one with fewer machines, then the safer one.
+
+    Args:
+        target: largest joint chance accepted, in (0, 1).
+        have: the chances of machines that are there already.
+        least: fewest machines in all.
+
+    Raises:
+        LocalError: no kinds, a chance or the target outside (0, 1), or more combinations than can be looked through.
+    """
+    if not kinds or any(kind.usd_per_hour < 0 for kind in kinds):
+        raise LocalError("expected at least one kind of machine, and no negative price")
+    if not 0 < target < 1:
+        raise LocalError(f"target {target:g}: expected a number between 0 and 1")
+    already = joint(have)
+    floor = max(0, least - len(have))
+    most = [max(floor, _alone(kind, target, already)) for kind in kinds]
+    if math.prod(each + 1 for each in most) > _MOST_MIXES:
+        raise LocalError(f"up to {most} machines of {len(kinds)} kinds: ask for fewer kinds, or for less")
+    mixes = (
+        Mix(
+            more,
+            already * joint(kind.chance**count for kind, count in zip(kinds, more, strict=True)),
+            sum(kind.usd_per_hour * count for kind, count in zip(kinds, more, strict=True)),
+        )
+        for more in itertools.product(*(range(each + 1) for each in most))
+        if sum(more) >= floor
+    )
+    enough = (mix for mix in mixes if mix.chance <= target * (1 + 1e-9))
+    return min(enough, key=lambda mix: (round(mix.usd_per_hour, 9), sum(mix.more), mix.chance))
+
+
+def _alone(kind: Kind, target: float, already: float) -> int:
+    """Return how many of one kind are enough without any other."""
+    return 0 if already <= target else replicas_needed(kind.chance, target / already)

@@ -1,0 +1,176 @@
+"""Table I: what one on-demand machine costs against two of them and against two spot machines.
+
+Place: command; reads the price list of this package, prints a table, writes ``docs/experiments/table1.{md,png,json}``.
+
+    python scripts/experiments/table1.py                         # everything, under 5 seconds
+    python scripts/experiments/table1.py --region us-west-2 --json --no-write
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+from rich.console import Console
+from rich.table import Column, Table
+
+from fog.catalog.aws import aws_prices
+from fog.offer import Offer
+from fog.plan.cost import Bill, compared
+from gdp.cli.node import failing_clearly
+from gdp.errors import LocalError
+
+PAGES: Final = Path(__file__).parents[2] / "docs/experiments"
+TYPES: Final = ("c5.4xlarge", "c6i.4xlarge", "m6i.4xlarge", "r5.16xlarge", "t3.xlarge", "g4dn.xlarge", "p3.2xlarge")
+PAPER: Final = (
+    "The paper's abstract claims up to 2.2 times lower cost for motion planning. The figures of its Table I are not at "
+    "hand here, so they do not stand beside ours."
+)
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A machine type's three bills."""
+
+    type_name: str
+    bills: tuple[Bill, Bill, Bill]
+    taken_a_month: str
+
+    @property
+    def times_cheaper(self) -> float:
+        """How many times less two spot machines cost than one on-demand machine; below 1: they cost more."""
+        return 1 / self.bills[2].of_single
+
+
+@app.command(epilog="Example: python scripts/experiments/table1.py --region us-east-1")
+def table1(
+    region: Annotated[str, typer.Option(help="of AWS")] = "us-east-1",
+    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
+    write: Annotated[bool, typer.Option("--write/--no-write", help="the page, the picture and the JSON")] = True,
+) -> None:
+    """Compare the cost of one on-demand machine, two on-demand machines and two spot machines."""
+    with failing_clearly():
+        rows = bills(region)
+        document = {
+            "region": region,
+            "sources": aws_prices().sources,
+            "rows": [asdict(row) | {"times_cheaper": round(row.times_cheaper, 2)} for row in rows],
+        }
+        if as_json:
+            print(json.dumps(document))
+        else:
+            Console(width=120).print(_table(region, rows))
+        if write:
+            PAGES.mkdir(parents=True, exist_ok=True)
+            (PAGES / "table1.json").write_text(json.dumps(document, indent=1) + "\n")
+            (PAGES / "table1.md").write_text(page(region, rows))
+            _draw(PAGES / "table1.png", region, rows)
+
+
+def bills(region: str) -> list[Row]:
+    """Return the rows of the types that have both prices there.
+
+    Raises:
+        LocalError: none has.
+    """
+    prices = aws_prices()
+    offers: dict[tuple[str, bool], Offer] = {
+        (offer.type_name, offer.is_spot): offer for offer in prices.offers if offer.region == region
+    }
+    rows = [
+        Row(name, compared(offers[name, False], offers[name, True]), prices.bands[prices.band[region, name]])
+        for name in TYPES
+        if (name, False) in offers and (name, True) in offers
+    ]
+    if not rows:
+        raise LocalError(
+            f"no prices of {region}: expected one of {', '.join(sorted({o.region for o in prices.offers}))}"
+        )
+    return rows
+
+
+def page(region: str, rows: Sequence[Row]) -> str:
+    """Return the page, in Markdown."""
+    best = max(rows, key=lambda row: row.times_cheaper)
+    worst = min(rows, key=lambda row: row.times_cheaper)
+    lines = [
+        "# Table I: the price of a replica",
+        "",
+        "Made by `python scripts/experiments/table1.py`; USD an hour, and a month of 730 hours.",
+        "",
+        f"| {region} | one on-demand | two on-demand | two spot | a month: one | two | two spot "
+        "| two spot cost | taken a month |",
+        "|---|--:|--:|--:|--:|--:|--:|--:|--:|",
+    ]
+    for row in rows:
+        hours = " | ".join(f"{bill.usd_per_hour:.4f}" for bill in row.bills)
+        months = " | ".join(f"{bill.usd_per_month:,.2f}" for bill in row.bills)
+        lines.append(f"| {row.type_name} | {hours} | {months} | {_against(row)} | {row.taken_a_month} |")
+    lines += [
+        "",
+        "![prices](table1.png)",
+        "",
+        f"Two spot machines cost between {best.bills[2].of_single:.2f} ({best.type_name}) and "
+        f"{worst.bills[2].of_single:.2f} ({worst.type_name}) of what one on-demand machine costs: at best "
+        f"{best.times_cheaper:.1f} times less. They cost less as soon as the savings pass 50 %.",
+        "",
+        PAPER,
+        "",
+        "Sources: " + "; ".join(aws_prices().sources) + ". Spot = on-demand × (1 − savings); the advisor's savings are "
+        "averages in whole percent, and traffic and disks are not in the price.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _against(row: Row) -> str:
+    return f"{row.bills[2].of_single:.2f} ×"
+
+
+def _table(region: str, rows: Sequence[Row]) -> Table:
+    headers = (
+        "one /h",
+        "two /h",
+        "two spot /h",
+        "one /month",
+        "two /month",
+        "two spot /month",
+        "of one",
+        "taken a month",
+    )
+    table = Table(f"{region}, USD", *(Column(header, justify="right") for header in headers))
+    for row in rows:
+        hours = (f"{bill.usd_per_hour:.4f}" for bill in row.bills)
+        months = (f"{bill.usd_per_month:,.2f}" for bill in row.bills)
+        table.add_row(row.type_name, *hours, *months, _against(row), row.taken_a_month)
+    return table
+
+
+def _draw(path: Path, region: str, rows: Sequence[Row]) -> None:
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axis = plt.subplots(figsize=(8, 4), layout="constrained")
+    for at, colour in enumerate(("#99a8b2", "#5d6b75", "#1f6f8b")):
+        places = [place + (at - 1) * 0.27 for place in range(len(rows))]
+        axis.bar(places, [row.bills[at].of_single for row in rows], 0.25, color=colour, label=rows[0].bills[at].what)
+    axis.axhline(1, color="#222222", lw=0.7)
+    axis.set_xticks(range(len(rows)), [row.type_name for row in rows], fontsize=8)
+    axis.set_ylabel("price, of one on-demand machine")
+    axis.set_title(f"AWS {region}", loc="left", fontsize=10)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.set_ylim(0, 2.6)
+    axis.legend(fontsize=8, frameon=False, ncols=3, loc="upper left")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    app()

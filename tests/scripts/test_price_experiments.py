@@ -1,0 +1,49 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from gdp.errors import LocalError
+from scripts.experiments import availability, table1
+
+needs_traces = pytest.mark.skipif(not availability.SPOT.is_dir(), reason="no ../shared/data/spot here")
+
+
+def test_table_one_compares_three_ways_to_run_a_service() -> None:
+    result = CliRunner().invoke(table1.app, ["--json", "--no-write"])
+    (first, *_) = json.loads(result.stdout)["rows"]
+    assert [bill["of_single"] for bill in first["bills"][:2]] == [1.0, 2.0]
+    assert first["bills"][2]["of_single"] < 1 < first["times_cheaper"]
+
+
+def test_a_region_without_prices_is_refused() -> None:
+    with pytest.raises(LocalError, match="us-east-1"):
+        table1.bills("mars")
+
+
+def test_the_page_of_table_one_is_of_the_shipped_prices() -> None:
+    shown = Path(table1.PAGES / "table1.md").read_text()
+    assert shown == table1.page("us-east-1", table1.bills("us-east-1"))
+
+
+@needs_traces
+def test_replayed_pools_are_up_more_with_more_replicas() -> None:
+    cases = list(availability.replay(availability.recorded(), 300, np.random.default_rng(1)))
+    for way in availability.WAYS:
+        nested = [case for case in cases if case.way == way and (way == "moves" or "bcd".startswith(case.zones))]
+        shares = [case.none_up.share for case in sorted(nested, key=lambda case: case.replicas)]
+        assert len(shares) == 3
+        assert shares == sorted(shares, reverse=True)
+
+
+@needs_traces
+def test_zones_that_wait_for_machines_fail_together_more_often_than_independent_ones() -> None:
+    cases = availability.replay(availability.recorded(), 34, np.random.default_rng(1))
+    for case in cases:
+        if case.way == "stays" and case.replicas > 1:
+            assert case.independent is not None
+            assert case.none_up.share > case.independent
