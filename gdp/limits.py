@@ -37,6 +37,9 @@ PROBE_MIN_S: Final = 0.03
 PROBE_MAX_S: Final = 0.25
 REPORT_IDLE_S: Final = 1.0  # a live reader reports at least this often
 READER_LEASE_S: Final = 6.0  # a reader that does not report for this long no longer holds its publisher
+CALL_LAG_S: Final = 1.0  # ... or of requests, that has not confirmed in this time what another server has
+CALL_IDLE_S: Final = 0.5  # a live server reports at least this often to its clients
+CALL_QUIET_S: Final = 2.0  # a server that does not report for this long is no peer meanwhile
 NACKS_PER_REPORT: Final = 24  # ranges: a report, sealed and alone in its frame, fits the smallest link there may be
 
 # Control plane

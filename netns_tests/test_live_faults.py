@@ -92,10 +92,11 @@ def flows(a: Peer, b: Peer) -> None:
 
 def tells(proxy: Proxy, name: str, fault: str) -> str:
     """Wait until a proxy has warned of a fault, once, in its log, and counted it in its metrics; return the detail."""
-    until(lambda: any(each.startswith(fault + ": ") for each in proxy.warnings(name)), f"{fault} of {name}")
-    (warning,) = proxy.warnings(name)
+    until(lambda: proxy.warnings(name), f"{fault} of {name}")
+    warnings = proxy.warnings(name)
+    assert [warning.partition(": ")[0] for warning in warnings] == [fault], warnings
     assert proxy.faults(fault) > 0
-    return warning.removeprefix(fault + ": ")
+    return warnings[0].removeprefix(fault + ": ")
 
 
 def test_a_type_that_the_far_machine_has_not(pair: Pair, a: Peer, b: Peer) -> None:

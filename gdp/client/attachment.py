@@ -39,6 +39,7 @@ __all__ = ["Attachment", "Claimed"]
 
 CLAIM_LEASE_S: Final = 24.0
 _CLAIM_AGAIN_S: Final = 0.5  # until it is judged
+_ECHO_S: Final = 0.02  # the greeter answers a new session within this time
 _RTCERT_S: Final = 600
 
 
@@ -200,8 +201,10 @@ class Attachment:
         self._switch_nonce = b"" if best is None else best.nonce
         if best is not None and not is_same:
             self._rtcert = b""
+            echo_at_s = self.greeter.ports[best.port].hello_at_s
+            claim_at_s = echo_at_s if echo_at_s <= now_s + _ECHO_S else now_s  # what comes before our echo is dropped
             for each in self._claims.values():
-                each.claim_at_s, each.is_taken, each.refused, each.join_sequence = now_s, False, None, -1
+                each.claim_at_s, each.is_taken, each.refused, each.join_sequence = claim_at_s, False, None, -1
 
     def _claim_wire(self, each: Claimed, now: Instant) -> bytes:
         assert self._switch is not None

@@ -94,6 +94,7 @@ class Feed:
         self._report_at_s = now_s
         self._unreported_bytes = 0
         self._clean_bytes = 0  # reported since something was last missing
+        self.idle_s = REPORT_IDLE_S  # it reports at least so often
         self.claim = b""  # of the publisher, the newest
         self.claim_sequence = 0
         self.lost = 0  # at least: of a bundle that did not come nobody knows how many were in it
@@ -156,7 +157,7 @@ class Feed:
         missing = self._missing() if self._is_reliable else ()
         if missing:
             self._clean_bytes = 0
-        self._report_at_s = now_s + (REPORT_DELAY_S if missing else REPORT_IDLE_S)
+        self._report_at_s = now_s + (REPORT_DELAY_S if missing else self.idle_s)
         part = self._data.progress(self._expected)
         return self._note.seal(Report(ReportFlag.NONE, self._expected, part, missing).to_wire())
 

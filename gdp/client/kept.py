@@ -16,10 +16,11 @@ class Kept(SendWindow):
     Args:
         keep_last: messages that are kept for late joiners, acknowledged or not.
         newest: the highest number that was used before.
+        lag_s: as for every window.
     """
 
-    def __init__(self, keep_last: int, newest: int) -> None:
-        super().__init__(keep_last)
+    def __init__(self, keep_last: int, newest: int, lag_s: float) -> None:
+        super().__init__(keep_last, lag_s=lag_s)
         self._newest = newest
 
     def keep(self, last: int, newest: int) -> None:

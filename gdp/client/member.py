@@ -3,8 +3,8 @@
 Place: pure; a shell or a simulated network feeds it frames and time, and takes out frames and messages.
 
 The walk of a message out: ``publish`` -> Publisher (number, seal, keep) -> the switch. And in: DATA or STATUS -> the
-feed of its topic and source -> ``take_messages``. Whoever serves or calls a name both publishes and reads it; a server
-has a private stream to each client besides, for its answers.
+feed of its topic and source -> ``take_messages``. Whoever serves or calls a name both publishes and reads it; what a
+server answers one client, and what a client asks one server, goes by private streams.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from gdp.client.feed import Feed, FeedState, Reader
 from gdp.client.private import Life
 from gdp.client.publications import Publications
 from gdp.client.publisher import Publisher
+from gdp.client.readers import CALLS, TOPICS
 from gdp.client.source import Source
 from gdp.client.subscription import Message, Subscription, Subscriptions, Topic
 from gdp.control.join import Join
@@ -30,12 +31,14 @@ from gdp.effects import Arrival, Instant, Transmit
 from gdp.errors import DropReason, LocalError, RemoteError, StatementError
 from gdp.frame.codec import Header, decode
 from gdp.frame.kinds import CONTROL_FROM, Kind
+from gdp.limits import HELLO_S
 from gdp.names import Name
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.verifier import ClaimVerifier
 
 _FOR_FEEDS: Final = (int(Kind.DATA), int(Kind.STATUS))
+_STALL_S: Final = 2 * HELLO_S  # a member that is not called for longer, though hellos are due, had no time
 
 __all__ = ["Member", "Message", "Topic"]
 
@@ -56,6 +59,7 @@ class Member:
         self._messages: list[Message] = []
         self._under_way: tuple[Feed, Subscription] | None = None  # whose next part is expected
         self._now_s = 0.0
+        self._awake_s = 0.0  # since when this member has had time
         self._drops: Counter[DropReason] = Counter()
         self.attachment = Attachment(identity, policy, settings)
         self.attachment.claim(identity.subject, Right.ATTACH, (), is_global=True)
@@ -105,22 +109,16 @@ class Member:
         self._claim(topic, Right.PUBLISH, is_global=is_global)
         return publisher
 
-    def serve(
-        self, topic: Topic, description: bytes, *, is_global: bool = True, urgent: bool = False
-    ) -> Publisher:
+    def serve(self, topic: Topic, description: bytes, *, is_global: bool = True, urgent: bool = False) -> Publisher:
         """Serve a name from now on; return the stream that all its clients hear. ``answer`` reaches one of them.
 
         Raises:
             LocalError: not delegated to this member, no secret for it, or the name is in use here.
         """
-        publisher = self._take_part(topic, Right.SERVE, description, is_global=is_global, urgent=urgent)
-        self._publications.serve(topic.name, topic.secrets, urgent=urgent)
-        return publisher
+        return self._take_part(topic, Right.SERVE, description, is_global=is_global, urgent=urgent)
 
-    def call(
-        self, topic: Topic, description: bytes, *, is_global: bool = True, urgent: bool = False
-    ) -> Publisher:
-        """Call a name from now on; return the stream of requests, that all its servers hear.
+    def call(self, topic: Topic, description: bytes, *, is_global: bool = True, urgent: bool = False) -> Publisher:
+        """Call a name from now on; return the stream of requests, that all its servers hear. ``ask`` reaches one.
 
         A request that is published while ``peers`` is empty reaches nobody.
 
@@ -133,18 +131,28 @@ class Member:
         """Send a message to one client of a name that is served here.
 
         Raises:
-            LocalError: that client is not known (any more), or there are too many; or the message is above the limits.
+            LocalError: that client is not heard (any more), or there are too many; or the message is above the limits.
         """
-        self._publications.answer(service, client, message, self._now_s)
+        self._tell(Right.SERVE, service, client, message)
+
+    def ask(self, service: Name, server: Name, message: bytes) -> None:
+        """Send a request to one server of a name that is called here, beside the stream that all of them hear.
+
+        Raises:
+            LocalError: that server is not heard (any more), or there are too many; or the message is above the limits.
+        """
+        self._tell(Right.CALL, service, server, message)
 
     def peers(self, service: Name) -> list[Name]:
-        """Return the servers of a name called here, or the clients of one served here, that hear us and are heard."""
+        """Return the servers of a name called here, or the clients of one served here, that are heard and follow.
+
+        A server that falls behind the others, or is silent for ``CALL_QUIET_S``, is none until it confirms again.
+        """
         publisher = self._publications.get(service)
-        return [
-            feed.publisher
-            for feed in self.feeds_of(service)
-            if feed.state is FeedState.LIVE and publisher is not None and publisher.has_reader(feed.publisher)
-        ]
+        if publisher is None:
+            return []
+        heard = [feed.publisher for feed in self.feeds_of(service) if feed.state is FeedState.LIVE]
+        return [party for party in heard if publisher.is_followed_by(party, self._now_s, self._awake_s)]
 
     def withdraw(self, name: Name) -> None:
         """Publish, serve or call a name no more; what is not, is not.
@@ -196,18 +204,18 @@ class Member:
         return list(self._publications)
 
     def feeds(self) -> Iterator[Feed]:
-        """Yield what is being read: a feed for each publisher of each topic, and for each server's answers."""
+        """Yield what is being read: a feed for each publisher of each topic, and for what comes privately."""
         for subscription in self._subscriptions:
             yield from subscription.all()
 
     def feeds_of(self, topic: Name) -> list[Feed]:
-        """Return the feeds of one topic, those of answers apart."""
+        """Return the feeds of one topic, private ones apart."""
         subscription = self._subscriptions.get(topic)
         return [] if subscription is None else list(subscription.feeds.values())
 
     def receive(self, arrivals: Sequence[Arrival], now: Instant) -> None:
         """Take frames in."""
-        self._now_s = now.mono_s
+        self._look_at_clock(now.mono_s)
         fed: dict[Feed, Subscription] = {}
         at = 0
         while at < len(arrivals):
@@ -252,7 +260,7 @@ class Member:
     def timeout(self, now: Instant) -> None:
         """Do what is due."""
         self.attachment.timeout(now)
-        self._now_s = now.mono_s
+        self._look_at_clock(now.mono_s)
         self._publications.timeout(now.mono_s)
         for feed in self._feeds_due.take_due(now.mono_s):
             feed.timeout(now.mono_s)
@@ -263,7 +271,7 @@ class Member:
         """Hand what publishers and feeds have ready to the switch."""
         if self.attachment.switch is None:
             return
-        self._now_s = now_s
+        self._look_at_clock(now_s)
         for frames in self._turns.take(now_s):
             self.attachment.send(frames)
         for feed in self._reporting:
@@ -315,19 +323,32 @@ class Member:
         delegation = topic.delegation
         self.attachment.claim(delegation.subject, right, delegation.chain, is_global=is_global)
 
-    def _take_part(
-        self, topic: Topic, right: Right, description: bytes, *, is_global: bool, urgent: bool
-    ) -> Publisher:
+    def _take_part(self, topic: Topic, right: Right, description: bytes, *, is_global: bool, urgent: bool) -> Publisher:
         is_free = topic.name not in self._publications and self._subscriptions.get(topic.name) is None
         self._check(topic, right, is_free=is_free)
-        publisher = self._publications.begin(topic.name, topic.secrets, description, reliable=True, urgent=urgent)
+        publisher = self._publications.begin(
+            topic.name, topic.secrets, description,
+            reliable=True, urgent=urgent, patience=CALLS if right is Right.CALL else TOPICS,
+        )  # fmt: skip
+        self._publications.begin_private(topic.name, topic.secrets, urgent=urgent)
         self._subscriptions.add(topic, right)
         self._claim(topic, right, is_global=is_global)
         return publisher
 
+    def _look_at_clock(self, now_s: float) -> None:
+        if now_s - self._now_s > _STALL_S:
+            self._awake_s = now_s  # what the others said meanwhile is still to be read
+        self._now_s = now_s
+
+    def _tell(self, right: Right, service: Name, party: Name, message: bytes) -> None:
+        subscription = self._subscriptions.get(service)
+        if subscription is None or subscription.right is not right:
+            raise LocalError(f"no {right.value} of {service.short} here")
+        self._publications.tell(service, party, message, self._now_s)
+
     def _feed(self, header: Header, frame: bytes, now_s: float, fed: dict[Feed, Subscription]) -> None:
         """Give a frame to the feed that it is for, and note that one."""
-        found = self._subscriptions.find(header)
+        found = self._subscriptions.find(header, now_s)
         if found is None:
             self._drops[DropReason.NOT_FOR_US] += 1
             return
@@ -352,10 +373,10 @@ class Member:
             self._close(change.ended)
             self._reporting.update(dict.fromkeys(change.opened))
 
-    def _life_of(self, service: Name, client: bytes) -> Life | None:
-        """Return the life of a client of a service that is heard now."""
+    def _life_of(self, service: Name, party: bytes) -> Life | None:
+        """Return the life of another party of a service that is heard now."""
         subscription = self._subscriptions.get(service)
-        feed = None if subscription is None else subscription.feeds.get(client)  # type: ignore[call-overload]
+        feed = None if subscription is None else subscription.feeds.get(party)  # type: ignore[call-overload]
         return None if feed is None else Life(feed.publisher, feed.incarnation)
 
     def _revoke(self, statement: Statement, now: Instant) -> None:
@@ -364,10 +385,10 @@ class Member:
             self._close(self._subscriptions.recheck(now.unix_s))
 
     def _close(self, feeds: list[Feed]) -> None:
-        """Say goodbye to whom these feeds are of; a client that goes is answered no more."""
+        """Say goodbye to whom these feeds are of; a party that goes is told nothing more."""
         self._under_way = None
         for feed in feeds:
             self.attachment.send([feed.close()])
             self._reporting.pop(feed, None)
             self._feeds_due.touch(feed)
-            self._publications.forget_client(feed.topic, Life(feed.publisher, feed.incarnation))
+            self._publications.forget(feed.topic, Life(feed.publisher, feed.incarnation))

@@ -1,12 +1,12 @@
-"""A private stream: what one server answers to one client, by unicast, reliable and in order.
+"""A private stream: what a server answers to one client, or a client asks one server; by unicast, reliable, in order.
 
 Place: pure; time comes in as ``now_s`` (monotonic seconds).
 Source: DESIGN section 6 ("answers return by unicast"). It is an ordinary stream, but for three things:
 
-- its frames are addressed to the client, so any switch finds their way;
+- its frames are addressed to the reader, so any switch finds their way;
 - a name that both ends derive from who they are, in this life, stands for the topic in keys and notes, and the header's
   incarnation is derived from that: a later life of either end shares nothing with it;
-- nobody introduces himself. The server knows its one reader by the client's claim, and the client expects number 1.
+- nobody introduces himself. The writer knows its one reader by that one's claim, and the reader expects number 1.
 """
 
 from __future__ import annotations
@@ -19,13 +19,15 @@ from gdp.client.pasts import Past
 from gdp.client.publisher import Publisher
 from gdp.client.source import Secrets, Source
 from gdp.crypto.envelope import Sealer, Signer
+from gdp.errors import DropReason
+from gdp.frame.codec import Header
 from gdp.frame.kinds import Kind
-from gdp.limits import MTU_MIN_BYTES, REPORT_IDLE_S
+from gdp.limits import FLIGHT_START_BYTES, MTU_MIN_BYTES, REPORT_IDLE_S
 from gdp.message.join import Joined, VerifiesDigest
 from gdp.message.memory import Budget
 from gdp.names import Name
 
-__all__ = ["IDLE_S", "AnswerFeed", "AnswerStream", "Life", "private_incarnation", "private_name"]
+__all__ = ["IDLE_S", "Life", "PrivateFeed", "PrivateStream", "private_incarnation", "private_name"]
 
 IDLE_S: Final = 60.0  # without a reader and a message, after which a stream is forgotten
 
@@ -37,9 +39,9 @@ class Life(NamedTuple):
     incarnation: int
 
 
-def private_name(service: Name, server: Life, client: Life) -> Name:
-    """Return the name of what a server answers to a client."""
-    ends = b"".join(name + incarnation.to_bytes(8, "big") for name, incarnation in (server, client))
+def private_name(service: Name, writer: Life, reader: Life) -> Name:
+    """Return the name of what one says to another on a service's name; the other way is another stream."""
+    ends = b"".join(name + incarnation.to_bytes(8, "big") for name, incarnation in (writer, reader))
     return Name(hashlib.sha256(b"gdp-private-1" + service + ends).digest())
 
 
@@ -58,11 +60,11 @@ class _PrivateSealer(Sealer):
         self._fixed = (epoch, kind, source.incarnation, destination, source.name)
 
 
-class AnswerStream(Publisher):
-    """The server's end.
+class PrivateStream(Publisher):
+    """The writer's end.
 
     Args:
-        server: its source for all clients.
+        writer: its source for all readers.
         mtu: smallest on the way; None where that is not known yet.
         past: of the same stream, if it was forgotten.
     """
@@ -70,8 +72,8 @@ class AnswerStream(Publisher):
     def __init__(
         self,
         service: Name,
-        server: Source,
-        client: Life,
+        writer: Source,
+        reader: Life,
         secrets: Secrets,
         *,
         mtu: int | None,
@@ -79,17 +81,17 @@ class AnswerStream(Publisher):
         past: Past,
         now_s: float,
     ) -> None:
-        name = private_name(service, Life(server.name, server.incarnation), client)
-        source = Source(server.name, private_incarnation(name), server.signer)
-        self.client = client
+        name = private_name(service, Life(writer.name, writer.incarnation), reader)
+        source = Source(writer.name, private_incarnation(name), writer.signer)
+        self.reader = reader
         self._touched_s = now_s
         super().__init__(name, source, secrets, b"", reliable=True, urgent=urgent, past=past)
         self.tree_stands(MTU_MIN_BYTES if mtu is None else mtu)
 
     def touch(self, now_s: float) -> None:
-        """Note that there is something to say, or to hear; a client that was silent is a reader again, from now on."""
+        """Note that there is something to say, or to hear; who was silent is a reader again, from now on."""
         self._touched_s = now_s
-        name, incarnation = self.client
+        name, incarnation = self.reader
         if name not in self._readers:
             self._readers.admit(name, incarnation, now_s)
             self._window.add_reader(name, self._next_number, now_s)
@@ -100,15 +102,19 @@ class AnswerStream(Publisher):
 
     def _sealer(self, kind: Kind) -> Sealer:
         source, secret = self._source, self._secrets[self._epoch]
-        return _PrivateSealer(secret, self._epoch, kind, source, self.topic, self.client.name, source.signer)
+        return _PrivateSealer(secret, self._epoch, kind, source, self.topic, self.reader.name, source.signer)
 
 
-class AnswerFeed(Feed):
-    """The client's end.
+class PrivateFeed(Feed):
+    """The reader's end.
+
+    It is made for the first frame that comes, lost ones before that are asked for. What it brings is handed on when it
+    is known what its writer's messages are, and until then not much is taken.
 
     Args:
         name: of the stream.
-        writer: verifies the server's signatures.
+        public: what the same writer says to all.
+        verifier: of the writer's signatures.
         ended: where the same stream ended before, in this life.
     """
 
@@ -116,19 +122,34 @@ class AnswerFeed(Feed):
         self,
         name: Name,
         reader: Reader,
-        server: Name,
-        writer: VerifiesDigest,
+        public: Feed,
+        verifier: VerifiesDigest,
         secrets: Secrets,
         budget: Budget,
         now_s: float,
         ended: Ended,
     ) -> None:
-        super().__init__(name, reader, server, private_incarnation(name), writer, secrets, budget, now_s, ended)
+        writer, incarnation = public.publisher, private_incarnation(name)
+        super().__init__(name, reader, writer, incarnation, verifier, secrets, budget, now_s, ended)
         self.state = FeedState.LIVE
+        self._public = public
+        self._early_bytes = 0
         self._is_reliable = True
         self._expected = max(ended.number, 1)
         self._data.begin(self._expected, ())
-        self._report_at_s = now_s + REPORT_IDLE_S  # the server may not have heard of us yet
+        self._report_at_s = now_s + REPORT_IDLE_S
+
+    def receive(self, header: Header, frame: bytes, now_s: float) -> None:
+        """Take one DATA or STATUS frame of this writer; one that is refused is asked for again."""
+        if self._public.state is FeedState.NEW and self._early_bytes >= FLIGHT_START_BYTES:
+            self._data.drops[DropReason.MEMORY_FULL] += 1
+        else:
+            super().receive(header, frame, now_s)
+
+    def _hand_out(self, joined: Joined) -> None:
+        if self._public.state is FeedState.NEW:
+            self._early_bytes += len(joined.message)
+        super()._hand_out(joined)
 
     def _take_status(self, joined: Joined, epoch: int, now_s: float) -> None:
         self._note = self._note_sealer(epoch)  # one that the server has

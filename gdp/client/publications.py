@@ -1,4 +1,4 @@
-"""What a member says on its names: a publisher for each, and where it serves, a private stream to each client besides.
+"""What a member says on its names: a publisher for each, and where it serves or calls, private streams besides.
 
 Place: pure; time comes in as ``now_s`` (monotonic seconds).
 """
@@ -9,10 +9,11 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 
 from gdp.client.agenda import Agenda
-from gdp.client.answering import Answering
 from gdp.client.pasts import Pasts
 from gdp.client.private import Life
+from gdp.client.private_streams import PrivateStreams
 from gdp.client.publisher import Publisher
+from gdp.client.readers import TOPICS, Patience
 from gdp.client.source import Secrets, Source
 from gdp.client.turns import Turns
 from gdp.control.join import Join
@@ -29,14 +30,14 @@ class Publications:
 
     Args:
         source: the member.
-        heard: returns the life of a client of a service, if that is heard now.
+        heard: returns the life of another party of a service, if that is heard now.
     """
 
     def __init__(self, source: Source, heard: Callable[[Name, bytes], Life | None]) -> None:
         self._source = source
         self._heard = heard
         self._publishers: dict[Name, Publisher] = {}
-        self._answering: dict[Name, Answering] = {}  # by service
+        self._private: dict[Name, PrivateStreams] = {}  # by service
         self._pasts = Pasts()
         self._agenda = Agenda[Publisher]()
         self.turns = Turns(self._agenda.touch)
@@ -52,69 +53,77 @@ class Publications:
     def drops(self) -> Counter[DropReason]:
         """Return what was dropped, by reason."""
         publishers = sum((publisher.drops for publisher in self), self._drops)
-        return sum((answering.drops for answering in self._answering.values()), publishers)
+        return sum((streams.drops for streams in self._private.values()), publishers)
 
     def get(self, name: Name) -> Publisher | None:
         """Return the publisher of a name, or None."""
         return self._publishers.get(name)
 
     def begin(
-        self, name: Name, secrets: Secrets, description: bytes, *, reliable: bool, depth: int = 0, urgent: bool
+        self,
+        name: Name,
+        secrets: Secrets,
+        description: bytes,
+        *,
+        reliable: bool,
+        depth: int = 0,
+        urgent: bool,
+        patience: Patience = TOPICS,
     ) -> Publisher:
         """Publish a name from now on, above all numbers that were used for it before."""
         publisher = Publisher(
             name, self._source, secrets, description,
-            reliable=reliable, depth=depth, urgent=urgent, past=self._pasts.of(name),
+            reliable=reliable, depth=depth, urgent=urgent, past=self._pasts.of(name), patience=patience,
         )  # fmt: skip
         publisher.published = self.turns.add
         self._publishers[name] = publisher
         return publisher
 
-    def serve(self, name: Name, secrets: Secrets, *, urgent: bool) -> None:
-        """Answer clients of a name from now on."""
-        self._answering[name] = Answering(name, self._source, secrets, self._pasts, self.turns.add, urgent=urgent)
+    def begin_private(self, name: Name, secrets: Secrets, *, urgent: bool) -> None:
+        """Have private streams on a published name from now on."""
+        self._private[name] = PrivateStreams(name, self._source, secrets, self._pasts, self.turns.add, urgent=urgent)
 
     def end(self, name: Name) -> bool:
-        """Publish and answer a name no more; return whether it was published."""
-        publisher, answering = self._publishers.pop(name, None), self._answering.pop(name, None)
+        """Say nothing on a name any more; return whether it was published."""
+        publisher, streams = self._publishers.pop(name, None), self._private.pop(name, None)
         if publisher is None:
             return False
         self._pasts.put(name, publisher.past)
         publisher.close()
         self._drops += publisher.drops
-        if answering is not None:
-            answering.close()
-            self._drops += answering.drops
+        if streams is not None:
+            streams.close()
+            self._drops += streams.drops
         return True
 
     def renew(self, name: Name, secrets: Secrets) -> None:
         """Take a name's secrets anew."""
-        for each in (self._publishers.get(name), self._answering.get(name)):
+        for each in (self._publishers.get(name), self._private.get(name)):
             if each is not None:
                 each.renew(secrets)
 
-    def answer(self, service: Name, client: Name, message: bytes, now_s: float) -> None:
-        """Send a message to one client of a service.
+    def tell(self, service: Name, party: Name, message: bytes, now_s: float) -> None:
+        """Send a message to one other party of a service alone.
 
         Raises:
             LocalError: it is not heard, there are too many, or the message is above the limits.
         """
-        answering, life = self._answering.get(service), self._heard(service, client)
-        if answering is None or life is None:
-            raise LocalError(f"{client.short} is no client of {service.short}")
-        answering.stream(life, self._publishers[service].mtu, now_s).publish(message)
+        streams, life = self._private.get(service), self._heard(service, party)
+        if streams is None or life is None:
+            raise LocalError(f"{party.short} is not heard on {service.short}")
+        streams.stream(life, self._publishers[service].mtu, now_s).publish(message)
 
-    def forget_client(self, service: Name, client: Life) -> None:
-        """Let go of what waits for a client that is gone."""
-        answering = self._answering.get(service)
-        if answering is not None:
-            answering.forget(client)
+    def forget(self, service: Name, party: Life) -> None:
+        """Let go of what waits for a party of a service that is gone."""
+        streams = self._private.get(service)
+        if streams is not None:
+            streams.forget(party)
 
     def take_report(self, header: Header, frame: bytes, now_s: float) -> None:
-        """Take a reader's or a client's note.
+        """Take a reader's note.
 
         Raises:
-            RemoteError: it is about nothing that is published here, or there are too many clients.
+            RemoteError: it is about nothing that is published here, or there are too many private streams.
         """
         topic = topic_of(header, frame)
         publisher = self._publishers.get(topic) or self._stream(topic, header.source, now_s)  # type: ignore[call-overload]
@@ -125,7 +134,7 @@ class Publications:
         """Learn that a tree stands, and how wide it is."""
         publisher = self._publishers.get(join.topic)
         if publisher is not None and join.publisher == self._source.name and join.lease_s > 0:
-            for each in (publisher, *self._answering.get(join.topic, ())):
+            for each in (publisher, *self._private.get(join.topic, ())):
                 each.tree_stands(join.mtu)
                 self.turns.add(each)
 
@@ -134,21 +143,21 @@ class Publications:
         for publisher in self._agenda.take_due(now_s):
             publisher.timeout(now_s)
             self.turns.add(publisher)
-        for answering in self._answering.values():
-            answering.forget_idle(now_s)
+        for streams in self._private.values():
+            streams.forget_idle(now_s)
 
     def next_due(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         return self._agenda.next_due()
 
-    def _stream(self, stream: bytes, client: bytes, now_s: float) -> Publisher:
-        """Return the private stream that a client's note is about."""
-        for service, answering in self._answering.items():
-            life = self._heard(service, client)
-            if life is None or not answering.is_about(stream, life):
+    def _stream(self, stream: bytes, reader: bytes, now_s: float) -> Publisher:
+        """Return the private stream that a note is about."""
+        for service, streams in self._private.items():
+            life = self._heard(service, reader)
+            if life is None or not streams.is_about(stream, life):
                 continue
             try:
-                return answering.stream(life, self._publishers[service].mtu, now_s)
+                return streams.stream(life, self._publishers[service].mtu, now_s)
             except LocalError as error:
                 raise StatementError(DropReason.QUOTA, "private streams") from error
         raise StatementError(DropReason.NOT_FOR_US)

@@ -23,7 +23,7 @@ from typing import Final
 from gdp.client.best_effort import Unsent
 from gdp.client.kept import Kept
 from gdp.client.pasts import FIRST, Past
-from gdp.client.readers import Readers
+from gdp.client.readers import TOPICS, Patience, Readers
 from gdp.client.source import Secrets, Source
 from gdp.client.statuses import Statuses
 from gdp.crypto.envelope import SIGNATURE_BYTES, Sealed, Sealer, part_room
@@ -51,6 +51,7 @@ class Publisher:
         depth: how many messages late joiners get (0: none).
         urgent: its frames go before those of other topics, wherever they queue.
         past: where the one that published the same before, in this life, ended.
+        patience: with its readers.
     """
 
     def __init__(
@@ -64,6 +65,7 @@ class Publisher:
         depth: int = 0,
         urgent: bool = False,
         past: Past = FIRST,
+        patience: Patience = TOPICS,
     ) -> None:
         if not secrets:
             raise LocalError("a publisher needs a topic secret")
@@ -76,7 +78,7 @@ class Publisher:
         self.is_urgent = urgent
         self.has_more = False  # ``take`` came to its limit
         self.published: Callable[[Publisher], None] = lambda _: None  # called when something waits to be taken
-        self._window = Kept(depth, past.next_number - 1)
+        self._window = Kept(depth, past.next_number - 1, patience.lag_s)
         self._depth = depth
         self._flags = self._flags_now()
         self._epoch = max(secrets)
@@ -84,7 +86,7 @@ class Publisher:
         self._status = self._sealer(Kind.STATUS)
         self._next_number = past.next_number
         self.mtu: int | None = None  # smallest on the tree; unknown until one stands
-        self._readers = Readers(topic, source)
+        self._readers = Readers(topic, source, patience)
         self._moves: deque[Move] = deque(maxlen=MOVES_MAX)
         self._skipped = past.next_number - 1  # numbers that its past used, or that moves left behind
         self.bundle_bytes = BUNDLE_BYTES  # 0: each message has a seal of its own
@@ -101,9 +103,10 @@ class Publisher:
         """Return how many readers have introduced themselves and are alive; none before a tree stands."""
         return 0 if self.mtu is None else len(self._readers)
 
-    def has_reader(self, name: Name) -> bool:
-        """Return whether a reader has introduced itself and is alive, and a tree stands."""
-        return self.mtu is not None and name in self._readers
+    def is_followed_by(self, name: Name, now_s: float, awake_s: float) -> bool:
+        """Return whether a tree stands, and a reader is heard and keeps up; ``awake_s``: since when we can hear."""
+        keeps_up = self._window.has_reader(name) or not self._repairs_wanted
+        return self.mtu is not None and keeps_up and self._readers.is_heard(name, now_s, awake_s)
 
     @property
     def past(self) -> Past:
@@ -236,7 +239,7 @@ class Publisher:
         for name in self._readers.silent(now_s):
             self._forget(name)
         for name in self._window.laggards(now_s):
-            self._readers[name].do_penance(now_s)
+            self._readers.do_penance(name, now_s)
             self._window.drop_reader(name)
             self._statuses.wanted = True
         self._statuses.wanted |= self._window.probe_due(now_s)
@@ -244,7 +247,7 @@ class Publisher:
 
     def next_timeout(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._window.next_probe(), self._readers.next_silent()]
+        times = [self._window.next_probe(), self._window.next_laggard(), self._readers.next_silent()]
         if self._readers and self.mtu is not None:
             times.append(self._statuses.next_timeout())
         return min((time for time in times if time is not None), default=None)
@@ -257,9 +260,8 @@ class Publisher:
         while self._early:
             self.publish(self._early.popleft())
         limit = max(limit_bytes // self.mtu, 1)
-        frames = self._unsent.take(limit)
-        if self._statuses.is_due(now_s):
-            frames += self._seal_status(now_s)
+        frames = self._seal_status(now_s) if self._statuses.is_due(now_s) else []
+        frames += self._unsent.take(max(limit - len(frames), 1))
         frames += self._window.take(now_s, max(limit - len(frames), 1))
         while self._gathered and len(frames) < limit and not self._has_unsent():
             self._seal_next()

@@ -8,23 +8,38 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from gdp.client.source import Secrets, Source
 from gdp.crypto.note import NoteOpener
 from gdp.errors import DropReason, EnvelopeError, FrameError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Kind
-from gdp.limits import READER_LEASE_S
+from gdp.limits import CALL_LAG_S, CALL_QUIET_S, READER_LEASE_S
 from gdp.message.report import Report, ReportFlag
 from gdp.names import Name
 
-__all__ = ["Readers", "Reading"]
+__all__ = ["CALLS", "TOPICS", "Patience", "Readers", "Reading"]
 
 READERS_MAX: Final = 1_024
 _LIVES_MAX: Final = 4_096  # incarnations of readers whose old notes are known as such
-_PENANCE_MIN_S: Final = 2 * READER_LEASE_S
-_PENANCE_MAX_S: Final = 16 * READER_LEASE_S
+_PENANCE_MIN_LAGS: Final = 2
+_PENANCE_MAX_LAGS: Final = 16
+
+
+class Patience(NamedTuple):
+    """How long a publisher bears with a reader.
+
+    ``lag_s``: one that has not confirmed in this time what another has holds the window no longer; ``quiet_s``: one
+    from whom nothing is heard for this long does not follow.
+    """
+
+    lag_s: float
+    quiet_s: float
+
+
+TOPICS: Final = Patience(READER_LEASE_S, READER_LEASE_S)
+CALLS: Final = Patience(CALL_LAG_S, CALL_QUIET_S)  # other replicas must not wait for a dead one
 
 
 @dataclass(slots=True)
@@ -35,20 +50,16 @@ class Reading:
     heard_s: float
     start: int | None = None  # its first message; None once it has begun to confirm
     out_until_s: float = 0.0  # it may not hold the window before
-    penance_s: float = _PENANCE_MIN_S
-
-    def do_penance(self, now_s: float) -> None:
-        """Hold no window for a while, each time for longer."""
-        self.out_until_s = now_s + self.penance_s
-        self.penance_s = min(2 * self.penance_s, _PENANCE_MAX_S)
+    penances: int = 0
 
 
 class Readers:
     """The readers of one publisher, by name."""
 
-    def __init__(self, topic: Name, source: Source) -> None:
+    def __init__(self, topic: Name, source: Source, patience: Patience = TOPICS) -> None:
         self._topic = topic
         self._source = source
+        self._patience = patience
         self._readers: dict[bytes, Reading] = {}
         self._lives: OrderedDict[tuple[bytes, int, int], NoteOpener] = OrderedDict()
 
@@ -76,6 +87,18 @@ class Readers:
         """Return the monotonic second at which ``silent`` has somebody to return, or None."""
         heard_s = min((reading.heard_s for reading in self._readers.values()), default=None)
         return None if heard_s is None else heard_s + READER_LEASE_S + 0.001
+
+    def is_heard(self, name: bytes, now_s: float, awake_s: float) -> bool:
+        """Return whether somebody is a reader, and was not silent for too long since ``awake_s``."""
+        reading = self._readers.get(name)
+        return reading is not None and now_s - max(reading.heard_s, awake_s) <= self._patience.quiet_s
+
+    def do_penance(self, name: bytes, now_s: float) -> None:
+        """Have a reader hold no window for a while, each time for longer."""
+        reading = self._readers[name]
+        lags = min(_PENANCE_MIN_LAGS << reading.penances, _PENANCE_MAX_LAGS)
+        reading.out_until_s = now_s + lags * self._patience.lag_s
+        reading.penances = min(reading.penances + 1, _PENANCE_MAX_LAGS)
 
     def admit(self, name: bytes, incarnation: int, now_s: float) -> Reading:
         """Take somebody for a reader, in place of a former life of his."""

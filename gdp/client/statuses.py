@@ -3,7 +3,8 @@
 Place: pure; time comes in as ``now_s`` (monotonic seconds).
 
 A new reader asks until it is told what the messages are. Those that read already do not know that there is news, and
-nothing confirms a status: so news is said several times, at growing distances.
+nothing confirms a status: so news is said at once, before any message that it is about, and several times more, at
+growing distances.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ class Statuses:
         if description == self._description:
             return False
         self._description, self._said, self.wanted = description, 0, True
+        self._at_s = -_NEVER
         return True
 
     @property

@@ -3,7 +3,8 @@
 Place: pure; time comes in as ``now_s`` (monotonic seconds).
 
 Whose word counts is decided here, by the claim that the switch hands on and this member verifies itself: a reader hears
-who publishes, a server who calls, a client who serves. A client has a second feed from each server, of its answers.
+who publishes, a server who calls, a client who serves. What a server answers one client, or a client asks one server,
+comes by a second feed from the same party, made when something does.
 """
 
 from __future__ import annotations
@@ -14,12 +15,14 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from gdp.client.feed import Delivered, Ended, Feed, FeedState, Reader
-from gdp.client.private import AnswerFeed, Life, private_name
+from gdp.client.private import Life, PrivateFeed, private_incarnation, private_name
 from gdp.client.source import Secrets
 from gdp.control.query import Answer
 from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
 from gdp.frame.codec import Header
+from gdp.limits import CALL_IDLE_S
+from gdp.message.join import VerifiesDigest
 from gdp.message.memory import Budget
 from gdp.names import Name
 from gdp.trust.claim import Claim
@@ -37,7 +40,7 @@ _NOWHERE: Final = Ended()
 class Message(NamedTuple):
     """A message that arrived, and what its publisher says the topic's messages are.
 
-    ``private``: a server's answer, for nobody else.
+    ``private``: a server's answer, or a client's request to one server; for nobody else.
     """
 
     topic: Name
@@ -66,22 +69,30 @@ class Subscription:
     topic: Topic
     right: Right
     feeds: dict[Name, Feed] = field(default_factory=dict)
-    answers: dict[Name, AnswerFeed] = field(default_factory=dict)  # by server
+    private: dict[Name, PrivateFeed] = field(default_factory=dict)  # by writer
 
     def all(self) -> list[Feed]:
         """Return every feed."""
-        return [*self.feeds.values(), *self.answers.values()]
+        return [*self.feeds.values(), *self.private.values()]
 
     def take(self, source: Name) -> list[Message]:
-        """Return, once, the messages of one source; answers not before it has said what they are."""
+        """Return, once, the messages of one source; private ones not before it has said what they are."""
         feed, topic = self.feeds.get(source), self.topic.name
         if feed is None:
             return []
         messages = [Message(topic, each, feed.description) for each in feed.take_delivered()]
-        answers = self.answers.get(source)
-        if answers is not None and feed.state is FeedState.LIVE:
-            messages += [Message(topic, each, feed.description, True) for each in answers.take_delivered()]
+        private = self.private.get(source)
+        if private is not None and feed.state is FeedState.LIVE:
+            messages += [Message(topic, each, feed.description, True) for each in private.take_delivered()]
         return messages
+
+
+class _Way(NamedTuple):
+    """By which a party may say something to us alone."""
+
+    subscription: Subscription
+    stream: Name
+    verifier: VerifiesDigest
 
 
 class Change(NamedTuple):
@@ -103,7 +114,7 @@ class Subscriptions:
         self._verifier = verifier
         self._budget = Budget()
         self._by_name: dict[Name, Subscription] = {}
-        self._answers: dict[tuple[bytes, int], Subscription] = {}  # by server and incarnation, as headers have them
+        self._ways: dict[tuple[bytes, int], _Way] = {}  # by writer and incarnation, as headers have them
         self._ended: Lru[Ended] = Lru(ENDED_MAX)
         self.drops: Counter[DropReason] = Counter()  # of feeds that are gone, and of claims
 
@@ -128,17 +139,16 @@ class Subscriptions:
         subscription = self._by_name.pop(name, None)
         return [] if subscription is None else self._end_all(subscription)
 
-    def find(self, header: Header) -> tuple[Subscription, Feed] | None:
+    def find(self, header: Header, now_s: float) -> tuple[Subscription, Feed] | None:
         """Return whose frame this is, if it is anybody's."""
         subscription = self._by_name.get(header.destination)  # type: ignore[call-overload]
         if subscription is not None:
             feed = subscription.feeds.get(header.source)
-        elif header.destination == self._reader.name:
-            subscription = self._answers.get((header.source, header.incarnation))
-            feed = None if subscription is None else subscription.answers.get(header.source)  # type: ignore[call-overload]
-        else:
+            return None if feed is None else (subscription, feed)
+        if header.destination != self._reader.name:
             return None
-        return None if subscription is None or feed is None else (subscription, feed)
+        way = self._ways.get((header.source, header.incarnation))
+        return None if way is None else (way.subscription, self._private_feed(way, Name(header.source), now_s))
 
     def take(self, answer: Answer, now: Instant) -> Change:
         """Take what the switch says of somebody: its claim, or that it is gone.
@@ -182,23 +192,35 @@ class Subscriptions:
         return [feed for subscription in self._by_name.values() for feed in self._end_all(subscription)]
 
     def _open(self, subscription: Subscription, claim: Claim, now_s: float) -> list[Feed]:
-        topic, reader, server = subscription.topic, self._reader, claim.node
-        ended = self._ended.get(topic.name + _key(server, claim.incarnation)) or _NOWHERE
+        topic, reader, party = subscription.topic, self._reader, claim.node
+        ended = self._ended.get(topic.name + _key(party, claim.incarnation)) or _NOWHERE
         feed = Feed(
-            topic.name, reader, server, claim.incarnation, claim.member.key, topic.secrets, self._budget, now_s, ended
+            topic.name, reader, party, claim.incarnation, claim.member.key, topic.secrets, self._budget, now_s, ended
         )
         feed.claim_sequence, feed.claim = claim.sequence, claim.wire
-        subscription.feeds[server] = feed
-        if subscription.right is not Right.CALL:
-            return [feed]
-        name = private_name(topic.name, Life(server, claim.incarnation), Life(reader.name, reader.incarnation))
-        ended = self._ended.get(name) or _NOWHERE
-        answers = AnswerFeed(
-            name, reader, server, claim.member.key, topic.secrets, self._budget, now_s, ended
-        )
-        subscription.answers[server] = answers
-        self._answers[server, answers.incarnation] = subscription
-        return [feed, answers]
+        subscription.feeds[party] = feed
+        if subscription.right is Right.SERVE:
+            feed.idle_s = CALL_IDLE_S
+        if subscription.right is not Right.READ:
+            stream = self._stream_from(topic.name, feed)
+            self._ways[party, private_incarnation(stream)] = _Way(subscription, stream, claim.member.key)
+        return [feed]
+
+    def _private_feed(self, way: _Way, writer: Name, now_s: float) -> PrivateFeed:
+        """Return what a party says to us alone."""
+        subscription = way.subscription
+        feed = subscription.private.get(writer)
+        if feed is None:
+            public, ended = subscription.feeds[writer], self._ended.get(way.stream) or _NOWHERE
+            feed = subscription.private[writer] = PrivateFeed(
+                way.stream, self._reader, public, way.verifier, subscription.topic.secrets, self._budget, now_s, ended
+            )
+        return feed
+
+    def _stream_from(self, topic: Name, feed: Feed) -> Name:
+        """Return the name of the stream by which the publisher of a feed says something to us alone."""
+        reader = Life(self._reader.name, self._reader.incarnation)
+        return private_name(topic, Life(feed.publisher, feed.incarnation), reader)
 
     def _end_all(self, subscription: Subscription) -> list[Feed]:
         return [feed for party in list(subscription.feeds) for feed in self._end(subscription, party)]
@@ -206,12 +228,12 @@ class Subscriptions:
     def _end(self, subscription: Subscription, party: Name) -> list[Feed]:
         feed = subscription.feeds.pop(party)
         self._remember(subscription.topic.name + _key(party, feed.incarnation), feed)
-        answers = subscription.answers.pop(party, None)
-        if answers is None:
+        self._ways.pop((party, private_incarnation(self._stream_from(subscription.topic.name, feed))), None)
+        private = subscription.private.pop(party, None)
+        if private is None:
             return [feed]
-        del self._answers[party, answers.incarnation]
-        self._remember(answers.topic, answers)
-        return [feed, answers]
+        self._remember(private.topic, private)
+        return [feed, private]
 
     def _remember(self, key: bytes, feed: Feed) -> None:
         self._ended.put(key, feed.ended)

@@ -62,7 +62,7 @@ class _Reader:
     acked_at: int
     next_number: int
     moved_s: float  # when it last confirmed something new, or had everything
-    mark_at: int  # what had been sent at ``mark_s``; the mark moves on when the reader has confirmed that
+    mark_at: int  # what another had confirmed at ``mark_s``; the mark moves on when this one has, too
     mark_s: float
 
 
@@ -73,9 +73,11 @@ class SendWindow:
         keep_last: messages that are kept for late joiners, acknowledged or not.
         budget_bytes: how much is kept; when full, ``has_room`` is false, and past twice that ``add`` lets the oldest
             go.
+        lag_s: how long a reader may hold the window while others are through.
     """
 
-    def __init__(self, keep_last: int = 0, budget_bytes: int = WINDOW_BYTES) -> None:
+    def __init__(self, keep_last: int = 0, budget_bytes: int = WINDOW_BYTES, *, lag_s: float = READER_LEASE_S) -> None:
+        self._lag_s = lag_s
         self._keep_last = keep_last
         self._budget_bytes = budget_bytes
         self._kept: OrderedDict[int, _Kept] = OrderedDict()
@@ -182,7 +184,7 @@ class SendWindow:
         """Let a reader hold the window from a message on."""
         kept = self._kept.get(first_number)
         acked_at = min(kept.begin_at, self._sent_at) if kept else self._sent_at
-        self._readers[reader] = _Reader(acked_at, first_number, now_s, self._sent_at, now_s)
+        self._readers[reader] = _Reader(acked_at, first_number, now_s, acked_at, now_s)
 
     def drop_reader(self, reader: bytes) -> None:
         """Let a reader hold nothing any more."""
@@ -192,22 +194,26 @@ class SendWindow:
     def laggards(self, now_s: float) -> list[bytes]:
         """Return the readers that hold the window for nothing, whose time it is to let go.
 
-        Such a one has confirmed nothing new of what was sent for ``READER_LEASE_S``; or not, in that time, what was
-        then under way, while another has.
+        Such a one has confirmed nothing new of what was sent for ``READER_LEASE_S``; or not, for ``lag_s``, what
+        another has.
         """
+        first_at = self._first_at()
         return [
             name
             for name, reader in self._readers.items()
             if reader.acked_at < self._sent_at
             and (
                 now_s - reader.moved_s > READER_LEASE_S
-                or (
-                    now_s - reader.mark_s > READER_LEASE_S
-                    and reader.acked_at < reader.mark_at
-                    and any(other.acked_at >= reader.mark_at for other in self._readers.values())
-                )
+                or (now_s - reader.mark_s > self._lag_s and reader.acked_at < reader.mark_at <= first_at)
             )
         ]
+
+    def next_laggard(self) -> float | None:
+        """Return the monotonic second at which a reader that lags behind another is to let go, or None."""
+        first_at = self._first_at()
+        behind = (each.mark_s for each in self._readers.values() if each.acked_at < each.mark_at <= first_at)
+        mark_s = min(behind, default=None)
+        return None if mark_s is None else mark_s + self._lag_s + 0.001
 
     def report(self, reader: bytes, report: Report, now_s: float) -> None:
         """Take a known reader's report: release, grow or shrink, and queue repairs."""
@@ -278,6 +284,10 @@ class SendWindow:
     def _acked_at(self) -> int:
         return min((reader.acked_at for reader in self._readers.values()), default=self._sent_at)
 
+    def _first_at(self) -> int:
+        """Return how far the first reader is."""
+        return max((reader.acked_at for reader in self._readers.values()), default=0)
+
     def _least_number(self) -> int:
         return min((reader.next_number for reader in self._readers.values()), default=1 << 64)
 
@@ -290,14 +300,16 @@ class SendWindow:
         if position > reader.acked_at:
             reader.acked_at = position
             reader.moved_s = now_s
-        if reader.acked_at >= reader.mark_at:
-            reader.mark_at, reader.mark_s = self._sent_at, now_s
+        first_at = self._first_at()
+        for each in self._readers.values():
+            if each.mark_at <= each.acked_at < first_at:
+                each.mark_at, each.mark_s = first_at, now_s
 
     def _start_clocks(self, now_s: float) -> None:
         """Begin to wait only now for readers that owed nothing."""
         for reader in self._readers.values():
             if reader.acked_at >= self._sent_at:
-                reader.moved_s = reader.mark_s = now_s
+                reader.moved_s = now_s
 
     def _grow(self, acknowledged_bytes: int, now_s: float) -> None:
         if acknowledged_bytes <= 0:

@@ -25,6 +25,7 @@ from gdp.switch.table import Table
 
 __all__ = ["Cable", "MemoryNetwork", "Tap"]
 
+_STALLED_MAX: Final = 8_192  # frames that wait for a frozen node, about what a socket holds
 _SAME_INSTANT_MAX: Final = 100  # timers of one node, before it counts as one that never moves on
 EPOCH_UNIX_S: Final = 1_800_000_000.0
 
@@ -65,6 +66,7 @@ class _Node:
     fired_s: float = float("-inf")
     fired: int = 0  # times in the instant ``fired_s``
     is_alive: bool = True
+    stalled: list[tuple[_End, bytes]] | None = None  # what came while it was frozen
 
 
 class MemoryNetwork:
@@ -135,6 +137,18 @@ class MemoryNetwork:
     def stop(self, name: str) -> None:
         """Kill a node: it says no goodbye."""
         self._nodes[name].is_alive = False
+
+    def freeze(self, name: str) -> None:
+        """Give a node no more time; what comes waits, as far as there is room."""
+        self._nodes[name].stalled = []
+
+    def thaw(self, name: str) -> None:
+        """Let a frozen node go on."""
+        node = self._nodes[name]
+        stalled, node.stalled = node.stalled or [], None
+        for end, frame in stalled:
+            self._deliver(end, frame)
+        self._arm(name)
 
     def replace(self, name: str, machine: Machine, table: Table | None = None) -> None:
         """Start a node anew, with nothing remembered, on the same cables."""
@@ -212,6 +226,8 @@ class MemoryNetwork:
         if node.timer_s is None or node.timer_s > self._now_s:
             return
         node.timer_s = None
+        if node.stalled is not None:
+            return
         node.fired = node.fired + 1 if node.fired_s == self._now_s else 1
         node.fired_s = self._now_s
         if node.fired > _SAME_INSTANT_MAX:
@@ -254,6 +270,10 @@ class MemoryNetwork:
     def _deliver(self, end: _End, frame: bytes) -> None:
         node = self._nodes[end.node]
         if not node.is_alive or frame[:6] not in (end.mac, BROADCAST):
+            return
+        if node.stalled is not None:
+            if len(node.stalled) < _STALLED_MAX:
+                node.stalled.append((end, frame))
             return
         if node.table is not None:
             mtus = {port: cable.mtu for port, (cable, _, _) in node.ports.items() if cable.is_up}

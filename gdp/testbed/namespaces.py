@@ -20,7 +20,7 @@ from gdp.testbed import netns_files
 from gdp.testbed.runs import Run, in_first_user_namespace
 from gdp.testbed.topology import Link, Topology
 
-__all__ = ["Namespaces"]
+__all__ = ["Namespaces", "silence"]
 
 _MAC_PREFIX: Final = "02:67:64:70"  # locally administered; "gdp" in ASCII
 _LOOPBACK: Final = 1  # the index of lo in every namespace
@@ -45,7 +45,7 @@ class Namespaces:
         for path in self._paths.values():
             run.plan_namespace(path)
             netns_files.create(path)
-            netns_files.inside(path, _silence)
+            netns_files.inside(path, silence)
         self._join()
         for node in topology.nodes:
             self._inside(node, partial(_raise, [link.other(node) for link in topology.links_of(node)]))
@@ -98,8 +98,8 @@ class Namespaces:
             raise LocalError(f"namespace of {node}: {error}") from error
 
 
-def _silence() -> None:
-    """Switch IPv6 off before the first device comes, so that not even a neighbour solicitation leaves it."""
+def silence() -> None:
+    """Switch IPv6 off in this namespace before its first device comes: not even a neighbour solicitation leaves it."""
     for scope in _NO_IPV6:
         setting = _IPV6_SETTINGS / scope / "disable_ipv6"
         if setting.exists() and os.access(setting, os.W_OK):  # containers may have it read-only

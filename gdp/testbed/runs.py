@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.testbed.cgroups import Cgroup
 from gdp.testbed.processes import Process, boot_id, end_all
 
 __all__ = ["Record", "Run", "Runs", "in_first_user_namespace", "outer_uid"]
@@ -54,6 +55,7 @@ class Record:
     processes: list[Process] = field(default_factory=list)
     namespaces: list[str] = field(default_factory=list)  # paths of files that hold a network namespace
     files: list[str] = field(default_factory=list)  # files and directories to delete
+    cgroups: list[str] = field(default_factory=list)  # names
 
     @classmethod
     def from_text(cls, text: str) -> Record:
@@ -92,14 +94,31 @@ class Run:
         self._save()
         directory.mkdir(mode=0o700)
 
+    @classmethod
+    def resumed(cls, record: Record, path: Path) -> Run:
+        """Return the run of a record that is there already."""
+        run = cls.__new__(cls)
+        run._record, run._path, run.directory = record, path, Path(record.files[0])
+        return run
+
     @property
     def id(self) -> str:
         """Return the id of the run, six hex digits."""
         return self._record.run
 
+    @property
+    def record(self) -> Record:
+        """Return what it made until now."""
+        return self._record
+
     def plan_namespace(self, path: Path) -> None:
         """Note a namespace that is about to be made."""
         self._record.namespaces.append(str(path))
+        self._save()
+
+    def plan_cgroup(self, name: str) -> None:
+        """Note a control group that is about to be made."""
+        self._record.cgroups.append(name)
         self._save()
 
     def note_process(self, pid: int) -> None:
@@ -149,6 +168,21 @@ class Runs:
         record = Record(run, boot_id(), Process.of(os.getpid()), files=[str(directory)])
         return Run(record, self._directory / f"{run}.json", directory)
 
+    def all(self) -> list[Record]:
+        """Return the record of every run."""
+        return [record for record, _ in self._records()]
+
+    def resume(self, run: str) -> Run:
+        """Go on with a run that was kept, to add to it or to end it; or with a dead one, to end it.
+
+        Raises:
+            LocalError: there is none, or its owner is at it.
+        """
+        for record, path in self._records():
+            if record.run == run and (record.kept or record.dead):
+                return Run.resumed(record, path)
+        raise LocalError(f"no run {run} to go on with")
+
     def sweep(self) -> list[str]:
         """Take down every run that nobody answers for; return their ids."""
         return [record.run for record, path in self._records() if record.dead and _take_down(record, path)]
@@ -184,6 +218,8 @@ def _take_down(record: Record, path: Path) -> bool:
 
     if record.boot == boot_id():
         end_all(record.processes)
+        for group in record.cgroups:
+            Cgroup(group).remove()
         for namespace in record.namespaces:
             release(Path(namespace))
     for name in record.files:

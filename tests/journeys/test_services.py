@@ -186,7 +186,7 @@ def test_a_node_without_the_right_to_serve_or_call_does_neither() -> None:
     caller = world.topic(SERVICE, member, [Right.CALL], kind="service")
     with pytest.raises(LocalError, match="no delegation to serve"):
         member.serve(caller, b"")
-    with pytest.raises(LocalError, match="is no client"):
+    with pytest.raises(LocalError, match="no serve of"):
         member.answer(caller.name, world.members[SERVER].name, b"")
     with pytest.raises(LocalError, match="no delegation to call"):
         member.call(world.topic(SERVICE, member, [Right.SERVE], kind="service"), b"")
@@ -259,13 +259,13 @@ def test_a_private_stream_that_nobody_uses_is_forgotten_and_goes_on_above_its_nu
     server, client = pair(world)
     server.answer(client.member.name, b"1")
     assert work(world, client, until_s=2, have=1)
-    answering = server.member._publications._answering[server.service]
-    assert len(answering) == 1
+    streams = server.member._publications._private[server.service]
+    assert len(streams) == 1
     world.network.run(1)
     (feed,) = [feed for feed in client.member.feeds() if feed not in client.member.feeds_of(client.service)]
     feed._report_at_s = float("inf")  # it says nothing any more
     world.network.run(READER_LEASE_S + 1.5 * IDLE_S)
-    assert len(answering) == 0
+    assert len(streams) == 0
     server.answer(client.member.name, b"2")
     assert work(world, client, until_s=2, have=2)
     assert [each.delivered.number for each in client.got] == [1, 2]
@@ -322,7 +322,7 @@ def test_a_client_whose_delegation_is_revoked_is_answered_no_more() -> None:
     )
     world.network.touch("nuc5")
     assert world.network.run(1, lambda: not server.member.peers(server.service))
-    with pytest.raises(LocalError, match="is no client"):
+    with pytest.raises(LocalError, match="is not heard"):
         server.answer(client.member.name, b"?")
 
 

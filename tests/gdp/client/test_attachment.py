@@ -66,6 +66,16 @@ def test_a_node_whose_clock_went_back_finds_its_way_past_its_earlier_life() -> N
     assert member.attachment.refusals[DropReason.STALE] >= 1
 
 
+@pytest.mark.parametrize("away_s", [0.1, 3.0])
+def test_a_node_that_starts_is_attached_as_soon_as_both_ends_have_heard_each_other(away_s: float) -> None:
+    world = ring()
+    world.network.stop(ROBOT)
+    world.network.run(away_s)
+    member = world.restart_member(ROBOT)
+    world.network.touch(ROBOT)
+    assert world.network.run(0.1, lambda: member.attachment.is_attached)
+
+
 def test_who_leaves_is_gone_in_every_tier() -> None:
     world = ring()
     flow = advertise(world)

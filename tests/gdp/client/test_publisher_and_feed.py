@@ -280,3 +280,17 @@ def test_what_no_switch_takes_of_a_best_effort_topic_stays_within_the_window() -
     assert sum(map(len, frames)) <= 32 << 20
     assert publisher.drops[DropReason.MEMORY_FULL] > 0
     assert decode(frames[-1]).number == 50
+
+
+@pytest.mark.parametrize("reliable", [True, False])
+def test_a_new_description_goes_before_what_is_published_behind_it(reliable: bool) -> None:
+    pipe = Pipe(publisher_of(reliable=reliable))
+    end = pipe.join(b"a")
+    assert pipe.run(1.0, lambda: end.feed.state is FeedState.LIVE)
+    publisher = pipe.publisher
+    for description in (b"another", b"a third, right behind"):
+        publisher.describe(description)
+        publisher.publish(bytes(100_000))
+        publisher.publish(b"small")
+        kinds = [decode(frame).kind for frame in publisher.take(pipe.now_s)]
+        assert kinds.index(Kind.DATA) == kinds.count(Kind.STATUS) == 1

@@ -264,6 +264,42 @@ def test_a_reader_that_moves_too_slowly_is_a_laggard_only_where_others_wait_for_
         assert window.laggards(9.0) == expected
 
 
+@pytest.mark.parametrize("lag_s", [1.0, READER_LEASE_S])
+def test_a_reader_is_a_laggard_when_it_has_not_confirmed_for_so_long_what_another_has(lag_s: float) -> None:
+    window = SendWindow(lag_s=lag_s)
+    for reader in (A, B):
+        window.add_reader(reader, 1, 0.0)
+    now_s = 10.0
+    for number in range(1, 5):  # both have everything each time, until B says nothing more
+        put(window, number, message(number, 1))
+        window.take(now_s)
+        window.report(A, has(number + 1), now_s)
+        if number < 3:
+            window.report(B, has(number + 1), now_s)
+        now_s += lag_s / 4
+    behind_s = 10.0 + lag_s / 2  # when A confirmed the third
+    assert window.laggards(behind_s + lag_s - 0.01) == []
+    due_s = window.next_laggard()
+    assert due_s == pytest.approx(behind_s + lag_s, abs=0.01)
+    assert window.laggards(due_s) == [B]
+    window.drop_reader(B)
+    assert window.next_laggard() is None
+    assert window.is_acknowledged()
+
+
+def test_who_was_behind_one_that_is_gone_is_no_laggard_for_that() -> None:
+    window = SendWindow(lag_s=1.0)
+    for reader in (A, B):
+        window.add_reader(reader, 1, 0.0)
+    put(window, 1, message(1, 1))
+    window.take(0.0)
+    window.report(A, has(2), 0.1)
+    window.drop_reader(A)
+    assert window.next_laggard() is None
+    assert window.laggards(2.0) == []
+    assert window.laggards(READER_LEASE_S + 0.2) == [B]
+
+
 def test_a_reader_that_owed_nothing_for_long_is_no_laggard_when_something_new_goes_out() -> None:
     window = window_of(1, 10)
     window.take(0.0)

@@ -1,12 +1,12 @@
-"""The private streams of one server: how many there may be, which are forgotten, and where they go on."""
+"""The private streams of one node: how many there may be, which are forgotten, and where they go on."""
 
 from __future__ import annotations
 
 import pytest
 
-from gdp.client.answering import STREAMS_MAX, Answering
 from gdp.client.pasts import Past, Pasts
 from gdp.client.private import IDLE_S, Life, private_incarnation, private_name
+from gdp.client.private_streams import STREAMS_MAX, PrivateStreams
 from gdp.client.publisher import Source
 from gdp.errors import LocalError
 from gdp.limits import READER_LEASE_S
@@ -18,8 +18,8 @@ SERVER = Source(Name(b"p" * 32), 5, WRITER)
 CLIENT = Life(Name(b"c" * 32), 7)
 
 
-def answering(pasts: Pasts | None = None) -> Answering:
-    return Answering(SERVICE, SERVER, SECRETS, Pasts() if pasts is None else pasts, lambda _: None, urgent=False)
+def streams_of(pasts: Pasts | None = None) -> PrivateStreams:
+    return PrivateStreams(SERVICE, SERVER, SECRETS, Pasts() if pasts is None else pasts, lambda _: None, urgent=False)
 
 
 def client(number: int) -> Life:
@@ -44,7 +44,7 @@ def test_the_name_of_a_private_stream_is_this() -> None:
 
 
 def test_there_are_no_more_streams_than_the_bound_while_all_are_in_use() -> None:
-    desk = answering()
+    desk = streams_of()
     for number in range(STREAMS_MAX):
         desk.stream(client(number), 1500, 0.0)
     with pytest.raises(LocalError, match="no more at once"):
@@ -53,7 +53,7 @@ def test_there_are_no_more_streams_than_the_bound_while_all_are_in_use() -> None
 
 
 def test_a_silent_client_gives_way_to_one_that_asks() -> None:
-    desk = answering()
+    desk = streams_of()
     for number in range(STREAMS_MAX):
         desk.stream(client(number), 1500, 0.0)
     for stream in desk:
@@ -64,7 +64,7 @@ def test_a_silent_client_gives_way_to_one_that_asks() -> None:
 
 def test_an_idle_stream_is_forgotten_and_its_numbers_are_not() -> None:
     pasts = Pasts()
-    desk = answering(pasts)
+    desk = streams_of(pasts)
     desk.stream(CLIENT, 1500, 0.0).publish(bytes(60_000))
     desk.forget_idle(IDLE_S)
     assert len(desk) == 1
@@ -76,7 +76,7 @@ def test_an_idle_stream_is_forgotten_and_its_numbers_are_not() -> None:
 
 
 def test_a_former_life_of_a_client_does_not_close_the_stream_to_its_present_one() -> None:
-    desk = answering()
+    desk = streams_of()
     stream = desk.stream(CLIENT, 1500, 0.0)
     desk.forget(CLIENT._replace(incarnation=6))
     assert desk.stream(CLIENT, 1500, 0.0) is stream

@@ -1,0 +1,158 @@
+"""A robot's thin uplink carries one copy of a request, whatever the number of replicas: real switches, real counters.
+
+::
+
+    [robot] ---- [gateway, RIB] ---- [r0]  [r1]  [r2]  [r3]           a replica beside each of r0 to r3
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from typing import Final
+
+import pytest
+import yaml
+from pyroute2 import IPRoute
+
+from gdp.crypto.certificates import Role
+from gdp.metadata import Metadata
+from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
+from gdp.stores.keyring import CARD, ROOT_CERTIFICATE
+from gdp.testbed import netns_files
+from gdp.testbed.namespaces import Namespaces
+from gdp.testbed.runs import Run, Runs
+from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
+from gdp.trust.right import Right
+from proxy.ring.plan import Credentials, rib_yaml, switch_yaml
+from tests.pages import ROOT
+
+pytestmark = pytest.mark.netns
+
+REPLICAS: Final = ("r0", "r1", "r2", "r3")
+REQUESTS, BYTES = 200, 10_000
+PARTS, MTU_BYTES, OVERHEAD_BYTES = 8, 1_500, 14 + 96  # Ethernet and our header, in each part
+SERVICE: Final = Metadata({"kind": "service", "name": "/plan", "type": "std_srvs/srv/SetBool"})
+TOPOLOGY: Final = Topology(
+    links=(Link("robot", "gateway"), *(Link("gateway", name) for name in REPLICAS)),
+    domains=(DomainPlan("field", ("robot", "gateway", *REPLICAS)),),
+    attachments=(
+        Attachment("gateway", "rib", "rib"),
+        *(Attachment(name, "proxy", "member") for name in ("robot", *REPLICAS)),
+    ),
+)
+
+
+class Field:
+    """What runs: switches and the RIB from the start, members as they are asked for."""
+
+    def __init__(self, run: Run, undo: ExitStack) -> None:
+        self._folder = run.directory
+        self._run = run
+        self._undo = undo
+        self._spaces = Namespaces(TOPOLOGY, run)
+        self._starting: list[subprocess.Popen[bytes]] = []
+        make_domain(self._folder / "field", "field")
+        make_owner(self._folder / "owner")
+        for name in TOPOLOGY.nodes:
+            content = switch_yaml(TOPOLOGY, name, self._credentials(Role.SWITCH, name), "auto", metrics=False)
+            self._command(Role.SWITCH, name, content)
+        self.wait()
+        (rib,) = TOPOLOGY.attached("rib")
+        self._command(Role.RIB, rib.switch, rib_yaml(rib, self._credentials(Role.RIB, "rib"), None, metrics=False))
+
+    def wait(self) -> None:
+        """Return when all that were started are up."""
+        for process in self._starting:
+            assert process.stdout is not None
+            assert b"up" in process.stdout.readline(), (self._folder / "log").read_text()[-2_000:]
+        self._starting.clear()
+
+    def member(self, switch: str, right: Right, *load: int) -> subprocess.Popen[bytes]:
+        """Begin to start a member beside a switch."""
+        credentials = self._credentials(Role.PROXY, switch)
+        given = delegate(self._folder / "owner", credentials.identity / CARD, SERVICE, [right])
+        install_delegation(credentials.identity, given)
+        where = [given.name.to_text(), str(credentials.identity), str(credentials.root), "member"]
+        return self._start(switch, ["netns_tests.uplink_child", *where, right.value, *map(str, load)])
+
+    def sent_bytes(self) -> int:
+        """Return what came out of the robot's uplink at its far end; a frame that the kernel hands over skips ours."""
+
+        def look() -> int:
+            with IPRoute() as ipr:
+                (link,) = ipr.get_links(ifname="robot")
+                return int(link.get_attr("IFLA_STATS64")["rx_bytes"])
+
+        return netns_files.inside(self._spaces.path("gateway"), look)
+
+    def _command(self, role: Role, switch: str, content: Mapping[str, object]) -> None:
+        path = self._folder / f"{role.value}-{switch}.yaml"
+        path.write_text(yaml.safe_dump(content))
+        self._start(switch, [f"gdp.cli.{role.value}", "--config", str(path)])
+
+    def _credentials(self, role: Role, name: str) -> Credentials:
+        identity = self._folder / "nodes" / f"{role.value}-{name}"
+        make_node(identity, role, f"{role.value}-{name}", self._folder / "field")
+        return Credentials(identity, self._folder / "field" / ROOT_CERTIFICATE, ())
+
+    def _start(self, switch: str, argv: list[str]) -> subprocess.Popen[bytes]:
+        with (self._folder / "log").open("ab") as log:
+            process = subprocess.Popen(
+                self._spaces.command(switch, [sys.executable, "-m", *argv]),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                env={**os.environ, "PYTHONPATH": str(ROOT)},
+                start_new_session=True,
+            )
+        self._run.note_process(process.pid)
+        self._undo.callback(_end, process)
+        self._starting.append(process)
+        return process
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.communicate()
+
+
+def tell(robot: subprocess.Popen[bytes], word: object) -> None:
+    """Have the robot do something; return when it is done."""
+    assert robot.stdin is not None
+    assert robot.stdout is not None
+    robot.stdin.write(f"{word}\n".encode())
+    robot.stdin.flush()
+    assert robot.stdout.readline() == b"done\n"
+
+
+@pytest.fixture
+def field() -> Iterator[Field]:
+    run = Runs().start()
+    with ExitStack() as undo:
+        undo.callback(run.end)
+        yield Field(run, undo)
+
+
+def test_one_copy_of_a_request_leaves_the_robot_whatever_the_number_of_replicas(field: Field) -> None:
+    robot = field.member("robot", Right.CALL, REQUESTS, BYTES)
+    sent: dict[int, int] = {}
+    started = 0
+    for replicas in (1, 2, 4):
+        for name in REPLICAS[started:replicas]:
+            field.member(name, Right.SERVE)
+        field.wait()
+        started = replicas
+        tell(robot, replicas)
+        before = field.sent_bytes()
+        tell(robot, "go")
+        sent[replicas] = field.sent_bytes() - before
+    once = REQUESTS * (BYTES + PARTS * OVERHEAD_BYTES)
+    assert all(once < each < 1.15 * once for each in sent.values()), sent
+    assert max(sent.values()) < 1.05 * min(sent.values()), sent
+    before = field.sent_bytes()
+    tell(robot, "ask")
+    assert field.sent_bytes() - before < 1.15 * once

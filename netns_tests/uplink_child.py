@@ -1,0 +1,94 @@
+"""One member of the uplink's test, in a process of its own: a replica that takes requests, or the robot that asks.
+
+python -m netns_tests.uplink_child SERVICE IDENTITY ROOT DEVICE serve
+python -m netns_tests.uplink_child SERVICE IDENTITY ROOT DEVICE call REQUESTS BYTES
+
+The robot takes words on standard input: a number, and it says ``met`` when it has so many peers; ``go``, and it says
+``done`` when its requests are confirmed by all of them; ``ask``, the same with requests to one of them.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from gdp.client.member import Member, Topic
+from gdp.control.settings import NodeSettings
+from gdp.nodes.membership import incarnation, wall_clock_ms
+from gdp.nodes.runtime import Runtime
+from gdp.ports.raw import RawPlane
+from gdp.stores.keyring import DELEGATIONS, load_identity, load_root
+from gdp.trust.domain import Policy
+from proxy.held import Held
+
+GAP_S = 0.002  # between requests
+PATIENCE_S = 30.0
+
+
+class Robot:
+    """Asks as it is told."""
+
+    def __init__(self, member: Member, runtime: Runtime, topic: Topic, requests: int, size: int) -> None:
+        self._member, self._runtime, self._service = member, runtime, topic.name
+        self._requests, self._body = requests, bytes(size)
+        self._stream = member.call(topic, b"requests")
+        self._stream.bundle_bytes = 0
+
+    def meet(self, peers: int) -> None:
+        """Return when it has so many peers."""
+        deadline_s = time.monotonic() + PATIENCE_S
+        assert self._runtime.run(lambda: len(self._member.peers(self._service)) == peers, deadline_s)
+
+    def publish(self) -> None:
+        """Ask all; return when all have confirmed."""
+        for _ in self._paced():
+            self._stream.publish(self._body)
+        assert self._runtime.run(self._stream.is_acknowledged, time.monotonic() + PATIENCE_S)
+
+    def ask(self) -> None:
+        """Ask one; return when what it was asked has left."""
+        server = self._member.peers(self._service)[0]
+        for _ in self._paced():
+            self._member.ask(self._service, server, self._body)
+        self._runtime.run(lambda: False, time.monotonic() + 0.2)
+
+    def _paced(self) -> Iterator[None]:
+        for _ in range(self._requests):
+            yield
+            self._runtime.run(lambda: False, time.monotonic() + GAP_S)
+
+
+def main(service: str, identity_at: str, root: str, device: str, role: str, *load: str) -> None:
+    identity = load_identity(Path(identity_at), time.time())
+    policy = Policy(load_root(Path(root)), [])
+    (topic,) = Held(Path(identity_at) / DELEGATIONS, identity)
+    assert topic.name.to_text() == service
+    member = Member(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes))
+    plane = RawPlane([device])
+    runtime = Runtime(member, plane)
+    if role == "serve":
+        member.serve(topic, b"a replica")
+        print("up", flush=True)
+        runtime.run(lambda: bool(member.take_messages() and False))
+        return
+    robot = Robot(member, runtime, topic, *map(int, load))
+    words = os.fdopen(os.dup(sys.stdin.fileno()), "rb", buffering=0)
+    heard: list[str] = []
+    runtime.watch(words, lambda: heard.append(words.readline().decode().strip()))
+    print("up", flush=True)
+    while runtime.run(lambda: bool(heard)) and (word := heard.pop()):
+        if word == "go":
+            robot.publish()
+        elif word == "ask":
+            robot.ask()
+        else:
+            robot.meet(int(word))
+        print("done", flush=True)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,93 @@
+"""Control groups, where the system lets us make some."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from gdp.errors import LocalError
+from gdp.testbed.cgroups import Cgroup
+from gdp.testbed.runs import Runs
+
+_PATIENCE_S = 10.0
+
+
+@pytest.fixture
+def group() -> Iterator[Cgroup]:
+    made = Cgroup(f"gdp-test-{os.getpid()}")
+    if not made.make():
+        made.remove()
+        pytest.skip("cgroups with bounds on processor time and memory cannot be made here")
+    yield made
+    made.remove()
+
+
+@pytest.fixture
+def sleeper() -> Iterator[subprocess.Popen[bytes]]:
+    with subprocess.Popen(["sleep", "1000"], start_new_session=True) as process:
+        yield process
+        process.kill()
+
+
+def found(name: str) -> list[Path]:
+    return list(Path("/sys/fs/cgroup").glob(f"**/{name}"))
+
+
+def test_a_group_is_removed_with_all_that_is_in_it(group: Cgroup, sleeper: subprocess.Popen[bytes]) -> None:
+    group.add(sleeper.pid)
+    group.remove()
+    assert sleeper.wait(_PATIENCE_S) == -signal.SIGKILL
+    assert found(group.name) == []
+    group.remove()
+
+
+def test_a_bound_on_memory_holds(group: Cgroup) -> None:
+    group.limit_memory(64 << 20)
+    code = "import sys; sys.stdin.readline(); bytearray(256 << 20)"
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE) as greedy:
+        group.add(greedy.pid)
+        greedy.communicate(b"go\n", timeout=_PATIENCE_S)
+    assert greedy.returncode == -signal.SIGKILL
+    group.limit_memory(None)
+
+
+def test_bounds_are_set_and_taken_off(group: Cgroup) -> None:
+    for cpus, told in ((0.5, {"10000 20000", "10000"}), (None, {"max 20000", "-1"})):
+        group.limit_cpu(cpus)
+        files = [path for folder in found(group.name) for path in folder.glob("cpu.[mc]*")]
+        values = {path.read_text().strip() for path in files if path.name in ("cpu.max", "cpu.cfs_quota_us")}
+        assert values <= told
+        assert values
+
+
+def test_a_bound_that_cannot_be_set_is_refused() -> None:
+    with pytest.raises(LocalError, match="no bound on processor time"):
+        Cgroup("gdp-never-made").limit_cpu(1.0)
+
+
+def test_what_was_never_made_is_removed_without_complaint() -> None:
+    Cgroup("gdp-never-made").kill()
+    Cgroup("gdp-never-made").remove()
+
+
+def test_a_run_takes_its_group_down(
+    group: Cgroup, sleeper: subprocess.Popen[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    runs = Runs(tmp_path / "runs")
+    run = runs.start()
+    run.plan_cgroup(group.name)
+    group.add(sleeper.pid)
+    run.keep()
+    assert [record.cgroups for record in runs.all()] == [[group.name]]
+    runs.resume(run.id).end()
+    assert sleeper.wait(_PATIENCE_S) == -signal.SIGKILL
+    assert found(group.name) == []
+    with pytest.raises(LocalError, match="no run"):
+        runs.resume(run.id)
