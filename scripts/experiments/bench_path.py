@@ -1,0 +1,18 @@
+"""Where the benches lie: importing it lets the experiments import what they share with them.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Final
+
+__all__ = ["BENCHES", "ROOT"]
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+BENCHES: Final = ROOT / "scripts" / "bench"
+
+if str(BENCHES) not in sys.path:
+    sys.path.append(str(BENCHES))

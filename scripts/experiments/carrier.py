@@ -1,0 +1,53 @@
+"""How a grey frame goes to a service and what was seen in it comes back, in a service type that every ROS 2 has.
+
+Place: pure.
+
+The installed packages have no service that takes an image, so ``rcl_interfaces/srv/
+SetParameters`` carries it: the request has one parameter, called like the frame's number, whose integer array holds the
+640 x 480 bytes of the frame, eight to an integer; the answer's ``reason`` is JSON.
+"""
+
+from __future__ import annotations
+
+import array
+import json
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue, SetParametersResult
+from rcl_interfaces.srv import SetParameters
+from vision import SHAPE, Grey
+
+__all__ = ["TYPE", "answer_of", "frame_of", "number_of", "request_of", "said_in"]
+
+TYPE: Final = "rcl_interfaces/srv/SetParameters"
+
+
+def request_of(frame: Grey, number: int) -> SetParameters.Request:
+    """Return the request that carries a frame."""
+    words = array.array("q", frame.tobytes())
+    value = ParameterValue(type=ParameterType.PARAMETER_INTEGER_ARRAY, integer_array_value=words)
+    return SetParameters.Request(parameters=[Parameter(name=str(number), value=value)])
+
+
+def frame_of(request: SetParameters.Request) -> Grey:
+    """Return the frame that a request carries."""
+    words = np.asarray(request.parameters[0].value.integer_array_value, dtype=np.int64)
+    return words.view(np.uint8).reshape(SHAPE)
+
+
+def number_of(request: SetParameters.Request) -> int:
+    """Return the number of a request's frame."""
+    return int(request.parameters[0].name)
+
+
+def answer_of(said: Mapping[str, object]) -> SetParameters.Response:
+    """Return the response that says something."""
+    return SetParameters.Response(results=[SetParametersResult(successful=True, reason=json.dumps(said))])
+
+
+def said_in(response: SetParameters.Response) -> dict[str, object]:
+    """Return what a response says."""
+    said = json.loads(response.results[0].reason)
+    return said if isinstance(said, dict) else {}

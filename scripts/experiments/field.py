@@ -1,0 +1,269 @@
+"""Where the experiments take place: a robot, two switches, and as many machines as wanted, a namespace each.
+
+Place: shell; makes namespaces and keys, and starts the commands that robots and servers run.
+::
+
+    robot -- s1 -- gate --+-- m1          switches s1 and gate with the RIB beside gate; a proxy at the robot and at
+                          +-- m2          every machine; the machines' proxies expose, the robot's imports
+                          +-- (x3) -- m3  x: a relay where the link takes time
+
+Every namespace has a ROS domain of its own, so nothing but the proxies joins the nodes. Why Fast DDS is set as it is:
+``scripts/bench/ros_row.py``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import yaml
+from bench_path import ROOT
+from peers.process import Started
+
+from gdp.metadata import Metadata
+from gdp.stores.issue import delegate, install_delegation
+from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
+from gdp.testbed.namespaces import Namespaces
+from gdp.testbed.runs import Run
+from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
+from gdp.trust.right import Right
+from proxy.ring.materials import Materials
+
+__all__ = ["READY_S", "ROBOT", "Field", "Served", "Server", "Work"]
+
+ROBOT: Final = "robot"
+READY_S: Final = 40.0
+_NEAR, _GATE = "s1", "gate"
+_HERE: Final = ROOT / "scripts" / "experiments"
+_DOMAIN: Final = 150  # of the robot; the machines' follow
+_PROFILE: Final = """<?xml version="1.0" encoding="UTF-8" ?>
+<dds xmlns="http://www.eprosima.com"><profiles>
+ <transport_descriptors><transport_descriptor>
+  <transport_id>udp</transport_id><type>UDPv4</type>
+  <sendBufferSize>4194304</sendBufferSize><receiveBufferSize>4194304</receiveBufferSize>
+ </transport_descriptor></transport_descriptors>
+ <participant profile_name="participant" is_default_profile="true"><rtps>
+  <userTransports><transport_id>udp</transport_id></userTransports><useBuiltinTransports>false</useBuiltinTransports>
+ </rtps></participant>
+</profiles></dds>
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Served:
+    """A service.
+
+    Args:
+        machines: which expose it.
+        expose: further keys of their rules.
+        imports: further keys of the robot's rule.
+    """
+
+    name: str
+    type_name: str
+    machines: tuple[str, ...]
+    expose: Mapping[str, object] = field(default_factory=dict)
+    imports: Mapping[str, object] = field(default_factory=dict)
+
+    @property
+    def metadata(self) -> Metadata:
+        """Return what its name in the overlay digests."""
+        return Metadata({"kind": "service", "name": self.name, "type": self.type_name})
+
+    def rule(self, owner: Path, further: Mapping[str, object]) -> dict[str, object]:
+        """Return a rule about it."""
+        told = {"name": self.name, "kind": "service", "type": self.type_name, "encoding": "cdr"}
+        return {**told, "owner": str(owner), **further}
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """What a machine's node does: a role of ``program`` and its settings."""
+
+    role: str
+    settings: Mapping[str, object] = field(default_factory=dict)
+    program: Path = _HERE / "replica.py"
+
+
+class Server:
+    """A machine's proxy and node; both can be killed, and come back as they were."""
+
+    def __init__(self, place: Field, label: str, config: str, work: Work) -> None:
+        self.label = label
+        self._place = place
+        self._config = config
+        self._work = work
+        self._running: list[Started] = []
+
+    def begin(self) -> None:
+        """Start both."""
+        told = {**self._work.settings, "machine": self.label}
+        self._running = [
+            self._place.process(self.label, "proxy", ["-m", "proxy.cli", "--config", self._config]),
+            self._place.process(self.label, "node", [str(self._work.program), self._work.role, json.dumps(told)]),
+        ]
+
+    def wait(self) -> None:
+        """Wait until both are ready. They say so before the robot's proxy knows of them.
+
+        Raises:
+            FailedError: one did not come up.
+        """
+        for each in self._running:
+            each.read_line(READY_S)
+
+    def hear(self, patience_s: float) -> dict[str, object]:
+        """Return the next that its node says; raises as ``wait``."""
+        return self._running[-1].read(patience_s)
+
+    def kill(self) -> None:
+        """Kill both at once: SIGKILL, nobody is told."""
+        self._signal(signal.SIGKILL)
+        self.end()
+
+    def freeze(self) -> None:
+        """Stop both; what is sent to them waits."""
+        self._signal(signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        """Let both go on."""
+        self._signal(signal.SIGCONT)
+
+    def end(self) -> None:
+        """End both; what is gone already is fine."""
+        for each in self._running:
+            each.__exit__(None, None, None)
+        self._running = []
+
+    def _signal(self, number: int) -> None:
+        for each in self._running:
+            with suppress(ProcessLookupError):
+                os.killpg(each.pid, number)
+
+
+class Field:
+    """The field with switches, RIB, proxies and servers running; a context manager that ends them.
+
+    Args:
+        run: of which the namespaces are.
+        served: the services; those that any of them names are the machines.
+        work: what every machine's node does.
+        delays: seconds that a machine's link takes, each way.
+        mtu: of every link.
+
+    Raises:
+        LocalError: the kernel refuses.
+        FailedError: a process did not come up; also where ROS 2 is not installed.
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        served: Sequence[Served],
+        work: Mapping[str, Work],
+        *,
+        delays: Mapping[str, float] | None = None,
+        mtu: int = 1_500,
+    ) -> None:
+        self._run = run
+        self._undo = ExitStack()
+        self._machines = tuple(work)
+        self._relays = {machine: f"x{machine}" for machine in delays or {}}
+        topology = self._topology(mtu)
+        self._spaces = Namespaces(topology, run)
+        self._files = run.directory / "keys"
+        self._files.mkdir(mode=0o700)
+        (self._files / "dds.xml").write_text(_PROFILE, encoding="utf-8")
+        materials = Materials(topology, self._files, metrics=False)
+        with ExitStack() as undo:
+            for machine, seconds in (delays or {}).items():
+                relay = [str(_HERE / "relay.py"), _GATE, machine, str(1e3 * seconds)]
+                undo.enter_context(self.process(self._relays[machine], "relay", relay)).read_line(READY_S)
+            planes = set()
+            for node in (_NEAR, _GATE):
+                argv = ["-m", "gdp.cli.switch", "--json", "--config", str(materials.switch(node, "auto"))]
+                planes.add(str(undo.enter_context(self.process(node, "switch", argv)).read(READY_S)["data_plane"]))
+            self.data_plane = ", ".join(sorted(planes))
+            (at,) = topology.attached("rib")
+            rib = ["-m", "gdp.cli.rib", "--json", "--config", str(materials.rib(at))]
+            undo.enter_context(self.process(at.switch, "rib", rib)).read(READY_S)
+            argv = ["-m", "proxy.cli", "--config", self._admit(ROBOT, served)]
+            robot = undo.enter_context(self.process(ROBOT, "proxy", argv))
+            self.servers = {each: Server(self, each, self._admit(each, served), work[each]) for each in self._machines}
+            for server in self.servers.values():
+                undo.callback(server.end)
+                server.begin()
+            for server in self.servers.values():
+                server.wait()
+            robot.read_line(READY_S)
+            self._undo = undo.pop_all()
+
+    def __enter__(self) -> Field:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._undo.close()
+
+    def client(self, place: str, role: str, program: Path = _HERE / "robot.py", **settings: object) -> Started:
+        """Start a client at the robot, or beside a server: a role of ``program`` and its settings."""
+        return self.process(place, role, [str(program), role, json.dumps(settings)])
+
+    def process(self, node: str, what: str, arguments: Sequence[str]) -> Started:
+        """Start a Python process in a namespace."""
+
+        def command(argv: Sequence[str]) -> list[str]:
+            return self._spaces.command(node, ["env", *self._environment(node), *argv])
+
+        return Started(self._run, f"{what} at {node}", command, arguments)
+
+    def _environment(self, node: str) -> list[str]:
+        profile = self._files / "dds.xml"
+        return [
+            f"ROS_DOMAIN_ID={self._domain(node)}",
+            "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET",
+            "RMW_IMPLEMENTATION=rmw_fastrtps_cpp",
+            f"FASTRTPS_DEFAULT_PROFILES_FILE={profile}",  # its name before Fast DDS 3
+            f"FASTDDS_DEFAULT_PROFILES_FILE={profile}",
+            "OPENBLAS_NUM_THREADS=1",  # a machine here is one core's worth
+            "OMP_NUM_THREADS=1",
+        ]
+
+    def _domain(self, node: str) -> int:
+        return _DOMAIN + 1 + self._machines.index(node) if node in self._machines else _DOMAIN
+
+    def _admit(self, node: str, served: Sequence[Served]) -> str:
+        """Let a proxy carry its side of everything, and write its configuration; return the file."""
+        identity, owner = self._files / "nodes" / f"proxy-{node}", self._files / "owner"
+        side, right = ("import", Right.CALL) if node == ROBOT else ("expose", Right.SERVE)
+        rules = []
+        for each in served:
+            if node == ROBOT or node in each.machines:
+                install_delegation(identity, delegate(owner, identity / CARD, each.metadata, [right]))
+                rules.append(each.rule(owner / OWNER_PUBLIC, each.imports if node == ROBOT else each.expose))
+        content = {
+            "identity": str(identity),
+            "domain": {"root": str(self._files / "domains" / "field" / ROOT_CERTIFICATE)},
+            "iface": _NEAR if node == ROBOT else self._relays.get(node, _GATE),
+            "delegations": str(identity / DELEGATIONS),
+            "ros": {"endpoint": "ros2", "domain": self._domain(node)},
+            side: rules,
+        }
+        path = self._files / f"proxy-{node}.yaml"
+        path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+        return str(path)
+
+    def _topology(self, mtu: int) -> Topology:
+        links = [Link(ROBOT, _NEAR, mtu=mtu), Link(_NEAR, _GATE, mtu=mtu)]
+        for machine in self._machines:
+            relay = self._relays.get(machine)
+            between = [(_GATE, machine)] if relay is None else [(_GATE, relay), (relay, machine)]
+            links += [Link(a, b, mtu=mtu) for a, b in between]
+        nodes = (ROBOT, _NEAR, _GATE, *self._relays.values(), *self._machines)
+        ends = tuple(Attachment(each, "proxy", "end") for each in (ROBOT, *self._machines))
+        return Topology(tuple(links), (DomainPlan("field", nodes),), (Attachment(_GATE, "rib", "rib"), *ends))

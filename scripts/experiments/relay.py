@@ -1,0 +1,18 @@
+"""A link that takes time, in both directions: ``relay.py DEVICE DEVICE MILLISECONDS``.
+
+Place: process of its own, in the namespace between two machines. The relay is the one of the provider ``local``, which
+waits on its standard input for leave to begin; here it has that from the start.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+
+from fog.providers.local.delay import main
+
+__all__: list[str] = []
+
+if __name__ == "__main__":
+    sys.stdin = io.StringIO("\n")
+    main()

@@ -1,0 +1,215 @@
+"""The service nodes of the experiments: ordinary rclpy nodes that know nothing of the overlay.
+
+Place: process of its own, started by ``field.py`` on a machine: ``replica.py ROLE SETTINGS``.
+
+``plan`` and ``replay`` serve ``nav_msgs/srv/GetPlan``: the request's start names the problem in its ``frame_id`` (one
+that nobody knows is answered at once, without a way), its goal's stamp holds the number of the request in seconds; the
+answer's header names the machine, and its stamp is how long it worked. Both break off when the service's ``/stop`` is
+called (``std_srvs/srv/Trigger``). ``detect``, ``segment``, ``light`` and ``tag`` serve what ``carrier.py`` tells, one
+request at a time.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Final
+
+import bench_path  # noqa: F401 - finds ``peers``
+import rclpy
+from builtin_interfaces.msg import Time
+from carrier import answer_of, frame_of
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
+from nav_msgs.srv import GetPlan
+from peers.lines import say
+from rcl_interfaces.srv import SetParameters
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+from vision import Grey
+
+__all__: list[str] = []
+
+_THREADS: Final = 32
+_COARSE: Final = 4
+Settings = Mapping[str, object]
+
+
+class _Service:
+    """One ``GetPlan`` service and its ``/stop``: the requests under way, each with a flag: wanted no longer."""
+
+    def __init__(self, planner: _Planner, node: Node, name: str, machine: str) -> None:
+        self._planner = planner
+        self._machine = machine
+        self._flags: set[threading.Event] = set()
+        self._lock = threading.Lock()
+        group = ReentrantCallbackGroup()
+        node.create_service(GetPlan, name, self._answer, callback_group=group)
+        node.create_service(Trigger, f"{name}/stop", self._stop, callback_group=group)
+
+    def _answer(self, request: GetPlan.Request, response: GetPlan.Response) -> GetPlan.Response:
+        begun_s, flag = time.monotonic(), threading.Event()
+        with self._lock:
+            self._flags.add(flag)
+        try:
+            response.plan.poses = self._planner.way(request, flag)
+        finally:
+            with self._lock:
+                self._flags.discard(flag)
+        part_s, whole_s = math.modf(time.monotonic() - begun_s)
+        response.plan.header.frame_id = self._machine
+        response.plan.header.stamp = Time(sec=int(whole_s), nanosec=int(part_s * 1e9))
+        return response
+
+    def _stop(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        del request
+        with self._lock:
+            response.success = bool(self._flags)
+            for flag in self._flags:
+                flag.set()
+        return response
+
+
+class _Planner(ABC):
+    """Answers ``GetPlan``, and breaks off when it is told to."""
+
+    def __init__(self, node: Node, settings: Settings) -> None:
+        self._services = [_Service(self, node, name, str(settings["machine"])) for name in _names(settings)]
+
+    @abstractmethod
+    def way(self, request: GetPlan.Request, flag: threading.Event) -> list[PoseStamped]:
+        """Return the poses of the answer; they do not matter once the flag is raised."""
+
+
+class _Ompl(_Planner):
+    """Plans by OMPL; a request that comes while another is planned waits for its core, not for a lock."""
+
+    def __init__(self, node: Node, settings: Settings) -> None:
+        from planning import Problem, be_quiet
+
+        be_quiet()
+        folder, names = Path(str(settings["folder"])), str(settings["problems"]).split()
+        self._problems = {name: Problem.load(folder, name) for name in names}
+        self._kind = str(settings["planner"])
+        self._patience_s = float(str(settings["patience_s"]))
+        super().__init__(node, settings)
+
+    def way(self, request: GetPlan.Request, flag: threading.Event) -> list[PoseStamped]:
+        problem = self._problems.get(request.start.header.frame_id)
+        if problem is None:
+            return []
+        found = problem.solve(self._kind, self._patience_s, flag.is_set) or []
+        return [_stamped(each) for each in found]
+
+
+class _Replay(_Planner):
+    """Waits as long as a recording says, and computes nothing: what is measured is the overlay's part alone."""
+
+    def __init__(self, node: Node, settings: Settings) -> None:
+        waits = settings["waits_s"]
+        self._waits_s: dict[str, list[float]] = waits if isinstance(waits, dict) else {}
+        super().__init__(node, settings)
+
+    def way(self, request: GetPlan.Request, flag: threading.Event) -> list[PoseStamped]:
+        if waits_s := self._waits_s.get(request.start.header.frame_id):
+            flag.wait(waits_s[request.goal.header.stamp.sec % len(waits_s)])
+        return [PoseStamped()]
+
+
+def _look(node: Node, settings: Settings, see: Callable[[Grey], Mapping[str, object]]) -> None:
+    machine = settings["machine"]
+
+    def answer(request: SetParameters.Request, response: SetParameters.Response) -> SetParameters.Response:
+        del response
+        begun_s = time.monotonic()
+        said = see(frame_of(request))
+        return answer_of({"machine": machine, "worked_s": time.monotonic() - begun_s, **said})
+
+    for name in _names(settings):
+        node.create_service(SetParameters, name, answer)
+
+
+def _detect(node: Node, settings: Settings) -> None:
+    from vision import find_objects
+
+    _look(node, settings, lambda frame: {"found": find_objects(frame)})
+
+
+def _segment(node: Node, settings: Settings) -> None:
+    from vision import count_regions
+
+    _look(node, settings, lambda frame: {"regions": count_regions(frame)})
+
+
+def _light(node: Node, settings: Settings) -> None:
+    """Segment coarsely, and wait for the rest of the time: as long as another processor than ours would work."""
+    from vision import count_regions
+
+    takes_s = float(str(settings["takes_s"]))
+
+    def see(frame: Grey) -> dict[str, object]:
+        done_s = time.monotonic() + takes_s
+        regions = count_regions(frame, _COARSE)
+        time.sleep(max(done_s - time.monotonic(), 0))
+        return {"regions": regions}
+
+    _look(node, settings, see)
+
+
+def _tag(node: Node, settings: Settings) -> None:
+    from tag import TagCamera
+
+    camera = TagCamera()
+
+    def see(frame: Grey) -> dict[str, object]:
+        pose = camera.find(frame)
+        return {} if pose is None else {"turn": pose.turn, "at": pose.at}
+
+    _look(node, settings, see)
+
+
+_ROLES: Final[Mapping[str, Callable[[Node, Settings], object]]] = {
+    "plan": _Ompl,
+    "replay": _Replay,
+    "detect": _detect,
+    "segment": _segment,
+    "light": _light,
+    "tag": _tag,
+}
+
+
+def _names(settings: Settings) -> list[str]:
+    return str(settings["services"]).split()
+
+
+def _stamped(place: tuple[float, ...]) -> PoseStamped:
+    x, y, z, *turn = place
+    qx, qy, qz, qw = turn
+    pose = Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+    return PoseStamped(pose=pose)
+
+
+def main() -> None:
+    """Serve until killed."""
+    role, settings = sys.argv[1], json.loads(sys.argv[2])
+    rclpy.init()
+    node = Node(f"replica_{role}")
+    executor = MultiThreadedExecutor(_THREADS) if role in ("plan", "replay") else SingleThreadedExecutor()
+    executor.add_node(node)
+    serving = _ROLES[role](node, settings)
+    say(event="ready")
+    try:
+        executor.spin()
+    except ExternalShutdownException:
+        del serving
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,86 @@
+"""What became of requests, and what may be said of it: mean, p99, gains, and the least of two that arithmetic promises.
+
+Place: pure.
+Source: FogROS2-FT (IROS 2024), whose figures compare mean and 99th percentile of one server and of two.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import fmean
+
+__all__ = ["Sample", "Summary", "least_of_two", "p99", "quantile"]
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One request.
+
+    Args:
+        service: the name that was called.
+        begun_s: when, in monotonic seconds of the machine that all stand on.
+        latency_s: until the answer was in the caller's hands; of a failed one, until that was known.
+        machine: who answered; empty: nobody.
+        worked_s: how long the server says that it took.
+        is_right: the answer is there and is the right one.
+        note: what the experiment wants to know of the answer.
+    """
+
+    service: str
+    begun_s: float
+    latency_s: float
+    machine: str
+    worked_s: float
+    is_right: bool
+    note: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """Latencies in short, in seconds."""
+
+    count: int
+    failed: int
+    mean_s: float
+    p50_s: float
+    p99_s: float
+    worst_s: float
+
+    @classmethod
+    def of(cls, samples: Sequence[Sample]) -> Summary:
+        """Return the summary of one request or more; failed ones count with the time that they cost.
+
+        Raises:
+            ValueError: none at all.
+        """
+        times = [each.latency_s for each in samples]
+        failed = sum(not each.is_right for each in samples)
+        return cls(len(times), failed, fmean(times), quantile(times, 0.5), p99(times), max(times))
+
+
+def quantile(values: Sequence[float], share: float) -> float:
+    """Return the smallest value that at least ``share`` (0 to 1) of the values do not pass.
+
+    Raises:
+        ValueError: no values.
+    """
+    if not values:
+        raise ValueError("no values")
+    return sorted(values)[max(0, math.ceil(share * len(values)) - 1)]
+
+
+def p99(values: Sequence[float]) -> float:
+    """Return the 99th percentile; of fewer than a hundred values it is the largest.
+
+    Raises:
+        ValueError: no values.
+    """
+    return quantile(values, 0.99)
+
+
+def least_of_two(values: Sequence[float]) -> list[float]:
+    """Return the smaller one of every pair of values: two servers that work independently, with no overlay at all."""
+    ordered = sorted(values)
+    return [small for at, small in enumerate(ordered) for _ in ordered[at + 1 :]]

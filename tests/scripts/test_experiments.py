@@ -1,0 +1,99 @@
+"""What the experiments' figures rest on: statistics, frames whose truth is known, planners that can be stopped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.pages import ROOT
+
+MESHES = ROOT.parent / "shared" / "data" / "planning"
+
+
+def needs(*modules: str) -> None:
+    for module in modules:
+        pytest.importorskip(module, reason=f"{module} is not installed: pip install 'gdp-ros[experiments]'")
+
+
+def test_the_least_of_two_takes_every_pair_once() -> None:
+    from samples import least_of_two
+
+    assert sorted(least_of_two([3.0, 1.0, 2.0])) == [1.0, 1.0, 2.0]
+
+
+def test_the_p99_of_few_values_is_the_largest() -> None:
+    from samples import p99
+
+    assert p99([5.0, 9.0, 1.0]) == 9.0
+    assert p99([float(value) for value in range(1, 201)]) == 198.0
+
+
+def test_a_failed_request_counts_with_the_time_that_it_cost() -> None:
+    from samples import Sample, Summary
+
+    right = Sample("/s", 0.0, 1.0, "m1", 0.5, is_right=True)
+    failed = Sample("/s", 1.0, 9.0, "", 0.0, is_right=False)
+    summary = Summary.of([right, failed])
+    assert (summary.count, summary.failed, summary.mean_s, summary.worst_s) == (2, 1, 5.0, 9.0)
+
+
+def test_what_is_drawn_is_found_and_counted() -> None:
+    needs("scipy")
+    from vision import Scene, count_regions, find_objects
+
+    for seed in range(3):
+        scene = Scene.draw(seed)
+        assert scene.agrees(find_objects(scene.frame))
+        assert count_regions(scene.frame) == count_regions(scene.frame, 4) == len(scene.centres)
+
+
+def test_an_object_too_many_or_elsewhere_is_wrong() -> None:
+    needs("scipy")
+    from vision import Scene
+
+    scene = Scene.draw(1)
+    found = list(scene.centres)
+    assert scene.agrees(found)
+    assert not scene.agrees([*found, (5, 5)])
+    assert not scene.agrees([(row + 10, column) for row, column in found])
+
+
+def test_a_frame_comes_through_its_carrier_unchanged() -> None:
+    needs("scipy", "rcl_interfaces")
+    from carrier import answer_of, frame_of, number_of, request_of, said_in
+    from vision import Scene
+
+    frame = Scene.draw(2).frame
+    request = request_of(frame, 7)
+    assert (frame_of(request) == frame).all()
+    assert number_of(request) == 7
+    assert said_in(answer_of({"machine": "m1"})) == {"machine": "m1"}
+
+
+def test_a_drawn_tag_is_found_where_it_is() -> None:
+    needs("pupil_apriltags", "scipy")
+    from tag import Pose, TagCamera
+
+    camera = TagCamera()
+    for number in (0, 40, 90):
+        truth = Pose.on_its_way(number)
+        found = camera.find(camera.draw(truth))
+        assert found is not None
+        assert found.apart_m(truth) < 0.005
+        assert found.turned_rad(truth) < 0.03
+
+
+@pytest.mark.skipif(not MESHES.is_dir(), reason="no ../shared/data/planning here")
+def test_a_planner_finds_a_way_and_breaks_off_when_told() -> None:
+    needs("ompl", "fcl", "trimesh", "collada")
+    from planning import Problem, be_quiet
+
+    be_quiet()
+    easy = Problem.load(Path(MESHES), "Easy")
+    way = easy.solve("RRTConnect", 30.0, lambda: False)
+    assert way is not None
+    assert way[0][:3] == pytest.approx(easy.start)
+    assert way[-1][:3] == pytest.approx(easy.goal)
+    asked = iter([False, True])
+    assert Problem.load(Path(MESHES), "Twistycool").solve("RRTConnect", 30.0, lambda: next(asked, True)) is None
