@@ -397,6 +397,18 @@ def test_a_device_that_is_not_there_is_refused(node: Plane) -> None:
         node.add_port("p9")
 
 
+def test_a_device_that_may_come_later_is_opened_when_it_appears(node: Plane, space: Space) -> None:
+    heard: list[tuple[int, bool]] = []
+    node.on_link(lambda port, up: heard.append((port, up)))
+    port = node.add_port("p9", may_be_absent=True)
+    assert not node.port_state(port)
+    space.veth("p9", "q9", bytes([2, 0, 0, 0, 0, 9]), PEER_MACS[IN])
+    poll_until(node, lambda: node.port_state(port))
+    assert heard == [(port, True)]
+    assert node.ports[port].mac == bytes([2, 0, 0, 0, 0, 9])
+    assert node.transmit(port, PEER_MACS[IN], [frame(ONE)[14:]]) == 1
+
+
 def test_a_device_given_twice_is_refused(node: Plane) -> None:
     with pytest.raises(LocalError, match="given twice"):
         node.add_port("p0")

@@ -3,7 +3,7 @@
 #
 #   scripts/setup.sh          to run
 #   scripts/setup.sh --ros2   to run where no ROS 2 is installed: with a real one from the package index
-#   scripts/setup.sh --dev    to test as well, with all that tests use: ROS 2, Cyclone DDS, and ROS 1 from Debian
+#   scripts/setup.sh --dev    to test as well, with all that tests use: ROS 2, Cyclone DDS, SkyPilot, ROS 1 from Debian
 #
 # Needs: python3 >= 3.10. System packages are installed only where something is missing, and only as root.
 set -euo pipefail
@@ -12,7 +12,7 @@ root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 cd "$root"
 venv=$root/.venv
 extras=""
-dev="[dev,bench,dds,ros2]"
+dev="[dev,bench,dds,ros2,aws,skypilot,experiments]"
 case "${1:-}" in
     --dev) extras=$dev ;;
     --ros2) extras="[ros2]" ;;
@@ -96,6 +96,9 @@ trap 'rm -f "$log"' EXIT
 if ! "$venv/bin/python" -m pip install --disable-pip-version-check --no-input -e ".$extras" >"$log" 2>&1; then
     tail -n 25 "$log" >&2
     fail "pip could not install the package; the lines above say why"
+fi
+if [[ "$extras" == "$dev" ]] && command -v apt-get >/dev/null; then
+    scripts/setup_cloud_schema.sh || say "the test of user data against cloud-init's schema will be skipped"
 fi
 rm -f "$venv"/.installed*
 printf '%s\n' "$wanted" >"$venv/.installed$extras"

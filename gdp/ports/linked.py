@@ -7,6 +7,7 @@ the port opens it anew. The kernel's own word (netlink) decides, so a cut link i
 A port's life::
 
     add_port -> open, up or down <-> up or down (carrier) -> absent (device deleted) -> open (device of that name) ...
+       `-----> absent, where it may be
 """
 
 from __future__ import annotations
@@ -133,10 +134,14 @@ class LinkedPlane(ABC):
             del self._ranks[fd]
             self._epoll.unregister(fd)
 
-    def add_port(self, ifname: str) -> int:
+    def add_port(self, ifname: str, *, may_be_absent: bool = False) -> int:
         if any(port.ifname == ifname for port in self._ports.values()):
             raise LocalError(f"port {ifname}: given twice")
         link = self._links.ask(ifname)
+        if link is None and may_be_absent:
+            self._know(Port(self._next_index, ifname, bytes(MAC_BYTES), MTU_MIN_BYTES, up=False))
+            self._next_index += 1
+            return self._next_index - 1
         if link is None:
             raise LocalError(f"port {ifname}: no such device")
         if link.mtu < MTU_MIN_BYTES:

@@ -100,8 +100,8 @@ class Plane(Protocol):
     def unwatch(self, source: HasFileno) -> None:
         """Undo ``watch``, before the source is closed."""
 
-    def add_port(self, ifname: str) -> int:
-        """Open a device and return its port index.
+    def add_port(self, ifname: str, *, may_be_absent: bool = False) -> int:
+        """Open a device and return its port index; one that may be absent is opened when it appears.
 
         Raises:
             LocalError: no such device, its MTU is too small, it is a port already, or raw sockets are not allowed here.

@@ -56,10 +56,9 @@ class Flooding:
         self._synced_s: dict[tuple[int, Name], float] = {}
 
     def digest_for(self, port: LinkPort) -> bytes:
-        """Return what to say in a hello on a port."""
-        switches = [each for each in port.neighbours.values() if each.role == Role.SWITCH]
-        domain = switches[0].domain if len(switches) == 1 else None
-        return bytes(DIGEST_BYTES) if domain is None else self.link_states.digest(domain)
+        """Return what to say in a hello on a port: nothing where its switches are of several domains."""
+        domains = {each.domain for each in port.neighbours.values() if each.role == Role.SWITCH}
+        return self.link_states.digest(domains.pop()) if len(domains) == 1 else bytes(DIGEST_BYTES)
 
     def receive(self, neighbour: Neighbour, statement: Statement, now: Instant) -> bool:
         """Take a link state that a neighbour passed on; return whether it was news.

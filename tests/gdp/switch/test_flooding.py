@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from gdp.control.hello import DIGEST_BYTES
 from gdp.control.link_state import LinkState, Scope
 from gdp.errors import DropReason
 from gdp.frame.codec import HEADER_BYTES, Header, encode
@@ -88,3 +91,19 @@ def test_neighbours_that_missed_a_flood_catch_up_by_their_digests() -> None:
     world.network.run(3)
     one, two = (world.switches[each]._flooding.link_states for each in ("nuc1", "nuc2"))
     assert one.digest(one._domain) == two.digest(two._domain)
+
+
+def test_a_port_with_several_switches_shows_what_all_of_them_should_have() -> None:
+    world = ring()
+    world.network.run(1)
+    flooding = world.switches["nuc1"]._flooding
+    (port,) = (
+        port
+        for port in flooding._greeter.ports.values()
+        if any(each.name == world.identities["nuc2"].name for each in port.neighbours.values())
+    )
+    (inside,) = port.neighbours.values()
+    port.neighbours[ZERO] = replace(inside, name=ZERO)
+    assert flooding.digest_for(port) == flooding.link_states.digest(inside.domain) != bytes(DIGEST_BYTES)
+    port.neighbours[ZERO] = replace(inside, name=ZERO, domain=ZERO)
+    assert flooding.digest_for(port) == bytes(DIGEST_BYTES)

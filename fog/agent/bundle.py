@@ -1,0 +1,75 @@
+"""A machine's boot as plain files, so that any provider can carry it: by hand, in user data, over ssh.
+
+Place: pure, but for ``install``, which writes them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+from fog.machine import Boot, Program
+from gdp.errors import LocalError
+from gdp.stores.files import private, write_all
+
+__all__ = ["BOOT_FILE", "install", "pack", "read_programs", "unpack"]
+
+BOOT_FILE: Final = "boot.json"
+
+
+def pack(boot: Boot) -> dict[str, bytes]:
+    """Return all files below the machine's folder: the boot's own, and ``boot.json``, which tells its programs.
+
+    Raises:
+        LocalError: a path that leads out of the folder, or is ``boot.json`` itself; two programs of one name.
+    """
+    for path in boot.files:
+        parts = PurePosixPath(path).parts
+        if not parts or path.startswith("/") or ".." in parts or path == BOOT_FILE:
+            raise LocalError(f"boot: {path!r} is no place for a file of a machine")
+    names = [program.name for program in boot.programs]
+    if len(set(names)) < len(names) or not all(name.replace("-", "").replace("_", "").isalnum() for name in names):
+        raise LocalError(f"boot: programs need different names of letters, digits, '-' and '_': {', '.join(names)}")
+    told = {"programs": [asdict(program) for program in boot.programs]}
+    return {**boot.files, BOOT_FILE: json.dumps(told, indent=1).encode()}
+
+
+def unpack(files: Mapping[str, bytes]) -> Boot:
+    """Return the boot that was packed.
+
+    Raises:
+        LocalError: ``boot.json`` is not there, or is something else.
+    """
+    if BOOT_FILE not in files:
+        raise LocalError(f"no {BOOT_FILE}")
+    others = {path: content for path, content in files.items() if path != BOOT_FILE}
+    return Boot(others, read_programs(files[BOOT_FILE]))
+
+
+def read_programs(content: bytes) -> tuple[Program, ...]:
+    """Return the programs that a ``boot.json`` tells.
+
+    Raises:
+        LocalError: it is something else.
+    """
+    try:
+        told = json.loads(content)["programs"]
+        return tuple(Program(**{**each, "argv": tuple(each["argv"])}) for each in told)
+    except (ValueError, KeyError, TypeError) as error:
+        raise LocalError(f"{BOOT_FILE} is none: {error!r}") from error
+
+
+def install(home: Path, boot: Boot) -> None:
+    """Write all files of a boot into a machine's folder, for its owner's eyes.
+
+    Raises:
+        LocalError: as ``pack``; a file is there already, or the system refuses.
+    """
+    for path, content in pack(boot).items():
+        place = home / path
+        for folder in [home, *(home / each for each in reversed(PurePosixPath(path).parents))]:
+            folder.mkdir(mode=0o700, exist_ok=True)
+        write_all(place.parent, {place.name: private(content)})

@@ -1,0 +1,57 @@
+"""The ``fog-machine`` command.
+
+Place: command.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fog.agent.host import Host
+from gdp.cli.node import Verbose, emit, failing_clearly, set_up_logging
+
+__all__ = ["main"]
+
+log = logging.getLogger(__name__)
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+Home = Annotated[
+    Path, typer.Option("--home", help="The machine's folder, with boot.json.", exists=True, file_okay=False)
+]
+Json = Annotated[bool, typer.Option("--json", help="Say at the end why, as a line of JSON.")]
+AwaitGo = Annotated[bool, typer.Option("--await-go", hidden=True)]
+
+
+@app.command(epilog="Example: fog-machine --home /var/lib/fog/machine")
+def machine(home: Home, json: Json = False, verbose: Verbose = False, await_go: AwaitGo = False) -> None:
+    """Be a machine of a cluster: run the programs of its boot.json, until SIGTERM; SIGUSR1 drains it first.
+
+    Its folder's status.json tells how they are, logs/ what they say.
+    """
+    set_up_logging(verbose=verbose)
+    with failing_clearly():
+        host = Host(home.resolve())
+        if await_go and not sys.stdin.readline():
+            log.warning("nobody says go, so nobody has a record of this machine")
+            raise typer.Exit(1)
+        reason = asyncio.run(host.run())
+        if json:
+            emit("done", reason=reason)
+        else:
+            typer.echo(f"machine ends: {reason}")
+
+
+def main() -> None:
+    """Run the command."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,33 @@
+"""The provider's word that it will take a machine, as ``notice.json`` in the machine's folder.
+
+Place: the file system.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Final
+
+__all__ = ["NOTICE_FILE", "read_notice", "write_notice"]
+
+NOTICE_FILE: Final = "notice.json"
+
+
+def write_notice(home: Path, leaves_at_unix_s: float) -> None:
+    """Say when the machine will be taken; an earlier word is replaced.
+
+    Raises:
+        OSError: the system refuses.
+    """
+    draft = home / f".{NOTICE_FILE}"
+    draft.write_text(json.dumps({"leaves_at_unix_s": leaves_at_unix_s}), encoding="ascii")
+    draft.replace(home / NOTICE_FILE)
+
+
+def read_notice(home: Path) -> float | None:
+    """Return when the machine will be taken, as Unix time; None: nobody said so."""
+    try:
+        return float(json.loads((home / NOTICE_FILE).read_bytes())["leaves_at_unix_s"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

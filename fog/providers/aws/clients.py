@@ -1,0 +1,89 @@
+"""One EC2 client for each region, made when it is first asked for; boto3 finds credentials its own way.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from threading import Lock
+from typing import TYPE_CHECKING
+
+from fog.providers.aws.faults import asking
+from gdp.errors import LocalError
+
+if TYPE_CHECKING:
+    from types_boto3_ec2 import EC2Client
+    from types_boto3_ec2.type_defs import FilterTypeDef
+
+__all__ = ["Clients", "filters"]
+
+_CONNECT_S = 5.0
+_ANSWER_S = 30.0
+_ATTEMPTS = 4
+_FIRST_REGION = "us-east-1"  # every account has it enabled
+
+
+class Clients:
+    """All regions of an account, or the chosen ones. May be used by several threads.
+
+    Raises:
+        LocalError: boto3 is not installed.
+    """
+
+    def __init__(self, chosen: tuple[str, ...] = ()) -> None:
+        try:
+            import boto3
+        except ModuleNotFoundError as missing:
+            raise LocalError("provider aws needs boto3: pip install 'gdp-ros[aws]'") from missing
+        with asking("credentials"):
+            self._session = boto3.session.Session()
+        self._regions = chosen
+        self._clients: dict[str, EC2Client] = {}
+        self._lock = Lock()  # a session makes clients for one thread at a time
+
+    def __getitem__(self, region: str) -> EC2Client:
+        """Return the client of a region.
+
+        Raises:
+            LocalError: there is no such region, or it is not among the chosen.
+        """
+        from botocore.config import Config
+
+        if self._regions and region not in self._regions:
+            raise LocalError(f"aws: region {region} is not among `aws.regions`: {', '.join(self._regions)}")
+        with self._lock:
+            if region not in self._clients:
+                retries = Config(
+                    connect_timeout=_CONNECT_S,
+                    read_timeout=_ANSWER_S,
+                    retries={"mode": "standard", "max_attempts": _ATTEMPTS},
+                )
+                with asking(region):
+                    self._clients[region] = self._session.client("ec2", region_name=region, config=retries)
+            return self._clients[region]
+
+    def regions(self) -> tuple[str, ...]:
+        """Return the chosen regions, else those that the account has enabled.
+
+        Raises:
+            StoreError: EC2 cannot be asked now.
+            LocalError: it refuses the credentials.
+        """
+        if not self._regions:
+            with asking("regions"):
+                found = self[_FIRST_REGION].describe_regions()["Regions"]
+            self._regions = tuple(sorted(each["RegionName"] for each in found))
+        return self._regions
+
+    def close(self) -> None:
+        """Close the connections."""
+        with self._lock:
+            for client in self._clients.values():
+                client.close()
+            self._clients.clear()
+
+
+def filters(wanted: Mapping[str, str]) -> list[FilterTypeDef]:
+    """Return EC2's form of "all of these are so"."""
+    return [{"Name": key, "Values": [value]} for key, value in wanted.items()]

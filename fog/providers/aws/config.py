@@ -1,0 +1,44 @@
+"""The settings of provider ``aws``: regions, image, network, and who may log in. Credentials are boto3's own affair.
+
+Place: pure.
+Source: Debian's images are published by account 136693071363 (wiki.debian.org/Cloud/AmazonEC2Image).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from ipaddress import IPv4Network
+from pathlib import Path
+
+from pydantic import Field
+
+from fog.providers.cloud_init import Setup
+from gdp.nodes.schema import Section
+
+__all__ = ["AwsConfig", "Ssh"]
+
+
+class Ssh(Section):
+    """Logging in: ``key_pair`` as EC2 calls it, ``sources`` the addresses that port 22 is opened to."""
+
+    key_pair: str
+    sources: IPv4Network
+    key_file: Path | None = None
+    user: str = "admin"
+
+
+class AwsConfig(Section):
+    """``aws:`` of ``fog.yaml``. Without ``regions`` all that the account has enabled are looked through. ``images``,
+    ``subnets`` and ``security_groups`` go by region; what is not there is the newest image of that owner and name, the
+    default VPC, and a security group of our own that lets nothing in but what ``ssh`` and ``setup.vxlan`` need.
+    """
+
+    regions: tuple[str, ...] = ()
+    images: Mapping[str, str] = Field(default_factory=dict)
+    image_owner: str = "136693071363"
+    image_name: str = "debian-12-amd64-*"
+    disk_gib: int = Field(default=20, ge=8, le=16_384)
+    subnets: Mapping[str, str] = Field(default_factory=dict)
+    security_groups: Mapping[str, tuple[str, ...]] = Field(default_factory=dict)
+    ssh: Ssh | None = None
+    setup: Setup = Setup()

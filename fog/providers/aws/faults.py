@@ -1,0 +1,88 @@
+"""What an error of EC2 means for who asked: try again or elsewhere, or it will never be had this way.
+
+Place: shell; waits for nothing itself.
+Source: "Error codes for the Amazon EC2 API" of the EC2 API reference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Final
+
+from gdp.errors import LocalError, StoreError
+
+__all__ = ["asking", "is_code"]
+
+_TRY_AGAIN: Final = {
+    "InsufficientInstanceCapacity": "there is no such machine to be had there now",
+    "InsufficientHostCapacity": "there is no such machine to be had there now",
+    "InsufficientAddressCapacity": "there is no public address to be had there now",
+    "InsufficientFreeAddressesInSubnet": "the subnet has no free address",
+    "SpotMaxPriceTooLow": "the spot price is above the limit now",
+    "IdempotentParameterMismatch": "the machine was asked for a moment ago, and is not listed yet",
+    "RequestLimitExceeded": "too many requests",
+    "ResourceCountExceeded": "too many requests",
+    "Throttling": "too many requests",
+    "ThrottlingException": "too many requests",
+}
+_WHAT_TO_DO: Final = {
+    "UnauthorizedOperation": "the credentials lack the permission; docs/providers.md lists what they need",
+    "AuthFailure": "the credentials are not valid, or the region is not enabled for the account",
+    "InvalidClientTokenId": "the credentials are not valid",
+    "OptInRequired": "the account is not subscribed to this",
+    "PendingVerification": "the account is not verified yet",
+    "VcpuLimitExceeded": "the account's quota of virtual CPUs is used up: ask for more in Service Quotas",
+    "InstanceLimitExceeded": "the account's quota is used up: ask for more in Service Quotas",
+    "MaxSpotInstanceCountExceeded": "the account's quota of spot machines is used up: ask for more in Service Quotas",
+    "Unsupported": "this region does not sell this type of machine in that form",
+    "InvalidKeyPair.NotFound": "the key pair of `aws.ssh` is not in this region: import it there",
+    "InvalidAMIID.NotFound": "the image of `aws.images` is not in this region",
+    "VPCIdNotSpecified": "the region has no default VPC: name one in `aws.subnets`",
+}
+
+
+@contextmanager
+def asking(what: str) -> Iterator[None]:
+    """Translate what boto3 raises inside; ``what`` was asked, such as ``us-east-1: create m3``.
+
+    Raises:
+        StoreError: it may be had later, or elsewhere; or EC2 cannot be reached.
+        LocalError: credentials, permissions, quota or parameters are wrong; the text says what to do.
+    """
+    from botocore import exceptions as boto
+
+    try:
+        yield
+    except boto.ClientError as error:
+        raise _translated(what, error) from error
+    except (
+        boto.NoCredentialsError,
+        boto.PartialCredentialsError,
+        boto.CredentialRetrievalError,
+        boto.ProfileNotFound,
+        boto.TokenRetrievalError,
+        boto.ParamValidationError,
+        boto.NoRegionError,
+        boto.InvalidRegionError,
+    ) as error:
+        raise LocalError(f"aws: {what}: {error}") from error
+    except boto.BotoCoreError as error:
+        raise StoreError(f"aws: {what}: {error}") from error
+
+
+def is_code(error: Exception | None, code: str) -> bool:
+    """Return whether EC2 answered with this code; ``error`` is what boto3 raised."""
+    from botocore.exceptions import ClientError
+
+    return isinstance(error, ClientError) and error.response["Error"]["Code"] == code
+
+
+def _translated(what: str, error: Exception) -> LocalError | StoreError:
+    response = getattr(error, "response", {})
+    code = str(response.get("Error", {}).get("Code", ""))
+    status = int(response.get("ResponseMetadata", {}).get("HTTPStatusCode", 0))
+    if code in _TRY_AGAIN or (status >= 500 and code not in _WHAT_TO_DO):
+        return StoreError(f"aws: {what}: {_TRY_AGAIN.get(code, 'EC2 failed')} ({error})")
+    advice = _WHAT_TO_DO.get(code)
+    return LocalError(f"aws: {what}: {advice} ({error})" if advice else f"aws: {what}: {error}")

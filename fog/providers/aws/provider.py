@@ -1,0 +1,214 @@
+"""Machines of Amazon EC2, on demand and spot.
+
+Place: shell; asks EC2, several regions at once.
+Source: EC2 API reference (RunInstances, "Ensuring idempotency"), EC2 user guide ("Spot Instance interruption notices").
+
+All that must outlast a restart stands in the tags of the instances. A spot machine is a one-time request that ends
+with its instance; a machine that powers itself off is terminated.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+from fog.agent.bundle import pack
+from fog.hardware import Hardware
+from fog.machine import Boot, Machine, MachineSpec, Program
+from fog.offer import Offer
+from fog.providers.aws.clients import Clients, filters
+from fog.providers.aws.config import AwsConfig
+from fog.providers.aws.faults import asking, is_code
+from fog.providers.aws.ground import ground_of
+from fog.providers.aws.order import order
+from fog.providers.aws.prices import spot_prices
+from fog.providers.aws.reading import CLUSTER, DRAIN, MACHINE, machine_of
+from fog.providers.cloud_init import lines_of, user_data
+from gdp.errors import LocalError
+
+if TYPE_CHECKING:
+    from types_boto3_ec2 import EC2Client
+    from types_boto3_ec2.type_defs import FilterTypeDef, InstanceTypeDef, SpotInstanceRequestTypeDef
+
+__all__ = ["WATCHER", "AwsProvider"]
+
+log = logging.getLogger(__name__)
+
+WATCHER: Final = Program("notice", ("{python}", "-m", "fog.providers.aws.notice", "--home", "{home}"))
+_AT_ONCE: Final = 8
+_LIVING: Final = ("pending", "running", "stopping", "stopped")
+
+
+class AwsProvider:
+    """Provider ``aws``; an id is ``region/instance``. It may be used by several threads.
+
+    Args:
+        prices: the catalogue: what has enough, whether spot -> its lines of provider ``aws``.
+
+    Raises:
+        LocalError: boto3 is not installed.
+    """
+
+    name: str = "aws"
+    poll_s: float = 5.0
+
+    def __init__(self, prices: Callable[[Hardware, bool], list[Offer]], config: AwsConfig | None = None) -> None:
+        self._prices = prices
+        self._config = config or AwsConfig()
+        self._clients = Clients(self._config.regions)
+        self._threads = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="aws")
+
+    def offers(self, hardware: Hardware, *, spot: bool) -> list[Offer]:
+        """Return the catalogue's lines, of spot machines with what they cost now where EC2 tells it.
+
+        Raises:
+            StoreError: EC2 cannot be asked now.
+            LocalError: it refuses the credentials.
+        """
+        regions = self._clients.regions()
+        lines = [each for each in self._prices(hardware, spot) if each.region in regions]
+        if spot:
+            by_region: dict[str, list[Offer]] = defaultdict(list)
+            for line in lines:
+                by_region[line.region].append(line)
+            lines = [line for part in self._threads.map(self._priced, by_region.values()) for line in part]
+        return sorted(lines, key=lambda each: each.usd_per_hour)
+
+    def create(self, spec: MachineSpec, boot: Boot) -> str:
+        """Run one instance; asking again for the same machine returns the one that there is.
+
+        Raises:
+            StoreError: there is none to be had there now, or EC2 cannot be asked.
+            LocalError: credentials, quota, type or settings are wrong, or the boot is too large.
+        """
+        region = spec.offer.region
+        client = self._clients[region]
+        data = user_data(pack(replace(boot, programs=(*boot.programs, WATCHER))), self._config.setup)
+        with asking(f"{region}: create {spec.name}"):
+            wanted = filters({f"tag:{CLUSTER}": spec.cluster, f"tag:{MACHINE}": spec.name})
+            living = [each for each in _instances(client, wanted) if each["State"]["Name"] in _LIVING]
+            if living:
+                return f"{region}/{living[0]['InstanceId']}"
+            ground = ground_of(client, region, self._config)
+            made = client.run_instances(**order(spec, ground, self._config, data))["Instances"]
+            return f"{region}/{made[0]['InstanceId']}"
+
+    def describe(self, cluster: str) -> list[Machine]:
+        """Return the machines with this cluster's tag, of all regions.
+
+        Raises:
+            StoreError: a region cannot be asked now: half an answer would look like machines that are gone.
+            LocalError: EC2 refuses the credentials.
+        """
+        regions = self._clients.regions()
+        parts = self._threads.map(lambda region: self._found(region, cluster), regions)
+        return sorted((each for part in parts for each in part), key=lambda each: each.started_unix_s)
+
+    def terminate(self, ids: Sequence[str]) -> None:
+        """Terminate instances; their disks and spot requests end with them.
+
+        Raises:
+            StoreError: EC2 cannot be asked now.
+            LocalError: it refuses, or an id is not of this provider.
+        """
+        by_region: dict[str, list[str]] = defaultdict(list)
+        for each in ids:
+            region, instance = _split(each)
+            by_region[region].append(instance)
+        for region, instances in by_region.items():
+            client = self._clients[region]
+            with asking(f"{region}: terminate {', '.join(instances)}"):
+                # by a filter, for one unknown id would refuse the whole request
+                found = _instances(client, [{"Name": "instance-id", "Values": instances}])
+                known = [each["InstanceId"] for each in found]
+                if known:
+                    client.terminate_instances(InstanceIds=known)
+
+    def drain(self, machine: str) -> None:
+        """Tag the instance; its watcher sees that in the instance's metadata within seconds and drains.
+
+        Raises:
+            StoreError: EC2 cannot be asked now.
+            LocalError: it refuses, or there is no such instance.
+        """
+        region, instance = _split(machine)
+        with asking(f"{region}: drain {instance}"):
+            self._clients[region].create_tags(Resources=[instance], Tags=[{"Key": DRAIN, "Value": "1"}])
+
+    def log(self, machine: str, program: str, lines: int) -> str:
+        """Return the last lines of a program in the instance's console, which EC2 shows a minute or more late.
+
+        Raises:
+            StoreError: EC2 cannot be asked now.
+            LocalError: it refuses, or there is no such instance.
+        """
+        region, instance = _split(machine)
+        with asking(f"{region}: console of {instance}"):
+            told = self._clients[region].get_console_output(InstanceId=instance).get("Output", "")
+        return lines_of(told.splitlines(), program, lines)
+
+    def shell(self, machine: str) -> list[str]:
+        """Return an ssh command line.
+
+        Raises:
+            StoreError: EC2 cannot be asked now.
+            LocalError: ``aws.ssh`` is not configured, or the machine has no address.
+        """
+        region, instance = _split(machine)
+        ssh = self._config.ssh
+        if ssh is None:
+            raise LocalError("aws: nobody may log in: set `aws.ssh` (key_pair, sources) before machines are made")
+        with asking(f"{region}: address of {instance}"):
+            found = _instances(self._clients[region], filters({"instance-id": instance}))
+        address = next((each.get("PublicIpAddress") or each.get("PrivateIpAddress") for each in found), None)
+        if not address:
+            raise LocalError(f"aws: {machine} has no address")
+        key = ["-i", str(ssh.key_file.expanduser())] if ssh.key_file else []
+        return ["ssh", "-o", "StrictHostKeyChecking=accept-new", *key, f"{ssh.user}@{address}"]
+
+    def close(self) -> None:
+        """Close connections and threads; machines stay."""
+        self._threads.shutdown(cancel_futures=True)
+        self._clients.close()
+
+    def _found(self, region: str, cluster: str) -> list[Machine]:
+        client = self._clients[region]
+        with asking(f"{region}: machines of {cluster}"):
+            found = _instances(client, filters({f"tag:{CLUSTER}": cluster}))
+            has_spot = any(each.get("InstanceLifecycle") == "spot" for each in found)
+            requests = _spot_requests(client, cluster) if has_spot else {}
+        return [machine_of(region, each, requests.get(each["InstanceId"])) for each in found]
+
+    def _priced(self, lines: Sequence[Offer]) -> list[Offer]:
+        region = lines[0].region
+        with asking(f"{region}: spot prices"):
+            try:
+                now = spot_prices(self._clients[region], [each.type_name for each in lines])
+            except self._clients[region].exceptions.ClientError as error:
+                if not is_code(error, "UnauthorizedOperation"):
+                    raise
+                log.info("spot prices not allowed region=%s: the catalogue's hold", region)
+                return list(lines)
+        return [replace(each, usd_per_hour=now.get(each.type_name, each.usd_per_hour)) for each in lines]
+
+
+def _instances(client: EC2Client, wanted: list[FilterTypeDef]) -> list[InstanceTypeDef]:
+    pages = client.get_paginator("describe_instances").paginate(Filters=wanted)
+    return [each for page in pages for reservation in page["Reservations"] for each in reservation["Instances"]]
+
+
+def _spot_requests(client: EC2Client, cluster: str) -> dict[str, SpotInstanceRequestTypeDef]:
+    wanted = filters({f"tag:{CLUSTER}": cluster})
+    pages = client.get_paginator("describe_spot_instance_requests").paginate(Filters=wanted)
+    return {each["InstanceId"]: each for page in pages for each in page["SpotInstanceRequests"] if "InstanceId" in each}
+
+
+def _split(machine: str) -> tuple[str, str]:
+    region, slash, instance = machine.partition("/")
+    if not slash or not instance.startswith("i-"):
+        raise LocalError(f"aws: {machine!r} is no machine of EC2: expected region/i-...")
+    return region, instance

@@ -1,0 +1,244 @@
+"""What a rented machine is told at its first start: the files of its boot, and a service that installs and runs it.
+
+Place: pure.
+Source: cloud-init's "cloud config" format (modules write_files, packages, runcmd), systemd.service(5); Amazon EC2
+takes at most 16 KiB of user data, before base64, and cloud-init reads it gzipped.
+
+``cloud_config`` is for providers that take user data, ``shell_script`` for those that only run a script as root; both
+come to the same files. What programs say goes to the journal and the console under their names, ``switch[712]: ...``;
+``lines_of`` finds it there. What is installed is named by ``Setup.requirements``, for pip: the package is on no public
+index yet, so a wheel's URL belongs there. A machine whose programs are done powers itself off.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import io
+import shlex
+import tarfile
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from ipaddress import IPv4Address, IPv6Address
+from typing import Final
+
+import yaml
+from pydantic import Field
+
+from fog.agent.bundle import BOOT_FILE, read_programs
+from gdp.errors import LocalError
+from gdp.nodes.schema import Section
+
+__all__ = ["HOME", "USER_DATA_MAX_BYTES", "VXLAN_PORT", "Placed", "Setup", "Vxlan", "cloud_config", "placed"]
+__all__ += ["lines_of", "shell_script", "user_data"]
+
+HOME: Final = "/var/lib/fog"
+USER_DATA_MAX_BYTES: Final = 16 * 1024
+VXLAN_PORT: Final = 4789  # RFC 7348
+_INSTALLED: Final = "/opt/fog"
+_INSTALL: Final = "/usr/local/sbin/fog-install"
+_PACKAGES: Final = ("python3-venv", "iproute2", "util-linux")
+_PRIVATE: Final = 0o600
+_LOG: Final = f"""[Unit]
+Description=The log of a machine's program %i, for the journal and the console
+
+[Service]
+ExecStart=/usr/bin/tail --follow=name --retry --lines=0 {HOME}/logs/%i.log
+SyslogIdentifier=%i
+StandardOutput=journal+console
+StandardError=null
+Restart=on-failure
+
+[Install]
+WantedBy=multi-user.target
+"""
+
+
+class Vxlan(Section):
+    """A layer-2 device through a tunnel that the operator's side ends. It is neither encrypted nor authenticated by
+    itself: frames on it are sealed, but who may inject some is for the firewall or a VPN below to say. ``remote`` is
+    the other end as the machine reaches it, ``device`` what the tunnel is called on the machine: the switch's port.
+    """
+
+    remote: IPv4Address | IPv6Address
+    id: int = Field(default=1, ge=1, lt=1 << 24)
+    device: str = Field(default="fog0", pattern=r"^[a-z][a-z0-9]{0,14}$")
+
+
+class Setup(Section):
+    """What a machine installs beside its boot: ``requirements`` for pip, such as ``gdp-ros[ros2]``, a wheel's URL or
+    the package that holds the nodes; ``packages`` of the distribution, beside those that are needed anyway. Without
+    ``vxlan`` the devices that the boot's switch names must be there without it.
+    """
+
+    requirements: tuple[str, ...] = Field(default=("gdp-ros[ros2]",), min_length=1)
+    packages: tuple[str, ...] = ()
+    vxlan: Vxlan | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """A file of the machine, owned by root.
+
+    Args:
+        path: absolute.
+        mode: its permissions.
+    """
+
+    path: str
+    content: bytes
+    mode: int = _PRIVATE
+
+
+def placed(files: Mapping[str, bytes], setup: Setup) -> list[Placed]:
+    """Return all that is written on the machine.
+
+    Args:
+        files: a packed boot: path below the machine's folder -> content.
+
+    Raises:
+        LocalError: a path leads out of that folder.
+    """
+    for path in files:
+        if path.startswith("/") or ".." in path.split("/"):
+            raise LocalError(f"a boot's file {path!r} lies outside the machine's folder")
+    own = [Placed(f"{HOME}/{path}", content) for path, content in sorted(files.items())]
+    own.append(Placed(_INSTALL, _install(setup).encode(), 0o755))
+    own.append(Placed("/etc/systemd/system/fog-machine.service", _service(setup).encode(), 0o644))
+    own.append(Placed("/etc/systemd/system/fog-log@.service", _LOG.encode(), 0o644))
+    if setup.vxlan:
+        own.append(Placed("/etc/systemd/system/fog-tunnel.service", _tunnel(setup.vxlan).encode(), 0o644))
+    return own
+
+
+def cloud_config(files: Mapping[str, bytes], setup: Setup) -> str:
+    """Return the machine's set-up as ``#cloud-config``. Text stays readable; the rest is base64.
+
+    Raises:
+        LocalError: a path of ``files`` leads out of the machine's folder.
+    """
+    written: list[dict[str, str]] = []
+    for file in placed(files, setup):
+        entry = {"path": file.path, "permissions": f"{file.mode:04o}"}
+        try:
+            written.append({**entry, "content": file.content.decode("ascii")})
+        except UnicodeDecodeError:
+            packed = base64.b64encode(file.content).decode()
+            written.append({**entry, "encoding": "b64", "content": packed})
+    config = {
+        "package_update": True,
+        "packages": [*_PACKAGES, *setup.packages],
+        "write_files": written,
+        "runcmd": [["chmod", "-R", "go-rwx", HOME], *(shlex.split(line) for line in _start(files, setup))],
+    }
+    return "#cloud-config\n" + yaml.safe_dump(config, sort_keys=False, width=4096)
+
+
+def user_data(files: Mapping[str, bytes], setup: Setup) -> bytes:
+    """Return ``cloud_config`` as EC2 takes it: gzipped.
+
+    Raises:
+        LocalError: it is more than EC2 takes, or a path of ``files`` leads out of the machine's folder.
+    """
+    data = gzip.compress(cloud_config(files, setup).encode(), mtime=0)
+    if len(data) > USER_DATA_MAX_BYTES:
+        raise LocalError(
+            f"the machine's files come to {len(data)} bytes of user data, EC2 takes {USER_DATA_MAX_BYTES}: "
+            "put what is large (models, meshes, code) into a package named in `requirements`"
+        )
+    return data
+
+
+def shell_script(files: Mapping[str, bytes], setup: Setup) -> str:
+    """Return a script for bash that, run by root or one who may ``sudo``, does what ``cloud_config`` does.
+
+    Raises:
+        LocalError: a path of ``files`` leads out of the machine's folder.
+    """
+    lines = [
+        "set -euo pipefail",
+        "base64 -d <<'EOF' | sudo tar --extract --gzip --no-same-owner --directory / --file -",
+        f"{_tar(files, setup)}EOF",
+        f"sudo chmod -R go-rwx {HOME}",
+        f"sudo env DEBIAN_FRONTEND=noninteractive apt-get install -qq {shlex.join([*_PACKAGES, *setup.packages])}",
+        *(f"sudo {line}" for line in _start(files, setup)),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def lines_of(journal: Iterable[str], program: str, lines: int) -> str:
+    """Return the last lines that a program wrote; of ``fog-machine`` itself where none is named."""
+    sign = f"{program or 'fog-machine'}["
+    return "\n".join(deque((line.rstrip() for line in journal if sign in line), maxlen=lines))
+
+
+def _tar(files: Mapping[str, bytes], setup: Setup) -> str:
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode="w:gz") as archive:
+        for file in placed(files, setup):
+            entry = tarfile.TarInfo(file.path.lstrip("/"))
+            entry.size, entry.mode = len(file.content), file.mode
+            archive.addfile(entry, io.BytesIO(file.content))
+    return base64.encodebytes(packed.getvalue()).decode()
+
+
+def _start(files: Mapping[str, bytes], setup: Setup) -> list[str]:
+    programs = read_programs(files[BOOT_FILE]) if BOOT_FILE in files else ()
+    units = ["fog-tunnel"] * bool(setup.vxlan) + ["fog-machine"] + [f"fog-log@{each.name}" for each in programs]
+    return ["systemctl daemon-reload", f"systemctl enable --now --no-block {' '.join(units)}"]
+
+
+def _install(setup: Setup) -> str:
+    # the service runs it before each start, so that an index that cannot be reached now is asked again
+    return f"""#!/bin/sh
+set -eu
+[ -e {_INSTALLED}/complete ] && exit 0
+python3 -m venv {_INSTALLED}
+{_INSTALLED}/bin/pip install --no-input --quiet -- {shlex.join(setup.requirements)}
+touch {_INSTALLED}/complete
+"""
+
+
+def _service(setup: Setup) -> str:
+    after = " fog-tunnel.service" if setup.vxlan else ""
+    return f"""[Unit]
+Description=The programs of a machine of a fog cluster
+After=network-online.target{after}
+Wants=network-online.target{after}
+StartLimitIntervalSec=0
+SuccessAction=poweroff
+
+[Service]
+ExecStartPre={_INSTALL}
+ExecStart={_INSTALLED}/bin/fog-machine --home {HOME}
+TimeoutStartSec=20min
+Restart=on-failure
+RestartSec=5
+KillMode=mixed
+SyslogIdentifier=fog-machine
+StandardOutput=journal+console
+StandardError=journal+console
+
+[Install]
+WantedBy=multi-user.target
+"""
+
+
+def _tunnel(vxlan: Vxlan) -> str:
+    link = f"{vxlan.device} type vxlan id {vxlan.id} remote {vxlan.remote} dstport {VXLAN_PORT}"
+    return f"""[Unit]
+Description=The layer-2 tunnel of a fog cluster
+After=network-online.target
+Wants=network-online.target
+
+[Service]
+Type=oneshot
+RemainAfterExit=yes
+ExecStart=/bin/sh -c 'ip link show {vxlan.device} || ip link add {link}'
+ExecStart=/bin/sh -c 'ip link set {vxlan.device} up'
+ExecStop=/bin/sh -c 'ip link delete {vxlan.device}'
+
+[Install]
+WantedBy=multi-user.target
+"""

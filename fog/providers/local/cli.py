@@ -1,0 +1,63 @@
+"""``fog local``: what can befall a local machine, by hand.
+
+Place: command; the application that registers it says where the records are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fog.providers.local import trouble
+from gdp.cli.node import failing_clearly
+from gdp.testbed.runs import Runs
+
+__all__ = ["local_app"]
+
+Machine = Annotated[str, typer.Argument(help="its id, or its name where only one is called so")]
+Seconds = Annotated[float, typer.Option("--seconds", min=0.0, help="until it is taken")]
+Off = Annotated[bool, typer.Option("--off", help="let it go on")]
+Share = Annotated[float, typer.Option("--share", min=0.0, help="of one processor; 0: what its hardware has")]
+Ms = Annotated[float, typer.Option("--ms", min=0.0, help="each way; 0: none")]
+
+
+def local_app(directory: Callable[[], Path]) -> typer.Typer:
+    """Return the verbs; ``directory``: asked, when one runs, where the provider's records are."""
+    app = typer.Typer(
+        no_args_is_help=True, help="Let something happen to a local machine. Example: fog local notice m2 --seconds 30"
+    )
+
+    @app.command()
+    def notice(machine: Machine, seconds: Seconds = 120.0) -> None:
+        """Give notice: the machine is taken after some seconds."""
+        with failing_clearly():
+            trouble.notice(Runs(directory()), machine, seconds)
+
+    @app.command()
+    def kill(machine: Machine) -> None:
+        """Kill all of the machine at once."""
+        with failing_clearly():
+            trouble.kill(Runs(directory()), machine)
+
+    @app.command()
+    def freeze(machine: Machine, off: Off = False) -> None:
+        """Stop the machine where it is."""
+        with failing_clearly():
+            (trouble.thaw if off else trouble.freeze)(Runs(directory()), machine)
+
+    @app.command()
+    def slow(machine: Machine, share: Share = 0.1) -> None:
+        """Let the machine have a share of one processor."""
+        with failing_clearly():
+            trouble.slow(Runs(directory()), machine, share or None)
+
+    @app.command()
+    def delay(machine: Machine, ms: Ms = 100.0) -> None:
+        """Make the machine's link longer."""
+        with failing_clearly():
+            trouble.delay(Runs(directory()), machine, ms)
+
+    return app

@@ -1,0 +1,57 @@
+"""What the provider keeps of a local machine: ``machine.json`` in the folder of its run.
+
+Place: the file system; times come in as arguments.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final
+
+from fog.hardware import Hardware
+from fog.machine import MachineSpec
+from fog.offer import Offer
+
+__all__ = ["MachineFile"]
+
+_FILE: Final = "machine.json"
+
+
+@dataclass(frozen=True, slots=True)
+class MachineFile:
+    """A machine as it was asked for.
+
+    Args:
+        gateway: the file that holds the namespace of the gateway it is next to.
+        is_bounded: its processes take no more processor time and memory than its hardware has.
+        gone_unix_s: when it was first seen to be gone.
+    """
+
+    spec: MachineSpec
+    started_unix_s: float
+    gateway: str
+    is_bounded: bool = False
+    gone_unix_s: float | None = None
+
+    def write(self, directory: Path) -> None:
+        """Replace what was there.
+
+        Raises:
+            OSError: the system refuses.
+        """
+        draft = directory / f".{_FILE}"
+        draft.write_text(json.dumps(asdict(self)), encoding="utf-8")
+        draft.replace(directory / _FILE)
+
+    @classmethod
+    def read(cls, directory: Path) -> MachineFile | None:
+        """Return what was written; None: this is not the folder of a machine, or not yet."""
+        try:
+            told = json.loads((directory / _FILE).read_bytes())
+            offer = told["spec"]["offer"]
+            offer = Offer(**{**offer, "hardware": Hardware(**offer["hardware"])})
+            return cls(**{**told, "spec": MachineSpec(**{**told["spec"], "offer": offer})})
+        except (OSError, ValueError, KeyError, TypeError):
+            return None

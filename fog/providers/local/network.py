@@ -1,0 +1,157 @@
+"""The gateways of a site: namespaces with a switch each, joined to the robot and to each other as a tree.
+
+Place: shell; needs root of the machine or of a user namespace. All of it is one kept run; ``network.json`` in its
+folder tells which.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from fog.agent.bundle import install
+from fog.machine import Boot
+from fog.providers.local.begin import begin
+from fog.providers.local.wire import MACHINES, UP, delete, exists, join, make_segment, make_space, space_path
+from fog.topology import Gateway
+from gdp.errors import LocalError
+from gdp.testbed.processes import Process
+from gdp.testbed.runs import Record, Run, Runs
+
+__all__ = ["GatewayBoot", "Network"]
+
+log = logging.getLogger(__name__)
+
+GatewayBoot = Callable[[str, Sequence[str]], Boot]
+
+_FILE: Final = "network.json"
+
+
+@dataclass(frozen=True, slots=True)
+class _Standing:
+    """A network that is there, or was."""
+
+    record: Record
+    topology: Gateway
+
+    def space(self, label: str) -> Path:
+        return space_path(self.record.run, Path(self.record.files[0]), label)
+
+    def home(self, label: str) -> Path:
+        return Path(self.record.files[0]) / label
+
+    def is_up(self, label: str) -> bool:
+        """Return whether a gateway's process runs."""
+        try:
+            pid, started = json.loads((self.home(label) / "process.json").read_bytes())
+        except (OSError, ValueError):
+            return False
+        return Process(pid, started).alive
+
+
+class Network:
+    """The one network of a site.
+
+    Args:
+        runs: where its record is.
+        topology: its gateways.
+        boot: makes what a gateway runs, of its label and its ports.
+        uplink: the robot's end of its link to the first gateway.
+        robot: the namespace of that end; None: that of whoever opens the network.
+    """
+
+    def __init__(self, runs: Runs, topology: Gateway, boot: GatewayBoot, uplink: str, robot: Path | None) -> None:
+        self._runs = runs
+        self._topology = topology
+        self._boot = boot
+        self._uplink = uplink
+        self._robot = robot
+
+    def open(self) -> None:
+        """Make what is not there, and start gateways that do not run; what stands is left as it is.
+
+        Raises:
+            LocalError: the kernel refuses; the uplink is somebody else's device; another topology stands.
+        """
+        standing = self._find()
+        if standing is None or not standing.record.kept or standing.record.dead:
+            self.close()
+            self._make()
+            return
+        if standing.topology != self._topology:
+            raise LocalError("the gateways that stand have another topology; 'fog down --all' first")
+        run = self._runs.resume(standing.record.run)
+        for gateway in self._topology.walk():
+            if not standing.is_up(gateway.gateway):
+                log.warning("gateway started again gateway=%s", gateway.gateway)
+                self._start(run, standing, gateway)
+
+    def close(self) -> None:
+        """Remove it all; fine if nothing stands."""
+        standing = self._find()
+        if standing is not None:
+            delete(self._robot, self._uplink)  # by itself it would go some time after its namespace
+            self._runs.resume(standing.record.run).end()
+
+    def gateway(self, region: str) -> Path:
+        """Return the namespace of the gateway next to a region's machines.
+
+        Raises:
+            LocalError: the network is not open.
+        """
+        standing = self._find()
+        if standing is None or not standing.record.kept:
+            raise LocalError("the local network is not open")
+        return standing.space(standing.topology.serving(region).gateway)
+
+    def _find(self) -> _Standing | None:
+        for record in self._runs.all():
+            try:
+                told = (Path(record.files[0]) / _FILE).read_bytes()
+            except OSError:
+                continue
+            return _Standing(record, Gateway.model_validate_json(told))
+        return None
+
+    def _make(self) -> None:
+        if exists(self._robot, self._uplink):
+            raise LocalError(f"the device {self._uplink} is there already, and not ours")
+        run = self._runs.start()
+        try:
+            (run.directory / _FILE).write_text(self._topology.model_dump_json(), encoding="utf-8")
+            standing = _Standing(run.record, self._topology)
+            gateways = list(self._topology.walk())
+            for gateway in gateways:
+                space = standing.space(gateway.gateway)
+                run.plan_namespace(space)
+                make_space(space, "")
+                make_segment(space)
+            join(self._robot, self._uplink, standing.space(self._topology.gateway), UP)
+            for gateway in gateways:
+                for child in gateway.children:
+                    ends = standing.space(gateway.gateway), standing.space(child.gateway)
+                    join(ends[0], f"to-{child.gateway}", ends[1], UP)
+            for gateway in gateways:
+                self._start(run, standing, gateway)
+        except BaseException:
+            run.end()
+            delete(self._robot, self._uplink)
+            raise
+
+    def _start(self, run: Run, standing: _Standing, gateway: Gateway) -> None:
+        home = standing.home(gateway.gateway)
+        ports = (UP, *(f"to-{child.gateway}" for child in gateway.children), MACHINES)
+        if not (home / "process.json").exists():
+            install(home, self._boot(gateway.gateway, ports))
+            (home / "logs").mkdir(mode=0o700, exist_ok=True)
+
+        def note(pid: int) -> None:
+            process = Process.of(pid)
+            (home / "process.json").write_text(json.dumps([process.pid, process.started]), encoding="ascii")
+
+        argv = ["fog.agent.cli", "--home", str(home), "--await-go"]
+        begin(run, standing.space(gateway.gateway), argv, home / "logs" / "machine.log", note)

@@ -1,0 +1,235 @@
+"""Machines on this one: each a network namespace with an address, a process group, bounds and programs of its own.
+
+Place: shell; needs root of the machine or of a user namespace. A machine is a kept run (``gdp/testbed/runs.py``) with
+``machine.json`` in its folder: all that is known lies there, so that whoever comes later, or after a crash, finds it.
+They live on when their creator is killed, as machines elsewhere do.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import re
+import signal
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from fog.agent.bounded_log import last_lines
+from fog.agent.bundle import install
+from fog.catalog.local import LOCAL_REGIONS, local_offers
+from fog.hardware import Hardware
+from fog.machine import Boot, Machine, MachineSpec, MachineState
+from fog.offer import Offer
+from fog.providers.local.begin import begin
+from fog.providers.local.machine_file import MachineFile
+from fog.providers.local.network import GatewayBoot, Network
+from fog.providers.local.standing import Standing, find, standing
+from fog.providers.local.trouble import hold, kill
+from fog.providers.local.wire import MACHINE_DEVICE, delete, join, make_space, plug
+from fog.topology import AUTOMATIC, Gateway
+from gdp.errors import LocalError, StoreError
+from gdp.testbed.processes import end_all
+from gdp.testbed.runs import Run, Runs
+
+__all__ = ["UPLINK", "LocalProvider"]
+
+log = logging.getLogger(__name__)
+
+UPLINK: Final = "fog0"
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,40}")
+_GONE_S: Final = 600.0  # its logs may be read for so long
+_END_PATIENCE_S: Final = 6.0
+_GIB: Final = 1 << 30
+
+
+class LocalProvider:
+    """``Provider`` of namespaces.
+
+    Args:
+        directory: the records of this site's machines and gateways; made if it is not there.
+        gateway_boot: makes what a gateway runs, of its label and its ports.
+        topology: the tree of gateways.
+        uplink: the robot's end of its link to the first gateway.
+        robot: the namespace of that end; None: that of whoever calls ``open_network``.
+        regions: to be offered beside the provider's own: it pretends to have any.
+
+    Raises:
+        LocalError: the directory belongs to somebody else.
+    """
+
+    name = "local"
+    poll_s = 0.2
+
+    def __init__(
+        self,
+        directory: Path,
+        gateway_boot: GatewayBoot,
+        topology: Gateway = AUTOMATIC,
+        *,
+        uplink: str = UPLINK,
+        robot: Path | None = None,
+        regions: Sequence[str] = (),
+    ) -> None:
+        self._directory = directory
+        self._runs = Runs(directory)
+        self._network = Network(self._runs, topology, gateway_boot, uplink, robot)
+        named = [region for gateway in topology.walk() for region in gateway.regions]
+        self._regions = tuple(dict.fromkeys((*LOCAL_REGIONS, *named, *regions)))
+
+    # the network
+
+    def open_network(self) -> None:
+        """Make the gateways and the uplink, and start gateways that do not run; what stands is left as it is.
+
+        The uplink is there afterwards, so that a switch with a port on it can be started.
+
+        Raises:
+            LocalError: the kernel refuses; the uplink is somebody else's device; another topology stands.
+        """
+        with self._alone():
+            self._network.open()
+
+    def close_network(self) -> None:
+        """Remove gateways and uplink. Machines that stand lose their links."""
+        with self._alone():
+            self._network.close()
+
+    def sweep(self) -> list[str]:
+        """Remove what ended, or was begun by somebody who is gone; return the ids."""
+        with self._alone():
+            gone = [each.id for each in standing(self._runs) if not each.is_alive]
+            self._end(gone)
+            return [*gone, *self._runs.sweep()]
+
+    # the Provider protocol
+
+    def offers(self, hardware: Hardware, *, spot: bool) -> list[Offer]:
+        everything = local_offers(self._regions)
+        fitting = [each for each in everything if each.is_spot == spot and hardware.fits(each.hardware)]
+        return sorted(fitting, key=lambda each: each.usd_per_hour)
+
+    def create(self, spec: MachineSpec, boot: Boot) -> str:
+        if not _NAME.fullmatch(spec.name):
+            raise LocalError(f"machine {spec.name!r}: a name has letters, digits, '-' and '_'")
+        with self._alone():
+            for each in standing(self._runs, spec.cluster):
+                if each.file.spec.name == spec.name:
+                    return each.id  # asked for again by somebody who was killed before noting it
+            gateway = self._network.gateway(spec.offer.region)
+            run = self._runs.start()
+            file = MachineFile(spec, time.time(), str(gateway))
+            file.write(run.directory)
+        try:
+            self._make(run, file, boot)
+        except OSError as error:
+            run.end()
+            raise StoreError(f"machine {spec.name}: {error}") from error
+        except BaseException:
+            run.end()
+            raise
+        return run.id
+
+    def describe(self, cluster: str) -> list[Machine]:
+        now_unix_s = time.time()
+        told = []
+        for each in standing(self._runs, cluster):
+            machine = each.describe()
+            if machine.state is MachineState.GONE:
+                if self._is_forgotten(each, now_unix_s):
+                    continue
+            elif machine.leaves_at_unix_s is not None and machine.leaves_at_unix_s < now_unix_s:
+                kill(self._runs, each.id)  # held, it could not end itself
+                machine = replace(machine, state=MachineState.GONE)
+            told.append(machine)
+        return told
+
+    def terminate(self, ids: Sequence[str]) -> None:
+        self._end(ids)
+
+    def drain(self, machine: str) -> None:
+        self._tell(machine, signal.SIGUSR1)
+
+    def log(self, machine: str, program: str, lines: int) -> str:
+        if not _NAME.fullmatch(program or "machine"):
+            raise LocalError(f"no program {program!r}")
+        return last_lines(find(self._runs, machine).home / "logs" / f"{program or 'machine'}.log", lines)
+
+    def shell(self, machine: str) -> list[str]:
+        found = find(self._runs, machine)
+        inside = ["env", f"--chdir={found.home}", f"FOG_MACHINE={found.file.spec.name}", "bash"]
+        return ["nsenter", f"--net={found.space}", "--", *inside]
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    @property
+    def runs(self) -> Runs:
+        """Return the records of this site, for ``trouble``."""
+        return self._runs
+
+    def _make(self, run: Run, file: MachineFile, boot: Boot) -> None:
+        machine = Standing(run.record, file)
+        run.plan_namespace(machine.space)
+        make_space(machine.space, machine.address)
+        join(machine.gateway, machine.plug, machine.space, MACHINE_DEVICE)
+        plug(machine.gateway, machine.plug)
+        install(machine.home, boot)
+        (machine.home / "logs").mkdir(mode=0o700, exist_ok=True)
+
+        def confine(pid: int) -> None:
+            group, hardware = machine.cgroup, file.spec.offer.hardware
+            run.plan_cgroup(group.name)
+            is_bounded = group.make()
+            if is_bounded:
+                group.limit_cpu(hardware.cpus or None)
+                group.limit_memory(int(hardware.memory_gib * _GIB) or None)
+            else:
+                log.warning("no bounds on processor time and memory here machine=%s", run.id)
+            group.add(pid)
+            replace(file, is_bounded=is_bounded).write(run.directory)
+
+        argv = ["fog.agent.cli", "--home", str(machine.home), "--await-go"]
+        begin(run, machine.space, argv, machine.home / "logs" / "machine.log", confine)
+
+    def _is_forgotten(self, machine: Standing, now_unix_s: float) -> bool:
+        """Note when it was first seen to be gone, and remove it some time after."""
+        if machine.file.gone_unix_s is None:
+            with suppress(OSError):  # somebody else removes it
+                replace(machine.file, gone_unix_s=now_unix_s).write(machine.directory)
+            return False
+        if now_unix_s - machine.file.gone_unix_s < _GONE_S:
+            return False
+        self.terminate([machine.id])
+        return True
+
+    def _end(self, ids: Sequence[str]) -> None:
+        """Let machines end, all at once, and remove what is left of them. Others may be at it, too."""
+        machines = [each for each in standing(self._runs) if each.id in ids]
+        if new := [each.id for each in machines if not (each.record.kept or each.record.dead)]:
+            raise StoreError(f"just being made: {', '.join(new)}")
+        for each in machines:
+            hold(each, held=False)
+        end_all([each.host for each in machines if each.host is not None], _END_PATIENCE_S)
+        for each in machines:
+            for device in (each.plug, each.relay_out):
+                delete(each.gateway, device)  # by itself it would go some time after its namespace
+            if each.id in {record.run for record in self._runs.all()}:
+                self._runs.resume(each.id).end()
+
+    def _tell(self, machine: str, number: signal.Signals) -> None:
+        found = find(self._runs, machine)
+        if found.host is not None and found.host.alive:
+            with suppress(ProcessLookupError):
+                os.kill(found.host.pid, number)
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Keep others of this site, in any process, from changing what stands meanwhile."""
+        with (self._directory / ".lock").open("w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield

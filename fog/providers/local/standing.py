@@ -1,0 +1,127 @@
+"""A local machine as it is found on disk: where everything of it is, and how it is.
+
+Place: shell; it reads, and changes nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from fog.agent.notice import read_notice
+from fog.agent.status import Status
+from fog.machine import Machine, MachineState
+from fog.providers.local.machine_file import MachineFile
+from fog.providers.local.wire import space_path
+from gdp.errors import LocalError
+from gdp.testbed.cgroups import Cgroup
+from gdp.testbed.processes import Process
+from gdp.testbed.runs import Record, Runs
+
+__all__ = ["Standing", "find", "standing"]
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """A machine whose record is there.
+
+    Attributes:
+        host: the process that is the machine; None: it was not started yet.
+    """
+
+    record: Record
+    file: MachineFile
+
+    @property
+    def id(self) -> str:
+        return self.record.run
+
+    @property
+    def directory(self) -> Path:
+        return Path(self.record.files[0])
+
+    @property
+    def home(self) -> Path:
+        """Return the machine's own folder."""
+        return self.directory / "home"
+
+    @property
+    def space(self) -> Path:
+        return space_path(self.id, self.directory, self.file.spec.name)
+
+    @property
+    def plug(self) -> str:
+        """Return the far end of its device, in its gateway's namespace."""
+        return f"m-{self.id}"
+
+    @property
+    def gateway(self) -> Path:
+        """Return the namespace of its gateway."""
+        return Path(self.file.gateway)
+
+    @property
+    def relay_out(self) -> str:
+        """Return the device beyond its plug by which a relay sends on; see ``trouble.delay``."""
+        return f"d-{self.id}"
+
+    @property
+    def relay_in(self) -> str:
+        """Return the other end of that, which is in the segment then."""
+        return f"e-{self.id}"
+
+    @property
+    def address(self) -> str:
+        """Return its own address: the id's three bytes."""
+        return ".".join(map(str, (10, *bytes.fromhex(self.id))))
+
+    @property
+    def cgroup(self) -> Cgroup:
+        return Cgroup(f"gdp-{self.id}")
+
+    @property
+    def host(self) -> Process | None:
+        return next(iter(self.record.processes), None)
+
+    @property
+    def is_alive(self) -> bool:
+        """Return whether it runs, or its creator still works on it."""
+        return not self.record.dead and (self.host is None or self.host.alive)
+
+    def describe(self) -> Machine:
+        """Return what the provider says of it."""
+        state, reason = self._state()
+        return Machine(
+            self.id, self.file.spec, state, self.file.started_unix_s, self.address, read_notice(self.home), reason
+        )
+
+    def _state(self) -> tuple[MachineState, str]:
+        said, notice = Status.read(self.home), read_notice(self.home)
+        if not self.is_alive:
+            if said is not None and said.state in (MachineState.LEAVING, MachineState.GONE):
+                return MachineState.GONE, said.reason
+            return MachineState.GONE, "preempted" if notice is not None else "killed"
+        if notice is not None:
+            return MachineState.LEAVING, "preempted"
+        return (MachineState.BOOTING, "") if said is None else (said.state, said.reason)
+
+
+def standing(runs: Runs, cluster: str | None = None) -> list[Standing]:
+    """Return the machines of a cluster, or of all."""
+    files = ((record, MachineFile.read(Path(record.files[0]))) for record in runs.all())
+    found = [Standing(record, file) for record, file in files if file is not None]
+    return [each for each in found if cluster is None or each.file.spec.cluster == cluster]
+
+
+def find(runs: Runs, machine: str) -> Standing:
+    """Return the machine of this id, or the one of this name if there is only one.
+
+    Raises:
+        LocalError: there is none.
+    """
+    everyone = standing(runs)
+    found = [each for each in everyone if each.id == machine]
+    found = found or [each for each in everyone if each.file.spec.name == machine]
+    if len(found) != 1:
+        known = ", ".join(f"{each.id} ({each.file.spec.cluster}/{each.file.spec.name})" for each in everyone)
+        raise LocalError(f"no local machine {machine}; there are: {known or 'none'}")
+    return found[0]

@@ -1,0 +1,203 @@
+"""The devices between machines, gateways and the robot.
+
+Place: shell; needs CAP_NET_ADMIN in the namespaces it works in. One gateway's namespace, with two machines::
+
+    up ---- towards the robot          to-LABEL ---- towards a gateway behind this one
+
+    machines ==== machines-b -+
+                              |-- segment (a bridge: what a switch port with several neighbours looks like)
+                  m-1f2e3d ---+        |
+                     ||             m-4c5b6a
+                  eth0 of a machine    ||
+                                    eth0 of another
+
+Two ends of a pair must not share an index, or Linux may tell of a lost carrier a whole second late (see
+``gdp/testbed/namespaces.py``); so one end has a high one. No device but the loopback has an address.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from gdp.errors import LocalError
+from gdp.testbed import netns_files
+from gdp.testbed.runs import in_first_user_namespace
+
+if TYPE_CHECKING:
+    from pyroute2 import IPRoute  # and what imports it: 0.2 s to load, which most commands need not wait for
+
+__all__ = [
+    "MACHINES",
+    "MACHINE_DEVICE",
+    "UP",
+    "delete",
+    "exists",
+    "join",
+    "join_within",
+    "make_segment",
+    "make_space",
+    "plug",
+    "space_path",
+]
+
+MACHINE_DEVICE: Final = "eth0"
+UP: Final = "up"
+MACHINES: Final = "machines"
+_SEGMENT: Final = "segment"
+_MTU: Final = 1_500
+_LOOPBACK: Final = 1
+_HIGH_INDEX: Final = 1 << 20
+
+T = TypeVar("T")
+
+
+def space_path(run: str, directory: Path, label: str) -> Path:
+    """Return the file that holds a namespace of a run; ``directory``: the run's own."""
+    folder = netns_files.IP_NETNS_DIRECTORY if in_first_user_namespace() else directory / "netns"
+    return folder / f"gdp-{run}-{label}"
+
+
+def make_space(path: Path, address: str) -> None:
+    """Make a namespace whose loopback has this address beside its own; empty: none.
+
+    Raises:
+        LocalError: the kernel refuses.
+    """
+    from gdp.testbed.namespaces import silence
+
+    netns_files.create(path)
+    netns_files.inside(path, silence)
+    _ask(path, partial(_raise_loopback, address))
+
+
+def join(near: Path | None, near_device: str, far: Path, far_device: str) -> None:
+    """Join two namespaces by a pair of devices; ``near`` None: the namespace of the caller.
+
+    Raises:
+        LocalError: the kernel refuses; a device of that name is there.
+    """
+    with _opened(far) as far_fd:
+        _ask(near, partial(_add_pair, near_device, {"ifname": far_device, "net_ns_fd": far_fd}))
+    _ask(far, partial(_set_up, far_device))
+
+
+def join_within(space: Path, device: str, other: str) -> None:
+    """Make a pair of devices in one namespace.
+
+    Raises:
+        LocalError: the kernel refuses.
+    """
+
+    def work(links: IPRoute) -> None:
+        _add_pair(device, {"ifname": other}, links)
+        _set_up(other, links)
+
+    _ask(space, work)
+
+
+def make_segment(gateway: Path) -> None:
+    """Make a gateway's bridge, and its port on it.
+
+    Raises:
+        LocalError: the kernel refuses.
+    """
+
+    def make(links: IPRoute) -> None:
+        links.link("add", ifname=_SEGMENT, kind="bridge", br_mcast_snooping=0)
+        _set_up(_SEGMENT, links)
+
+
+    _ask(gateway, make)
+    join_within(gateway, MACHINES, f"{MACHINES}-b")
+    plug(gateway, f"{MACHINES}-b")
+
+
+def plug(gateway: Path, device: str, *, into: bool = True) -> None:
+    """Connect a device with a gateway's segment, or take it off.
+
+    Raises:
+        LocalError: the kernel refuses.
+    """
+    _ask(gateway, partial(_enslave, device) if into else partial(_release, device))
+
+
+def delete(space: Path | None, device: str) -> None:
+    """Delete a device, and with it the other end of its pair; fine if it is gone, with its namespace or without."""
+
+    from pyroute2.netlink.exceptions import NetlinkError
+
+    def work(links: IPRoute) -> None:
+        with suppress(NetlinkError):  # gone between the look and the act
+            for index in links.link_lookup(ifname=device):
+                links.link("del", index=index)
+
+    if space is None or space.exists():
+        _ask(space, work)
+
+
+def exists(space: Path | None, device: str) -> bool:
+    """Return whether there is a device of this name."""
+    return _ask(space, lambda links: bool(links.link_lookup(ifname=device)))
+
+
+def _ask(space: Path | None, work: Callable[[IPRoute], T]) -> T:
+    from pyroute2 import IPRoute
+    from pyroute2.netlink.exceptions import NetlinkError
+
+    def ask() -> T:
+        with IPRoute() as links:
+            return work(links)
+
+    try:
+        return ask() if space is None else netns_files.inside(space, ask)
+    except (NetlinkError, OSError) as error:
+        raise LocalError(f"devices of {space.name if space else 'this namespace'}: {error}") from error
+
+
+@contextmanager
+def _opened(space: Path) -> Iterator[int]:
+    try:
+        descriptor = os.open(space, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError as error:
+        raise LocalError(f"namespace {space.name}: {error.strerror}") from error
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def _raise_loopback(address: str, links: IPRoute) -> None:
+    links.link("set", index=_LOOPBACK, state="up")
+    if address:
+        links.addr("add", index=_LOOPBACK, address=address, prefixlen=32)
+
+
+def _add_pair(device: str, peer: dict[str, object], links: IPRoute) -> None:
+    """Make a pair and switch its near end on."""
+    number = {} if "net_ns_fd" not in peer else {"index": _HIGH_INDEX}
+    links.link("add", kind="veth", ifname=device, mtu=_MTU, peer={**peer, **number, "mtu": _MTU})
+    _set_up(device, links)
+
+
+def _set_up(device: str, links: IPRoute) -> None:
+    links.link("set", index=_index(device, links), state="up")
+
+
+def _enslave(device: str, links: IPRoute) -> None:
+    links.link("set", index=_index(device, links), master=_index(_SEGMENT, links))
+
+
+def _release(device: str, links: IPRoute) -> None:
+    links.link("set", index=_index(device, links), master=0)
+
+
+def _index(device: str, links: IPRoute) -> int:
+    found = links.link_lookup(ifname=device)
+    if not found:
+        raise LocalError(f"no device {device}")
+    return int(found[0])

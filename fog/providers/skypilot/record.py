@@ -1,0 +1,150 @@
+"""A machine as SkyPilot's records tell it: one cluster of one node, its labels, its state.
+
+Place: pure.
+Source: SkyPilot 0.14, ``ClusterStatus`` and ``StatusResponse``. Some clouds allow only small letters, digits, ``-`` and
+``_`` in a label, at most 63, so what is not of that form is written in hexadecimal digits, and prices in millionths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final, Protocol
+
+from fog.hardware import Hardware
+from fog.machine import Machine, MachineSpec, MachineState
+from fog.offer import Offer
+from gdp.errors import LocalError
+
+__all__ = ["LAUNCH", "Request", "Status", "being_made", "cluster_name", "labels_of", "machine_of"]
+
+LAUNCH: Final = "sky.launch"
+_PREFIX: Final = "fog"
+_CLUSTER: Final = "fog-cluster"
+_MACHINE: Final = "fog-machine"
+_PLACE: Final = "fog-place"
+_TYPE: Final = "fog-type"
+_HARDWARE: Final = "fog-hardware"
+_PRICE: Final = "fog-micro-usd"
+_SPOT: Final = "fog-spot"
+_MILLIONTHS: Final = 1_000_000
+_LABEL_MAX: Final = 63
+
+_STATES: Final = {
+    "INIT": MachineState.BOOTING,
+    "PENDING": MachineState.BOOTING,
+    "UP": MachineState.RUNNING,
+    "STOPPED": MachineState.LEAVING,  # still paid for, so not gone
+    "AUTOSTOPPING": MachineState.LEAVING,
+}
+
+
+class Named(Protocol):
+    """A value of an enumeration of SkyPilot's."""
+
+    @property
+    def value(self) -> str: ...
+
+
+class Status(Protocol):
+    """What is read of a ``StatusResponse``."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def status(self) -> Named: ...
+    @property
+    def launched_at(self) -> int: ...
+    @property
+    def labels(self) -> Mapping[str, str] | None: ...
+    @property
+    def init_kind(self) -> str | None: ...
+    @property
+    def init_status_reason(self) -> str | None: ...
+    @property
+    def handle(self) -> object: ...
+
+
+class Request(Protocol):
+    """What is read of a ``RequestPayload``: something that the API server was asked and has not finished."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def cluster_name(self) -> str | None: ...
+    @property
+    def created_at(self) -> float: ...
+
+
+def cluster_name(spec: MachineSpec) -> str:
+    """Return what SkyPilot calls a machine."""
+    return f"{_PREFIX}-{spec.cluster}-{spec.name}"
+
+
+def labels_of(spec: MachineSpec) -> dict[str, str]:
+    """Return what is written on a machine so that ``machine_of`` can read it back.
+
+    Raises:
+        LocalError: a name is too long.
+    """
+    offer = spec.offer
+    labels = {
+        _CLUSTER: _hex(spec.cluster),
+        _MACHINE: _hex(spec.name),
+        _PLACE: _hex(offer.region),
+        _TYPE: _hex(offer.type_name),
+        _HARDWARE: _hex(offer.hardware.to_text()),
+        _PRICE: str(round(offer.usd_per_hour * _MILLIONTHS)),
+        _SPOT: str(int(offer.is_spot)),
+    }
+    if too_long := [key for key, value in labels.items() if len(value) > _LABEL_MAX]:
+        raise LocalError(f"skypilot: {cluster_name(spec)}: too long for a label: {', '.join(too_long)}")
+    return labels
+
+
+def machine_of(status: Status, cluster: str) -> Machine | None:
+    """Return the machine that a record tells of; None: it is not of this cluster.
+
+    SkyPilot knows that a machine is set up, not that its programs serve: the RIB knows that.
+    """
+    labels = status.labels or {}
+    if labels.get(_CLUSTER) != _hex(cluster):
+        return None
+    state, reason = _STATES.get(status.status.value, MachineState.BOOTING), ""
+    if status.init_kind == "unhealthy":
+        state, reason = MachineState.LEAVING, status.init_status_reason or "not as SkyPilot left it"
+    elif state is MachineState.LEAVING:
+        reason = status.status.value.lower()
+    address = getattr(status.handle, "head_ip", None)
+    try:
+        spec = _spec_of(cluster, labels)
+    except (KeyError, ValueError) as error:
+        raise LocalError(f"skypilot: {status.name}: its labels make no sense: {error!r}") from error
+    return Machine(status.name, spec, state, float(status.launched_at), str(address or ""), None, reason)
+
+
+def being_made(requests: Sequence[Request], cluster: str, known: Sequence[str]) -> list[Machine]:
+    """Return the machines of a cluster that were asked for and have no record yet; of their offers nothing is known."""
+    prefix = f"{_PREFIX}-{cluster}-"
+    found = {}
+    for request in requests:
+        name = request.cluster_name or ""
+        machine = name.removeprefix(prefix)
+        # a machine's name has no hyphen, so "fog-a-b-m1" is of cluster "a-b", not of "a"
+        if request.name == LAUNCH and name.startswith(prefix) and "-" not in machine and name not in known:
+            offer = Offer("skypilot", "", "", Hardware(), is_spot=False, usd_per_hour=0.0)
+            spec = MachineSpec(cluster, machine, offer)
+            found[name] = Machine(name, spec, MachineState.BOOTING, request.created_at)
+    return list(found.values())
+
+
+def _spec_of(cluster: str, labels: Mapping[str, str]) -> MachineSpec:
+    place, type_name, hardware, name = (
+        bytes.fromhex(labels[key]).decode() for key in (_PLACE, _TYPE, _HARDWARE, _MACHINE)
+    )
+    usd = int(labels[_PRICE]) / _MILLIONTHS
+    offer = Offer("skypilot", place, type_name, Hardware.from_text(hardware), labels[_SPOT] == "1", usd)
+    return MachineSpec(cluster, name, offer)
+
+
+def _hex(text: str) -> str:
+    return text.encode().hex()

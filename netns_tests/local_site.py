@@ -1,0 +1,136 @@
+"""A site for tests of the provider ``local``: plain programs, or a real domain with a robot's switch and RIB."""
+
+from __future__ import annotations
+
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+import yaml
+
+from fog.hardware import Hardware
+from fog.machine import Boot, Machine, MachineSpec, Program
+from fog.offer import Offer
+from fog.providers.local.provider import LocalProvider
+from gdp.crypto.certificates import Role
+from gdp.stores.issue import make_domain, make_node
+from gdp.stores.keyring import DELEGATIONS
+
+__all__ = ["PATIENCE_S", "Domain", "leftovers", "machine_of", "plain_gateway", "spec", "ticking", "until"]
+
+PATIENCE_S: Final = 30.0
+_TICKS: Final = "import time\nprint('ready')\nwhile True:\n    time.sleep(0.01)\n    print('tick')"
+
+
+def until(is_met: Callable[[], object], what: str) -> None:
+    """Look until something holds that tells nobody when it does."""
+    end_s = time.monotonic() + PATIENCE_S
+    while not is_met():
+        assert time.monotonic() < end_s, f"{what}: not within {PATIENCE_S:g} s"
+        time.sleep(0.01)
+
+
+def spec(name: str, region: str = "local-a", hardware: Hardware | None = None) -> MachineSpec:
+    """Return what to ask for."""
+    has = hardware or Hardware(2, 4.0)
+    return MachineSpec("test", name, Offer("local", region, "local.small", has, True, 0.01))
+
+
+def machine_of(provider: LocalProvider, machine: str) -> Machine:
+    """Return what the provider says of a machine."""
+    (found,) = (each for each in provider.describe("test") if each.id == machine)
+    return found
+
+
+def plain_gateway(_: str, __: Sequence[str]) -> Boot:
+    """Return a gateway that forwards nothing."""
+    return Boot({}, (Program("idle", ("sleep", "1000")),))
+
+
+def ticking(code: str = _TICKS) -> Boot:
+    """Return a machine that writes a line every now and then."""
+    return Boot({}, (Program("ticker", ("{python}", "-c", code), "ready"),))
+
+
+def leftovers(provider_folder: Path, ids: Sequence[str]) -> list[str]:
+    """Return all that is left of runs: records, folders, namespaces, groups, processes."""
+    places = [provider_folder, Path("/tmp"), Path("/run/netns"), *Path("/sys/fs/cgroup").glob("*/")]
+    found = [str(path) for place in places if place.is_dir() for path in place.iterdir()]
+    found += [group for path in Path("/proc").glob("[0-9]*") if (group := _group(path))]
+    return [each for each in found if any(run in each for run in ids)]
+
+
+def _group(process: Path) -> str:
+    """Return the groups of a process; empty: it has ended, though perhaps nobody has taken note of it."""
+    try:
+        is_over = (process / "stat").read_text(errors="replace").rpartition(")")[2].split()[0] in "ZX"
+        return "" if is_over else (process / "cgroup").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return ""
+
+
+class Domain:
+    """A trust domain, and the boots of its members; ``folder``: for keys and files.
+
+    The robot's side runs where it was made, and ends with ``close``.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._running: list[subprocess.Popen[str]] = []
+        make_domain(folder / "domain", "test")
+
+    def gateway(self, label: str, ifaces: Sequence[str]) -> Boot:
+        """Return what a gateway runs."""
+        return Boot(self._switch(label, ifaces), (_command("switch", "gdp.cli.switch"),))
+
+    def machine(self, name: str) -> Boot:
+        """Return what a machine runs: a switch, and a proxy that carries nothing."""
+        files = self._switch(name, ["eth0"], ["proxy0"])
+        files |= self._node(Role.PROXY, name, {"iface": "proxy0", "delegations": f"proxy/{DELEGATIONS}"})
+        files[f"proxy/{DELEGATIONS}/.none"] = b""
+        return Boot(files, (_command("switch", "gdp.cli.switch"), _command("proxy", "proxy.cli", " is attached")))
+
+    def start_robot(self, uplink: str) -> None:
+        """Start the robot's switch and the domain's RIB in this namespace."""
+        self._start("switch", self._switch("robot", [uplink], ["rib0"]))
+        self._start("rib", self._node(Role.RIB, "robot", {"iface": "rib0"}))
+
+    def close(self) -> None:
+        """End the robot's side."""
+        for process in reversed(self._running):
+            process.terminate()
+            process.communicate(timeout=PATIENCE_S)
+
+    def _switch(self, label: str, ifaces: Sequence[str], attach: Sequence[str] = ()) -> dict[str, bytes]:
+        ports = [{"iface": iface} for iface in ifaces]
+        return self._node(Role.SWITCH, label, {"ports": ports, "attach": list(attach)})
+
+    def _node(self, role: Role, label: str, content: Mapping[str, object]) -> dict[str, bytes]:
+        keys = self._folder / f"{role.value}-{label}"
+        make_node(keys, role, label, self._folder / "domain")
+        files = {f"{role.value}/{path.name}": path.read_bytes() for path in keys.iterdir()}
+        told = {"identity": role.value, "domain": {"root": f"{role.value}/root.crt"}, **content}
+        return {**files, f"{role.value}.yaml": yaml.safe_dump(told).encode()}
+
+    def _start(self, role: str, files: Mapping[str, bytes]) -> None:
+        home = self._folder / "robot"
+        for path, content in files.items():
+            (home / path).parent.mkdir(parents=True, exist_ok=True)
+            (home / path).write_bytes(content)
+            (home / path).chmod(0o600)
+        argv = [sys.executable, "-m", f"gdp.cli.{role}", "--config", str(home / f"{role}.yaml")]
+        with (home / f"{role}.log").open("wb") as log:
+            process = subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=log, text=True)
+        self._running.append(process)
+        assert process.stdout is not None
+        assert select.select([process.stdout], [], [], PATIENCE_S)[0], f"{role} says nothing"
+        assert " is up" in process.stdout.readline(), (home / f"{role}.log").read_text()
+
+
+def _command(role: str, module: str, sign: str = " is up") -> Program:
+    return Program(role, ("{python}", "-m", module, "--config", f"{{home}}/{role}.yaml"), sign)

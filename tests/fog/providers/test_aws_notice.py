@@ -1,0 +1,164 @@
+"""The watcher of an EC2 machine, against a metadata service on a loopback port."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from fog.agent.bundle import install
+from fog.agent.notice import read_notice
+from fog.machine import Boot
+from fog.providers.aws.notice import DRAIN_BEFORE_S, Metadata, Watch
+from fog.providers.aws.provider import WATCHER
+
+ACTION = "/latest/meta-data/spot/instance-action"
+DRAIN = "/latest/meta-data/tags/instance/fog-drain"
+LEAVES_AT = 1_505_722_920.0  # 2017-09-18T08:22:00Z
+
+
+class Service(ThreadingHTTPServer):
+    """Version 2 of the service: a path's text, for those who have a token."""
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), Answer)
+        self.told: dict[str, str] = {}
+        self.token = "first"
+        self.tokens_given = 0
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server_address[1]}"
+
+
+class Answer(BaseHTTPRequestHandler):
+    server: Service
+
+    def do_PUT(self) -> None:
+        is_right = self.path == "/latest/api/token" and int(self.headers["X-aws-ec2-metadata-token-ttl-seconds"]) > 0
+        self.server.tokens_given += 1
+        self.reply(200 if is_right else 400, self.server.token)
+
+    def do_GET(self) -> None:
+        if self.headers["X-aws-ec2-metadata-token"] != self.server.token:
+            self.reply(401, "")
+        elif self.path in self.server.told:
+            self.reply(200, self.server.told[self.path])
+        else:
+            self.reply(404, "")
+
+    def reply(self, code: int, text: str) -> None:
+        self.send_response(code)
+        self.send_header("Content-Length", str(len(text)))
+        self.end_headers()
+        self.wfile.write(text.encode())
+
+    def log_message(self, *args: object) -> None:
+        pass
+
+
+@pytest.fixture
+def service() -> Iterator[Service]:
+    with Service() as made:
+        thread = threading.Thread(target=made.serve_forever, args=(0.01,))
+        thread.start()
+        yield made
+        made.shutdown()
+        thread.join()
+
+
+class Seen:
+    """A watch and what it told."""
+
+    def __init__(self, service: Service) -> None:
+        self.notices: list[float] = []
+        self.drains = 0
+        self.watch = Watch(Metadata(service.url), self.notices.append, self.drain)
+
+    def drain(self) -> None:
+        self.drains += 1
+
+
+def interrupt(service: Service) -> None:
+    service.told[ACTION] = json.dumps({"action": "terminate", "time": "2017-09-18T08:22:00Z"})
+
+
+def test_a_machine_that_may_stay_hears_nothing(service: Service) -> None:
+    seen = Seen(service)
+    assert not seen.watch.look(LEAVES_AT)
+    assert (seen.notices, seen.drains, service.tokens_given) == ([], 0, 1)
+
+
+def test_a_notice_is_told_at_once_and_the_machine_drains_in_time(service: Service) -> None:
+    seen = Seen(service)
+    interrupt(service)
+    assert not seen.watch.look(LEAVES_AT - 120)
+    assert not seen.watch.look(LEAVES_AT - 90)
+    assert (seen.notices, seen.drains) == ([LEAVES_AT], 0)
+    assert seen.watch.look(LEAVES_AT - DRAIN_BEFORE_S)
+    assert (seen.notices, seen.drains) == ([LEAVES_AT], 1)
+
+
+def test_the_owners_tag_drains_at_once(service: Service) -> None:
+    seen = Seen(service)
+    service.told[DRAIN] = "1"
+    assert seen.watch.look(0.0)
+    assert (seen.notices, seen.drains) == ([], 1)
+
+
+def test_an_expired_token_is_replaced(service: Service) -> None:
+    seen = Seen(service)
+    seen.watch.look(0.0)
+    service.token = "second"
+    interrupt(service)
+    seen.watch.look(0.0)
+    assert seen.notices == [LEAVES_AT]
+    assert service.tokens_given == 2
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"time": 3}', '{"time": "soon"}', "\u00e4"])
+def test_nonsense_is_an_error_that_may_pass(service: Service, text: str) -> None:
+    seen = Seen(service)
+    service.told[ACTION] = text
+    with pytest.raises(OSError, match=r"makes no sense|metadata"):
+        seen.watch.look(0.0)
+    interrupt(service)
+    seen.watch.look(0.0)
+    assert seen.notices == [LEAVES_AT]
+
+
+def test_the_program_tells_the_machine_and_waits_to_be_ended(service: Service, tmp_path: Path) -> None:
+    interrupt(service)
+    command = [sys.executable, "-m", "fog.providers.aws.notice", "--home", str(tmp_path), "--url", service.url]
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1, signal.SIGUSR2})
+    program = subprocess.Popen([*command, "--poll-s", "0.01"], stdout=subprocess.PIPE)
+    try:
+        assert signal.sigtimedwait({signal.SIGUSR2}, 20)
+        assert read_notice(tmp_path) == LEAVES_AT
+        assert signal.sigtimedwait({signal.SIGUSR1}, 20)  # the moment is long past
+    finally:
+        program.terminate()
+        told, _ = program.communicate(timeout=20)
+        while signal.sigtimedwait({signal.SIGUSR1, signal.SIGUSR2}, 0):
+            continue
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGUSR1, signal.SIGUSR2})
+    assert program.returncode == 0
+    assert told.decode().splitlines() == ["EC2 takes this machine at 1505722920", "the machine drains"]
+
+
+def test_a_machine_ends_well_when_its_owner_drains_it(service: Service, tmp_path: Path) -> None:
+    service.told[DRAIN] = "1"
+    home = tmp_path / "machine"
+    watcher = replace(WATCHER, argv=(*WATCHER.argv, "--url", service.url, "--poll-s", "0.01"))
+    install(home, Boot({}, (watcher,)))
+    command = [sys.executable, "-m", "fog.agent.cli", "--home", str(home), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert json.loads(done.stdout)["reason"] == "drained"

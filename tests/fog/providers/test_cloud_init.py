@@ -1,0 +1,136 @@
+"""What a rented machine is told at its first start."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+import os
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import jsonschema
+import pytest
+import yaml
+from pydantic import ValidationError
+
+from fog.agent.bundle import pack
+from fog.machine import Boot, Program
+from fog.providers.cloud_init import (
+    USER_DATA_MAX_BYTES,
+    Setup,
+    Vxlan,
+    cloud_config,
+    placed,
+    shell_script,
+    user_data,
+)
+from gdp.errors import LocalError
+
+SCHEMA = Path(sys.prefix) / "share/cloud-init/schema.json"
+FILES = pack(
+    Boot(
+        {"keys/own.key": bytes(range(256)), "proxy.yaml": "rules: []  # käse\n".encode(), "a.txt": b"x: 'y'\n\ttab\n"},
+        (Program("switch", ("gdp-switch", "--config", "{home}/switch.yaml"), ready="is up"),),
+    )
+)
+TUNNEL = Setup(
+    requirements=("https://example.org/gdp_ros-0.1.0-py3-none-any.whl", "my nodes"),
+    packages=("libfcl-dev",),
+    vxlan=Vxlan.model_validate({"remote": "198.51.100.7", "id": 42}),
+)
+
+
+def read_back(text: str) -> dict[str, tuple[bytes, int]]:
+    """Return path -> content and mode, as cloud-init's write_files would write it."""
+    entries = yaml.safe_load(text)["write_files"]
+    found = {}
+    for each in entries:
+        content = each["content"].encode()
+        assert each.get("encoding", "b64") == "b64"
+        found[each["path"]] = (
+            base64.b64decode(content) if "encoding" in each else content,
+            int(each["permissions"], 8),
+        )
+    return found
+
+
+@pytest.mark.parametrize("setup", [Setup(), TUNNEL])
+def test_the_schema_of_cloud_init_allows_it(setup: Setup) -> None:
+    if not SCHEMA.is_file():
+        pytest.skip("cloud-init's schema is not here: scripts/setup_cloud_schema.sh fetches it")
+    jsonschema.validate(yaml.safe_load(cloud_config(FILES, setup)), json.loads(SCHEMA.read_text()))
+
+
+def test_the_schema_of_cloud_init_would_notice() -> None:
+    if not SCHEMA.is_file():
+        pytest.skip("cloud-init's schema is not here: scripts/setup_cloud_schema.sh fetches it")
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({"runcmd": 7}, json.loads(SCHEMA.read_text()))
+
+
+def test_it_is_a_cloud_config_that_installs_and_starts() -> None:
+    text = cloud_config(FILES, TUNNEL)
+    assert text.startswith("#cloud-config\n")
+    config = yaml.safe_load(text)
+    assert set(config) == {"package_update", "packages", "write_files", "runcmd"}
+    assert {"python3-venv", "libfcl-dev"} <= set(config["packages"])
+    assert config["runcmd"][-1][4:] == ["fog-tunnel", "fog-machine", "fog-log@switch"]
+    install = read_back(text)["/usr/local/sbin/fog-install"][0].decode()
+    assert "https://example.org/gdp_ros-0.1.0-py3-none-any.whl 'my nodes'" in install
+
+
+def test_user_data_is_small_and_the_same_each_time() -> None:
+    data = user_data(FILES, TUNNEL)
+    assert data == user_data(FILES, TUNNEL)
+    assert len(data) < USER_DATA_MAX_BYTES
+    assert gzip.decompress(data).decode() == cloud_config(FILES, TUNNEL)
+
+
+def test_too_much_for_ec2_is_refused_before_it_is_asked() -> None:
+    with pytest.raises(LocalError, match="16384"):
+        user_data({"model.onnx": random.Random(1).randbytes(20_000)}, Setup())
+
+
+@pytest.mark.parametrize("path", ["/etc/passwd", "../shadow", "a/../../b"])
+def test_a_file_outside_the_machines_folder_is_refused(path: str) -> None:
+    with pytest.raises(LocalError, match="outside"):
+        placed({path: b""}, Setup())
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"remote": "a;b"}, {"remote": "1.2.3.4", "id": 0}, {"remote": "::1", "device": "x y"}]
+)
+def test_a_tunnel_that_cannot_be_is_refused(wrong: dict[str, object]) -> None:
+    with pytest.raises(ValidationError):
+        Vxlan.model_validate(wrong)
+
+
+def test_the_script_comes_to_the_same_files(tmp_path: Path) -> None:
+    root, asked = tmp_path / "root", tmp_path / "asked"
+    root.mkdir()
+    sudo = tmp_path / "sudo"  # does what touches files below `root`, writes down what would change the machine
+    sudo.write_text(
+        f'#!/bin/sh\nif [ "$1" = tar ]; then exec "$@" --directory {root}; fi\necho "$@" >> {asked}\n', encoding="ascii"
+    )
+    sudo.chmod(0o755)
+    subprocess.run(
+        ["bash", "-s"],
+        input=shell_script(FILES, TUNNEL).encode(),
+        env={"PATH": f"{tmp_path}:{os.environ['PATH']}"},
+        timeout=30,
+        check=True,
+    )
+    for file in placed(FILES, TUNNEL):
+        there = root / file.path.lstrip("/")
+        assert there.read_bytes() == file.content
+        assert there.stat().st_mode & 0o777 == file.mode
+    assert asked.read_text().splitlines()[-1].startswith("systemctl enable --now")
+
+
+def test_the_installation_is_done_once_and_again_after_a_failure(tmp_path: Path) -> None:
+    installs = next(file for file in placed(FILES, TUNNEL) if file.path.endswith("fog-install")).content.decode()
+    subprocess.run(["sh", "-n"], input=installs.encode(), check=True)
+    assert installs.index("complete ] && exit 0") < installs.index("pip install") < installs.index("touch")
