@@ -6,6 +6,7 @@ Place: pure. A service has one part, itself. An action has five, in this order: 
     request   version (1) | part (1) | call (8) | patience in ms, 0: none (4) | body
     answer    version (1) | part (1) | call (8) | outcome (1)                 | body, or a reason in UTF-8
     news      version (1) | part (1) | stamp in ns (8)                        | body
+    stop      version (1) | part + 0x80 (1) | calls that have ended (8 each)
 """
 
 from __future__ import annotations
@@ -22,15 +23,18 @@ from proxy.serial.channel import CHANNEL_MAX_BYTES, Channel
 from proxy.serial.serializer import Encoding
 from proxy.serial.service import Service
 
-__all__ = ["Answer", "Exchange", "News", "Outcome", "Request", "too_large"]
+__all__ = ["Answer", "Exchange", "News", "Outcome", "Request", "Stop", "too_large"]
 
 VERSION: Final = 1
 PARTS_MAX: Final = 8
+_STOPS: Final = 0x80  # in the place of a part
 PATIENCE_MAX_MS: Final = (1 << 32) - 1
 _REASON_MAX_BYTES: Final = 1_024
 _REQUEST: Final = struct.Struct("!BBQI")
 _ANSWER: Final = struct.Struct("!BBQB")
 _NEWS: Final = struct.Struct("!BBQ")
+_STOP: Final = struct.Struct("!BB")
+_CALL: Final = struct.Struct("!Q")
 _HEAD_MAX_BYTES: Final = max(_REQUEST.size, _ANSWER.size, _NEWS.size)
 _ENCODINGS: Final[dict[object, Encoding]] = {"json": "json", "cbor": "cbor", "cdr": "cdr"}
 
@@ -63,6 +67,35 @@ class Request(NamedTuple):
         """
         part, call, patience_ms = _head(_REQUEST, wire)
         return cls(part, call, patience_ms, wire[_REQUEST.size :])
+
+
+class Stop(NamedTuple):
+    """Word from a client's proxy that calls have ended: whoever still works on one need not."""
+
+    part: int
+    calls: tuple[int, ...]
+
+    def to_wire(self) -> bytes:
+        """Return the wire form."""
+        return _STOP.pack(VERSION, self.part | _STOPS) + b"".join(map(_CALL.pack, self.calls))
+
+    @staticmethod
+    def is_in(wire: bytes) -> bool:
+        """Return whether these bytes are meant as one, not as a request."""
+        return len(wire) >= _STOP.size and bool(wire[1] & _STOPS)
+
+    @classmethod
+    def from_wire(cls, wire: bytes) -> Stop:
+        """Read the wire form.
+
+        Raises:
+            RemoteError: MALFORMED or BAD_VERSION.
+        """
+        (part,) = _head(_STOP, wire)
+        calls = wire[_STOP.size :]
+        if not part & _STOPS or not calls or len(calls) % _CALL.size:
+            raise RemoteError(DropReason.MALFORMED, "a word about ended calls that names none")
+        return cls(part & ~_STOPS, tuple(call for (call,) in _CALL.iter_unpack(calls)))
 
 
 class Answer(NamedTuple):
@@ -147,11 +180,13 @@ class Exchange:
     Args:
         services: by part.
         topics: of an action; their parts follow the services'.
+        is_leaving: a server that answers what is under way, and then goes: ask others.
     """
 
     encoding: Encoding
     services: tuple[Service, ...]
     topics: tuple[Channel, ...] = ()
+    is_leaving: bool = False
 
     def to_wire(self) -> bytes:
         """Return the wire form.
@@ -160,7 +195,8 @@ class Exchange:
             LocalError: a part is longer than a peer would take.
         """
         services = [service.to_wire() for service in self.services]
-        return encode({"e": self.encoding, "s": services, "c": [channel.to_wire() for channel in self.topics]})
+        said = {"e": self.encoding, "s": services, "c": [channel.to_wire() for channel in self.topics]}
+        return encode(said | {"l": True} if self.is_leaving else said)
 
     @classmethod
     def from_wire(cls, wire: bytes) -> Exchange:
@@ -170,7 +206,7 @@ class Exchange:
             RemoteError: MALFORMED, whatever else these bytes are.
         """
         match decode(wire, 2 * PARTS_MAX * CHANNEL_MAX_BYTES):
-            case {"e": str(encoding), "s": [*services], "c": [*topics]} if (
+            case {"e": str(encoding), "s": [*services], "c": [*topics], **more} if (
                 encoding in _ENCODINGS and services and len(services) + len(topics) <= PARTS_MAX
             ):
                 parts = [each for each in [*services, *topics] if isinstance(each, bytes)]
@@ -179,5 +215,6 @@ class Exchange:
                         _ENCODINGS[encoding],
                         tuple(map(Service.from_wire, parts[: len(services)])),
                         tuple(map(Channel.from_wire, parts[len(services) :])),
+                        more.get("l") is True,
                     )
         raise RemoteError(DropReason.MALFORMED, "a description of a service")

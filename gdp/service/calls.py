@@ -8,6 +8,7 @@ with all others; whatever comes for it later finds nobody.
 from __future__ import annotations
 
 import heapq
+from collections.abc import Iterator
 from typing import Final, Generic, TypeVar
 
 from gdp.errors import LocalError
@@ -26,9 +27,6 @@ class Calls(Generic[T]):
     Args:
         limit: of calls at once.
         start: the first call's number, random in 64 bits: no number of an earlier life is met again.
-
-    Attributes:
-        unmatched: answers that came for no call, or for one that had ended.
     """
 
     def __init__(self, limit: int, start: int) -> None:
@@ -36,7 +34,6 @@ class Calls(Generic[T]):
         self._next = start % _NUMBERS
         self._contexts: dict[int, T] = {}  # in the order of their beginning
         self._timers: list[tuple[float, int]] = []  # a heap; of ended calls, too
-        self.unmatched = 0
 
     def __len__(self) -> int:
         return len(self._contexts)
@@ -44,13 +41,17 @@ class Calls(Generic[T]):
     def __contains__(self, number: int) -> bool:
         return number in self._contexts
 
+    def __iter__(self) -> Iterator[tuple[int, T]]:
+        """Yield numbers and contexts, the oldest first; calls may begin and end meanwhile."""
+        return iter(list(self._contexts.items()))
+
     def begin(self, now_s: float, timeout_s: float | None, context: T) -> int:
         """Return the number of a new call; none comes twice.
 
         Args:
             now_s: the present moment.
             timeout_s: how long it may take; None: as long as it likes.
-            context: what ``answered``, ``expired`` or ``fail_all`` gives back.
+            context: what ``end``, ``expired`` or ``fail_all`` gives back.
 
         Raises:
             LocalError: as many as there may be are under way.
@@ -64,12 +65,14 @@ class Calls(Generic[T]):
             heapq.heappush(self._timers, (now_s + timeout_s, number))
         return number
 
-    def answered(self, number: int) -> T | None:
-        """End a call with its first answer; return its context, or None where nobody waits."""
+    def get(self, number: int) -> T | None:
+        """Return the context of a call that is under way, or None."""
+        return self._contexts.get(number)
+
+    def end(self, number: int) -> T | None:
+        """End a call; return its context, or None where it has ended before."""
         context = self._contexts.pop(number, None)
-        if context is None:
-            self.unmatched += 1
-        elif len(self._timers) > 2 * len(self._contexts) + _SPARE:
+        if context is not None and len(self._timers) > 2 * len(self._contexts) + _SPARE:
             self._timers = [timer for timer in self._timers if timer[1] in self._contexts]
             heapq.heapify(self._timers)
         return context

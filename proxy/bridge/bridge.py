@@ -144,17 +144,25 @@ class Bridge:
             self._refresh(now_s)
         for seat in self._seats:
             seat.deliver_faults(now_s)
-        if now_s >= self._tick_at_s:
-            self._tick_at_s = now_s + TICK_S
-            for flow in self._timed:
+        is_tick = now_s >= self._tick_at_s
+        for flow in self._timed:
+            due_s = flow.next_timeout()
+            if is_tick:
                 flow.tick(now_s)
+            elif due_s is not None and due_s <= now_s:
+                flow.timeout(now_s)
+        if is_tick:
+            self._tick_at_s = now_s + TICK_S
             self._site.traffic.dropped = sum(seat.endpoint.dropped for seat in self._seats)
 
     def next_timeout(self) -> float | None:
         """Return the monotonic second at which there is something to do, or None."""
         if self._is_stale:
             return 0.0
-        return self._tick_at_s if self._timed or self._since else None
+        if not self._timed:
+            return self._tick_at_s if self._since else None
+        times = [flow.next_timeout() for flow in self._timed]
+        return min([self._tick_at_s, *(time for time in times if time is not None)])
 
     def reload(self, config: ProxyConfig, held: Held) -> None:
         """Take rules and delegations anew; flows whose rule is the same go on undisturbed while it is delegated."""
@@ -167,6 +175,16 @@ class Bridge:
                 flow.renew(topic)
         self._failed.clear()
         self._is_stale = True
+
+    def drain(self, now_s: float) -> None:
+        """Let no client begin anything new with the servers here; what is under way is answered."""
+        for _, flow in self.flows:
+            if isinstance(flow, ExposedService):
+                flow.drain(now_s)
+
+    def is_drained(self, now_s: float) -> bool:
+        """Return whether every server here, after ``drain``, has answered everything."""
+        return all(flow.is_drained(now_s) for _, flow in self.flows if isinstance(flow, ExposedService))
 
     def close(self) -> None:
         """End every flow; endpoints stay open."""

@@ -1,43 +1,41 @@
 """A local server on its way out: requests from far clients, asked here, answered to the one that asked.
 
-Place: shell; endpoint and member do the I/O. A service and an action differ only in their parts.
+Place: shell; endpoint and member do the I/O, ``gdp/service/serving.py`` keeps order. A service and an action differ in
+their parts; and what nobody waits for any more is broken off by cancelling its goal, or by calling the rule's ``stop``.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Final
 
 from gdp.client.member import Message, Topic
 from gdp.errors import LocalError, RemoteError
 from gdp.names import Name
-from gdp.service.calls import Calls
+from gdp.service.serving import Asked, Serving
+from proxy.bridge.goals import cancel_of, goal_of
 from proxy.bridge.incoming import Incoming
-from proxy.bridge.parts import PROFILES, Parts
+from proxy.bridge.parts import CANCEL, GOAL, PROFILES, RESULT, Parts
 from proxy.bridge.rivals import mark_of, sign
 from proxy.bridge.seat import Seat
 from proxy.bridge.site import Site
 from proxy.bridge.wishes import Wish
 from proxy.endpoints.endpoint import Answered, Described, Event, Failed, Faulted, Heard
-from proxy.exchange import Answer, Exchange, News, Outcome, Request, too_large
+from proxy.exchange import Answer, Exchange, News, Outcome, Request, Stop, too_large
 from proxy.faults import Fault
 from proxy.serial.schema import DefinitionError
 from proxy.serial.serializer import Serializer
 
 __all__ = ["ExposedService"]
 
-_CALLS_MAX = 65_536  # under way at one server
-_EARLY_MAX = 256  # requests of clients that are not described yet
-_GRACE_S = 0.5  # it is the client's side that ends a call; here it is only forgotten
-_CLIENTS_MAX = 1_024  # descriptions of clients kept ready; the oldest go
-
-
-class _Asked(NamedTuple):
-    """A call under way here: whose, under which number of theirs."""
-
-    client: Name
-    part: int
-    call: int
+_EARLY_MAX: Final = 256  # requests of clients that are not described yet
+_GRACE_S: Final = 0.5  # it is the client's side that ends a call; here it is only forgotten
+_CLIENTS_MAX: Final = 1_024  # descriptions of clients kept ready; the oldest go
+_CANCEL_S: Final = 5.0
+_NOTICE_S: Final = 1.0  # a server that leaves still takes requests for so long: of clients that have not heard it yet
+_TRIGGER: Final = "std_srvs/srv/Trigger"
+_NO_FIELDS: Final = {1: b"", 2: b"\0\1\0\0\0"}  # a request of it; ROS 2 fills a message without fields with one byte
 
 
 class ExposedService:
@@ -55,7 +53,10 @@ class ExposedService:
         self._seat = seat
         self._wish = wish
         self._topic = topic
-        self._calls: Calls[_Asked] = Calls(_CALLS_MAX, random_start)
+        self._serving: Serving[bytes] = Serving(random_start, wish.rule.at_once)
+        self._goals: dict[Asked, bytes] = {}  # of an action's calls under way
+        self._words = 0  # of ours to the local server; their numbers
+        self._refuses_from_s: float | None = None
         self._clients: dict[tuple[bytes, bytes], tuple[Incoming, ...]] = {}
         self._early = deque[Message](maxlen=_EARLY_MAX)
         endpoint, rule = seat.endpoint, wish.rule
@@ -65,6 +66,7 @@ class ExposedService:
         self._news = [Serializer(each, rule.encoding) for each in self._exchange.topics]
         self._mark = seat.advertise(self, sign(mark_of(wish.local), endpoint.ros))
         self._servers = [seat.dial(self, *part) for part in parts.services]
+        self._stopper = None if rule.stop is None else seat.dial(self, rule.stop, _TRIGGER)
         self._topics = [
             seat.subscribe(self, *part, profile) for part, profile in zip(parts.topics, PROFILES, strict=False)
         ]
@@ -73,26 +75,32 @@ class ExposedService:
         )
 
     def receive(self, message: Message, now_s: float) -> None:
-        """Take a far client's request; what comes before its description waits for that."""
+        """Take a far client's request, or its word that some have ended; before its description both wait."""
         if not message.description:
             self._early.append(message)
             return
         try:
-            self._ask(message, now_s)
+            if Stop.is_in(message.delivered.message):
+                self._stop(Name(message.delivered.publisher), Stop.from_wire(message.delivered.message), now_s)
+            else:
+                self._ask(message, now_s)
         except RemoteError as error:
             self._site.faults.tell(self._wish.local, Fault.MALFORMED, str(error))
+        self._give()
 
     def take(self, event: Event, now_s: float) -> None:
         """Take what the local server, or an action's topics, say."""
         del now_s
-        if isinstance(event, Answered):
-            asked = self._calls.answered(event.call)
-            if asked is not None:
+        if isinstance(event, Answered | Failed) and event.handle == self._stopper:
+            if isinstance(event, Failed):
+                self._site.faults.tell(f"{self._wish.rule.stop}", Fault.REFUSED, event.reason)
+        elif isinstance(event, Answered | Failed):
+            asked = self._serving.end(event.call)
+            if asked is not None and isinstance(event, Answered):
                 self._answer(asked, event.raw)
-        elif isinstance(event, Failed):
-            asked = self._calls.answered(event.call)
-            if asked is not None:
+            elif asked is not None and isinstance(event, Failed):
                 self._fail(asked, Fault.REFUSED, event.reason)
+            self._give()
         elif isinstance(event, Heard):
             self._publish(event)
         elif isinstance(event, Faulted):
@@ -101,22 +109,42 @@ class ExposedService:
             assert isinstance(event, Described)  # what an action's topics are was known before
 
     def tick(self, now_s: float) -> None:
-        """Give up what its client no longer waits for."""
+        """Take what came before its description."""
         if self._early:
             self._take_early(now_s)
-        for number, asked in self._calls.expired(now_s):
-            self._seat.endpoint.drop(self._servers[asked.part], number)
-            self._fail(asked, Fault.TIMED_OUT, "the server did not answer in time")
+        self.timeout(now_s)
+
+    def timeout(self, now_s: float) -> None:
+        """Give up what its client no longer waits for."""
+        for number, part, asked, is_given in self._serving.expired(now_s):
+            if is_given:
+                self._seat.endpoint.drop(self._servers[part], number)
+                self._break_off()
+            if asked is not None:
+                self._fail(asked, Fault.TIMED_OUT, "the server did not answer in time")
+        self._give()
 
     def next_timeout(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        return self._calls.next_timeout()
+        return self._serving.next_timeout()
+
+    def drain(self, now_s: float) -> None:
+        """Tell clients to ask others, and answer what is under way."""
+        if self._refuses_from_s is None:
+            self._refuses_from_s = now_s + _NOTICE_S
+            self._publisher.describe(replace(self._exchange, is_leaving=True).to_wire())
+
+    def is_drained(self, now_s: float) -> bool:
+        """Return whether nothing is under way any more, and nothing new will be."""
+        is_closed = self._refuses_from_s is not None and now_s >= self._refuses_from_s
+        return is_closed and not self._serving and not self._early
 
     def close(self, now_s: float) -> None:
         """Serve nobody any more; calls under way fail."""
-        for _, asked in self._calls.fail_all():
+        for asked in self._serving.fail_all():
             self._fail(asked, Fault.NO_SERVER, "the server is gone")
-        for handle in [self._mark, *self._servers, *self._topics]:
+        stopper = [] if self._stopper is None else [self._stopper]
+        for handle in [self._mark, *self._servers, *stopper, *self._topics]:
             self._seat.close(handle)
         self._site.member.flush(now_s)  # what was said last must not wait: it would go with its stream
         self._site.member.withdraw(self._topic.name)
@@ -137,22 +165,77 @@ class ExposedService:
     def _ask(self, message: Message, now_s: float) -> None:
         delivered = message.delivered
         request = Request.from_wire(delivered.message)
-        asked = _Asked(Name(delivered.publisher), request.part, request.call)
+        asked = Asked(Name(delivered.publisher), request.part, request.call)
         self._site.traffic.received(len(delivered.message))
+        before = self._serving.answer_of(asked)
+        if before is not None or asked in self._serving:
+            if before:
+                self._send_wire(asked.client, before)
+            return
+        if self._refuses_from_s is not None and now_s >= self._refuses_from_s:
+            self._send(asked, Answer.failed(asked.part, asked.call, "the server is leaving"))
+            return
         try:
             incoming = self._incoming(message)
             if request.part >= len(incoming):
                 raise DefinitionError("the client asks for a part that this service has not")
             raw = incoming[request.part].decode(request.body)
             patience_s = request.patience_ms / 1e3 + _GRACE_S if request.patience_ms else None
-            number = self._calls.begin(now_s, patience_s, asked)
+            self._begin(now_s, patience_s, asked, raw)
         except LocalError as error:
             self._fail(asked, Fault.OTHER_TYPE, str(error))
-            return
         except RemoteError as error:
             self._fail(asked, Fault.MALFORMED, str(error))
-            return
-        self._seat.endpoint.call(self._servers[request.part], number, raw)
+
+    def _begin(self, now_s: float, patience_s: float | None, asked: Asked, raw: bytes) -> None:
+        """Take a request; what is about a goal waits until the local server knows whether it accepts that one."""
+        goal = goal_of(raw) if self._wish.rule.kind == "action" else b""
+        accepting = (other for other, its in self._goals.items() if other.part == GOAL and its == goal)
+        self._serving.begin(now_s, patience_s, asked, raw, None if asked.part == GOAL else next(accepting, None))
+        if goal and asked.part != CANCEL:
+            self._goals[asked] = goal
+
+    def _give(self) -> None:
+        """Give the local server what it is the turn of; forget what has ended."""
+        for number, asked, raw in self._serving.take():
+            self._seat.endpoint.call(self._servers[asked.part], number, raw)
+        if len(self._goals) > 0:
+            self._goals = {asked: goal for asked, goal in self._goals.items() if asked in self._serving}
+
+    def _stop(self, client: Name, stop: Stop, now_s: float) -> None:
+        """Learn that a client's calls have ended: what waits is left undone, what is worked on is broken off."""
+        is_working = False
+        for call in stop.calls:
+            asked = Asked(client, stop.part, call)
+            goal = self._goals.pop(asked, None)
+            number = self._serving.stop(asked)
+            if number is not None and stop.part < len(self._servers):
+                is_working = True
+                if self._wish.rule.at_once is None:
+                    self._seat.endpoint.drop(self._servers[stop.part], number)
+            if goal is not None and stop.part == RESULT and goal not in self._results():
+                self._cancel(goal, now_s)
+        if is_working:
+            self._break_off()
+
+    def _cancel(self, goal: bytes, now_s: float) -> None:
+        self._words += 1
+        cancel = Asked(self._site.member.name, CANCEL, self._words)
+        try:
+            self._begin(now_s, _CANCEL_S, cancel, cancel_of(goal))
+        except LocalError as error:
+            self._site.faults.tell(self._wish.local, Fault.TOO_FAST, str(error))
+
+    def _break_off(self) -> None:
+        """Let the local server know that nobody waits for what it works on, if the rule says how."""
+        if self._stopper is not None:
+            self._seat.endpoint.drop(self._stopper, self._words)  # what the last word came to is nobody's
+            self._words += 1
+            self._seat.endpoint.call(self._stopper, self._words, _NO_FIELDS[self._seat.endpoint.ros])
+
+    def _results(self) -> set[bytes]:
+        """Return the goals whose results somebody waits for."""
+        return {goal for asked, goal in self._goals.items() if asked.part == RESULT}
 
     def _incoming(self, message: Message) -> tuple[Incoming, ...]:
         """Return what a client's requests are, by part.
@@ -171,21 +254,27 @@ class ExposedService:
                 del self._clients[next(iter(self._clients))]
         return self._clients[key]
 
-    def _answer(self, asked: _Asked, raw: bytes) -> None:
+    def _answer(self, asked: Asked, raw: bytes) -> None:
         body = self._answers[asked.part].encode(raw)
         if reason := too_large("an answer", len(raw), self._wish.rule.max_bytes, len(body)):
             self._fail(asked, Fault.TOO_LARGE, reason)
         else:
             self._send(asked, Answer(asked.part, asked.call, Outcome.ANSWERED, body))
 
-    def _fail(self, asked: _Asked, fault: Fault, reason: str) -> None:
+    def _fail(self, asked: Asked, fault: Fault, reason: str) -> None:
         self._site.faults.tell(self._wish.local, fault, reason)
         self._send(asked, Answer.failed(asked.part, asked.call, reason))
 
-    def _send(self, asked: _Asked, answer: Answer) -> None:
+    def _send(self, asked: Asked, answer: Answer) -> None:
+        if asked.client == self._site.member.name:
+            return  # our own word that a goal is cancelled
         wire = answer.to_wire()
+        self._serving.remember(asked, wire)
+        self._send_wire(asked.client, wire)
+
+    def _send_wire(self, client: Name, wire: bytes) -> None:
         try:
-            self._site.member.answer(self._topic.name, asked.client, wire)
+            self._site.member.answer(self._topic.name, client, wire)
         except LocalError:
             self._site.traffic.unread += 1  # the client is gone
             return

@@ -1,52 +1,58 @@
-"""A far server on its way in: a virtual server here, each request sent out under a number of its own.
+"""Far servers on their way in: one virtual server here, whose requests go to them all or to some, under own numbers.
 
-Place: shell; endpoint and member do the I/O. The virtual server stands while a far one is heard, so that local clients
-see whether there is one. A call ends with the first answer, with a reason, or when its time is up; a later answer
-finds nobody.
+Place: shell; endpoint and member do the I/O, ``gdp/service/dispatch.py`` decides. The virtual server stands while a far
+one is heard, so that local clients see whether there is one. A call ends with the first answer, with a reason, or when
+its time is up; a later answer finds nobody, and servers that still work on it are told.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import NamedTuple
+from collections import deque
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Final, NamedTuple
 
 from gdp.client.member import Message, Topic
 from gdp.errors import GdpError, LocalError, RemoteError
 from gdp.names import Name
-from gdp.service.calls import Calls
-from proxy.bridge.incoming import Incoming
-from proxy.bridge.parts import PROFILES, RESULT, Parts
+from gdp.service.dispatch import Ask, Dispatch, Effect, Failure
+from gdp.service.replication import ALL, Mode
+from proxy.bridge.far_server import FarServer
+from proxy.bridge.goals import Goals, goal_of, says_yes
+from proxy.bridge.parts import CANCEL, GOAL, PROFILES, RESULT, Parts
 from proxy.bridge.seat import Seat
 from proxy.bridge.site import Site
 from proxy.bridge.wishes import Wish
 from proxy.endpoints.endpoint import Asked, Event, Faulted
-from proxy.exchange import PATIENCE_MAX_MS, Answer, Exchange, News, Outcome, Request, too_large
+from proxy.exchange import PATIENCE_MAX_MS, Answer, Exchange, News, Outcome, Request, Stop, too_large
 from proxy.faults import Fault
-from proxy.serial.channel import Channel
 from proxy.serial.serializer import Serializer
-from proxy.serial.service import Service
-from proxy.serial.service_twin import twin_service
-from proxy.serial.twin import twin_channel
 
 __all__ = ["ImportedService"]
 
-_CALLS_MAX = 65_536  # under way from this machine
-_GONE = "the far server is gone"
+_GONE: Final = "the far server is gone"
+_FAULTS: Final = {
+    Failure.TIMED_OUT: Fault.TIMED_OUT,
+    Failure.NO_SERVER: Fault.NO_SERVER,
+    Failure.REFUSED: Fault.REFUSED,
+}
 
 
-class _Waiting(NamedTuple):
-    """A local client's request."""
+@dataclass(slots=True)
+class _Waiting:
+    """A local client's request; of an action, about which goal."""
 
     part: int
     ticket: int
+    goal: bytes
+    call: int = 0
 
 
-class _Server(NamedTuple):
-    """A far server's dialect, by part."""
+class _Won(NamedTuple):
+    """An answer, and whose."""
 
-    description: bytes
-    answers: tuple[Incoming, ...]
-    news: tuple[Incoming, ...]
+    server: Name
+    raw: bytes
 
 
 class ImportedService:
@@ -62,9 +68,18 @@ class ImportedService:
         self._wish = wish
         self._topic = topic
         self._parts = Parts.of(wish.rule.kind, wish.local, wish.type_name)
-        self._calls: Calls[_Waiting] = Calls(_CALLS_MAX, random_start)
-        self._left: dict[int, set[Name]] = {}  # call -> servers that may still answer it
-        self._servers: dict[Name, _Server] = {}
+        self._goals = Goals() if wish.rule.kind == "action" else None
+        self._calls = tuple(
+            Dispatch[_Won](
+                ALL if self._goals is not None and part == CANCEL else wish.rule.spread,
+                start=random_start,
+                stops=self._goals is None or part == RESULT,  # a goal is every server's, until one has its result
+            )
+            for part in range(len(self._parts.services))
+        )
+        self._about: dict[tuple[int, int], bytes] = {}  # part and call -> goal, while under way
+        self._for_all = deque[tuple[int, Effect]]()  # waits until the stream to all servers has room
+        self._servers: dict[Name, FarServer] = {}
         self._requests: tuple[Serializer, ...] = ()
         self._handles: list[int] = []
         self._topics: list[int] = []
@@ -74,33 +89,41 @@ class ImportedService:
 
     def receive(self, message: Message, now_s: float) -> None:
         """Take a far server's answer, or what its action's topics say."""
-        del now_s
         self._site.traffic.received(len(message.delivered.message))
         try:
             if message.private:
-                self._take_answer(message)
+                self._take_answer(message, now_s)
             else:
                 self._take_news(message)
         except RemoteError as error:
             self._site.faults.tell(self._wish.local, Fault.MALFORMED, str(error))
+        self._send_out(now_s)
 
     def take(self, event: Event, now_s: float) -> None:
         """Take a local client's request."""
         if isinstance(event, Asked):
             self._ask(event, now_s)
+            self._send_out(now_s)
         elif isinstance(event, Faulted):
             self._site.tell(self._wish.local, event, Fault.REFUSED)
 
     def tick(self, now_s: float) -> None:
-        """Open or close the virtual server as far ones come and go; fail what waited too long."""
-        self._follow()
-        for number, waiting in self._calls.expired(now_s):
-            self._left.pop(number, None)
-            self._refuse(waiting, Fault.TIMED_OUT, f"no answer within {self._wish.rule.timeout_s:g} s")
+        """Open or close the virtual server as far ones come and go."""
+        self._follow(now_s)
+        self.timeout(now_s)
+
+    def timeout(self, now_s: float) -> None:
+        """Do what is due, between looks at who is there."""
+        for dispatch in self._calls:
+            dispatch.timeout(now_s)
+        self._send_out(now_s)
 
     def next_timeout(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        return self._calls.next_timeout()
+        if self._for_all and self._publisher.has_room():
+            return 0.0
+        times = [dispatch.next_timeout() for dispatch in self._calls]
+        return min((time for time in times if time is not None), default=None)
 
     def close(self, now_s: float) -> None:
         """Call nobody any more; calls under way fail."""
@@ -113,45 +136,49 @@ class ImportedService:
         self._topic = topic
         self._site.member.renew(topic)
 
-    def _follow(self) -> None:
-        peers = self._site.member.peers(self._topic.name)
+    def _follow(self, now_s: float) -> None:
+        peers = set(self._site.member.peers(self._topic.name))
         feeds = self._site.member.feeds_of(self._topic.name) if peers else []
-        descriptions = {feed.publisher: feed.description for feed in feeds if feed.publisher in peers}
-        for name in [name for name, each in self._servers.items() if descriptions.get(name) != each.description]:
+        heard = {feed.publisher: feed for feed in feeds if feed.publisher in peers}
+        for name, server in list(self._servers.items()):
+            feed = heard.get(name)
+            if feed is not None and (feed.incarnation, feed.description) == (server.incarnation, server.description):
+                continue
+            same = server.said_anew(feed.description) if feed and feed.incarnation == server.incarnation else None
+            if same is not None:
+                self._servers[name] = same
+                self._mark(name, same, now_s)
+                continue
             del self._servers[name]
-            for call in [call for call, left in self._left.items() if name in left]:
-                self._rule_out(name, call, Fault.NO_SERVER, _GONE)
-        for name, description in descriptions.items():
+            if self._goals is not None:
+                self._goals.gone(name)
+            for dispatch in self._calls:
+                dispatch.gone(name, now_s, _GONE)
+        for name, feed in heard.items():
             if name not in self._servers:
-                self._learn(name, description)
+                self._learn(name, feed.incarnation, feed.description, now_s)
         if not self._servers and self._handles:
             self._shut(_GONE)
 
-    def _learn(self, name: Name, description: bytes) -> None:
+    def _learn(self, name: Name, incarnation: int, description: bytes, now_s: float) -> None:
         """Make ready for a server's answers; the first one opens the virtual server here."""
-        what, ros = self._wish.local, self._seat.endpoint.ros
+        endpoint = self._seat.endpoint
         try:
-            theirs = Exchange.from_wire(description)
-            types = [*(each.type_name for each in theirs.services), *(each.type_name for each in theirs.topics)]
-            if types != [type_name for _, type_name in (*self._parts.services, *self._parts.topics)]:
-                raise LocalError(f"the far side serves something else under this name: {', '.join(types)}")
-            ours = self._ours(theirs)
-            services, topics = zip(theirs.services, ours.services, strict=True), zip(
-                theirs.topics, ours.topics, strict=True
-            )
-            server = _Server(
-                description,
-                tuple(Incoming.ready(a.response, theirs.encoding, b.response, ros) for a, b in services),
-                tuple(Incoming.ready(a, theirs.encoding, b, ros) for a, b in topics),
-            )
-            for our, their in zip(ours.services, theirs.services, strict=True):
-                Incoming.ready(our.request, ours.encoding, their.request, theirs.services[0].ros)  # or it says why not
-            if not self._handles:
-                self._open(ours)
+            server = FarServer.learn(incarnation, description, self._parts, endpoint, self._wish.rule.encoding)
+            if not self._handles and server.ours is not None:
+                self._open(server.ours)
         except GdpError as error:
-            self._site.faults.tell(what, Fault.OTHER_TYPE, str(error))
-            server = _Server(description, (), ())
+            self._site.faults.tell(self._wish.local, Fault.OTHER_TYPE, str(error))
+            self._servers[name] = FarServer(incarnation, description)
+            return
         self._servers[name] = server
+        self._mark(name, server, now_s)
+
+    def _mark(self, name: Name, server: FarServer, now_s: float) -> None:
+        for dispatch in self._calls:
+            dispatch.came(name, now_s)
+            if server.is_leaving:
+                dispatch.leaves(name)
 
     def _description(self) -> bytes:
         """Return how this machine knows the service; empty where it must learn that from the far side."""
@@ -160,29 +187,6 @@ class ImportedService:
         except LocalError:
             return b""
         return exchange.to_wire()
-
-    def _ours(self, theirs: Exchange) -> Exchange:
-        """Return how this machine knows the service, from the far side's definitions where it does not by itself.
-
-        Raises:
-            LocalError: it cannot be known here.
-        """
-        endpoint = self._seat.endpoint
-        services = list[Service]()
-        for (name, type_name), their in zip(self._parts.services, theirs.services, strict=True):
-            try:
-                services.append(endpoint.service(name, type_name))
-            except LocalError:
-                same = their if their.ros == endpoint.ros else twin_service(their, endpoint.ros)
-                services.append(replace(same, name=name))
-        topics = list[Channel]()
-        for (name, type_name), channel in zip(self._parts.topics, theirs.topics, strict=True):
-            try:
-                topics.append(endpoint.channel(name, type_name))
-            except LocalError:
-                same_channel = channel if channel.ros == endpoint.ros else twin_channel(channel, endpoint.ros)
-                topics.append(replace(same_channel, topic=name))
-        return Exchange(self._wish.rule.encoding, tuple(services), tuple(topics))
 
     def _open(self, ours: Exchange) -> None:
         self._publisher.describe(ours.to_wire())
@@ -194,74 +198,158 @@ class ImportedService:
         self._handles = [self._seat.serve(self, each) for each in ours.services]
 
     def _shut(self, reason: str) -> None:
-        for _, waiting in self._calls.fail_all():
-            self._refuse(waiting, Fault.NO_SERVER, reason)
-        self._left.clear()
+        for dispatch in self._calls:
+            dispatch.fail_all(reason)
+        self._for_all.clear()
+        self._goals = None if self._goals is None else Goals()
         for handle in [*self._handles, *self._topics]:
             self._seat.close(handle)
         self._handles, self._topics = [], []
 
     def _ask(self, event: Asked, now_s: float) -> None:
-        part = self._handles.index(event.handle)
-        waiting = _Waiting(part, event.ticket)
-        timeout_s = self._wish.rule.timeout_s
-        if part == RESULT and self._wish.rule.kind == "action":
-            timeout_s = None
+        part, rule = self._handles.index(event.handle), self._wish.rule
+        waiting = _Waiting(part, event.ticket, b"")
         body = self._requests[part].encode(event.raw)
-        if reason := too_large("a request", len(event.raw), self._wish.rule.max_bytes, len(body)):
+        if reason := too_large("a request", len(event.raw), rule.max_bytes, len(body)):
             self._refuse(waiting, Fault.TOO_LARGE, reason)
             return
-        if not self._publisher.has_room():
-            self._refuse(waiting, Fault.TOO_FAST, "requests come faster than far servers confirm them")
-            return
+        first: tuple[Name, ...] = ()
+        timeout_s = rule.timeout_s
         try:
-            number = self._calls.begin(now_s, timeout_s, waiting)
+            if self._goals is not None:
+                waiting.goal = goal_of(event.raw)
+                if part == RESULT:
+                    first, timeout_s = self._holders(waiting.goal, self._goals), None
+            write = partial(self._write, waiting, body, timeout_s)
+            answered, failed = partial(self._answered, waiting), partial(self._failed, waiting)
+            self._calls[part].begin(now_s, write, timeout_s, answered, failed, first)
+        except RemoteError as error:
+            self._refuse(waiting, Fault.MALFORMED, str(error))
         except LocalError as error:
-            self._refuse(waiting, Fault.TOO_FAST, str(error))
-            return
-        self._left[number] = {name for name, server in self._servers.items() if server.answers}
-        patience_ms = 0 if timeout_s is None else min(max(int(timeout_s * 1e3), 1), PATIENCE_MAX_MS)
-        wire = Request(part, number, patience_ms, body).to_wire()
-        self._publisher.publish(wire)
-        self._site.traffic.sent(len(wire))
+            fault = Fault.TOO_FAST if self._calls[part].servers else Fault.NO_SERVER
+            self._refuse(waiting, fault, str(error))
 
-    def _take_answer(self, message: Message) -> None:
+    def _write(self, waiting: _Waiting, body: bytes, timeout_s: float | None, call: int) -> bytes:
+        patience_ms = 0 if timeout_s is None else min(max(int(timeout_s * 1e3), 1), PATIENCE_MAX_MS)
+        wire = Request(waiting.part, call, patience_ms, body).to_wire()
+        waiting.call = call
+        if self._goals is not None:
+            self._about[waiting.part, call] = waiting.goal
+            if waiting.part == GOAL:
+                self._goals.sent(waiting.goal, wire)
+            elif waiting.part == CANCEL:
+                self._goals.cancelled(waiting.goal)
+        return wire
+
+    def _holders(self, goal: bytes, goals: Goals) -> tuple[Name, ...]:
+        """Return whom to ask for a result, in place of what the rule says; nobody: as it says."""
+        servers = self._calls[RESULT].servers
+        holders = goals.holders(goal) & set(servers)
+        if self._wish.rule.spread.mode is Mode.ALL:
+            return () if not holders or len(holders) == len(servers) else tuple(servers)
+        return tuple(holders or servers)
+
+    def _send_out(self, now_s: float) -> None:
+        """Send what was decided; what is for all servers waits for room on the stream that they all hear."""
+        for part, dispatch in enumerate(self._calls):
+            while effects := dispatch.take():
+                for effect in effects:
+                    whom = effect.servers if isinstance(effect, Ask) else effect.server and (effect.server,)
+                    if whom is None:
+                        self._for_all.append((part, effect))
+                    for server in whom or ():
+                        self._send_to(server, part, effect, now_s)
+        while self._for_all and self._publisher.has_room():
+            part, effect = self._for_all.popleft()
+            if isinstance(effect, Ask):
+                if effect.call not in self._calls[part]:
+                    continue  # it ended while it waited
+                self._note_holders(part, effect.call, set(self._calls[part].servers))
+            wire = _wire(part, effect)
+            self._publisher.publish(wire)
+            self._site.traffic.sent(len(wire))
+
+    def _send_to(self, server: Name, part: int, effect: Effect, now_s: float) -> None:
+        wires = [_wire(part, effect)]
+        if isinstance(effect, Ask) and self._goals is not None:
+            goal = self._about.get((part, effect.call), b"")
+            if part == RESULT and server not in self._goals.holders(goal):
+                again = self._goals.again(goal)  # a server that came later works on the goal as well
+                wires = wires if again is None else [again, *wires]
+            self._note_holders(part, effect.call, {server})
+        for wire in wires:
+            try:
+                self._site.member.ask(self._topic.name, server, wire)
+            except LocalError as error:
+                self._site.traffic.unread += 1
+                if isinstance(effect, Ask):
+                    self._calls[part].refused(effect.call, server, str(error), now_s)
+                return
+            self._site.traffic.sent(len(wire))
+
+    def _note_holders(self, part: int, call: int, servers: set[Name]) -> None:
+        if self._goals is not None and part != CANCEL:
+            self._goals.holds(self._about[part, call], servers)
+
+    def _take_answer(self, message: Message, now_s: float) -> None:
         answer, name = Answer.from_wire(message.delivered.message), Name(message.delivered.publisher)
+        if name not in self._servers:
+            self._follow(now_s)  # it may have come just now
         server = self._servers.get(name)
         if server is None or answer.part >= len(server.answers):
             return  # of a server that is gone, or that cannot be understood here: that was told
+        dispatch = self._calls[answer.part]
         if answer.outcome is Outcome.FAILED:
-            self._rule_out(name, answer.call, Fault.REFUSED, answer.reason)
+            dispatch.refused(answer.call, name, answer.reason, now_s)
             return
         try:
             raw = server.answers[answer.part].decode(answer.body)
         except RemoteError as error:
-            self._rule_out(name, answer.call, Fault.MALFORMED, str(error))
+            self._site.faults.tell(self._wish.local, Fault.MALFORMED, str(error))
+            dispatch.refused(answer.call, name, str(error), now_s)
             return
-        waiting = self._calls.answered(answer.call)
-        self._left.pop(answer.call, None)
-        if waiting is not None:
-            self._seat.endpoint.answer(self._handles[waiting.part], waiting.ticket, raw)
+        if self._goals is None or says_yes(answer.part, raw):
+            dispatch.answered(answer.call, name, _Won(name, raw), now_s)
+        else:
+            dispatch.declined(answer.call, name, _Won(name, raw), now_s)
 
-    def _rule_out(self, name: Name, call: int, fault: Fault, reason: str) -> None:
-        """Learn that a server will not answer a call, which fails if no other may."""
-        left = self._left.get(call, set())
-        left.discard(name)
-        if left:
+    def _answered(self, waiting: _Waiting, won: _Won) -> None:
+        self._about.pop((waiting.part, waiting.call), None)
+        self._seat.endpoint.answer(self._handles[waiting.part], waiting.ticket, won.raw)
+        if self._goals is None or not says_yes(waiting.part, won.raw):
             return
-        self._left.pop(call, None)
-        waiting = self._calls.answered(call)
-        if waiting is not None:
-            self._refuse(waiting, fault, reason)
+        if waiting.part == GOAL:
+            self._goals.accepted(waiting.goal, won.server)
+        elif waiting.part == RESULT:
+            self._tell_status(self._goals.ended(waiting.goal, won.server, won.raw))
+
+    def _failed(self, waiting: _Waiting, failure: Failure, reason: str) -> None:
+        self._about.pop((waiting.part, waiting.call), None)
+        if failure is Failure.TIMED_OUT:
+            reason = f"no answer within {self._wish.rule.timeout_s:g} s"
+        self._refuse(waiting, _FAULTS[failure], reason)
 
     def _take_news(self, message: Message) -> None:
-        news = News.from_wire(message.delivered.message)
-        server = self._servers.get(Name(message.delivered.publisher))
+        news, name = News.from_wire(message.delivered.message), Name(message.delivered.publisher)
+        server = self._servers.get(name)
         at = news.part - len(self._parts.services)
-        if server is not None and 0 <= at < len(server.news) and self._topics:
-            self._seat.endpoint.publish(self._topics[at], server.news[at].decode(news.body))
+        if server is None or self._goals is None or not 0 <= at < len(server.news) or not self._topics:
+            return
+        raw = server.news[at].decode(news.body)
+        if at > 0:
+            self._tell_status(self._goals.statuses(name, raw))
+        elif self._goals.may_feed(name, raw):
+            self._seat.endpoint.publish(self._topics[at], raw)
+
+    def _tell_status(self, raw: bytes | None) -> None:
+        if raw is not None and self._topics:
+            self._seat.endpoint.publish(self._topics[-1], raw)
 
     def _refuse(self, waiting: _Waiting, fault: Fault, reason: str) -> None:
         self._site.faults.tell(self._wish.local, fault, reason)
         if self._handles:
             self._seat.endpoint.refuse(self._handles[waiting.part], waiting.ticket, reason)
+
+
+def _wire(part: int, effect: Effect) -> bytes:
+    return effect.request if isinstance(effect, Ask) else Stop(part, effect.calls).to_wire()

@@ -14,12 +14,14 @@ from proxy.exchange import Exchange
 from proxy.qos import default
 from proxy.serial.serializer import Encoding
 
-__all__ = ["PROFILES", "RESULT", "Parts", "action_of", "is_part"]
+__all__ = ["CANCEL", "GOAL", "PROFILES", "RESULT", "Parts", "action_of", "is_part"]
 
-RESULT: Final = 2  # the part of an action that answers when the goal has ended, however long that takes
+GOAL: Final = 0  # the parts of an action
+CANCEL: Final = 1
+RESULT: Final = 2  # answers when the goal has ended, however long that takes
 PROFILES: Final = (default(depth=100), default(latched=True, depth=1))  # of feedback and status, as rcl_action has them
 _INFIX: Final = "/_action/"
-_GOAL: Final = "_SendGoal"
+_SEND_GOAL: Final = "_SendGoal"
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +66,6 @@ def is_part(name: str) -> bool:
 def action_of(end: End) -> tuple[str, str] | None:
     """Return name and type of the action that this end is the ``send_goal`` of, None for any other."""
     name, infix, part = end.name.partition(_INFIX)
-    if not infix or part != "send_goal" or not end.type_name.endswith(_GOAL):
+    if not infix or part != "send_goal" or not end.type_name.endswith(_SEND_GOAL):
         return None
-    return name, end.type_name[: -len(_GOAL)]
+    return name, end.type_name[: -len(_SEND_GOAL)]

@@ -38,6 +38,10 @@ class RosEnd(Section):
         description=f"URI of the ROS 1 master. `null`: ROS_MASTER_URI of the environment, else {DEFAULT_MASTER}.",
         json_schema_extra={"pattern": "^http://[^/]+:[0-9]+/?$"},
     )
+    alone: bool = Field(
+        default=False,
+        description="No other proxy takes part in this graph: what it carries begins without looking for one (2 s).",
+    )
 
     @property
     def ros(self) -> RosVersion:

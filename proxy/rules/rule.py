@@ -26,6 +26,7 @@ from gdp.limits import MESSAGE_MAX_BYTES
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.nodes.schema import Section, relative
+from gdp.service.replication import Mode, Replication
 from proxy.rules.pattern import NAME_FORM, NAME_MAX_CHARS, PATTERN_FORM, is_name, is_pattern, matches
 from proxy.serial.serializer import Encoding
 
@@ -35,6 +36,8 @@ Kind: TypeAlias = Literal["topic", "service", "action"]
 
 CALL_S: Final = 5.0
 CALL_MAX_S: Final = 86_400.0
+COPIES_MAX: Final = 1_024
+AT_ONCE_MAX: Final = 65_536
 RATE_MAX_HZ: Final = 1e6
 DOMAIN_MAX: Final = 232  # the ports of a higher one would lie above 65535; DDSI-RTPS 2.5, section 9.6.2
 
@@ -47,7 +50,13 @@ _TYPES: Final[dict[Kind, tuple[str, str]]] = {
 }
 _OWN_KEYS: Final = ("kind", "name", "type")
 _OF_TOPICS: Final = ("reliable", "latched", "max_hz")
-_OF_CALLS: Final = ("timeout_s",)
+_OF_CALLS: Final = ("timeout_s", "replication")
+_OF_SERVICES: Final = ("stop", "at_once")
+_FOREIGN: Final[dict[Kind, tuple[str, ...]]] = {
+    "topic": (*_OF_CALLS, *_OF_SERVICES),
+    "service": _OF_TOPICS,
+    "action": (*_OF_TOPICS, *_OF_SERVICES),
+}
 
 
 def _extra_metadata(items: dict[str, str | int]) -> dict[str, str | int]:
@@ -80,10 +89,23 @@ CallSeconds = Annotated[float, Field(gt=0, le=CALL_MAX_S)]
 
 def _by_kind(kind: Kind) -> JsonValue:
     """Return what a JSON schema says of the rules of one kind; without ``kind`` a rule is about a topic."""
-    foreign = _OF_CALLS if kind == "topic" else _OF_TOPICS
-    then: JsonDict = {"type": {"pattern": f"^(?:|{_TYPES[kind][0]})$"}, **dict.fromkeys(foreign, False)}
+    then: JsonDict = {"type": {"pattern": f"^(?:|{_TYPES[kind][0]})$"}, **dict.fromkeys(_FOREIGN[kind], False)}
     condition: JsonDict = {"properties": {"kind": {"const": kind}}, "required": [] if kind == "topic" else ["kind"]}
     return {"if": condition, "then": {"properties": then}}
+
+
+class Spread(Section):
+    """How requests are spread over a service's servers."""
+
+    mode: Literal["all", "some", "hedged"] = Field(
+        default="all",
+        description="`all`: every server gets each request, by one copy on this machine's link; `some`: so many as"
+        " `copies` says, those that answered fastest lately; `hedged`: one, and a second one if it is late.",
+    )
+    copies: int = Field(default=2, ge=1, le=COPIES_MAX, description="With `some`: how many servers get each request.")
+    budget: float = Field(
+        default=0.02, ge=0, le=1, description="With `hedged`: most second copies, as a share of requests."
+    )
 
 
 class Rule(Section):
@@ -147,6 +169,23 @@ class Rule(Section):
         description="Services and actions: seconds that an answer may take. An action's result may always take as long"
         " as it wants. `null`: no limit.",
     )
+    replication: Spread = Field(
+        default_factory=Spread,
+        description="Services and actions, under `import`: which of several servers get each request.",
+    )
+    stop: str | None = Field(
+        default=None,
+        description="Services, under `expose`: a local `std_srvs/srv/Trigger` that is called when nobody waits any more"
+        " for what the server works on. `null`: it works on.",
+        json_schema_extra={"pattern": f"^{NAME_FORM}$", "maxLength": NAME_MAX_CHARS},
+    )
+    at_once: int | None = Field(
+        default=None,
+        ge=1,
+        le=AT_ONCE_MAX,
+        description="Services, under `expose`: how many requests the local server gets at one time; the others wait"
+        " in the proxy, in order. `null`: all.",
+    )
     priority: Literal["normal", "urgent"] = Field(
         default="normal", description="`urgent`: goes before everything `normal`, wherever frames queue."
     )
@@ -205,6 +244,11 @@ class Rule(Section):
             LocalError: as ``overlay_metadata``.
         """
         return self.overlay_metadata.name(self.owner.compressed)
+
+    @property
+    def spread(self) -> Replication:
+        """Return how requests are spread over servers."""
+        return Replication(Mode(self.replication.mode), self.replication.copies, self.replication.budget)
 
     def matches(self, local_name: str) -> bool:
         """Return whether it is about what this machine calls so."""
@@ -277,12 +321,26 @@ class Rule(Section):
             raise ValueError("only topics have this")
         return value
 
-    @field_validator("timeout_s")
+    @field_validator("timeout_s", "replication")
     @classmethod
-    def _is_of_calls(cls, value: float | None, info: ValidationInfo) -> float | None:
+    def _is_of_calls(cls, value: object, info: ValidationInfo) -> object:
         if info.data.get("kind", "service") == "topic":
             raise ValueError("only services and actions have this")
         return value
+
+    @field_validator("stop", "at_once")
+    @classmethod
+    def _is_of_services(cls, value: object, info: ValidationInfo) -> object:
+        if info.data.get("kind", "service") != "service":
+            raise ValueError("only services have this")
+        return value
+
+    @field_validator("stop")
+    @classmethod
+    def _stop(cls, text: str | None) -> str | None:
+        if text is not None and not is_name(text):
+            raise ValueError("expected a full ROS name, such as /plan/stop")
+        return text
 
 
 def fits_kind(type_name: str, kind: Kind) -> bool:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from gdp.errors import RemoteError
 from gdp.limits import MESSAGE_MAX_BYTES
-from proxy.exchange import PATIENCE_MAX_MS, Answer, Exchange, News, Outcome, Request, too_large
+from proxy.exchange import PATIENCE_MAX_MS, Answer, Exchange, News, Outcome, Request, Stop, too_large
 from tests.proxy.bridge import known
 
 SWITCH = known.services()[known.SET_BOOL]
@@ -37,7 +37,23 @@ def test_news_there_and_back_are_the_same(part: int, stamp_ns: int, body: bytes)
     assert News.from_wire(news.to_wire()) == news
 
 
-@pytest.mark.parametrize("read", [Request.from_wire, Answer.from_wire, News.from_wire, Exchange.from_wire])
+@given(st.integers(0, 127), st.lists(calls, min_size=1))
+def test_a_word_to_stop_there_and_back_is_the_same_and_is_no_request(part: int, ended: list[int]) -> None:
+    stop = Stop(part, tuple(ended))
+    assert Stop.from_wire(stop.to_wire()) == stop
+    assert Stop.is_in(stop.to_wire())
+    assert not Stop.is_in(Request(part, ended[0], 0, b"").to_wire())
+
+
+@pytest.mark.parametrize("wire", [b"\1\x80", b"\1\x80" + bytes(9), b"\1\0" + bytes(8), b"\2\x80" + bytes(8), b""])
+def test_a_word_to_stop_that_names_no_calls_is_refused(wire: bytes) -> None:
+    with pytest.raises(RemoteError):
+        Stop.from_wire(wire)
+
+
+@pytest.mark.parametrize(
+    "read", [Request.from_wire, Answer.from_wire, News.from_wire, Stop.from_wire, Exchange.from_wire]
+)
 @given(wire=st.binary(max_size=64))
 def test_any_bytes_are_read_or_refused(read: Callable[[bytes], object], wire: bytes) -> None:
     with contextlib.suppress(RemoteError):
@@ -59,8 +75,9 @@ def test_a_reason_is_bounded_and_always_readable() -> None:
 
 
 def test_a_description_there_and_back_is_the_same() -> None:
-    exchange = Exchange("cbor", (SWITCH, SWITCH, SWITCH), (TEXT, TEXT))
-    assert Exchange.from_wire(exchange.to_wire()) == exchange
+    for is_leaving in (False, True):
+        exchange = Exchange("cbor", (SWITCH, SWITCH, SWITCH), (TEXT, TEXT), is_leaving)
+        assert Exchange.from_wire(exchange.to_wire()) == exchange
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import pytest
 
 from gdp.errors import LocalError
 from gdp.metadata import Metadata
+from gdp.service.replication import Mode, Replication
 from proxy.rules.choice import choose, imported
 from tests.proxy.rule_files import OTHER, OWNER, furnish, proxy, refusals, rule, rules
 
@@ -29,6 +30,9 @@ GOOD = [
     "name: /set, kind: service, type: std_srvs/srv/SetBool",
     "name: /set, kind: service, timeout_s: null",
     "name: /set, kind: service, timeout_s: 0.5, priority: urgent, max_bytes: 100",
+    "name: /set, kind: service, stop: /set/stop, at_once: 1",
+    "name: /set, kind: service, replication: {mode: some, copies: 3}",
+    "name: /fold, kind: action, replication: {mode: hedged, budget: 0.1}",
     "name: /fold, kind: action, type: test_msgs/action/Fibonacci, timeout_s: 10",
     "name: /a, remap: /b/c",
     "name: /a, max_hz: 10",
@@ -67,6 +71,14 @@ BAD = [
     ("name: /a, kind: service, max_hz: 1", "max_hz: only topics have this"),
     ("name: /a, kind: service, reliable: true", "reliable: only topics have this"),
     ("name: /a, kind: action, latched: true", "latched: only topics have this"),
+    ("name: /a, replication: {mode: all}", "replication: only services and actions have this"),
+    ("name: /a, kind: service, replication: {mode: most}", "replication.mode: expected 'all', 'some' or 'hedged'"),
+    ("name: /a, kind: service, replication: {copies: 0}", "replication.copies: expected greater than or equal to 1"),
+    ("name: /a, kind: service, replication: {budget: 2}", "replication.budget: expected less than or equal to 1"),
+    ("name: /a, kind: service, stop: halt", "stop: expected a full ROS name, such as /plan/stop"),
+    ("name: /a, kind: service, at_once: 0", "at_once: expected greater than or equal to 1"),
+    ("name: /a, kind: action, stop: /halt", "stop: only services have this"),
+    ("name: /a, kind: action, at_once: 1", "at_once: only services have this"),
     ("name: /a, ros: 3", "ros: expected 1 or 2, not 3"),
     ("name: /a, domain: 233", "domain: expected less than or equal to 232"),
     ("name: /a, metadata: {name: /b}", "metadata: name: state it as a key of the rule itself"),
@@ -79,7 +91,7 @@ def test_a_bad_rule_is_refused_at_the_key_that_is_wrong(place: Path, text: str, 
     (line,) = refusals(place, "ros: {endpoint: ros2, domain: 0}\nexpose:\n" + rules(text))
     where, _, rest = line.partition(": expose[0].")
     assert rest.startswith(complaint)
-    key = complaint.partition(":")[0]
+    key = complaint.partition(":")[0].rpartition(".")[2]
     shown = key if "unknown key" in complaint else f"{key}: "  # a wrong value is shown where it begins
     begins = text.index(key) if shown == key else text.rindex(shown) + len(shown)
     assert where == f"proxy.yaml:7:{begins + len('  - {') + 1}"
@@ -133,6 +145,11 @@ def test_what_a_rule_leaves_open_follows_the_source(place: Path) -> None:
     assert (free.wants_reliable, free.wants_latched, free.reliable, free.latched) == (None, None, True, False)
     set_ = rule(place, "name: /a, reliable: false, latched: true")
     assert (set_.wants_reliable, set_.wants_latched, set_.reliable, set_.latched) == (False, True, False, True)
+
+
+def test_a_rule_says_how_requests_are_spread(place: Path) -> None:
+    given = [rule(place, f"name: /a, kind: service{more}").spread for more in ("", ", replication: {mode: some}")]
+    assert given == [Replication(copies=2), Replication(Mode.SOME, copies=2)]
 
 
 def test_a_remapped_rule_knows_both_names(place: Path) -> None:

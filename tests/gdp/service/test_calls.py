@@ -13,8 +13,7 @@ from gdp.service.calls import Calls
 def test_the_first_answer_wins_and_a_later_one_finds_nobody() -> None:
     calls: Calls[str] = Calls(4, 7)
     number = calls.begin(0.0, 5.0, "first")
-    assert [calls.answered(number), calls.answered(number)] == ["first", None]
-    assert calls.unmatched == 1
+    assert [calls.get(number), calls.end(number), calls.end(number)] == ["first", "first", None]
 
 
 def test_an_answer_after_the_timeout_never_answers_the_next_call() -> None:
@@ -22,7 +21,7 @@ def test_an_answer_after_the_timeout_never_answers_the_next_call() -> None:
     late = calls.begin(0.0, 1.0, "late")
     assert calls.expired(1.0) == [(late, "late")]
     calls.begin(1.0, 1.0, "next")
-    assert (calls.answered(late), len(calls)) == (None, 1)
+    assert (calls.end(late), len(calls)) == (None, 1)
 
 
 def test_numbers_begin_at_the_random_start_and_wrap_in_64_bits() -> None:
@@ -42,7 +41,7 @@ def test_calls_above_the_limit_are_refused_until_one_ends() -> None:
     calls.begin(0.0, 1.0, 2)
     with pytest.raises(LocalError, match="2 calls"):
         calls.begin(0.0, 1.0, 3)
-    calls.answered(first)
+    calls.end(first)
     calls.begin(0.0, 1.0, 3)
 
 
@@ -58,7 +57,7 @@ def test_a_hundred_thousand_answered_calls_leave_no_timers_behind() -> None:
     calls: Calls[int] = Calls(8, 0)
     standing = calls.begin(0.0, 3_600.0, -1)
     for each in range(100_000):
-        calls.answered(calls.begin(0.0, 3_600.0, each))
+        calls.end(calls.begin(0.0, 3_600.0, each))
     assert len(calls._timers) < 200
     assert (calls.next_timeout(), standing in calls) == (3_600.0, True)
 
@@ -83,7 +82,7 @@ def test_each_call_ends_exactly_once_and_never_before_its_time(steps: list[tuple
             open_until[number] = float("inf") if value is None else now_s + value
             begun += 1
         elif step == "answer" and value is not None:
-            assert (calls.answered(value) is not None) == (open_until.pop(value, None) is not None)
+            assert (calls.end(value) is not None) == (open_until.pop(value, None) is not None)
         elif step == "wait" and value is not None:
             now_s += value
             due = {number for number, until_s in open_until.items() if until_s <= now_s}

@@ -18,6 +18,7 @@ __all__ = [
     "IMAGE",
     "SET_BOOL",
     "STRING",
+    "TRIGGER",
     "channel",
     "channels",
     "image",
@@ -32,18 +33,24 @@ __all__ = [
 STRING: Final = "std_msgs/msg/String"
 IMAGE: Final = "sensor_msgs/msg/Image"
 SET_BOOL: Final = "std_srvs/srv/SetBool"
+TRIGGER: Final = "std_srvs/srv/Trigger"
 FIBONACCI: Final = "test_msgs/action/Fibonacci"
 _CDR: Final = b"\x00\x01\x00\x00"
-_UUID: Final = "=" * 80 + "\nMSG: unique_identifier_msgs/UUID\nuint8[16] uuid\n"
+_LINE: Final = "=" * 80 + "\n"
 _SERVICES: Final = {
     SET_BOOL: ("bool data\n", "bool success\nstring message\n"),
+    TRIGGER: ("", "bool success\nstring message\n"),
     "test_msgs/action/Fibonacci_SendGoal": ("uint8[16] goal_id\nint32 order\n", "bool accepted\n"),
     "action_msgs/srv/CancelGoal": ("uint8[16] goal_id\n", "int8 return_code\n"),
     "test_msgs/action/Fibonacci_GetResult": ("uint8[16] goal_id\n", "int8 status\nint32[] sequence\n"),
 }
 _TOPICS: Final = {
     "test_msgs/action/Fibonacci_FeedbackMessage": "uint8[16] goal_id\nint32[] sequence\n",
-    "action_msgs/msg/GoalStatusArray": "int8[] status\n",
+    "action_msgs/msg/GoalStatusArray": "action_msgs/GoalStatus[] status_list\n"
+    + f"{_LINE}MSG: action_msgs/GoalStatus\naction_msgs/GoalInfo goal_info\nint8 status\n"
+    + f"{_LINE}MSG: action_msgs/GoalInfo\nunique_identifier_msgs/UUID goal_id\nbuiltin_interfaces/Time stamp\n"
+    + f"{_LINE}MSG: unique_identifier_msgs/UUID\nuint8[16] uuid\n"
+    + f"{_LINE}MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n",
 }
 
 
@@ -82,7 +89,8 @@ def service(type_name: str, request: str, response: str, ros: RosVersion = 2) ->
 @cache
 def services(ros: RosVersion = 2) -> dict[str, Service]:
     """Return the service types that a machine knows if nothing else is said."""
-    return {name: service(name, *texts, ros) for name, texts in _SERVICES.items() if ros == 2 or name == SET_BOOL}
+    both = (SET_BOOL, TRIGGER)
+    return {name: service(name, *texts, ros) for name, texts in _SERVICES.items() if ros == 2 or name in both}
 
 
 def string(text: str, ros: RosVersion = 2) -> bytes:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from proxy.endpoints.fake import FakeGraph, Publication
+from proxy.qos import default
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import FIBONACCI
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
@@ -57,7 +58,7 @@ class ActionServer:
         self.cancels = LocalServer(graph, f"{AT}cancel_goal", "action_msgs/srv/CancelGoal", lambda _: CANCELED)
         self.results = LocalServer(graph, f"{AT}get_result", f"{FIBONACCI}_GetResult")
         self.feedback = graph.publish("/server", f"{AT}feedback", FEEDBACK)
-        graph.publish("/server", f"{AT}status", STATUS)
+        graph.publish("/server", f"{AT}status", STATUS, default(latched=True, depth=1))
 
     def leave(self) -> None:
         for server in (self.goals, self.cancels, self.results):

@@ -1,0 +1,344 @@
+"""Requests to a service that has several servers: whom to ask, whose answer counts, whom to tell that it is over.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds); what is to be sent comes out of ``take``.
+Source: FogROS2-FT: all replicas are asked and the first answer wins; hedging after "The Tail at Scale" (2013).
+
+A call under way has asked some servers, which owe it an answer; others said no. It ends once::
+
+    first valid answer of one that owes it  ->  answered;  after GATHER_S those still owing are told to stop
+    its time is up                          ->  failed (or answered with the best that was declined)
+    nobody owes it, and nobody is left      ->  likewise
+
+When one that owes an answer says no or goes, the next one not yet asked is asked at once.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Final, Generic, NamedTuple, TypeAlias, TypeVar
+
+from gdp.errors import LocalError
+from gdp.names import Name
+from gdp.service.budget import HedgeBudget
+from gdp.service.calls import Calls
+from gdp.service.latency import Latencies
+from gdp.service.replication import ALL, Mode, Replication
+
+__all__ = ["Ask", "Dispatch", "Effect", "Failure", "Stop"]
+
+A = TypeVar("A")
+
+CALLS_MAX: Final = 65_536  # under way at once
+HELD_MAX_BYTES: Final = 128 << 20  # of their requests, kept for servers that are asked later
+GATHER_S: Final = 0.004  # servers that answer so soon after the first need no word
+STOP_MAX: Final = 1_024  # calls in one word
+HEDGE_PERCENTILE: Final = 0.95  # of recent answers, after which a second copy may go
+HEDGE_LATER_MAX: Final = 4.0  # times that, where a small budget is better spent on the slowest few
+HEDGE_FIRST_S: Final = 0.05  # while there are too few of them
+_HEDGE_MIN_S: Final = 0.0005
+
+
+class Failure(Enum):
+    """Why a call ended without an answer."""
+
+    TIMED_OUT = "timed out"
+    NO_SERVER = "no server"
+    REFUSED = "refused by all"
+
+
+class Ask(NamedTuple):
+    """Send a request to these servers; None: to everybody, by the tree."""
+
+    call: int
+    request: bytes
+    servers: tuple[Name, ...] | None
+
+
+class Stop(NamedTuple):
+    """Tell a server that calls have ended; None: tell everybody, by the tree."""
+
+    calls: tuple[int, ...]
+    server: Name | None
+
+
+Effect: TypeAlias = "Ask | Stop"
+
+
+@dataclass(slots=True, eq=False)
+class _Call(Generic[A]):
+    answered: Callable[[A], None]
+    failed: Callable[[Failure, str], None]
+    begun_s: float
+    request: bytes = b""
+    owing: dict[Name, float] = field(default_factory=dict)  # and since when
+    refused: set[Name] = field(default_factory=set)
+    declined: list[A] = field(default_factory=list)  # an answer that says no, should nobody say yes
+
+
+class _Ended(NamedTuple):
+    stop_at_s: float
+    owing: dict[Name, float]
+
+
+class Dispatch(Generic[A]):
+    """The calls of one service from here.
+
+    Args:
+        start: the first call's number, random in 64 bits.
+        stops: whether servers that still owe an answer are to be told when a call has ended.
+
+    Attributes:
+        late: answers that came for a call that had ended.
+        strange: answers of servers that were not asked, or that said no before.
+    """
+
+    def __init__(
+        self,
+        replication: Replication = ALL,
+        *,
+        start: int,
+        stops: bool = True,
+        calls_max: int = CALLS_MAX,
+        held_max_bytes: int = HELD_MAX_BYTES,
+    ) -> None:
+        self._replication = replication
+        self._stops = stops
+        self._calls: Calls[_Call[A]] = Calls(calls_max, start)
+        self._held_max_bytes = held_max_bytes
+        self._held_bytes = 0
+        self._servers: dict[Name, bool] = {}  # whether it leaves
+        self._latencies = Latencies()
+        self._budget = HedgeBudget(replication.budget)
+        self._hedges: list[tuple[float, int]] = []  # a heap; of ended calls, too
+        self._ended: dict[int, _Ended] = {}  # in the order of their time
+        self._effects: list[Effect] = []
+        self.late = 0
+        self.strange = 0
+        self.hedged = 0
+
+    def __len__(self) -> int:
+        return len(self._calls)
+
+    def __contains__(self, number: int) -> bool:
+        return number in self._calls
+
+    @property
+    def servers(self) -> list[Name]:
+        """Return the servers that are there, those that leave included."""
+        return list(self._servers)
+
+    @property
+    def held_bytes(self) -> int:
+        """Return how much the requests of calls under way take."""
+        return self._held_bytes
+
+    def begin(
+        self,
+        now_s: float,
+        write: Callable[[int], bytes],
+        timeout_s: float | None,
+        answered: Callable[[A], None],
+        failed: Callable[[Failure, str], None],
+        first: Sequence[Name] = (),
+    ) -> int:
+        """Return the number of a new call; one of the callbacks is called, once, and never from here.
+
+        Args:
+            write: returns the request under its number.
+            timeout_s: how long it may take; None: as long as it likes.
+            answered: called with the first valid answer.
+            failed: called with why there is none, and the last server's words.
+            first: servers that are asked at first, in place of what the replication says.
+
+        Raises:
+            LocalError: there is no server, or too much is under way.
+        """
+        chosen = [server for server in first if server in self._servers]
+        if not self._servers:
+            raise LocalError("no server is there")
+        call = _Call(answered, failed, now_s)
+        number = self._calls.begin(now_s, timeout_s, call)
+        call.request = write(number)
+        if self._held_bytes + len(call.request) > self._held_max_bytes:
+            self._calls.end(number)
+            raise LocalError(f"requests of {self._held_bytes} bytes are under way: no more at once")
+        self._held_bytes += len(call.request)
+        self._budget.earn()
+        mode = self._replication.mode
+        if mode is Mode.ALL and not chosen:
+            call.owing = dict.fromkeys(self._servers, now_s)
+            self._effects.append(Ask(number, call.request, None))
+        else:
+            copies = self._replication.copies if mode is Mode.SOME else 1
+            self._ask(number, call, chosen or self._untried(call, now_s)[:copies], now_s)
+        if mode is Mode.HEDGED and not chosen:
+            heapq.heappush(self._hedges, (now_s + self._hedge_after_s(), number))
+        return number
+
+    def came(self, server: Name, now_s: float) -> None:
+        """Learn of a server; where all are asked, it is asked what is under way, too."""
+        if server in self._servers:
+            self._servers[server] = False
+            return
+        self._servers[server] = False
+        if self._replication.mode is Mode.ALL:
+            for number, call in self._calls:
+                self._ask(number, call, [server], now_s)
+
+    def leaves(self, server: Name) -> None:
+        """Learn that a server goes soon: it is asked only where no other is left, and its answers are good."""
+        if server in self._servers:
+            self._servers[server] = True
+
+    def gone(self, server: Name, now_s: float, reason: str) -> None:
+        """Learn that a server is no more, or no longer confirms."""
+        if self._servers.pop(server, None) is None:
+            return
+        self._latencies.forget(server)
+        for ended in self._ended.values():
+            ended.owing.pop(server, None)
+        for number, call in self._calls:
+            call.refused.discard(server)
+            if call.owing.pop(server, None) is not None:
+                self._go_on(number, call, Failure.NO_SERVER, reason, now_s)
+
+    def answered(self, number: int, server: Name, answer: A, now_s: float) -> None:
+        """Take a valid answer."""
+        call = self._take(number, server, now_s)
+        if call is None:
+            return
+        self._latencies.ended(now_s - call.begun_s)
+        self._calls.end(number)
+        self._held_bytes -= len(call.request)
+        if call.owing and self._stops:
+            self._ended[number] = _Ended(now_s + GATHER_S, call.owing)
+        call.answered(answer)
+
+    def refused(self, number: int, server: Name, reason: str, now_s: float) -> None:
+        """Take a server's word that it has no answer."""
+        call = self._take(number, server, now_s)
+        if call is not None:
+            call.refused.add(server)
+            self._go_on(number, call, Failure.REFUSED, reason, now_s)
+
+    def declined(self, number: int, server: Name, answer: A, now_s: float) -> None:
+        """Take an answer that says no: it counts if nobody says yes."""
+        call = self._take(number, server, now_s)
+        if call is not None:
+            call.refused.add(server)
+            call.declined.append(answer)
+            self._go_on(number, call, Failure.REFUSED, "", now_s)
+
+    def timeout(self, now_s: float) -> None:
+        """Do what is due."""
+        for _, call in self._calls.expired(now_s):
+            self._fail(call, Failure.TIMED_OUT, "")
+        while self._hedges and self._hedges[0][0] <= now_s:
+            self._hedge(heapq.heappop(self._hedges)[1], now_s)
+        self._tell_stops(now_s)
+
+    def next_timeout(self) -> float | None:
+        """Return the monotonic second of the next timer, or None."""
+        while self._hedges and self._hedges[0][1] not in self._calls:
+            heapq.heappop(self._hedges)
+        times = [self._calls.next_timeout(), self._hedges[0][0] if self._hedges else None]
+        times.append(next(iter(self._ended.values())).stop_at_s if self._ended else None)
+        return min((time for time in times if time is not None), default=None)
+
+    def fail_all(self, reason: str) -> None:
+        """End every call, for nobody is asked any more."""
+        for number, call in self._calls:
+            if self._calls.end(number) is not None:
+                self._fail(call, Failure.NO_SERVER, reason)
+        self._hedges.clear()
+        self._ended.clear()
+
+    def take(self) -> list[Effect]:
+        """Return, once, what is to be sent, in order."""
+        effects, self._effects = self._effects, []
+        return effects
+
+    def _take(self, number: int, server: Name, now_s: float) -> _Call[A] | None:
+        """Return the call to which this server owed an answer, and note that it owes none any more."""
+        call = self._calls.get(number)
+        if call is None:
+            self.late += 1
+            ended = self._ended.get(number)
+            since_s = None if ended is None else ended.owing.pop(server, None)
+            if ended is not None and not ended.owing:
+                del self._ended[number]
+        else:
+            since_s = call.owing.pop(server, None)
+            self.strange += since_s is None
+        if since_s is None:
+            return None
+        self._latencies.answered(server, now_s - since_s, now_s)
+        return call
+
+    def _go_on(self, number: int, call: _Call[A], failure: Failure, reason: str, now_s: float) -> None:
+        """Ask the next in place of one that has no answer; fail where nobody is left."""
+        if number not in self._calls:
+            return  # a callback ended it
+        self._ask(number, call, self._untried(call, now_s)[:1], now_s)
+        if not call.owing:
+            self._calls.end(number)
+            self._fail(call, failure, reason)
+
+    def _untried(self, call: _Call[A], now_s: float) -> list[Name]:
+        """Return whom to ask next, the best first; those that leave come last."""
+        free = [server for server in self._servers if server not in call.owing and server not in call.refused]
+        return sorted(self._latencies.ranked(free, now_s), key=self._servers.__getitem__)
+
+    def _ask(self, number: int, call: _Call[A], servers: Sequence[Name], now_s: float) -> None:
+        for server in servers:
+            call.owing[server] = now_s
+            self._latencies.asked(server, now_s)
+        if servers:
+            self._effects.append(Ask(number, call.request, tuple(servers)))
+
+    def _hedge(self, number: int, now_s: float) -> None:
+        call = self._calls.get(number)
+        others = self._untried(call, now_s)[:1] if call is not None else []
+        if call is None or not others:
+            return
+        if self._budget.spend():
+            self.hedged += 1
+            self._ask(number, call, others, now_s)
+        else:
+            heapq.heappush(self._hedges, (now_s + self._hedge_after_s(), number))
+
+    def _hedge_after_s(self) -> float:
+        """Return how long a first copy has."""
+        soon_s = self._latencies.percentile(HEDGE_PERCENTILE)
+        late_s = self._latencies.percentile(max(HEDGE_PERCENTILE, 1 - 0.75 * self._replication.budget))
+        if soon_s is None or late_s is None:
+            return HEDGE_FIRST_S
+        return max(min(late_s, HEDGE_LATER_MAX * soon_s), _HEDGE_MIN_S)
+
+    def _fail(self, call: _Call[A], failure: Failure, reason: str) -> None:
+        self._held_bytes -= len(call.request)
+        if call.declined:
+            call.answered(call.declined[0])
+        else:
+            call.failed(failure, reason)
+
+    def _tell_stops(self, now_s: float) -> None:
+        due: list[tuple[int, dict[Name, float]]] = []
+        for number, ended in self._ended.items():
+            if ended.stop_at_s > now_s:
+                break
+            due.append((number, ended.owing))
+        told: dict[Name | None, list[int]] = {}
+        for number, owing in due:
+            del self._ended[number]
+            for server, since_s in owing.items():
+                self._latencies.answered(server, now_s - since_s, now_s)
+            by_tree = self._replication.mode is Mode.ALL and bool(owing)
+            for each in [None] if by_tree else owing:
+                told.setdefault(each, []).append(number)
+        for whom, calls in told.items():
+            for at in range(0, len(calls), STOP_MAX):
+                self._effects.append(Stop(tuple(calls[at : at + STOP_MAX]), whom))

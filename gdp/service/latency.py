@@ -1,0 +1,80 @@
+"""How long recent answers took, and which server answered fastest lately.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+from math import inf
+from typing import Final
+
+from gdp.names import Name
+
+__all__ = ["Latencies"]
+
+RECENT: Final = 512  # answers that percentiles are of
+ENOUGH: Final = 32  # of them; fewer say nothing of a tail
+LATELY_S: Final = 10.0  # a server without an answer for so long is tried again, however slow it was
+_WEIGHT: Final = 0.2  # of the newest answer in a server's average
+_SORT_EVERY: Final = 16  # answers
+
+
+@dataclass(slots=True)
+class _Server:
+    average_s: float | None = None
+    seen_s: float = -inf  # when it was asked or answered last
+    owing_s: float | None = None  # since when it is asked without an answer to anything
+
+
+class Latencies:
+    """The answers of one service's servers."""
+
+    def __init__(self) -> None:
+        self._recent = deque[float](maxlen=RECENT)
+        self._sorted: list[float] = []
+        self._unsorted = 0
+        self._servers: dict[Name, _Server] = {}
+
+    def asked(self, server: Name, now_s: float) -> None:
+        """Note that a server is being tried."""
+        entry = self._servers.setdefault(server, _Server())
+        entry.seen_s = now_s
+        entry.owing_s = now_s if entry.owing_s is None else entry.owing_s
+
+    def answered(self, server: Name, seconds: float, now_s: float) -> None:
+        """Note how long a server took; of one that was stopped, how long it had."""
+        entry = self._servers.setdefault(server, _Server())
+        before = seconds if entry.average_s is None else entry.average_s
+        entry.average_s, entry.seen_s = before + _WEIGHT * (seconds - before), now_s
+        entry.owing_s = None
+
+    def ended(self, seconds: float) -> None:
+        """Note how long the first copy of a request took, or had when another was answered."""
+        self._recent.append(seconds)
+        self._unsorted += 1
+
+    def forget(self, server: Name) -> None:
+        """A server is gone."""
+        self._servers.pop(server, None)
+
+    def percentile(self, share: float) -> float | None:
+        """Return within how many seconds so large a share of recent answers came, or None: too few to say."""
+        if len(self._recent) < ENOUGH:
+            return None
+        if self._unsorted >= _SORT_EVERY or not self._sorted:
+            self._sorted, self._unsorted = sorted(self._recent), 0
+        return self._sorted[min(int(share * len(self._sorted)), len(self._sorted) - 1)]
+
+    def ranked(self, servers: Iterable[Name], now_s: float) -> list[Name]:
+        """Return servers in the order in which to ask them: untried ones, then the fastest lately."""
+        return sorted(servers, key=lambda server: self._expected_s(server, now_s))
+
+    def _expected_s(self, server: Name, now_s: float) -> float:
+        entry = self._servers.get(server)
+        if entry is None or now_s - entry.seen_s > LATELY_S:
+            return -1.0
+        silent_s = 0.0 if entry.owing_s is None else now_s - entry.owing_s  # it may have died
+        return inf if entry.average_s is None else max(entry.average_s, silent_s)

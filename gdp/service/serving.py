@@ -1,0 +1,183 @@
+"""Requests at the server's side: which wait for their turn, which the local server has, which ended lately.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds).
+
+A client may send one request twice (by the tree, and again to one that it takes for new): the second time the answer is
+given again, or nothing happens while the first is under way. And it may end a call: what waits then is never given to
+the local server; what that has already keeps its place until the server is done with it, for it works all the same.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Final, Generic, NamedTuple, TypeVar
+
+from gdp.names import Name
+from gdp.service.calls import Calls
+
+__all__ = ["Asked", "Expired", "Serving", "Turn"]
+
+R = TypeVar("R")
+
+CALLS_MAX: Final = 65_536
+ENDED_MAX: Final = 4_096  # ended calls that are remembered
+ANSWER_KEPT_BYTES: Final = 4_096  # larger answers are not: the request is served again
+
+
+class Asked(NamedTuple):
+    """A call: whose, and under which number of theirs."""
+
+    client: Name
+    part: int
+    call: int
+
+
+class Turn(NamedTuple, Generic[R]):
+    """A request whose turn it is, with the number under which it is under way here."""
+
+    number: int
+    asked: Asked
+    request: R
+
+
+class Expired(NamedTuple):
+    """A call that took too long.
+
+    ``asked``: None where nobody waited any more. ``is_given``: whether the local server has it.
+    """
+
+    number: int
+    part: int
+    asked: Asked | None
+    is_given: bool
+
+
+@dataclass(slots=True, eq=False)
+class _Served(Generic[R]):
+    asked: Asked
+    request: R | None  # None: the local server has it
+    is_wanted: bool = True
+
+
+class Serving(Generic[R]):
+    """The requests of one service here.
+
+    Args:
+        start: the first number of a call here, random in 64 bits.
+        at_once: how many the local server has at one time; None: all.
+    """
+
+    def __init__(self, start: int, at_once: int | None = None, limit: int = CALLS_MAX) -> None:
+        self._calls: Calls[_Served[R]] = Calls(limit, start)
+        self._numbers: dict[Asked, int] = {}
+        self._waiting: OrderedDict[int, None] = OrderedDict()
+        self._held_back: dict[Asked, list[int]] = {}  # call -> those that wait for its end
+        self._ended: OrderedDict[Asked, bytes] = OrderedDict()
+        self._at_once = at_once
+        self._given = 0
+
+    def __len__(self) -> int:
+        return len(self._calls)
+
+    def __contains__(self, asked: Asked) -> bool:
+        return asked in self._numbers
+
+    def answer_of(self, asked: Asked) -> bytes | None:
+        """Return what a call that ended lately was answered: nothing where it was stopped. None: it did not."""
+        return self._ended.get(asked)
+
+    def begin(
+        self, now_s: float, patience_s: float | None, asked: Asked, request: R, after: Asked | None = None
+    ) -> int:
+        """Take a request; return its number.
+
+        Args:
+            patience_s: how long its client waits; None: as long as it takes.
+            after: a call whose end it waits for, if that is under way.
+
+        Raises:
+            LocalError: as many as there may be are under way.
+        """
+        number = self._calls.begin(now_s, patience_s, _Served(asked, request))
+        self._numbers[asked] = number
+        if after is not None and after in self._numbers:
+            self._held_back.setdefault(after, []).append(number)
+        else:
+            self._waiting[number] = None
+        return number
+
+    def take(self) -> list[Turn[R]]:
+        """Return, once, the requests whose turn it is."""
+        turns: list[Turn[R]] = []
+        while self._waiting and (self._at_once is None or self._given < self._at_once):
+            number = self._waiting.popitem(last=False)[0]
+            served = self._calls.get(number)
+            if served is not None and served.request is not None:
+                turns.append(Turn(number, served.asked, served.request))
+                served.request = None
+                self._given += 1
+        return turns
+
+    def end(self, number: int) -> Asked | None:
+        """Learn that the local server is done with a call; return whose it is, None where nobody waits any more."""
+        served = self._calls.end(number)
+        if served is None:
+            return None
+        self._forget(number, served)
+        return served.asked if served.is_wanted else None
+
+    def remember(self, asked: Asked, answer: bytes) -> None:
+        """Keep what was answered for a while; nothing: the call was stopped."""
+        if len(answer) <= ANSWER_KEPT_BYTES:
+            self._ended[asked] = answer
+            if len(self._ended) > ENDED_MAX:
+                self._ended.popitem(last=False)
+
+    def stop(self, asked: Asked) -> int | None:
+        """Learn that a client's call has ended, known here or on its way; return its number if the server has it."""
+        number = self._numbers.pop(asked, None)
+        if number is None:
+            if asked not in self._ended:
+                self.remember(asked, b"")
+            return None
+        self.remember(asked, b"")
+        served = self._calls.get(number)
+        if served is not None and served.request is None:
+            served.is_wanted = False
+            if self._at_once is None:
+                self.end(number)
+            return number
+        self.end(number)
+        return None
+
+    def expired(self, now_s: float) -> list[Expired]:
+        """End what took too long."""
+        ended = []
+        for number, served in self._calls.expired(now_s):
+            self._forget(number, served)
+            asked = served.asked if served.is_wanted else None
+            ended.append(Expired(number, served.asked.part, asked, served.request is None))
+        return ended
+
+    def next_timeout(self) -> float | None:
+        """Return the monotonic second at which a call has taken too long, or None."""
+        return self._calls.next_timeout()
+
+    def fail_all(self) -> list[Asked]:
+        """End every call; return whose they are."""
+        ended = [served.asked for _, served in self._calls.fail_all() if served.is_wanted]
+        self._numbers.clear()
+        self._waiting.clear()
+        self._held_back.clear()
+        self._given = 0
+        return ended
+
+    def _forget(self, number: int, served: _Served[R]) -> None:
+        if self._numbers.get(served.asked) == number:
+            del self._numbers[served.asked]
+        self._waiting.pop(number, None)
+        self._given -= served.request is None
+        for each in self._held_back.pop(served.asked, ()):
+            if each in self._calls:
+                self._waiting[each] = None

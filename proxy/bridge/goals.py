@@ -1,0 +1,188 @@
+"""Goals of an action that has several servers: which of them speaks for each goal.
+
+Place: pure.
+Source: the interfaces of ``action_msgs`` and of the hidden services of an action, in CDR: a goal's id is the first 16
+bytes of its request, of its feedback, and of a request for its result; answers begin with one byte that says yes or no.
+
+Every server works on the goal. Its client hears of one at a time, its leader: the one whose acceptance it got, until
+that one goes; and at last the one whose result it got, even if others say later that they were cancelled.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from typing import Final
+
+from gdp.errors import DropReason, RemoteError
+from gdp.names import Name
+from proxy.bridge.parts import CANCEL
+
+__all__ = ["Goals", "cancel_of", "goal_of", "says_yes"]
+
+GOALS_MAX: Final = 1_024
+GOAL_KEPT_MAX_BYTES: Final = 64 << 10  # larger goals are not sent again to a server that arrives later
+_HEAD: Final = 4  # of CDR
+_ID: Final = 16
+_STAMP: Final = {order: struct.Struct(f"{order}iI") for order in "<>"}
+_COUNT: Final = {order: struct.Struct(f"{order}I") for order in "<>"}
+_ENTRY_MIN: Final = _ID + _STAMP["<"].size + 1
+_DONE: Final = 4  # SUCCEEDED; CANCELED and ABORTED follow
+_ALL: Final = bytes(_ID)
+
+
+def goal_of(raw: bytes) -> bytes:
+    """Return the id of the goal that a message is about.
+
+    Raises:
+        RemoteError: MALFORMED, it is too short.
+    """
+    if len(raw) < _HEAD + _ID:
+        raise RemoteError(DropReason.MALFORMED, "a message about a goal that names none")
+    return raw[_HEAD : _HEAD + _ID]
+
+
+def says_yes(part: int, raw: bytes) -> bool:
+    """Return whether an answer is worth more than another server's: accepted, cancels, or knows the goal."""
+    if len(raw) <= _HEAD:
+        return True
+    return (raw[_HEAD] == 0) is (part == CANCEL)
+
+
+def cancel_of(goal: bytes) -> bytes:
+    """Return the request that cancels one goal."""
+    return b"\0\1\0\0" + goal + bytes(_STAMP["<"].size)
+
+
+@dataclass(slots=True, eq=False)
+class _Goal:
+    leader: Name | None = None
+    holders: set[Name] = field(default_factory=set)
+    request: bytes | None = None  # as it was sent; None: it is not to be sent again
+    result: int | None = None  # the status that its client got
+    status: tuple[int, int, int] | None = None  # stamp and status, as the client knows it
+    led_by: Name | None = None  # who said that
+
+
+class Goals:
+    """What the clients here know of an action's goals."""
+
+    def __init__(self) -> None:
+        self._goals: OrderedDict[bytes, _Goal] = OrderedDict()
+        self._told = _write({})
+
+    def sent(self, goal: bytes, request: bytes) -> None:
+        """Learn that a client here sends a goal; the request is kept for servers that come later."""
+        self._of(goal).request = request if len(request) <= GOAL_KEPT_MAX_BYTES else None
+
+    def holds(self, goal: bytes, servers: set[Name]) -> None:
+        """Learn that servers were sent a goal."""
+        self._of(goal).holders |= servers
+
+    def holders(self, goal: bytes) -> set[Name]:
+        """Return the servers that were sent a goal."""
+        known = self._goals.get(goal)
+        return set() if known is None else set(known.holders)
+
+    def again(self, goal: bytes) -> bytes | None:
+        """Return the request of a goal, to send it to one more server; None where it is not to be sent."""
+        known = self._goals.get(goal)
+        return None if known is None else known.request
+
+    def accepted(self, goal: bytes, server: Name) -> None:
+        """Learn whose acceptance the client got."""
+        self._of(goal).leader = server
+
+    def cancelled(self, goal: bytes) -> None:
+        """Learn that a client cancels a goal, or all: no more servers get it."""
+        for each in self._goals.values() if goal == _ALL else filter(None, [self._goals.get(goal)]):
+            each.request = None
+
+    def ended(self, goal: bytes, server: Name, raw: bytes) -> bytes | None:
+        """Learn whose result the client got; return the status message that goes with it, if clients need one."""
+        known = self._of(goal)
+        known.request, known.leader = None, server
+        known.result = raw[_HEAD] if len(raw) > _HEAD else None
+        if known.result is not None and known.status is not None:
+            known.status = (*known.status[:2], known.result)
+        return self._news()
+
+    def gone(self, server: Name) -> None:
+        """Learn that a server is no more: another one speaks for its goals."""
+        for known in self._goals.values():
+            known.holders.discard(server)
+            known.led_by = None if known.led_by == server else known.led_by
+            if known.leader == server and known.result is None:
+                known.leader = None
+
+    def may_feed(self, server: Name, raw: bytes) -> bool:
+        """Return whether feedback goes to the clients.
+
+        Raises:
+            RemoteError: MALFORMED.
+        """
+        return self._leads(goal_of(raw), server)
+
+    def statuses(self, server: Name, raw: bytes) -> bytes | None:
+        """Return the status message that clients get now that a server has sent this one; None: nothing new.
+
+        Raises:
+            RemoteError: MALFORMED.
+        """
+        said = _read(raw)
+        for goal, known in self._goals.items():
+            is_its = known.led_by == server or (known.led_by is None and known.result is None)
+            if is_its and goal not in said:
+                known.status = known.led_by = None  # its server has forgotten it, or is gone
+        for goal, status in said.items():
+            if self._leads(goal, server):
+                known = self._of(goal)
+                known.led_by = server
+                known.status = status if known.result is None else (*status[:2], known.result)
+        return self._news()
+
+    def _leads(self, goal: bytes, server: Name) -> bool:
+        known = self._of(goal)
+        if known.leader is None:
+            known.leader = server
+        return known.leader == server
+
+    def _of(self, goal: bytes) -> _Goal:
+        known = self._goals.get(goal)
+        if known is None:
+            known = self._goals[goal] = _Goal()
+            if len(self._goals) > GOALS_MAX:
+                self._goals.popitem(last=False)
+        return known
+
+    def _news(self) -> bytes | None:
+        raw = _write({goal: known.status for goal, known in self._goals.items() if known.status is not None})
+        if raw == self._told:
+            return None
+        self._told = raw
+        return raw
+
+
+def _read(raw: bytes) -> dict[bytes, tuple[int, int, int]]:
+    """Read ``action_msgs/GoalStatusArray``: id -> stamp (two numbers) and status."""
+    order = "<" if raw[1:2] == b"\1" else ">"
+    body, said = raw[_HEAD:], dict[bytes, tuple[int, int, int]]()
+    try:
+        (count,) = _COUNT[order].unpack_from(body)
+        at = _COUNT[order].size
+        for _ in range(min(count, len(body) // _ENTRY_MIN)):
+            stamp_at = -(-(at + _ID) // 4) * 4
+            said[body[at : at + _ID]] = (*_STAMP[order].unpack_from(body, stamp_at), body[stamp_at + 8])
+            at = stamp_at + 9
+    except (struct.error, IndexError) as error:
+        raise RemoteError(DropReason.MALFORMED, "a status message that is too short") from error
+    return said
+
+
+def _write(statuses: dict[bytes, tuple[int, int, int]]) -> bytes:
+    body = bytearray(_COUNT["<"].pack(len(statuses)))
+    for goal, (seconds, nanoseconds, status) in statuses.items():
+        body += goal
+        body += bytes(-len(body) % 4) + _STAMP["<"].pack(seconds, nanoseconds) + bytes([status])
+    return b"\0\1\0\0" + bytes(body)
