@@ -1,0 +1,29 @@
+"""Replicated ROS services on machines in the cloud: launch descriptions, providers, the supervisor, prices.
+
+A launch file's words are loaded when first asked for: ``from fog import FogCluster, SpotMachine`` (docs/launch.md).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fog.launch.description import DeclareLaunchArgument, LaunchConfiguration, LaunchDescription, Node
+    from fog.launch.entity import FogCluster
+    from fog.launch.machines import CloudMachine, SpotMachine
+
+__all__ = [
+    "CloudMachine",
+    "DeclareLaunchArgument",
+    "FogCluster",
+    "LaunchConfiguration",
+    "LaunchDescription",
+    "Node",
+    "SpotMachine",
+]
+
+
+def __getattr__(name: str) -> object:
+    from fog.launch.words import word
+
+    return word(name)

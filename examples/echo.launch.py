@@ -1,0 +1,25 @@
+"""A service on two spot machines and a robot that calls it; all nodes come with this package.
+
+``fog launch examples/echo.launch.py rate:=50``
+"""
+
+from fog import DeclareLaunchArgument, FogCluster, LaunchConfiguration, LaunchDescription, Node, SpotMachine
+
+
+def generate_launch_description():
+    rate = DeclareLaunchArgument("rate", default_value="20.0", description="Calls a second.")
+    cluster = FogCluster(
+        name="echo",
+        cloud_nodes=[Node(package="fog.demo", executable="echo")],
+        deployments=[SpotMachine(hardware="cpu:1"), SpotMachine(hardware="cpu:1")],
+        services={"/echo": "std_srvs/srv/SetBool"},
+        idle="30min",
+        budget_usd=5.0,
+    )
+    caller = Node(
+        package="fog.demo",
+        executable="caller",
+        parameters=[{"rate_hz": LaunchConfiguration("rate")}],
+        output="screen",
+    )
+    return LaunchDescription([rate, cluster, caller])

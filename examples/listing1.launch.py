@@ -1,0 +1,18 @@
+"""The first listing of the FogROS2-FT paper: a detector on two machines, the robot's client beside the robot.
+
+``fog launch examples/listing1.launch.py --dry-run``; the packages are the reader's own.
+"""
+
+from fog import CloudMachine, FogCluster, LaunchDescription, Node, SpotMachine
+
+
+def generate_launch_description():
+    detector = Node(package="detection", executable="detector")
+    cluster = FogCluster(
+        cloud_nodes=[detector],
+        deployments=[
+            CloudMachine(region="us-west-1", hardware="cpu:16"),
+            SpotMachine(region="us-east-1", hardware="T4"),
+        ],
+    )
+    return LaunchDescription([cluster, Node(package="robot", executable="robot_client")])

@@ -1,0 +1,166 @@
+"""``fog ls``, ``status`` and ``cost``: what there is, what happens, what it costs.
+
+Place: command.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Annotated, Final, Optional
+
+import typer
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+
+from fog.cli.options import AsJson, ClusterName, SiteFile, State, opened, the_cluster
+from fog.cli.views import (
+    cluster_fields,
+    clusters_table,
+    cost_fields,
+    costs_table,
+    event_line,
+    events_table,
+    machine_fields,
+    machines_table,
+    print_json,
+    show,
+)
+from fog.site import Site
+from fog.supervisor.background import pid_of
+from fog.supervisor.journal import Cluster, Journal
+
+__all__ = ["cost", "ls", "status"]
+
+_STEP_S: Final = 0.2
+_EVENTS: Final = 20
+_LATEST: Final = 6
+
+Everything = Annotated[bool, typer.Option("--all", "-a", help="those that are gone as well")]
+Events = Annotated[bool, typer.Option("--events", help="what happened, the newest last")]
+Follow = Annotated[bool, typer.Option("--follow", "-f", help="go on as things happen, until Ctrl-C")]
+Last = Annotated[Optional[int], typer.Option("--last", "-n", min=1, help="only so many events")]  # noqa: UP045
+
+
+def ls(all_: Everything = False, site: SiteFile = None, state: State = None, as_json: AsJson = False) -> None:
+    """List clusters.
+
+    \b
+    Example:
+      fog ls
+    """
+    with opened(site, state) as (_, journal):
+        rows = [_fields(journal, each) for each in journal.clusters() if all_ or each.is_up or _left(journal, each)]
+        if as_json:
+            print_json(rows)
+        elif rows:
+            show(clusters_table(rows))
+        else:
+            typer.echo("no cluster is up")
+
+
+def status(
+    cluster: ClusterName = None,
+    all_: Everything = False,
+    events: Events = False,
+    follow: Follow = False,
+    last: Last = None,
+    site: SiteFile = None,
+    state: State = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show a cluster's machines, or what happened to them.
+
+    \b
+    Examples:
+      fog status
+      fog status planner --events --last 50
+      fog status --follow
+    """
+    with opened(site, state) as (here, journal):
+        found = the_cluster(journal, cluster)
+        name = found.plan.name
+        try:
+            if events:
+                _events(journal, name, last or _EVENTS, follow=follow, as_json=as_json)
+            elif as_json:
+                print_json(_status(here, journal, found, gone=all_))
+            elif follow:
+                with Live(console=Console(highlight=False), auto_refresh=False) as live:
+                    while True:
+                        live.update(_page(here, journal, journal.cluster(name), gone=all_), refresh=True)
+                        time.sleep(_STEP_S)
+            else:
+                show(_page(here, journal, found, gone=all_))
+        except KeyboardInterrupt:
+            raise typer.Exit(0) from None
+
+
+def cost(cluster: ClusterName = None, site: SiteFile = None, state: State = None, as_json: AsJson = False) -> None:
+    """Show what clusters have cost and cost now, by the prices at which their machines were asked for.
+
+    \b
+    Example:
+      fog cost
+    """
+    with opened(site, state) as (_, journal):
+        clusters = journal.clusters() if cluster is None else [journal.cluster(cluster)]
+        rows = [cost_fields(each, journal.machines(each.plan.name), time.time()) for each in clusters]
+        if as_json:
+            print_json(rows)
+        elif rows:
+            show(costs_table(rows))
+        else:
+            typer.echo("there was no cluster yet")
+
+
+def _left(journal: Journal, cluster: Cluster) -> bool:
+    return bool(journal.machines(cluster.plan.name, gone=False))
+
+
+def _fields(journal: Journal, cluster: Cluster) -> dict[str, object]:
+    return cluster_fields(cluster, journal.machines(cluster.plan.name), time.time())
+
+
+def _status(site: Site, journal: Journal, cluster: Cluster, *, gone: bool) -> dict[str, object]:
+    now_s, records = time.time(), journal.machines(cluster.plan.name)
+    return {
+        **cluster_fields(cluster, records, now_s),
+        "supervisor_pid": pid_of(site),
+        "members": [machine_fields(each, now_s) for each in records if gone or not each.is_gone],
+        "cost": cost_fields(cluster, records, now_s),
+    }
+
+
+def _page(site: Site, journal: Journal, cluster: Cluster, *, gone: bool) -> Group:
+    now_s, records = time.time(), journal.machines(cluster.plan.name)
+    rows = [machine_fields(each, now_s) for each in records if gone or not each.is_gone]
+    pid = pid_of(site)
+    supervisor = f"pid {pid}" if pid is not None else "begins" if cluster.is_up else "none lives, none is needed"
+    parts: list[Table | str | Group] = [
+        clusters_table([cluster_fields(cluster, records, now_s)]),
+        "",
+        machines_table(rows, now_s) if rows else "no machines",
+        "",
+        Group(*map(event_line, journal.events(cluster.plan.name, last=_LATEST))),
+        f"[dim]supervisor: {supervisor}[/]",
+    ]
+    return Group(*parts)
+
+
+def _events(journal: Journal, name: str, last: int, *, follow: bool, as_json: bool) -> None:
+    entries = journal.events(name, last=last)
+    if as_json:
+        for entry in entries:
+            print_json(entry)
+    else:
+        show(events_table(entries))
+    console, after = Console(highlight=False), max((each.id for each in entries), default=0)
+    while follow:
+        for entry in journal.events(name, after=after):
+            after = entry.id
+            if as_json:
+                print_json(entry)
+            else:
+                console.print(event_line(entry))
+        time.sleep(_STEP_S)

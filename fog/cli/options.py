@@ -1,0 +1,68 @@
+"""Options and the opened site that the verbs of ``fog`` share.
+
+Place: command.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+from fog.site import Site, open_site
+from fog.supervisor.background import ensure
+from fog.supervisor.journal import Cluster, Journal
+from gdp.cli.node import failing_clearly
+from gdp.errors import LocalError
+
+__all__ = ["AsJson", "ClusterName", "ClusterOption", "SiteFile", "State", "opened", "the_cluster"]
+
+# The command line's library reads these annotations at run time, on Python 3.10 too: hence Optional.
+SiteFile = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option("--site", metavar="FILE", help="fog.yaml; without it the one in this folder, else a site of its own"),
+]
+State = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option("--state", metavar="DIR", help="where clusters are remembered; default: $FOG_STATE, ~/.local/state"),
+]
+ClusterName = Annotated[Optional[str], typer.Argument(metavar="[CLUSTER]", help="only this one")]  # noqa: UP045
+ClusterOption = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--cluster", metavar="NAME", help="which cluster, where there are several"),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="print JSON")]
+
+
+@contextmanager
+def opened(file: Path | None, state: Path | None, *, supervised: bool = True) -> Iterator[tuple[Site, Journal]]:
+    """The site and its journal; errors end the command with one line and exit code 2.
+
+    Args:
+        supervised: start a supervisor again where something is wanted and none lives.
+    """
+    with failing_clearly():
+        site = open_site(file, state)
+        with closing(Journal(site.journal)) as journal:
+            if supervised and any(each.is_up for each in journal.clusters()):
+                ensure(site)
+            yield site, journal
+
+
+def the_cluster(journal: Journal, name: str | None) -> Cluster:
+    """Return the named cluster, or the only one that is up.
+
+    Raises:
+        LocalError: there is none, or it is not clear which.
+    """
+    if name is not None:
+        return journal.cluster(name)
+    up = [each for each in journal.clusters() if each.is_up]
+    if len(up) == 1:
+        return up[0]
+    if not up:
+        raise LocalError("no cluster is up; start one with: fog launch FILE")
+    raise LocalError(f"which cluster? There are {', '.join(each.plan.name for each in up)}")

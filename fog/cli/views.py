@@ -1,0 +1,221 @@
+"""How clusters, machines and events look: as tables for people, as JSON for programs.
+
+Place: command; pure but for the printing.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from datetime import datetime
+from typing import Final
+
+import typer
+from rich.console import Console, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from fog.plan.duration import duration_text
+from fog.supervisor.journal import Cluster, Entry
+from fog.supervisor.record import Record, cost_usd
+
+__all__ = [
+    "cluster_fields",
+    "clusters_table",
+    "cost_fields",
+    "costs_table",
+    "event_line",
+    "events_table",
+    "machine_fields",
+    "machines_table",
+    "print_json",
+    "show",
+    "stage",
+]
+
+MONTH_H: Final = 730.0
+_STYLES: Final = {
+    "serving": "green",
+    "unheard": "red",
+    "taken": "red",
+    "failed": "red",
+    "refused": "red",
+    "trouble": "red",
+    "notice": "yellow",
+    "draining": "yellow",
+    "leaving": "yellow",
+    "orphan": "yellow",
+    "gone": "dim",
+    "released": "dim",
+}
+
+
+def stage(record: Record) -> str:
+    """Return where a machine is, in one word."""
+    if record.is_gone:
+        return "gone" if record.ending is None else record.ending.value
+    if record.is_released:
+        return "leaving"
+    if record.drained_unix_s is not None:
+        return "draining"
+    if record.noticed_unix_s is not None:
+        return "notice"
+    if record.is_serving:
+        return "serving"
+    if record.served_unix_s is not None:
+        return "unheard"
+    return "asked" if not record.id else "booting" if record.up_unix_s is None else "up"
+
+
+def machine_fields(record: Record, now_s: float) -> dict[str, object]:
+    """Return what JSON says of a machine."""
+    offer = record.spec.offer
+    return {
+        "name": record.name,
+        "stage": stage(record),
+        "serving": record.is_serving,
+        "region": offer.region,
+        "type": offer.type_name,
+        "spot": offer.is_spot,
+        "provider": offer.provider,
+        "id": record.id,
+        "address": record.address,
+        "usd_per_hour": offer.usd_per_hour,
+        "usd": round(cost_usd(record, now_s), 6),
+        "asked_unix_s": record.asked_unix_s,
+        "served_unix_s": record.served_unix_s,
+        "gone_unix_s": record.gone_unix_s,
+        "reason": record.reason,
+    }
+
+
+def cluster_fields(cluster: Cluster, records: Sequence[Record], now_s: float) -> dict[str, object]:
+    """Return what JSON says of a cluster; ``records``: all of it, those that are gone included."""
+    plan = cluster.plan
+    live = [each for each in records if not each.is_gone]
+    return {
+        "name": plan.name,
+        "up": cluster.is_up,
+        "why": cluster.why,
+        "wanted": len(plan.machines) if cluster.is_up else 0,
+        "serving": sum(each.is_serving for each in live),
+        "machines": len(live),
+        "usd_per_hour": round(sum(each.spec.offer.usd_per_hour for each in live), 6),
+        "carried": [{"kind": each.kind, "name": each.name, "type": each.type_name} for each in plan.carried],
+        "since_unix_s": cluster.begun_unix_s,
+        "age_s": round(now_s - cluster.begun_unix_s, 1),
+    }
+
+
+def cost_fields(cluster: Cluster, records: Sequence[Record], now_s: float) -> dict[str, object]:
+    """Return what a cluster has cost and costs."""
+    per_hour = sum(each.spec.offer.usd_per_hour for each in records if not each.is_gone)
+    spent = sum(cost_usd(each, now_s) for each in records)
+    this = sum(cost_usd(each, now_s) for each in records if each.asked_unix_s >= cluster.begun_unix_s)
+    return {
+        "name": cluster.plan.name,
+        "usd": round(this, 6),
+        "usd_ever": round(spent, 6),
+        "usd_per_hour": round(per_hour, 6),
+        "usd_per_month": round(per_hour * MONTH_H, 2),
+        "budget_usd": cluster.plan.budget_usd,
+        "machines": len(records),
+    }
+
+
+def clusters_table(rows: Sequence[Mapping[str, object]]) -> Table:
+    """Return a line for each cluster."""
+    table = _table("cluster", "state", "serving", "machines", "USD/h", "since", "offers")
+    for row in rows:
+        names = [str(each["name"]) for each in row["carried"]] if isinstance(row["carried"], list) else []
+        is_whole = row["serving"] == row["wanted"]
+        state = Text("up", style="green" if is_whole else "yellow") if row["up"] else Text(f"down: {row['why']}", "dim")
+        table.add_row(
+            str(row["name"]),
+            state,
+            f"{row['serving']}/{row['wanted']}",
+            str(row["machines"]),
+            f"{row['usd_per_hour']:.4f}",
+            _moment(row["since_unix_s"]),
+            ", ".join(names),
+        )
+    return table
+
+
+def machines_table(rows: Sequence[Mapping[str, object]], now_s: float) -> Table:
+    """Return a line for each machine."""
+    table = _table("machine", "stage", "region", "type", "kind", "USD/h", "age", "address", "")
+    for row in rows:
+        began = float(str(row["asked_unix_s"]))
+        age = (now_s if row["gone_unix_s"] is None else float(str(row["gone_unix_s"]))) - began
+        table.add_row(
+            str(row["name"]),
+            Text(str(row["stage"]), style=_STYLES.get(str(row["stage"]), "")),
+            str(row["region"]),
+            str(row["type"]),
+            "spot" if row["spot"] else "on demand",
+            f"{row['usd_per_hour']:.4f}",
+            duration_text(max(round(age), 1)),
+            str(row["address"]) or "-",
+            str(row["reason"]),
+        )
+    return table
+
+
+def costs_table(rows: Sequence[Mapping[str, object]]) -> Table:
+    """Return a line for each cluster."""
+    table = _table("cluster", "USD", "USD ever", "USD/h now", "USD/month", "budget")
+    for row in rows:
+        table.add_row(
+            str(row["name"]),
+            f"{row['usd']:.4f}",
+            f"{row['usd_ever']:.4f}",
+            f"{row['usd_per_hour']:.4f}",
+            f"{row['usd_per_month']:.2f}",
+            "-" if row["budget_usd"] is None else f"{row['budget_usd']:.2f}",
+        )
+    return table
+
+
+def events_table(entries: Sequence[Entry]) -> Table:
+    """Return a line for each event."""
+    table = _table("time", "cluster", "machine", "what", "")
+    for entry in entries:
+        what = Text(entry.what, style=_STYLES.get(entry.what, ""))
+        table.add_row(_moment(entry.unix_s, "%H:%M:%S.%f")[:-3], entry.cluster, entry.machine, what, entry.detail)
+    return table
+
+
+def event_line(entry: Entry) -> Text:
+    """Return one event as people follow it."""
+    time = _moment(entry.unix_s, "%H:%M:%S.%f")[:-3]
+    return Text.assemble(
+        (time, "dim"),
+        f" {entry.machine or entry.cluster:<8} ",
+        (entry.what, _STYLES.get(entry.what, "")),
+        f"  {entry.detail}",
+    )
+
+
+def show(*parts: RenderableType) -> None:
+    """Print tables."""
+    console = Console(highlight=False)
+    for part in parts:
+        console.print(part)
+
+
+def print_json(value: object) -> None:
+    """Print one JSON value."""
+    typer.echo(json.dumps(value, ensure_ascii=False, default=asdict))
+
+
+def _table(*headings: str) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for heading in headings:
+        table.add_column(heading, justify="right" if heading.startswith("USD") else "left")
+    return table
+
+
+def _moment(unix_s: object, form: str = "%Y-%m-%d %H:%M") -> str:
+    return datetime.fromtimestamp(float(str(unix_s))).strftime(form)

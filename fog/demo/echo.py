@@ -1,0 +1,45 @@
+"""A ROS service that tells which machine answered: ``/echo``, ``std_srvs/srv/SetBool``.
+
+Place: shell; needs rclpy. The answer is {success: what was asked, message: the machine}, which the environment's
+``FOG_MACHINE`` names. Parameter ``delay_s``: how long an answer takes.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+
+import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.executors import ExternalShutdownException
+from std_srvs.srv import SetBool
+
+__all__ = ["main"]
+
+
+def main() -> None:
+    """Serve until Ctrl-C or SIGTERM."""
+    machine = os.environ.get("FOG_MACHINE", "")
+    rclpy.init()
+    node = rclpy.create_node("echo")
+    delay_s = float(node.declare_parameter("delay_s", 0.0, ParameterDescriptor(dynamic_typing=True)).value)
+
+    def answer(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        if delay_s:
+            time.sleep(delay_s)
+        response.success, response.message = request.data, machine
+        return response
+
+    node.create_service(SetBool, "/echo", answer)
+    node.get_logger().info("ready")
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass  # both are how it ends
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()

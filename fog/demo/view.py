@@ -1,0 +1,107 @@
+"""What the demonstration shows while it goes on: in a terminal a table that moves, elsewhere plain lines.
+
+Place: shell; prints. What a page says is made of records, events and counts alone.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Final
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.text import Text
+
+from fog.cli.views import event_line, machine_fields, machines_table, stage
+from fog.supervisor.journal import Entry
+from fog.supervisor.record import Record
+
+__all__ = ["Counts", "View"]
+
+_EVENTS: Final = 10  # of the newest
+_PLAIN_EVERY_S: Final = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """What the robot's node says of its requests.
+
+    Args:
+        failed: those without an answer or with a wrong one, and those that were not sent since no server was there.
+        rate: answered a second, lately.
+        by_machine: who answered first how often.
+    """
+
+    requests: int = 0
+    answered: int = 0
+    failed: int = 0
+    median_ms: float | None = None
+    p99_ms: float | None = None
+    rate: float = 0.0
+    by_machine: tuple[tuple[str, int], ...] = ()
+
+    def line(self) -> Text:
+        """Return it as one line."""
+        median, p99 = ("-" if each is None else f"{each:.1f} ms" for each in (self.median_ms, self.p99_ms))
+        failed = Text(f"{self.failed} failed", style="bold red" if self.failed else "green")
+        won = ", ".join(f"{machine} {count}" for machine, count in self.by_machine)
+        rest = (
+            f" of {self.requests} requests   {self.rate:.0f}/s   latency {median}, p99 {p99}   first were: {won or '-'}"
+        )
+        return Text.assemble(failed, rest)
+
+
+class View:
+    """Shows steps, machines, events and counts; a context manager.
+
+    Args:
+        console: where to.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._begun_s = time.monotonic()
+        self._told_s = self._begun_s
+        self._events: deque[Entry] = deque(maxlen=_EVENTS)
+        self._live = Live(console=console, auto_refresh=False, transient=False) if console.is_terminal else None
+
+    def __enter__(self) -> View:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def step(self, text: str) -> None:
+        """Tell what is done now."""
+        self._console.print(
+            f"[dim]{time.monotonic() - self._begun_s:5.1f} s[/dim]  [bold]{text}[/bold]", highlight=False
+        )
+
+    def happened(self, entries: Sequence[Entry]) -> None:
+        """Take in what the journal says is new."""
+        self._events.extend(entries)
+        if self._live is None:
+            for each in entries:
+                self._console.print(Text("         ") + event_line(each), soft_wrap=True)
+
+    def show(self, machines: Sequence[Record], counts: Counts) -> None:
+        """Show how it is now. Plain lines come every few seconds."""
+        if self._live is not None:
+            if not self._live.is_started:
+                self._live.start()
+            self._live.update(self._page(machines, counts), refresh=True)
+        elif time.monotonic() - self._told_s >= _PLAIN_EVERY_S:
+            self._told_s = time.monotonic()
+            there = ", ".join(f"{each.name} {each.spec.offer.region} {stage(each)}" for each in machines)
+            self._console.print(Text("         ") + counts.line() + Text(f"   machines: {there}"), soft_wrap=True)
+
+    def _page(self, machines: Sequence[Record], counts: Counts) -> RenderableType:
+        now_s = time.time()
+        rows = [machine_fields(each, now_s) for each in machines]
+        events = [event_line(each) for each in self._events]
+        return Group("", machines_table(rows, now_s), "", counts.line(), "", *events)

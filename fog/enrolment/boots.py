@@ -1,0 +1,193 @@
+"""What a machine of a cluster, a gateway, and the robot's own side boot: their files and programs.
+
+Place: I/O, through ``members``. Every file names others relative to itself, so it does not matter where they will lie.
+::
+
+    machine   [node ...] -- ROS graph of its own -- [proxy] -- [switch] -- iface        towards the gateway
+    gateway   ifaces -- [switch] -- ifaces
+    robot     ROS graph of the robot -- [proxy] -- [switch] -- uplink                   and [rib], and the watch
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import yaml
+
+from fog.cluster import Carried, CloudNode, ClusterPlan
+from fog.enrolment.members import Authority
+from fog.machine import Boot, Program
+from fog.supervisor.record import Papers
+from gdp.crypto.certificates import Membership, Role
+
+__all__ = ["PROXY", "RobotDevices", "gateway_boot", "machine_boot", "robot_boot", "robot_rule"]
+
+PROXY: Final = "proxy"
+_PROFILES: Final = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")  # since Fast DDS 3, and before
+_DOMAINS: Final = 100  # ROS domains of machines, so that no two that lie near each other share one
+_TABLE_MAX: Final = 8_192  # a machine hears of few names, and memory for the usual 131,072 takes time to clear
+_OWNER: Final = "owner.pub"
+_AWAIT: Final = ("--await-iface", "30")  # the switch beside it makes the device
+_UDP_ONLY: Final = {
+    # Where machines share a host, shared memory would join their graphs; the range LOCALHOST brings it back.
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
+    "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
+}
+_PROFILE: Final = "fastdds.xml"
+_OFTEN: Final = b"""<?xml version="1.0" encoding="UTF-8"?>
+<dds xmlns="http://www.eprosima.com"><profiles>
+ <participant profile_name="machine" is_default_profile="true"><rtps><builtin><discovery_config>
+  <leaseAnnouncement><sec>0</sec><nanosec>250000000</nanosec></leaseAnnouncement>
+ </discovery_config></builtin></rtps></participant>
+</profiles></dds>
+"""  # a node's first announcements are often missed where nodes start together; the next would come after 3 s
+
+
+@dataclass(frozen=True, slots=True)
+class RobotDevices:
+    """What the robot's switch joins: the port towards the machines, and what it makes for those beside it."""
+
+    uplink: str
+    proxy: str
+    rib: str
+    watch: str
+
+
+def machine_boot(
+    authority: Authority,
+    plan: ClusterPlan,
+    name: str,
+    command: Callable[[CloudNode], Sequence[str]],
+    *,
+    iface: str,
+    days: float,
+    shares_host: bool,
+) -> tuple[Boot, Papers]:
+    """Enrol a machine of a cluster; return what it boots, and the papers by which it is known.
+
+    Args:
+        name: of the machine.
+        command: how a node is started on it.
+        iface: its device towards the overlay.
+        days: how long its papers hold.
+        shares_host: whether other machines run on the same host.
+
+    Raises:
+        LocalError: as ``Authority.enrol``.
+    """
+    title = f"{plan.name}-{name}"
+    switch = authority.enrol(Role.SWITCH, title, days=days)
+    proxy = authority.enrol(Role.PROXY, title, plan.carried, days=days)
+    domain = 1 + int(name[1:]) % _DOMAINS
+    rules = [{**_rule(each), **each.served, "owner": _OWNER} for each in plan.carried]
+    files = {
+        **switch.below("switch"),
+        **proxy.below(PROXY),
+        _OWNER: authority.owner_key.read_bytes(),
+        _PROFILE: _OFTEN,
+        "switch.yaml": _yaml(
+            {**_who("switch"), "ports": [{"iface": iface}], "attach": ["proxy0"], "table_max": _TABLE_MAX}
+        ),
+        "proxy.yaml": _yaml(
+            {
+                **_who(PROXY),
+                "iface": "proxy0",
+                "delegations": f"{PROXY}/delegations",
+                "ros": {"endpoint": "ros2", "domain": domain, "alone": True},
+                "expose": rules,
+            }
+        ),
+    }
+    environment = {"FOG_CLUSTER": plan.name, "FOG_MACHINE": name, "ROS_DOMAIN_ID": str(domain)}
+    environment |= dict.fromkeys(_PROFILES, f"{{home}}/{_PROFILE}") | (_UDP_ONLY if shares_host else {})
+    nodes = [
+        Program(
+            f"node{index}" if len(plan.nodes) > 1 else "node",
+            tuple(command(node)),
+            environment={**environment, **node.environment},
+        )
+        for index, node in enumerate(plan.nodes)
+    ]
+    programs = (*nodes, _switch(), _proxy(environment))
+    until_s = float(min(switch.member.not_after_unix_s, proxy.member.not_after_unix_s))
+    return Boot(files, programs), _papers(proxy.member, until_s, switch.member)
+
+
+def gateway_boot(authority: Authority, label: str, ifaces: Sequence[str], *, days: float) -> Boot:
+    """Enrol a gateway: a switch between its devices.
+
+    Raises:
+        LocalError: as ``Authority.enrol``.
+    """
+    switch = authority.enrol(Role.SWITCH, f"gateway-{label}", days=days)
+    content = _yaml({**_who("switch"), "ports": [{"iface": iface} for iface in ifaces]})
+    return Boot({**switch.below("switch"), "switch.yaml": content}, (_switch(),))
+
+
+def robot_boot(authority: Authority, devices: RobotDevices, *, days: float) -> Boot:
+    """Enrol the robot's own side of a site that has none: switch, RIB and proxy.
+
+    Raises:
+        LocalError: as ``Authority.enrol``.
+    """
+    members = {role: authority.enrol(role, "robot", days=days) for role in (Role.SWITCH, Role.RIB, Role.PROXY)}
+    watch = authority.enrol(Role.PROXY, "supervisor", days=days)
+    attach = [devices.proxy, devices.rib, devices.watch]
+    switch = {"ports": [{"iface": devices.uplink}], "attach": attach, "revocations": "revocations"}
+    files: dict[str, bytes] = {}
+    for role, enrolled in members.items():
+        files |= enrolled.below(role.value)
+    files |= {
+        **watch.below("watch"),
+        _OWNER: authority.owner_key.read_bytes(),
+        "switch.yaml": _yaml({**_who("switch"), **switch}),
+        "rib.yaml": _yaml({**_who("rib"), "iface": devices.rib}),
+        "proxy.yaml": _yaml(
+            {
+                **_who(PROXY),
+                "iface": devices.proxy,
+                "delegations": f"{PROXY}/delegations",
+                "ros": {"endpoint": "ros2"},
+            }
+        ),
+    }
+    programs = (_switch(), _program("rib", "gdp.cli.rib", " is up", *_AWAIT), _proxy({}))
+    return Boot(files, programs)
+
+
+def robot_rule(carried: Carried) -> dict[str, object]:
+    """Return the rule by which the robot imports what is carried, without its owner."""
+    return {**_rule(carried), **carried.options}
+
+
+def _rule(carried: Carried) -> dict[str, object]:
+    return {"name": carried.name, "kind": carried.kind, "type": carried.type_name}
+
+
+def _who(folder: str) -> dict[str, object]:
+    return {"identity": folder, "domain": {"root": f"{folder}/root.crt"}}
+
+
+def _papers(proxy: Membership, until_s: float, *others: Membership) -> Papers:
+    return Papers(proxy.name.to_text(), until_s, tuple(each.fingerprint.hex() for each in (proxy, *others)))
+
+
+def _switch() -> Program:
+    return _program("switch", "gdp.cli.switch", " is up")
+
+
+def _proxy(environment: Mapping[str, str]) -> Program:
+    return _program(PROXY, "proxy.cli", '"ready"', "--json", *_AWAIT, environment=environment)
+
+
+def _program(
+    name: str, module: str, ready: str, *options: str, environment: Mapping[str, str] | None = None
+) -> Program:
+    argv = ("{python}", "-m", module, "--config", f"{{home}}/{name}.yaml", *options)
+    return Program(name, argv, ready, environment or {})
+
+
+def _yaml(content: Mapping[str, object]) -> bytes:
+    return yaml.safe_dump(dict(content), sort_keys=False).encode()

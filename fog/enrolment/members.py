@@ -1,0 +1,96 @@
+"""New members of the site's domain, with what the owner lets them do: keys and proofs as the files of a machine.
+
+Place: I/O; draws keys, reads the domain's and the owner's private ones, and leaves nothing on disk.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from fog.cluster import Carried
+from gdp.crypto.certificates import Membership, Role
+from gdp.metadata import Metadata
+from gdp.stores.issue import delegate, install_delegation, make_node
+from gdp.stores.keyring import CARD, OWNER_PUBLIC, save_delegation
+from gdp.trust.right import Right
+
+__all__ = ["Authority", "Enrolled", "metadata_of", "right_of"]
+
+_RIGHTS: Final = {"topic": (Right.PUBLISH, Right.READ)}
+_CALLS: Final = (Right.SERVE, Right.CALL)
+
+
+@dataclass(frozen=True, slots=True)
+class Enrolled:
+    """A new member.
+
+    Args:
+        files: of its directory, to be kept private.
+    """
+
+    member: Membership
+    files: Mapping[str, bytes]
+
+    def below(self, folder: str) -> dict[str, bytes]:
+        """Return its files with this folder before their names."""
+        return {f"{folder}/{name}": data for name, data in self.files.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Authority:
+    """Who admits and delegates: the directories of a domain and of an owner.
+
+    Args:
+        scratch: where files lie for a moment; what a killed process left there may be deleted.
+    """
+
+    domain: Path
+    owner: Path
+    scratch: Path | None = None
+
+    def enrol(self, role: Role, label: str, carried: Iterable[Carried] = (), *, days: float) -> Enrolled:
+        """Return a new member that may give (serve, publish) what is carried.
+
+        Raises:
+            LocalError: no domain or no owner there, or its root has run out.
+        """
+        with tempfile.TemporaryDirectory(prefix="gdp-fog-", dir=self.scratch) as scratch:
+            node = Path(scratch) / "node"
+            identity = make_node(node, role, label, self.domain, days=days)
+            for each in carried:
+                given = delegate(self.owner, node / CARD, metadata_of(each), [right_of(each, gives=True)], days=days)
+                install_delegation(node, given)
+            files = {str(path.relative_to(node)): path.read_bytes() for path in node.rglob("*") if path.is_file()}
+        return Enrolled(identity.member, files)
+
+    def let(self, node: Path, delegations: Path, carried: Iterable[Carried], *, days: float) -> None:
+        """Let a node of the robot's side take (call, read) what is carried; what it had of these names is replaced.
+
+        Raises:
+            LocalError: as ``enrol``, or the node's directory has no card.
+        """
+        for each in carried:
+            given = delegate(self.owner, node / CARD, metadata_of(each), [right_of(each, gives=False)], days=days)
+            save_delegation(delegations, given, force=True)
+
+    @property
+    def owner_key(self) -> Path:
+        """Return the file with the owner's public key."""
+        return self.owner / OWNER_PUBLIC
+
+
+def metadata_of(carried: Carried) -> Metadata:
+    """Return what the overlay's name of a service, action or topic digests."""
+    own = {"kind": carried.kind, "name": carried.name, "type": carried.type_name}
+    more = carried.options.get("metadata", {})
+    return Metadata({**own, **more} if isinstance(more, dict) else own)
+
+
+def right_of(carried: Carried, *, gives: bool) -> Right:
+    """Return what is needed to give, or to take, what is carried."""
+    give, take = _RIGHTS.get(carried.kind, _CALLS)
+    return give if gives else take

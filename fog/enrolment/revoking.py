@@ -1,0 +1,50 @@
+"""Memberships of machines that are gone are taken back, where the robot's switch can be told.
+
+Place: I/O; writes into the ``revocations`` folder of a switch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from gdp.crypto.statements import parse
+from gdp.errors import StatementError
+from gdp.limits import CLOCK_SKEW_S
+from gdp.stores.files import public, read_public, write_all
+from gdp.stores.keyring import load_domain
+from gdp.trust.revocation import Revocation
+
+__all__ = ["take_back"]
+
+_SUFFIX: Final = ".revoke"
+_TITLE_CHARS: Final = 32  # of the fingerprint
+
+
+def take_back(domain: Path, folder: Path, fingerprints: Iterable[str], *, until_unix_s: float, unix_s: float) -> bool:
+    """Write a revocation for each membership, and remove those whose time is over; return whether one is new.
+
+    Args:
+        fingerprints: in hex.
+        until_unix_s: when the memberships run out.
+        unix_s: now.
+
+    Raises:
+        LocalError: no domain there, or the folder cannot be written.
+    """
+    authority = load_domain(domain)
+    files = {}
+    for fingerprint in fingerprints:
+        name = fingerprint[:_TITLE_CHARS] + _SUFFIX
+        if not (folder / name).exists():
+            body = bytes.fromhex(fingerprint)
+            files[name] = public(Revocation.make(authority.key, authority.root.subject, body, int(until_unix_s)))
+    write_all(folder, files)
+    for path in folder.glob(f"[!.]*{_SUFFIX}"):
+        with suppress(StatementError):  # somebody else's: left alone
+            old = Revocation.from_statement(parse(read_public(path)))
+            if old.until_unix_s + 2 * CLOCK_SKEW_S < unix_s:
+                path.unlink(missing_ok=True)
+    return bool(files)

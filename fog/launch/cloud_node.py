@@ -1,0 +1,77 @@
+"""A ``Node`` of a launch file as what a plan says of it.
+
+Place: shell; reads the files of parameters, which the machines do not have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import cast
+
+import yaml
+
+from fog.cluster import CloudNode
+from fog.launch.description import LaunchConfiguration, Node, Parameters, Text, written
+from fog.launch.ros_args import named, parameters_of_file, parameters_of_map, remapped
+from gdp.errors import LocalError
+
+__all__ = ["cloud_node", "parameters_in"]
+
+
+def cloud_node(node: Node, given: Mapping[str, str]) -> CloudNode:
+    """Return a node with the launch arguments put in.
+
+    Raises:
+        LocalError: an argument is missing, or a file of parameters cannot be used.
+    """
+    name = None if node.name is None else written(node.name, given)
+    namespace = None if node.namespace is None else written(node.namespace, given)
+    ros = [written(each, given) for each in node.ros_arguments]
+    ros += named(name, namespace)
+    for parameters in node.parameters:
+        ros += _parameters(parameters, given, name, namespace)
+    ros += remapped((written(old, given), written(new, given)) for old, new in node.remappings)
+    arguments = [written(each, given) for each in node.arguments]
+    return CloudNode(
+        written(node.package, given),
+        written(node.executable, given),
+        (*arguments, "--ros-args", *ros) if ros else tuple(arguments),
+        {key: written(value, given) for key, value in node.additional_env.items()},
+    )
+
+
+def parameters_in(path: Path, name: str | None, namespace: str | None) -> list[str]:
+    """Return the words that set what a file of parameters says of a node.
+
+    Raises:
+        LocalError: it cannot be read or used.
+    """
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise LocalError(f"parameters: {path}: {error}") from error
+    return parameters_of_file(document, str(path), name, namespace)
+
+
+def _parameters(said: Parameters, given: Mapping[str, str], name: str | None, namespace: str | None) -> list[str]:
+    if isinstance(said, Mapping):
+        return parameters_of_map(_put_in(said, given))
+    return parameters_in(Path(written(said, given)), name, namespace)
+
+
+def _put_in(parameters: Mapping[str, object], given: Mapping[str, str]) -> dict[str, object]:
+    """Put arguments into values; what comes from the command line is read as YAML, as ROS 2 does."""
+    values: dict[str, object] = {}
+    for key, value in parameters.items():
+        if isinstance(value, Mapping):
+            values[key] = _put_in(value, given)
+        elif isinstance(value, LaunchConfiguration) or _has_argument(value):
+            values[key] = yaml.safe_load(written(cast("Text", value), given))
+        else:
+            values[key] = value
+    return values
+
+
+def _has_argument(value: object) -> bool:
+    return isinstance(value, list | tuple) and any(isinstance(each, LaunchConfiguration) for each in value)

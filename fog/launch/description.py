@@ -1,0 +1,102 @@
+"""What a launch file is made of where ROS 2's own ``launch`` and ``launch_ros`` are not installed.
+
+Place: pure. The same names and keywords as ROS 2's, those that mean something here; any other keyword is refused.
+Source: https://docs.ros.org/en/jazzy/Tutorials/Intermediate/Launch/Launch-Main.html.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+from gdp.errors import LocalError
+
+__all__ = [
+    "DeclareLaunchArgument",
+    "LaunchConfiguration",
+    "LaunchDescription",
+    "Node",
+    "Parameters",
+    "Text",
+    "written",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class LaunchConfiguration:
+    """The value of a launch argument, put in when the description is launched."""
+
+    variable_name: str
+    default: str | None = None
+
+
+Text: TypeAlias = str | LaunchConfiguration | Sequence[str | LaunchConfiguration]
+Parameters: TypeAlias = Mapping[str, object] | Text
+
+
+@dataclass(frozen=True, slots=True)
+class DeclareLaunchArgument:
+    """An argument that a launch file takes as ``name:=value``.
+
+    Args:
+        default_value: None: it must be given.
+        choices: all values that it may have; None: any.
+    """
+
+    name: str
+    default_value: str | None = None
+    description: str = ""
+    choices: Sequence[str] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Node:
+    """A ROS node.
+
+    Args:
+        package, executable: as ``ros2 run`` takes them; without such an installed package, the Python module
+            ``package.executable``.
+        parameters: maps of values, and paths of YAML files, in the order in which they count.
+        remappings: pairs (from, to).
+        arguments: after the executable, before ``--ros-args``.
+        ros_arguments: after ``--ros-args``.
+    """
+
+    package: Text
+    executable: Text
+    name: Text | None = None
+    namespace: Text | None = None
+    parameters: Sequence[Parameters] = ()
+    remappings: Sequence[tuple[Text, Text]] = ()
+    arguments: Sequence[Text] = ()
+    ros_arguments: Sequence[Text] = ()
+    additional_env: Mapping[str, Text] = field(default_factory=dict)
+    output: Literal["screen", "both", "log"] = "log"
+
+
+class LaunchDescription:
+    """What is launched, in order."""
+
+    def __init__(self, initial_entities: Iterable[object] = ()) -> None:
+        self.entities: list[object] = list(initial_entities)
+
+    def add_action(self, action: object) -> None:
+        """Append an entity."""
+        self.entities.append(action)
+
+
+def written(text: Text, given: Mapping[str, str]) -> str:
+    """Return a text with the launch arguments put in.
+
+    Raises:
+        LocalError: one is neither given nor has a default.
+    """
+    if isinstance(text, str):
+        return text
+    if not isinstance(text, LaunchConfiguration):
+        return "".join(written(part, given) for part in text)
+    value = given.get(text.variable_name, text.default)
+    if value is None:
+        raise LocalError(f"launch argument {text.variable_name!r} is not given: add {text.variable_name}:=VALUE")
+    return value

@@ -1,0 +1,198 @@
+"""Running a launch file: what cluster it wants, and which nodes run beside the robot.
+
+Place: shell; executes the file, which is Python, and starts nothing.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import sys
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Final, TypeAlias
+
+from fog.cluster import Carried, CloudNode, ClusterPlan
+from fog.launch.cloud_node import cloud_node
+from fog.launch.description import DeclareLaunchArgument, LaunchDescription, Node
+from fog.launch.entity import FogCluster
+from fog.launch.wish import Wish
+from fog.launch.words import has_ros_launch
+from gdp.errors import ConfigError, GdpError, LocalError
+
+__all__ = ["Loaded", "Probe", "RobotNode", "key_values", "load"]
+
+Probe: TypeAlias = Callable[[Sequence[CloudNode]], Sequence[tuple[str, str, str]]]
+
+_ENTRY: Final = "generate_launch_description"
+
+
+@dataclass(frozen=True, slots=True)
+class RobotNode:
+    """A node of the robot's side.
+
+    Args:
+        output: ``screen``, ``both`` or ``log``: where its output goes.
+    """
+
+    node: CloudNode
+    output: str = "screen"
+
+
+@dataclass(frozen=True, slots=True)
+class Loaded:
+    """What a launch file comes to.
+
+    Args:
+        keep: whether the cluster stays when the launch ends.
+        notes: what people should be told.
+        is_known: whether what the nodes offer is in the plan; else it is yet to be found out.
+    """
+
+    plan: ClusterPlan
+    robot_nodes: tuple[RobotNode, ...] = ()
+    keep: bool = False
+    notes: tuple[str, ...] = ()
+    is_known: bool = True
+
+
+def key_values(words: Sequence[str]) -> dict[str, str]:
+    """Read launch arguments, ``name:=value`` each.
+
+    Raises:
+        LocalError: one is of another form, or there twice.
+    """
+    given: dict[str, str] = {}
+    for word in words:
+        key, separator, value = word.partition(":=")
+        if not separator or not key or key in given:
+            raise LocalError(f"{word!r}: expected launch arguments as name:=value, each once")
+        given[key] = value
+    return given
+
+
+def load(path: Path, arguments: Mapping[str, str], probe: Probe | None = None) -> Loaded:
+    """Run a launch file, or read the plan (``.json``) that one came to.
+
+    Args:
+        probe: finds out what nodes offer (``fog.launch.probe.offered``) where the file does not say; None: left open.
+
+    Raises:
+        ConfigError: the file is not there, not Python, or fails; the text names the line.
+        LocalError: what it describes cannot be; the text says why.
+    """
+    if path.suffix == ".json":
+        try:
+            return Loaded(ClusterPlan.from_json(path.read_text(encoding="utf-8")), keep=True)
+        except OSError as error:
+            raise ConfigError(str(path), "", f"cannot be read: {error.strerror}") from error
+    description = _described(path)
+    if has_ros_launch():
+        from fog.launch.real_node import gathered
+
+        return _planned(*gathered(description, arguments), probe)
+    return _planned(*_gathered(description, arguments), probe)
+
+
+def _planned(
+    clusters: Sequence[tuple[Wish, Sequence[CloudNode]]], robot: Sequence[RobotNode], probe: Probe | None
+) -> Loaded:
+    if len(clusters) != 1:
+        raise LocalError(f"the launch description has {len(clusters)} FogClusters: expected one")
+    wish, nodes = clusters[0]
+    found: Sequence[Carried] = ()
+    if wish.carried is None and probe is not None:
+        wish.plan(nodes)  # complains before anything is started
+        found = wish.carry(probe(nodes))
+    is_known = wish.carried is not None or probe is not None
+    return Loaded(wish.plan(nodes, found), tuple(robot), wish.keep, wish.notes, is_known)
+
+
+def _gathered(
+    description: object, arguments: Mapping[str, str]
+) -> tuple[list[tuple[Wish, list[CloudNode]]], list[RobotNode]]:
+    if not isinstance(description, LaunchDescription):
+        raise LocalError(f"{_ENTRY} returned {type(description).__name__}: expected a LaunchDescription")
+    given = _arguments(description.entities, arguments)
+    clusters, robot = [], []
+    for entity in description.entities:
+        if isinstance(entity, FogCluster):
+            clusters.append((entity.wish, [_node(each, given) for each in entity.cloud_nodes]))
+        elif isinstance(entity, Node):
+            robot.append(RobotNode(cloud_node(entity, given), entity.output))
+        elif not isinstance(entity, DeclareLaunchArgument):
+            raise LocalError(
+                f"the launch description has a {type(entity).__name__}: expected FogCluster, Node or"
+                " DeclareLaunchArgument; more is understood where ROS 2's launch and launch_ros are installed"
+            )
+    return clusters, robot
+
+
+def _node(entity: object, given: Mapping[str, str]) -> CloudNode:
+    if not isinstance(entity, Node):
+        raise LocalError(f"cloud_nodes: expected Node, not {type(entity).__name__}")
+    return cloud_node(entity, given)
+
+
+def _arguments(entities: Sequence[object], given: Mapping[str, str]) -> dict[str, str]:
+    declared = [entity for entity in entities if isinstance(entity, DeclareLaunchArgument)]
+    if unknown := sorted(given.keys() - {each.name for each in declared}):
+        known = ", ".join(each.name for each in declared) or "none"
+        raise LocalError(f"launch argument {', '.join(unknown)}: not declared; declared: {known}")
+    values = {each.name: each.default_value for each in declared if each.default_value is not None} | dict(given)
+    for each in declared:
+        value = values.get(each.name)
+        if value is None:
+            raise LocalError(f"launch argument {each.name!r} is not given: add {each.name}:=VALUE  {each.description}")
+        if each.choices is not None and value not in each.choices:
+            raise LocalError(f"launch argument {each.name}:={value}: expected {', '.join(each.choices)}")
+    return values
+
+
+def _described(path: Path) -> object:
+    """Run the file and call its entry."""
+    try:
+        module = _module(path)
+        entry = getattr(module, _ENTRY, None)
+        if not inspect.isfunction(entry):
+            raise ConfigError(str(path), _ENTRY, "expected a function of this name that returns a LaunchDescription")
+        described: object = entry()
+    except ConfigError:
+        raise
+    except ModuleNotFoundError as error:
+        advice = ""
+        if str(error.name).partition(".")[0] in ("launch", "launch_ros"):
+            advice = "; ROS 2's launch is not installed: say `from fog import LaunchDescription, Node` instead"
+        raise ConfigError(_place(path, error), "", f"{error}{advice}") from error
+    except GdpError as error:
+        raise ConfigError(_place(path, error), "", str(error)) from error
+    except Exception as error:  # whatever the user's code raises is the user's to know, with its line
+        raise ConfigError(_place(path, error), "", f"{type(error).__name__}: {error}") from error
+    return described
+
+
+def _module(path: Path) -> ModuleType:
+    if not path.is_file():
+        raise ConfigError(str(path), "", "no such launch file")
+    spec = importlib.util.spec_from_file_location("fog_launch_file", path)
+    if spec is None or spec.loader is None:
+        raise ConfigError(str(path), "", "expected a Python launch file (.py), or a plan (.json)")
+    module = importlib.util.module_from_spec(spec)
+    folder = str(path.resolve().parent)
+    sys.path.insert(0, folder)
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        sys.path.remove(folder)
+    return module
+
+
+def _place(path: Path, error: BaseException) -> str:
+    """Return ``file:line`` of the last line of the launch file that the error went through."""
+    if isinstance(error, SyntaxError) and error.filename == str(path):
+        return f"{path}:{error.lineno}"
+    lines = [at.lineno for at in traceback.extract_tb(error.__traceback__) if at.filename == str(path)]
+    return f"{path}:{lines[-1]}" if lines else str(path)

@@ -1,0 +1,104 @@
+"""Names, remappings and parameters of a node as words of its command line, so that they travel without files.
+
+Place: pure.
+Source: https://design.ros2.org/articles/ros_command_line_arguments.html; the files of parameters as
+rcl_yaml_param_parser reads them (sections of nodes, ``ros__parameters`` within).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Final, TypeAlias
+
+from gdp.errors import LocalError
+
+__all__ = ["named", "parameters_of_file", "parameters_of_map", "remapped"]
+
+_PARAMETERS: Final = "ros__parameters"
+_Section: TypeAlias = tuple[Sequence[str], Mapping[str, object]]
+
+
+def named(name: str | None, namespace: str | None) -> list[str]:
+    """Return the words that give a node its name and namespace."""
+    words = ["-r", f"__node:={name}"] if name else []
+    return [*words, "-r", f"__ns:={_absolute(namespace)}"] if namespace else words
+
+
+def remapped(pairs: Iterable[tuple[str, str]]) -> list[str]:
+    """Return the words that rename what a node uses."""
+    return [word for old, new in pairs for word in ("-r", f"{old}:={new}")]
+
+
+def parameters_of_map(parameters: Mapping[str, object], prefix: str = "") -> list[str]:
+    """Return the words that set parameters; a map within a map is a group, joined with dots.
+
+    Args:
+        prefix: before each name, such as ``detector:`` for the node of that name only.
+
+    Raises:
+        LocalError: a value that no parameter can have.
+    """
+    return [word for key, value in _flat(parameters) for word in ("-p", f"{prefix}{key}:={_yaml(key, value)}")]
+
+
+def parameters_of_file(document: object, where: str, name: str | None, namespace: str | None) -> list[str]:
+    """Return the words that set what a file of parameters says of a node.
+
+    Args:
+        document: the file as YAML reads it.
+        where: its path, for errors.
+        name, namespace: of the node; None: not given, so that its own code says it.
+
+    Raises:
+        LocalError: it is no such file, or cannot be used without the node's name.
+    """
+    words = []
+    for path, parameters in _sections(document, where, ()):
+        node = [part for part in "/".join(path).split("/") if part]
+        if node == ["**"]:
+            words += parameters_of_map(parameters)
+        elif any("*" in part for part in node) or (name is None and len(node) != 1):
+            raise LocalError(f"{where}: section {'/'.join(path)}: cannot be used here: name the node, or say /**")
+        elif name is None:
+            words += parameters_of_map(parameters, f"{node[0]}:")
+        elif f"{_absolute(namespace).rstrip('/')}/{name}" == f"/{'/'.join(node)}":
+            words += parameters_of_map(parameters)
+    return words
+
+
+def _absolute(namespace: str | None) -> str:
+    return "/" + (namespace or "").strip("/")
+
+
+def _sections(
+    document: object, where: str, path: Sequence[str]
+) -> Iterator[tuple[Sequence[str], Mapping[str, object]]]:
+    if not isinstance(document, Mapping):
+        raise LocalError(f"{where}: {'/'.join(path) or 'the file'}: expected nodes with {_PARAMETERS} within")
+    for key, value in document.items():
+        if key != _PARAMETERS:
+            yield from _sections(value, where, (*path, str(key)))
+        elif path and isinstance(value, Mapping):
+            yield path, value
+        else:
+            raise LocalError(f"{where}: {'/'.join(path) or 'the file'}: {_PARAMETERS}: expected a map within a node")
+
+
+def _flat(parameters: Mapping[str, object], group: str = "") -> Iterator[tuple[str, object]]:
+    for key, value in parameters.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{group}{key}.")
+        else:
+            yield f"{group}{key}", value
+
+
+def _yaml(key: str, value: object) -> str:
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return f"[{', '.join(_yaml(key, each) for each in value)}]"
+    if isinstance(value, float) and not math.isfinite(value):
+        return ".nan" if math.isnan(value) else ".inf" if value > 0 else "-.inf"
+    if isinstance(value, bool | int | float | str):
+        return json.dumps(value, ensure_ascii=False)  # is YAML, too
+    raise LocalError(f"parameter {key}: {value!r}: expected text, a number, a truth value or a list of such")

@@ -1,0 +1,53 @@
+"""The words of a launch file: ROS 2's own where ``launch`` and ``launch_ros`` are installed, else ours of that name.
+
+Place: shell; looks where packages lie and imports what is asked for. PyPI's ``launch`` is an unrelated project, so a
+package of that name counts only with ROS 2's files in it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from pathlib import Path
+from typing import Final
+
+__all__ = ["WORDS", "has_ros_launch", "word"]
+
+_OWN: Final = {"CloudMachine": "fog.launch.machines", "SpotMachine": "fog.launch.machines"}
+_EITHER: Final = {  # word -> where ours is, where ROS 2's is
+    "DeclareLaunchArgument": ("fog.launch.description", "launch.actions"),
+    "FogCluster": ("fog.launch.entity", "fog.launch.ros_action"),
+    "LaunchConfiguration": ("fog.launch.description", "launch.substitutions"),
+    "LaunchDescription": ("fog.launch.description", "launch"),
+    "Node": ("fog.launch.description", "launch_ros.actions"),
+}
+_FILES: Final = {"launch": "launch_description.py", "launch_ros": "actions/node.py"}
+
+WORDS: Final = sorted({*_OWN, *_EITHER})
+
+
+def has_ros_launch() -> bool:
+    """Return whether ROS 2's ``launch`` and ``launch_ros`` are installed; imports neither."""
+    return all(map(_has, _FILES))
+
+
+def word(name: str) -> object:
+    """Return what a launch file means by a word of ``WORDS``.
+
+    Raises:
+        AttributeError: it is none.
+    """
+    if name in _OWN:
+        module = _OWN[name]
+    elif name in _EITHER:
+        module = _EITHER[name][has_ros_launch()]
+    else:
+        raise AttributeError(f"module 'fog' has no attribute {name!r}")
+    found: object = getattr(importlib.import_module(module), name)
+    return found
+
+
+def _has(package: str) -> bool:
+    spec = importlib.util.find_spec(package)
+    places = spec.submodule_search_locations if spec else None
+    return any((Path(place) / _FILES[package]).is_file() for place in places or ())

@@ -1,0 +1,82 @@
+"""The verbs of ``ros2 fog``: each hands its words to the ``fog`` command, so that both are one.
+
+Place: command; imported by ros2cli through the entry points ``ros2cli.extension_point`` and ``fog.verb``.
+Source: ros2cli 0.32 (jazzy), ``ros2cli.plugin_system``.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from ros2cli.plugin_system import PLUGIN_SYSTEM_VERSION, satisfies_version
+
+__all__ = [
+    "CostVerb",
+    "DownVerb",
+    "LaunchVerb",
+    "LogsVerb",
+    "LsVerb",
+    "PlanVerb",
+    "ScaleVerb",
+    "SshVerb",
+    "StatusVerb",
+    "VerbExtension",
+]
+
+
+class VerbExtension:
+    """The extension point ``fog.verb``; ros2cli sets ``NAME`` to the entry point's."""
+
+    NAME: str | None = None
+    EXTENSION_POINT_VERSION = "0.1"
+
+    def __init__(self) -> None:
+        satisfies_version(PLUGIN_SYSTEM_VERSION, "^0.1")
+
+    def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:  # noqa: ARG002  # their call
+        """Take all words as they are, ``--help`` included: the ``fog`` command knows what they mean."""
+        parser.prefix_chars = "\0"  # so that no word counts as an option
+        parser.add_argument("words", nargs=argparse.REMAINDER)
+
+    def main(self, *, args: argparse.Namespace) -> int:
+        """Run ``fog NAME WORDS``; leaves with its exit code if that is not 0."""
+        from fog.cli.app import main
+
+        main([str(self.NAME), *args.words])
+        return 0
+
+
+class LaunchVerb(VerbExtension):
+    """Start what a launch file describes, the cluster first."""
+
+
+class LsVerb(VerbExtension):
+    """List clusters."""
+
+
+class StatusVerb(VerbExtension):
+    """Show a cluster's machines and what they serve."""
+
+
+class ScaleVerb(VerbExtension):
+    """Add or take away replicas while all runs."""
+
+
+class LogsVerb(VerbExtension):
+    """Show what a machine's programs wrote."""
+
+
+class SshVerb(VerbExtension):
+    """Open a shell on a machine."""
+
+
+class CostVerb(VerbExtension):
+    """Show what clusters cost."""
+
+
+class PlanVerb(VerbExtension):
+    """Compute how many replicas are needed, and their price."""
+
+
+class DownVerb(VerbExtension):
+    """Give all machines of a cluster back."""

@@ -1,0 +1,247 @@
+"""A site: whose domain and owner clusters are of, which robot uses them, and which provider has the machines.
+
+Place: shell. ``fog.yaml`` states it; without one a site of its own is made in the state folder::
+
+    state/  site.json                 its id: devices and runs carry it
+            domain/ owner/            keys, as gdp lab makes them
+            robot/                    what the robot's side boots: switch, RIB, proxy; keys of the supervisor's watch
+            journal.sqlite3  supervisor.*  site.lock
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+from pydantic import AfterValidator, Field
+
+from fog.agent.bundle import install
+from fog.enrolment.boots import RobotDevices, robot_boot
+from fog.enrolment.members import Authority
+from fog.providers.aws.config import AwsConfig
+from fog.providers.skypilot.config import SkyPilotConfig
+from fog.topology import AUTOMATIC, Gateway
+from gdp.crypto.certificates import Role
+from gdp.errors import LocalError
+from gdp.nodes.config import SwitchConfig
+from gdp.nodes.schema import Directory, ExistingFile, Ifname, Section, Unique, load, relative
+from gdp.stores.files import private, read_private, write_all
+from gdp.stores.issue import make_domain, make_node, make_owner
+
+__all__ = ["SCRATCH", "ProviderName", "Site", "SiteConfig", "open_site", "state_folder"]
+
+ProviderName = Literal["local", "aws", "skypilot"]
+
+_ID_BYTES: Final = 3
+_OWN_DAYS: Final = 3_650.0
+_SITE: Final = "site.json"
+SCRATCH: Final = "scratch"
+_FILE: Final = "fog.yaml"
+
+
+class SiteConfig(Section):
+    """``fog.yaml``."""
+
+    domain: Directory = Field(description="Directory of the trust domain, with its root key: admits machines.")
+    owner: Directory = Field(description="Directory of the owner of the names that clusters serve.")
+    robots: Annotated[tuple[ExistingFile, ...], Unique] = Field(
+        default=(), description="`proxy.yaml` of each robot that is to use clusters; they are given rules."
+    )
+    switch: ExistingFile | None = Field(
+        default=None, description="`switch.yaml` of the robot's switch: its `revocations` learn which machines are gone"
+    )
+    watch: Ifname | None = Field(
+        default=None, description="A name of that switch's `attach`: from there it is seen which replicas serve."
+    )
+    provider: ProviderName = Field(default="local", description="Where machines come from.")
+    aws: AwsConfig = Field(default=AwsConfig(), description="Of provider `aws`; see docs/providers.md.")
+    skypilot: SkyPilotConfig = Field(
+        default=SkyPilotConfig(), description="Of provider `skypilot`; see docs/providers.md."
+    )
+    machine_iface: Ifname = Field(default="eth0", description="A machine's device towards the overlay.")
+    uplink: Ifname | None = Field(
+        default=None, description="`local`: the port of the robot's switch that leads to the machines; it is made."
+    )
+    topology: Gateway = Field(
+        default=AUTOMATIC, description="`local`: the tree of gateways to the machines. Without it there is one."
+    )
+    state: Annotated[Path, AfterValidator(relative)] | None = Field(
+        default=None, description="Folder of the journal. Default: $FOG_STATE, else ~/.local/state/gdp-fog."
+    )
+    papers_days: float = Field(
+        default=7.0, gt=0, le=3_650, description="How long a machine's keys hold; it is replaced before they end."
+    )
+    idle_s: float | None = Field(default=None, gt=0, description="Default of a cluster's idle limit, in seconds.")
+    budget_usd: float | None = Field(default=None, gt=0, description="Default of a cluster's budget.")
+
+    @classmethod
+    def load(cls, path: Path) -> SiteConfig:
+        """Read ``fog.yaml``.
+
+        Raises:
+            ConfigError: every error of the file, each with line and column.
+        """
+        return load(cls, path)
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """A site as the commands and the supervisor use it.
+
+    Args:
+        id: six hex digits.
+        file: its ``fog.yaml``; None: it is its own.
+        robots: configuration files of proxies.
+        revocations: folder, and the switch's file that names it; None: nobody is told.
+        watch: directory of keys, and device; None: the provider's word is all there is.
+        devices: of the robot's side that the site runs itself.
+    """
+
+    id: str
+    state: Path
+    file: Path | None
+    authority: Authority
+    robots: tuple[Path, ...]
+    revocations: tuple[Path, Path] | None
+    watch: tuple[Path, str] | None
+    uplink: str
+    devices: RobotDevices | None = None
+    provider: ProviderName = "local"
+    aws: AwsConfig = field(default_factory=AwsConfig)
+    skypilot: SkyPilotConfig = field(default_factory=SkyPilotConfig)
+    topology: Gateway = AUTOMATIC
+    machine_iface: str = "eth0"
+    papers_days: float = 7.0
+    idle_s: float | None = None
+    budget_usd: float | None = None
+
+    @property
+    def robot(self) -> Path | None:
+        """Return the folder of the robot's side that the site runs itself."""
+        return None if self.file is not None else self.state / "robot"
+
+    @property
+    def journal(self) -> Path:
+        """Return the journal's file."""
+        return self.state / "journal.sqlite3"
+
+    @contextmanager
+    def locked(self, what: str = "site") -> Iterator[None]:
+        """Hold what only one process may do at a time; others wait."""
+        with (self.state / f"{what}.lock").open("a") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield
+
+
+def state_folder() -> Path:
+    """Return where a site is kept if nothing else is said."""
+    if given := os.environ.get("FOG_STATE"):
+        return Path(given).expanduser().absolute()
+    base = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
+    return Path(base).expanduser() / "gdp-fog"
+
+
+def open_site(file: Path | None, state: Path | None = None) -> Site:
+    """Return the site that a file states, or ``fog.yaml`` here, or else the one of its own; that is made if need be.
+
+    Raises:
+        ConfigError, LocalError: the file, keys or folders are not as they should be.
+    """
+    if file is None and state is None and Path(_FILE).is_file():
+        file = Path(_FILE)
+    config = SiteConfig.load(file) if file is not None else None
+    folder = (state or (config.state if config is not None else None) or state_folder()).absolute()
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise LocalError(f"{folder}: {error.strerror}") from error
+    with (folder / "site.lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        identifier = _identifier(folder)
+        (folder / SCRATCH).mkdir(mode=0o700, exist_ok=True)
+        if config is None or file is None:
+            return _own(folder, identifier)
+        return _stated(config, file.absolute(), folder, identifier)
+
+
+def _identifier(folder: Path) -> str:
+    path = folder / _SITE
+    if not path.exists():
+        write_all(folder, {_SITE: private(json.dumps({"id": secrets.token_hex(_ID_BYTES)}).encode())})
+    try:
+        return str(json.loads(read_private(path))["id"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise LocalError(f"{path}: not what fog wrote; with no cluster left, the folder may be deleted") from error
+
+
+def _own(folder: Path, identifier: str) -> Site:
+    authority = Authority(folder / "domain", folder / "owner", folder / SCRATCH)
+    name = f"fog{identifier}"
+    devices = RobotDevices(f"{name}-up", f"{name}p", f"{name}r", f"{name}w")
+    if not authority.domain.exists():
+        make_domain(authority.domain, name)
+    if not authority.owner.exists():
+        make_owner(authority.owner)
+    robot = folder / "robot"
+    if not (robot / "boot.json").exists():  # the last file to be written
+        _install_anew(robot, authority, devices)
+    return Site(
+        id=identifier,
+        state=folder,
+        file=None,
+        authority=authority,
+        robots=(robot / "proxy.yaml",),
+        revocations=(robot / "revocations", robot / "switch.yaml"),
+        watch=(robot / "watch", devices.watch),
+        uplink=devices.uplink,
+        devices=devices,
+    )
+
+
+def _install_anew(robot: Path, authority: Authority, devices: RobotDevices) -> None:
+    """Write the files of the robot's side, over what a killed attempt left."""
+    shutil.rmtree(robot, ignore_errors=True)
+    for folder in ("proxy/delegations", "watch/delegations", "revocations"):
+        (robot / folder).mkdir(mode=0o700, parents=True)
+    install(robot, robot_boot(authority, devices, days=_OWN_DAYS))
+
+
+def _stated(config: SiteConfig, file: Path, folder: Path, identifier: str) -> Site:
+    authority = Authority(config.domain.absolute(), config.owner.absolute(), folder / SCRATCH)
+    revocations = None
+    if config.switch is not None:
+        directory = SwitchConfig.load(config.switch).revocations
+        revocations = None if directory is None else (directory.absolute(), config.switch.absolute())
+    watch = None
+    if config.watch is not None:
+        keys = folder / "watch"
+        if not (keys / "node.card").exists():
+            make_node(keys, Role.PROXY, "supervisor", authority.domain, force=True)
+        (keys / "delegations").mkdir(mode=0o700, exist_ok=True)
+        watch = (keys, config.watch)
+    return Site(
+        id=identifier,
+        state=folder,
+        file=file,
+        authority=authority,
+        robots=tuple(path.absolute() for path in config.robots),
+        revocations=revocations,
+        watch=watch,
+        uplink=config.uplink or f"fog{identifier}-up",
+        provider=config.provider,
+        aws=config.aws,
+        skypilot=config.skypilot,
+        topology=config.topology,
+        machine_iface=config.machine_iface,
+        papers_days=config.papers_days,
+        idle_s=config.idle_s,
+        budget_usd=config.budget_usd,
+    )

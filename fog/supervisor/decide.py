@@ -1,0 +1,179 @@
+"""What to do next, from what is wanted and what there is.
+
+Place: pure. The same question may be asked at any time, and after any crash: the answer follows from the records alone.
+A machine that serves is let go only when as many others as are wanted serve, or when its time is over anyway.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from fog.cluster import Wanted
+from fog.supervisor.record import Ending, Record
+
+__all__ = ["Action", "Drain", "Launch", "Patience", "Release", "decide"]
+
+
+@dataclass(frozen=True, slots=True)
+class Patience:
+    """How long what may last, in seconds.
+
+    Args:
+        boot_s: from asking for a machine until its replica serves.
+        unheard_s: a replica that served is not heard, while another is.
+        lonely_s: the same while none is: then it is rather the way to all of them that is cut.
+        drain_s: from telling a machine to finish until it is given back.
+        release_s: until a machine that was given back and is still there is given back again.
+        papers_s: this long before its papers run out, another machine takes its place.
+    """
+
+    boot_s: float = 90.0
+    unheard_s: float = 1.0
+    lonely_s: float = 10.0
+    drain_s: float = 12.0
+    release_s: float = 5.0
+    papers_s: float = 1_800.0
+
+
+@dataclass(frozen=True, slots=True)
+class Launch:
+    """Ask for a machine."""
+
+    wanted: Wanted
+
+
+@dataclass(frozen=True, slots=True)
+class Drain:
+    """Tell a machine to finish what is under way."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Release:
+    """Give a machine back."""
+
+    name: str
+    reason: str
+    ending: Ending = Ending.RELEASED
+
+
+Action: TypeAlias = "Launch | Drain | Release"
+
+
+def decide(
+    wanted: Sequence[Wanted], records: Sequence[Record], now_s: float, patience: Patience, *, told: bool = True
+) -> list[Action]:
+    """Return what brings a cluster nearer to what is wanted.
+
+    Args:
+        wanted: one a machine; empty: all are given back at once.
+        records: of the cluster; those that are gone are of no account.
+        told: whether the overlay can be asked who serves; if not, a machine that is up counts as serving.
+    """
+    there = [record for record in records if not record.is_gone]
+    if not wanted:
+        return [
+            Release(each.name, "the cluster is down")
+            for each in there
+            if not each.is_released or now_s - (each.released_unix_s or now_s) >= patience.release_s
+        ]
+    view = _View(now_s, patience, told, any(_serves(each, told=told) for each in there))
+    actions: list[Action] = []
+    fit: list[Record] = []  # to stay, if wanted
+    leaving: list[Record] = []  # serve on until others do, or their time is over
+    for each in there:
+        if (ended := view.ended(each)) is not None:
+            actions.append(ended)
+        elif each.is_released or each.drained_unix_s is not None:
+            continue
+        elif each.noticed_unix_s is not None or view.is_old(each):
+            leaving.append(each)
+        else:
+            fit.append(each)
+    fit.sort(key=lambda each: (not view.serves(each), each.up_unix_s is None, each.asked_unix_s))
+    kept, missing = _match(wanted, fit)
+    actions += [Launch(each) for each in missing]
+    spare = [each for each in fit if each not in kept]
+    owed = len(wanted) - sum(view.serves(each) for each in kept)  # how many more should serve
+    for each in [*spare, *sorted(leaving, key=lambda each: -(each.leaves_at_unix_s or now_s))]:
+        why = each.reason if each.noticed_unix_s is not None else "another took its place"
+        if not view.serves(each):
+            actions.append(Release(each.name, why if each in leaving else "not needed"))
+        elif owed > 0 and not view.is_due(each):
+            owed -= 1
+        else:
+            actions.append(Drain(each.name, why if each in leaving else "not needed"))
+    return actions
+
+
+def _serves(record: Record, *, told: bool) -> bool:
+    return record.is_serving if told else record.is_serving or record.up_unix_s is not None
+
+
+@dataclass(frozen=True, slots=True)
+class _View:
+    """A look at machines, one by one."""
+
+    now_s: float
+    patience: Patience
+    told: bool
+    is_any_serving: bool
+
+    def serves(self, record: Record) -> bool:
+        return _serves(record, told=self.told)
+
+    def is_old(self, record: Record) -> bool:
+        return record.papers.until_unix_s - self.patience.papers_s <= self.now_s
+
+    def is_due(self, record: Record) -> bool:
+        """Return whether half of the notice is over: what is under way needs the rest."""
+        if record.noticed_unix_s is None or record.leaves_at_unix_s is None:
+            return record.papers.until_unix_s <= self.now_s
+        return self.now_s >= (record.noticed_unix_s + record.leaves_at_unix_s) / 2
+
+    def ended(self, record: Record) -> Release | None:
+        """Return how to let go of what is to serve no more."""
+        limit, now_s = self.patience, self.now_s
+        if record.released_unix_s is not None:
+            is_late = now_s - record.released_unix_s >= limit.release_s
+            return Release(record.name, record.reason, record.ending or Ending.RELEASED) if is_late else None
+        if record.drained_unix_s is not None:
+            is_done = now_s - record.drained_unix_s >= limit.drain_s
+            return Release(record.name, record.reason) if is_done else None
+        if not self.told:
+            return None
+        if record.served_unix_s is None:
+            is_late = now_s - record.asked_unix_s >= limit.boot_s
+            return Release(record.name, "did not serve in time", Ending.FAILED) if is_late else None
+        since_s = record.unheard_unix_s
+        patience_s = limit.unheard_s if self.is_any_serving else limit.lonely_s
+        if since_s is not None and now_s - since_s >= patience_s:
+            return Release(record.name, "its replica is not heard any more", Ending.TAKEN)
+        return None
+
+
+def _match(wanted: Sequence[Wanted], fit: Sequence[Record]) -> tuple[list[Record], list[Wanted]]:
+    """Return the machines that do for what is wanted, the best first, and what is missing.
+
+    A region counts for nothing here: where a machine was taken, its successor is elsewhere.
+    """
+    open_, kept = list(wanted), list[Record]()
+    for is_same in (True, False):
+        for record in fit:
+            if record in kept:
+                continue
+            for each in open_:
+                if record.wanted == each if is_same else _does(record, each):
+                    open_.remove(each)
+                    kept.append(record)
+                    break
+    return kept, open_
+
+
+def _does(record: Record, wanted: Wanted) -> bool:
+    offer = record.spec.offer
+    return wanted.hardware.fits(offer.hardware) and offer.is_spot == wanted.is_spot

@@ -1,0 +1,226 @@
+"""The journal: what is wanted, which machines there are, and what happened, in one SQLite file.
+
+Place: I/O. An intention is written before the act; whatever dies in between, the next look finds the machine by name.
+Commands write what is wanted, the supervisor everything else; both may have the file open at once.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass, replace
+from enum import Enum
+from pathlib import Path
+from typing import Final
+
+from fog.cluster import ClusterPlan, Wanted
+from fog.hardware import Hardware
+from fog.machine import MachineSpec, MachineState
+from fog.offer import Offer
+from fog.supervisor.record import Ending, Papers, Record
+from gdp.errors import LocalError, StoreError
+
+__all__ = ["Cluster", "Entry", "Journal"]
+
+_PATIENCE_S: Final = 10.0  # for another process that is writing
+_EVENTS_MAX: Final = 10_000  # older ones go
+_TABLES: Final = """
+CREATE TABLE IF NOT EXISTS clusters (
+  name TEXT PRIMARY KEY, plan TEXT NOT NULL, is_up INTEGER NOT NULL, why TEXT NOT NULL,
+  begun_unix_s REAL NOT NULL, machines INTEGER NOT NULL DEFAULT 0
+) STRICT;
+CREATE TABLE IF NOT EXISTS machines (
+  cluster TEXT NOT NULL, name TEXT NOT NULL, is_gone INTEGER NOT NULL, record TEXT NOT NULL,
+  PRIMARY KEY (cluster, name)
+) STRICT;
+CREATE TABLE IF NOT EXISTS events (
+  id INTEGER PRIMARY KEY AUTOINCREMENT, unix_s REAL NOT NULL, cluster TEXT NOT NULL, machine TEXT NOT NULL,
+  what TEXT NOT NULL, detail TEXT NOT NULL
+) STRICT;
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Cluster:
+    """What is wanted of a cluster.
+
+    Args:
+        is_up: whether its machines are wanted at all.
+        why: it is not up, in a few words.
+        begun_unix_s: since when, for what it costs and how long it has been idle.
+    """
+
+    plan: ClusterPlan
+    is_up: bool
+    why: str
+    begun_unix_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """Something that happened. ``machine`` is empty where it is about the whole cluster."""
+
+    id: int
+    unix_s: float
+    cluster: str
+    machine: str
+    what: str
+    detail: str
+
+
+class Journal:
+    """The file, opened. Every method is one transaction.
+
+    Raises:
+        StoreError: it cannot be read or written now; from every method, too.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with _translated(path):
+            self._file = sqlite3.connect(path, timeout=_PATIENCE_S, isolation_level=None, check_same_thread=False)
+            self._file.execute("PRAGMA journal_mode=WAL")
+            self._file.execute("PRAGMA synchronous=NORMAL")
+            self._file.executescript(_TABLES)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def want(self, plan: ClusterPlan, now_s: float, *, why: str = "") -> None:
+        """Write that a cluster is wanted; one of that name that is up gets the new plan and goes on."""
+        with self._writing() as file:
+            file.execute(
+                "INSERT INTO clusters (name, plan, is_up, why, begun_unix_s) VALUES (?, ?, 1, '', ?)"
+                " ON CONFLICT (name) DO UPDATE SET plan = excluded.plan, why = '',"
+                " begun_unix_s = iif(is_up, begun_unix_s, excluded.begun_unix_s), is_up = 1",
+                (plan.name, plan.to_json(), now_s),
+            )
+            _tell(file, now_s, plan.name, "", "wanted", why or f"{len(plan.machines)} machines")
+
+    def unwant(self, name: str, why: str, now_s: float) -> None:
+        """Write that a cluster is wanted no more; one that is not up already stays as it is."""
+        with self._writing() as file:
+            if file.execute(
+                "UPDATE clusters SET is_up = 0, why = ? WHERE name = ? AND is_up = 1", (why, name)
+            ).rowcount:
+                _tell(file, now_s, name, "", "down", why)
+
+    def clusters(self) -> list[Cluster]:
+        """Return all clusters that there are or were, in the order of their names."""
+        with _translated(self._path):
+            rows = self._file.execute("SELECT plan, is_up, why, begun_unix_s FROM clusters ORDER BY name").fetchall()
+        return [Cluster(ClusterPlan.from_json(plan), bool(is_up), why, begun) for plan, is_up, why, begun in rows]
+
+    def cluster(self, name: str) -> Cluster:
+        """Return a cluster.
+
+        Raises:
+            LocalError: there is none of that name.
+        """
+        found = {each.plan.name: each for each in self.clusters()}
+        if name not in found:
+            known = f"there are {', '.join(found)}" if found else "there is none"
+            raise LocalError(f"no cluster is called {name}: {known}")
+        return found[name]
+
+    def next_machine(self, cluster: str) -> str:
+        """Return a name that no machine of the cluster ever had."""
+        with self._writing() as file:
+            (number,) = file.execute(
+                "UPDATE clusters SET machines = machines + 1 WHERE name = ? RETURNING machines", (cluster,)
+            ).fetchone()
+        return f"m{number}"
+
+    def put(self, record: Record, now_s: float, what: str = "", detail: str = "") -> None:
+        """Write what is known of a machine, and with it, if given, what happened."""
+        spec = record.spec
+        with self._writing() as file:
+            file.execute(
+                "INSERT OR REPLACE INTO machines (cluster, name, is_gone, record) VALUES (?, ?, ?, ?)",
+                (spec.cluster, spec.name, record.is_gone, json.dumps(asdict(record), default=_plain)),
+            )
+            if what:
+                _tell(file, now_s, spec.cluster, spec.name, what, detail)
+
+    def machines(self, cluster: str, *, gone: bool = True) -> list[Record]:
+        """Return the machines of a cluster in the order in which they were asked for.
+
+        Args:
+            gone: those that are no more as well.
+        """
+        query = "SELECT record FROM machines WHERE cluster = ?" + ("" if gone else " AND is_gone = 0")
+        with _translated(self._path):
+            rows = self._file.execute(query, (cluster,)).fetchall()
+        return sorted((_record(json.loads(row)) for (row,) in rows), key=lambda each: int(each.name[1:]))
+
+    def tell(self, now_s: float, cluster: str, machine: str, what: str, detail: str = "") -> None:
+        """Write that something happened."""
+        with self._writing() as file:
+            _tell(file, now_s, cluster, machine, what, detail)
+
+    def events(self, cluster: str = "", after: int = 0, last: int | None = None) -> list[Entry]:
+        """Return what happened, the oldest first.
+
+        Args:
+            cluster: empty: to any.
+            after: the id of the last one that is known.
+            last: only so many of the newest.
+        """
+        query = (
+            "SELECT id, unix_s, cluster, machine, what, detail FROM events"
+            " WHERE id > ? AND (? = '' OR cluster = ?) ORDER BY id DESC LIMIT ?"
+        )
+        with _translated(self._path):
+            rows = self._file.execute(query, (after, cluster, cluster, -1 if last is None else last)).fetchall()
+        return [Entry(*row) for row in reversed(rows)]
+
+    @contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        with _translated(self._path):
+            self._file.execute("BEGIN IMMEDIATE")
+            with self._file:  # commits, or rolls back
+                yield self._file
+
+
+def _tell(file: sqlite3.Connection, now_s: float, cluster: str, machine: str, what: str, detail: str) -> None:
+    with closing(file.cursor()) as cursor:
+        cursor.execute(
+            "INSERT INTO events (unix_s, cluster, machine, what, detail) VALUES (?, ?, ?, ?, ?)",
+            (now_s, cluster, machine, what, detail),
+        )
+        cursor.execute("DELETE FROM events WHERE id <= ?", ((cursor.lastrowid or 0) - _EVENTS_MAX,))
+
+
+@contextmanager
+def _translated(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except sqlite3.Error as error:
+        raise StoreError(f"{path}: {error}") from error
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, Enum):
+        return value.value
+    raise TypeError(f"not for the journal: {value!r}")
+
+
+def _record(items: dict[str, object]) -> Record:
+    match items:
+        case {"spec": dict(spec), "wanted": dict(wanted), "papers": dict(papers), **rest}:
+            offer = spec["offer"]
+            return replace(
+                Record(**{**rest, "spec": None, "wanted": None, "papers": None}),  # type: ignore[arg-type]
+                spec=MachineSpec(
+                    spec["cluster"], spec["name"], Offer(**{**offer, "hardware": Hardware(**offer["hardware"])})
+                ),
+                wanted=Wanted(Hardware(**wanted["hardware"]), wanted["region"], wanted["is_spot"]),
+                papers=Papers(papers["proxy"], papers["until_unix_s"], tuple(papers["fingerprints"])),
+                state=MachineState(rest["state"]),
+                ending=None if rest["ending"] is None else Ending(rest["ending"]),
+            )
+    raise StoreError("a machine in the journal that cannot be read")

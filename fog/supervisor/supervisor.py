@@ -1,0 +1,324 @@
+"""The supervisor: looks, learns, decides, acts, again and again. It carries no application data.
+
+Place: shell. What it must not forget is in the journal before it acts; what it forgets it sees again.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Final, TypeAlias
+
+from fog.cluster import CloudNode, ClusterPlan, Wanted
+from fog.enrolment.boots import PROXY, machine_boot
+from fog.enrolment.members import metadata_of
+from fog.enrolment.revoking import take_back
+from fog.enrolment.robot_side import forget_rules, introduce, reload
+from fog.machine import Machine, MachineSpec, MachineState
+from fog.offer import Offer
+from fog.providers.provider import Provider
+from fog.site import Site
+from fog.supervisor.activity import Activity, requests_in
+from fog.supervisor.acts import Acts
+from fog.supervisor.decide import Action, Drain, Launch, Patience, decide
+from fog.supervisor.journal import Cluster, Journal
+from fog.supervisor.place import place
+from fog.supervisor.record import Ending, Record, cost_usd, learn
+from fog.supervisor.story import changes
+from gdp.errors import GdpError, LocalError
+from gdp.stores.keyring import load_public_key
+
+__all__ = ["Heard", "Supervisor"]
+
+log = logging.getLogger(__name__)
+
+Heard: TypeAlias = "Mapping[str, frozenset[str]]"  # service -> proxies that serve it, each 64 hex digits
+
+_ACTIVITY_S: Final = 2.0  # between questions about it
+_OFFERS_S: Final = 60.0  # a price list holds
+_GRACE_POLLS: Final = 5  # looks in which a new machine may be missing
+_GRACE_MIN_S: Final = 2.0
+_LOG_LINES: Final = 20
+_ROBOT_DAYS: Final = 365.0
+PATIENCE: Final = Patience()
+
+
+class Supervisor:
+    """Keeps the clusters of a site as they are wanted.
+
+    Args:
+        command: how a node is started on a machine.
+        heard: what the overlay says of who serves; None: it cannot be asked.
+        on_names: called when the watch is to know more names.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        journal: Journal,
+        provider: Provider,
+        command: Callable[[CloudNode], Sequence[str]],
+        heard: Callable[[], Heard | None],
+        on_names: Callable[[], None] = lambda: None,
+        patience: Patience = PATIENCE,
+    ) -> None:
+        self._site = site
+        self._journal = journal
+        self._provider = provider
+        self._command = command
+        self._heard = heard
+        self._on_names = on_names
+        self._patience = patience
+        self._grace_s = max(_GRACE_POLLS * provider.poll_s, _GRACE_MIN_S)
+        self._woken = threading.Event()
+        self._acts = Acts(self._woken.set)
+        self._offers: dict[Wanted, tuple[float, list[Offer]]] = {}
+        self._activities: dict[str, Activity] = {}
+        self._asked_s: dict[str, float] = {}  # when activity was last asked about
+        self._plans: dict[str, ClusterPlan] = {}  # those that the robot's side knows
+        self._settled: set[str] = set()  # down, and nothing is left of them
+        self._swept: set[str] = set()  # machines of which nothing is left
+        self._troubles: dict[str, str] = {}  # told once
+        self._owner_key = load_public_key(site.authority.owner_key).compressed
+
+    @property
+    def is_done(self) -> bool:
+        """Return whether nothing is wanted and nothing is left."""
+        return all(not each.is_up and each.plan.name in self._settled for each in self._journal.clusters())
+
+    def use(self, provider: Provider) -> None:
+        """Ask another adapter of the same provider from now on, such as one that offers more regions."""
+        self._provider = provider
+        self._offers.clear()
+
+    def wake(self) -> None:
+        """Have ``wait`` return at once; from any thread."""
+        self._woken.set()
+
+    def wait(self) -> None:
+        """Return when it is time for the next look."""
+        self._woken.wait(self._provider.poll_s)
+        self._woken.clear()
+
+    def close(self) -> None:
+        """Wait for what is being done, and write it down; machines stay."""
+        self._acts.close()
+        self._harvest(time.time())
+
+    def look(self) -> None:
+        """Look at every cluster once, and do what is to be done.
+
+        Raises:
+            StoreError: the journal cannot be read or written.
+        """
+        self._harvest(time.time())
+        for cluster in self._journal.clusters():
+            name = cluster.plan.name
+            if cluster.is_up:
+                self._settled.discard(name)
+            elif name in self._settled:
+                continue
+            try:
+                self._tend(cluster)
+                self._troubles.pop(name, None)
+            except GdpError as error:
+                self._trouble(name, str(error))
+
+    def _tend(self, cluster: Cluster) -> None:
+        plan = cluster.plan
+        if cluster.is_up and self._plans.get(plan.name) != plan:
+            self._introduce(plan)
+        seen = {each.spec.name: each for each in self._provider.describe(plan.name)}
+        heard, now_s = self._heard(), time.time()
+        names = [] if self._site.watch is None else _services(plan, self._owner_key)
+        records = self._learn(plan, names, seen, heard, now_s)
+        self._end_orphans(plan.name, records, seen, now_s)
+        if cluster.is_up and (why := self._limit(cluster, records, now_s)):
+            self._journal.unwant(plan.name, why, now_s)
+            self.wake()
+            return
+        wanted = plan.machines if cluster.is_up else ()
+        for action in decide(wanted, records, now_s, self._patience, told=not names or heard is not None):
+            self._do(plan, action, records, now_s)
+        if not cluster.is_up and all(each.is_gone for each in records) and not self._acts.is_busy(plan.name):
+            self._forget(plan.name)
+
+    def _learn(
+        self,
+        plan: ClusterPlan,
+        names: Sequence[str],
+        seen: Mapping[str, Machine],
+        heard: Heard | None,
+        now_s: float,
+    ) -> list[Record]:
+        records = []
+        for before in self._journal.machines(plan.name, gone=False):
+            after, machine = before, seen.get(before.name)
+            if before.id or not self._acts.is_busy(plan.name, before.name):
+                serves = None if heard is None else all(before.papers.proxy in heard.get(each, ()) for each in names)
+                if not names:  # of topics nobody asks: a machine that is up does what it is for
+                    serves = machine is not None and machine.state is not MachineState.BOOTING
+                after = learn(before, machine, serves, now_s, grace_s=self._grace_s)
+            for what, detail in changes(before, after, now_s):
+                self._put(after, what, detail, now_s)
+            if after.is_gone and not before.is_gone:
+                self._revoke(after, now_s)
+            elif after != before:
+                self._put(after, "", "", now_s)
+            records.append(after)
+        return records
+
+    def _do(self, plan: ClusterPlan, action: Action, records: list[Record], now_s: float) -> None:
+        if isinstance(action, Launch):
+            self._launch(plan, action.wanted, records, now_s)
+            return
+        (record,) = (each for each in records if each.name == action.name)
+        if self._acts.is_busy(plan.name, record.name):
+            return
+        if isinstance(action, Drain):
+            known = replace(record, drained_unix_s=now_s, reason=action.reason)
+            self._put(known, "draining", action.reason, now_s)
+            self._acts.begin(plan.name, record.name, "drain", partial(self._provider.drain, record.id))
+        elif not record.id:
+            self._put(record.ended(action.ending, action.reason, now_s), action.ending.value, action.reason, now_s)
+        else:
+            known = replace(record, released_unix_s=now_s, ending=action.ending, reason=action.reason)
+            self._put(known, "leaving", action.reason, now_s)
+            self._revoke(known, now_s)
+            self._acts.begin(plan.name, record.name, "release", partial(self._provider.terminate, [record.id]))
+
+    def _launch(self, plan: ClusterPlan, wanted: Wanted, records: list[Record], now_s: float) -> None:
+        begun_s = self._journal.cluster(plan.name).begun_unix_s
+        past = [each for each in self._journal.machines(plan.name) if each.is_gone and each.asked_unix_s >= begun_s]
+        choice = place(wanted, self._offered(wanted, now_s), [*past, *records], now_s)
+        resting = f"{plan.name} rests"
+        if choice is None:
+            self._trouble(plan.name, "machines fail one after another: it is too early to ask again", key=resting)
+            return
+        self._troubles.pop(resting, None)
+        offer = choice.offer
+        spec = MachineSpec(plan.name, self._journal.next_machine(plan.name), offer)
+        boot, papers = machine_boot(
+            self._site.authority,
+            plan,
+            spec.name,
+            self._command,
+            iface=self._site.machine_iface,
+            days=self._site.papers_days,
+            shares_host=self._provider.name == "local",
+        )
+        record = Record(spec, wanted, papers, now_s)
+        records.append(record)
+        detail = f"{offer.region} {offer.type_name}, {offer.usd_per_hour:.4f} USD an hour: {choice.why}"
+        self._put(record, "asked", detail, now_s)
+        self._acts.begin(plan.name, spec.name, "create", partial(self._provider.create, spec, boot))
+
+    def _offered(self, wanted: Wanted, now_s: float) -> list[Offer]:
+        at_s, offers = self._offers.get(wanted, (0.0, []))
+        if now_s - at_s >= _OFFERS_S or not offers:
+            offers = self._provider.offers(wanted.hardware, spot=wanted.is_spot)
+            self._offers[wanted] = now_s, offers
+        return offers
+
+    def _harvest(self, now_s: float) -> None:
+        """Write down what became of acts."""
+        for done in self._acts.take_done():
+            if done.what == "create":
+                record = next(each for each in self._journal.machines(done.cluster) if each.name == done.machine)
+                if done.error is not None:
+                    reason = str(done.error)
+                    self._put(record.ended(Ending.FAILED, reason, now_s), "refused", reason, now_s)
+                elif not record.is_gone:
+                    self._put(replace(record, id=done.result), "", "", now_s)
+            elif done.error is not None:
+                self._journal.tell(now_s, done.cluster, done.machine, "trouble", f"{done.what}: {done.error}")
+
+    def _end_orphans(self, cluster: str, records: Sequence[Record], seen: Mapping[str, Machine], now_s: float) -> None:
+        """Give back what the journal does not know, or thought gone; and what is left of a machine that is gone."""
+        known = {each.name for each in records if not each.is_gone}
+        for name, machine in seen.items():
+            if name in known or machine.id in self._swept or self._acts.is_busy(cluster, name):
+                continue
+            if machine.state is MachineState.GONE:
+                self._swept.add(machine.id)
+            else:
+                self._journal.tell(now_s, cluster, name, "orphan", "nobody wants it: given back")
+            self._acts.begin(cluster, name, "release", partial(self._provider.terminate, [machine.id]))
+
+    def _limit(self, cluster: Cluster, records: Sequence[Record], now_s: float) -> str:
+        """Return which limit of the cluster is reached; empty: none."""
+        plan = cluster.plan
+        if plan.budget_usd is not None:
+            ours = (each for each in self._journal.machines(plan.name) if each.asked_unix_s >= cluster.begun_unix_s)
+            spent = sum(cost_usd(each, now_s) for each in ours)
+            if spent >= plan.budget_usd:
+                return f"its budget is spent: {spent:.2f} of {plan.budget_usd:.2f} USD"
+        if plan.idle_s is None or now_s - self._asked_s.get(plan.name, 0.0) < _ACTIVITY_S:
+            return ""
+        self._asked_s[plan.name] = now_s
+        counts = {each.name: self._requests(each) for each in records if each.is_serving}
+        idle_s = self._activities.setdefault(plan.name, Activity(now_s)).idle_s(counts, now_s)
+        return f"not called for {idle_s:.0f} s" if idle_s >= plan.idle_s else ""
+
+    def _requests(self, record: Record) -> int | None:
+        try:
+            return requests_in(self._provider.log(record.id, PROXY, _LOG_LINES))
+        except GdpError:
+            return None  # it may have ended this very moment; the next look knows
+
+    def _introduce(self, plan: ClusterPlan) -> None:
+        """Tell the robot's side, and the watch, what the cluster serves."""
+        authority = self._site.authority
+        for path in self._site.robots:
+            introduce(path, authority, plan.name, plan.carried, days=_ROBOT_DAYS)
+            reload(path)
+        if self._site.watch is not None:
+            keys, _ = self._site.watch
+            services = [each for each in plan.carried if each.kind != "topic"]
+            authority.let(keys, keys / "delegations", services, days=_ROBOT_DAYS)
+            self._on_names()
+        self._plans[plan.name] = plan
+
+    def _forget(self, name: str) -> None:
+        """Take from the robot's side what a cluster served that is no more; others may serve the same names."""
+        self._settled.add(name)
+        self._plans.pop(name, None)
+        self._activities.pop(name, None)
+        for path in self._site.robots:
+            if forget_rules(path, name):
+                for plan in self._plans.values():
+                    introduce(path, self._site.authority, plan.name, plan.carried, days=_ROBOT_DAYS)
+                reload(path)
+
+    def _revoke(self, record: Record, now_s: float) -> None:
+        if self._site.revocations is None:
+            return
+        folder, switch = self._site.revocations
+        papers = record.papers
+        domain = self._site.authority.domain
+        try:
+            if take_back(domain, folder, papers.fingerprints, until_unix_s=papers.until_unix_s, unix_s=now_s):
+                reload(switch)
+        except LocalError as error:
+            self._journal.tell(now_s, record.spec.cluster, record.name, "trouble", f"not revoked: {error}")
+
+    def _put(self, record: Record, what: str, detail: str, now_s: float) -> None:
+        self._journal.put(record, now_s, what, detail)
+        if what:
+            log.info("machine %s cluster=%s machine=%s %s", what, record.spec.cluster, record.name, detail)
+
+    def _trouble(self, cluster: str, reason: str, *, key: str = "") -> None:
+        """Tell what is wrong with a cluster, once."""
+        if self._troubles.get(key or cluster) != reason:
+            self._troubles[key or cluster] = reason
+            self._journal.tell(time.time(), cluster, "", "trouble", reason)
+            log.warning("trouble cluster=%s reason=%s", cluster, reason)
+
+
+def _services(plan: ClusterPlan, owner_key: bytes) -> list[str]:
+    """Return the overlay's names of what can be called."""
+    return [metadata_of(each).name(owner_key).to_text() for each in plan.carried if each.kind != "topic"]

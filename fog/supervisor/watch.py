@@ -1,0 +1,128 @@
+"""Who serves, as the overlay itself tells: a light member beside the robot's switch that would call every service.
+
+Place: shell; a thread of its own drives it. It asks nothing and is answered nothing; of an action's feedback it hears
+what any client does. Whom it hears, the robot's proxy hears as well: both learn it from the same switch and RIB.
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Final
+
+from gdp.client.member import Member
+from gdp.control.settings import NodeSettings
+from gdp.crypto.certificates import Role
+from gdp.errors import GdpError
+from gdp.names import Name
+from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
+from gdp.nodes.runtime import Runtime
+from gdp.nodes.schema import Domain
+from gdp.ports.raw import RawPlane
+from gdp.stores.keyring import DELEGATIONS, ROOT_CERTIFICATE
+from gdp.trust.right import Right
+from proxy.held import Held
+
+__all__ = ["Watch"]
+
+log = logging.getLogger(__name__)
+
+_STEP_S: Final = 0.05
+_AGAIN_S: Final = 0.5
+_SETTLED_S: Final = 3.0  # after it is attached, until silence means something
+
+
+class Watch:
+    """Looks from a device that the robot's switch made, with the keys in a folder.
+
+    Args:
+        identity: a proxy's directory with delegations to call.
+        iface: the device.
+    """
+
+    def __init__(self, identity: Path, iface: str) -> None:
+        self._identity = identity
+        self._iface = iface
+        self._lock = threading.Lock()
+        self._heard: Mapping[str, frozenset[str]] | None = None
+        self._again = threading.Event()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._keep, name="watch", daemon=True)
+        self._thread.start()
+
+    def heard(self) -> Mapping[str, frozenset[str]] | None:
+        """Return by service (64 hex digits) the proxies that serve it now; None: the overlay cannot be asked."""
+        with self._lock:
+            return self._heard
+
+    def reload(self) -> None:
+        """Read the delegations again."""
+        self._again.set()
+
+    def close(self) -> None:
+        """Leave the overlay."""
+        self._ended.set()
+        self._thread.join()
+
+    def _keep(self) -> None:
+        """Look, and begin anew where that fails: the robot's switch may come later, or again."""
+        told = ""
+        while not self._ended.is_set():
+            try:
+                self._look()
+            except (GdpError, OSError) as error:
+                if str(error) != told:
+                    log.warning("the overlay cannot be asked reason=%s", error)
+                    told = str(error)
+            finally:
+                self._tell(None)  # what was heard before is worth nothing now
+            self._ended.wait(_AGAIN_S)
+
+    def _look(self) -> None:
+        domain = Domain(root=self._identity / ROOT_CERTIFICATE, transit=None)
+        identity, policy = load_member(self._identity, domain, Role.PROXY)
+        member = Member(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes))
+        plane = RawPlane([self._iface])
+        try:
+            runtime = Runtime(member, plane)
+            called = self._call(member, Held(self._identity / DELEGATIONS, identity), [])
+            attached_s: float | None = None
+            while not self._ended.is_set() and any(port.up for port in plane.ports.values()):
+                if self._again.is_set():
+                    self._again.clear()
+                    called = self._call(member, Held(self._identity / DELEGATIONS, identity), called)
+                runtime.step(time.monotonic() + _STEP_S)
+                member.take_messages()
+                if not member.attachment.is_attached:
+                    attached_s = None
+                elif attached_s is None:
+                    attached_s = time.monotonic()
+                peers = {name.to_text(): frozenset(each.to_text() for each in member.peers(name)) for name in called}
+                is_told = attached_s is not None and (
+                    all(peers.values()) or time.monotonic() - attached_s >= _SETTLED_S
+                )
+                self._tell(peers if is_told else None)
+            member.leave()
+            runtime.send()
+        finally:
+            plane.close()
+
+    def _call(self, member: Member, held: Held, before: Iterable[Name]) -> list[Name]:
+        topics = {topic.name: topic for topic in held if Right.CALL in topic.delegation.rights}
+        for name in before:
+            if name not in topics:
+                member.withdraw(name)
+        for name, topic in topics.items():
+            if name in before:
+                member.renew(topic)
+            else:
+                member.call(topic, b"", is_global=False)
+        return list(topics)
+
+    def _tell(self, heard: Mapping[str, frozenset[str]] | None) -> None:
+        with self._lock:
+            self._heard = heard

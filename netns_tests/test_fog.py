@@ -1,0 +1,146 @@
+"""The ``fog`` command with real machines, switches, proxies and ROS nodes: launch, trouble, scale, down."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from netns_tests.local_site import PATIENCE_S
+from netns_tests.spaces import Space
+from tests.pages import ROOT
+
+pytestmark = pytest.mark.netns
+pytest.importorskip("rclpy", reason="needs the extra ros2")
+_LAUNCH = ROOT / "examples" / "echo.launch.py"
+_MACHINES_S = 3 * PATIENCE_S
+
+
+class Fog:
+    """The command with a state folder of its own, run in the namespace of the test."""
+
+    def __init__(self, state: Path) -> None:
+        self.state = state
+        self.environment = {
+            **os.environ,
+            "FOG_STATE": str(state),
+            "ROS_DOMAIN_ID": "171",
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
+            "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
+            "PYTHONPATH": str(ROOT),
+        }
+
+    def run(self, *words: str) -> str:
+        done = subprocess.run(
+            [sys.executable, "-m", "fog.cli.app", *words],
+            env=self.environment,
+            cwd=self.state.parent,
+            capture_output=True,
+            text=True,
+            timeout=_MACHINES_S,
+            check=False,
+        )
+        assert done.returncode == 0, f"fog {' '.join(words)}: {done.stdout}{done.stderr}{self.log()}"
+        return done.stdout
+
+    def log(self) -> str:
+        path = self.state / "supervisor.log"
+        return path.read_text() if path.exists() else ""
+
+    def status(self) -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(self.run("status", "--json"))
+        return found
+
+    def serving(self) -> list[str]:
+        return [each["name"] for each in self.status()["members"] if each["serving"]]
+
+    def until(self, is_met: Callable[[], object], what: str) -> None:
+        end_s = time.monotonic() + _MACHINES_S
+        while not is_met():
+            assert time.monotonic() < end_s, f"{what}: {self.log()}"
+            time.sleep(0.1)
+
+
+@pytest.fixture
+def fog(tmp_path: Path, space: Space) -> Iterator[Fog]:
+    subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
+    made = Fog(tmp_path / "state")
+    yield made
+    made.run("down", "--all")
+
+
+def test_calls_go_on_while_machines_are_taken_and_killed_and_the_supervisor_is(fog: Fog) -> None:
+    fog.run("launch", str(_LAUNCH), "--detach")
+    words = ["-m", "fog.demo.caller", "--ros-args", "-p", "rate_hz:=20.0"]
+    caller = subprocess.Popen(
+        [sys.executable, *words], env=fog.environment, cwd=fog.state.parent, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert caller.stdout is not None
+        while not json.loads(caller.stdout.readline())["answered"]:
+            pass
+        first, second = fog.serving()
+        os.kill(fog.status()["supervisor_pid"], signal.SIGKILL)
+        fog.run("local", "kill", first)  # nobody looks
+        fog.until(lambda: len({*fog.serving()} - {first}) == 2, "a killed machine is replaced")
+        fog.run("local", "notice", second, "--seconds", "5")
+        fog.until(lambda: len({*fog.serving()} - {first, second}) == 2, "a machine with notice is replaced")
+        caller.send_signal(signal.SIGINT)
+        last = json.loads(caller.communicate(timeout=PATIENCE_S)[0].splitlines()[-1])
+        assert last["done"]
+        assert last["failed"] == last["wrong"] == last["unserved"] == 0
+    finally:
+        caller.kill()
+        caller.wait()
+    what = [json.loads(line)["what"] for line in fog.run("status", "--events", "--json", "-n", "200").splitlines()]
+    assert {"taken", "notice", "draining"} <= set(what)
+    fog.run("scale", "down")
+    fog.until(lambda: len(fog.status()["members"]) == 1, "one replica is let go")
+    fog.run("down")
+    assert json.loads(fog.run("ls", "--json")) == []
+    assert not _left(fog)
+
+
+def test_down_ends_everything_though_launch_and_supervisor_were_killed_and_the_journal_is_gone(fog: Fog) -> None:
+    launch = subprocess.Popen(
+        [sys.executable, "-m", "fog.cli.app", "launch", str(_LAUNCH), "--json"],
+        env=fog.environment,
+        cwd=fog.state.parent,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert launch.stdout is not None
+    for line in launch.stdout:
+        if '"asked"' in line:
+            break
+    launch.kill()
+    launch.communicate()
+    pid = int((fog.state / "supervisor.lock").read_text())
+    fog.until(lambda: list((fog.state / "local").glob("*.json")), "a machine is begun")
+    os.kill(pid, signal.SIGKILL)
+    for path in fog.state.glob("journal.sqlite3*"):
+        path.unlink()
+    fog.run("down", "--all")
+    assert not _left(fog)
+
+
+def _left(fog: Fog) -> list[str]:
+    """Return the processes and devices that are still there of a site."""
+    words = []
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdigit():
+            try:
+                line = (folder / "cmdline").read_bytes().decode(errors="replace").replace("\0", " ")
+            except OSError:
+                continue
+            words += [line] if str(fog.state) in line else []
+    links = json.loads(subprocess.run(["ip", "-j", "link"], check=True, capture_output=True, text=True).stdout)
+    return [*words, *(each["ifname"] for each in links if each["ifname"].startswith("fog"))]

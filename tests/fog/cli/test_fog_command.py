@@ -1,0 +1,112 @@
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from click.testing import Result
+from typer.testing import CliRunner
+
+from fog.cli import options
+from fog.cli.app import app
+from fog.cluster import ClusterPlan
+from fog.supervisor.journal import Journal
+from tests.fog.supervisor.machines import record, serving
+from tests.fog.supervisor.test_journal import PLAN
+from tests.pages import ROOT
+
+VERBS = ["launch", "ls", "status", "scale up", "scale down", "logs", "ssh", "cost", "plan", "down", "supervise"]
+Run = Callable[..., Result]
+
+
+@pytest.fixture
+def fog(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    monkeypatch.setenv("FOG_STATE", str(tmp_path / "state"))
+    monkeypatch.setattr(options, "ensure", lambda site: False)
+    monkeypatch.chdir(tmp_path)
+    return lambda *words: CliRunner().invoke(app, [*words])
+
+
+@pytest.fixture
+def journal(tmp_path: Path, fog: Run):
+    journal = Journal(tmp_path / "state" / "journal.sqlite3")
+    yield journal
+    journal.close()
+
+
+def up(journal: Journal, plan: ClusterPlan = PLAN) -> None:
+    now_s = time.time()
+    journal.want(plan, now_s)
+    for each in (serving("m1"), record("m2", "west")):
+        journal.put(replace(each, asked_unix_s=now_s - 1_800), now_s, "asked", "east")
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_has_help_with_an_example(fog: Run, verb: str) -> None:
+    said = fog(*verb.split(), "--help").output
+    assert f"fog {verb}" in said.partition("Example")[2]
+
+
+def test_where_nothing_is_up_that_is_said(fog: Run) -> None:
+    assert "no cluster is up" in fog("ls").output
+    assert json.loads(fog("ls", "--json").output) == []
+    result = fog("status")
+    assert (result.exit_code, "fog launch" in result.output) == (2, True)
+
+
+def test_machines_and_their_stage_are_told(fog: Run, journal: Journal) -> None:
+    up(journal)
+    told = json.loads(fog("status", "--json").output)
+    assert (told["wanted"], told["serving"]) == (2, 1)
+    assert [(each["name"], each["stage"]) for each in told["members"]] == [("m1", "serving"), ("m2", "booting")]
+    assert "serving" in fog("status").output
+
+
+def test_cost_is_price_by_time(fog: Run, journal: Journal) -> None:
+    up(journal)
+    (told,) = json.loads(fog("cost", "--json").output)
+    assert told["usd_ever"] == pytest.approx(2 * 0.1 * 0.5, rel=0.02)
+    assert told["usd_per_hour"] == pytest.approx(0.2)
+
+
+def test_events_are_told_as_lines_of_json(fog: Run, journal: Journal) -> None:
+    up(journal)
+    events = [json.loads(line)["what"] for line in fog("status", "--events", "--json").output.splitlines()]
+    assert events == ["wanted", "asked", "asked"]
+
+
+def test_the_last_replica_is_not_scaled_away(fog: Run, journal: Journal) -> None:
+    up(journal)
+    result = fog("scale", "down", "2")
+    assert (result.exit_code, "fog down c" in result.output) == (2, True)
+    assert len(journal.cluster("c").plan.machines) == 2
+
+
+def test_a_dry_run_shows_the_price_and_changes_nothing(fog: Run, journal: Journal) -> None:
+    up(journal)
+    assert json.loads(fog("scale", "up", "--dry-run", "--json").output)["usd_per_hour"] > 0
+    told = json.loads(fog("launch", str(ROOT / "examples" / "echo.launch.py"), "--dry-run", "--json").output)
+    assert (len(told["machines"]), told["usd_per_hour"] > 0) == (2, True)
+    assert [each.plan.name for each in journal.clusters()] == ["c"]
+
+
+def test_of_several_clusters_one_must_be_named(fog: Run, journal: Journal) -> None:
+    up(journal)
+    up(journal, replace(PLAN, name="d"))
+    result = fog("status")
+    assert (result.exit_code, "c, d" in result.output) == (2, True)
+    assert fog("status", "d").exit_code == 0
+
+
+def test_a_wrong_key_of_fog_yaml_is_told_with_its_place(fog: Run, tmp_path: Path) -> None:
+    (tmp_path / "fog.yaml").write_text("provider: lokal\n")
+    result = fog("ls", "--site", "fog.yaml")
+    assert (result.exit_code, "fog.yaml:1:11: provider" in result.output) == (2, True)
+
+
+def test_a_launch_file_that_is_not_there_is_told(fog: Run) -> None:
+    result = fog("launch", "nowhere.py", "--dry-run")
+    assert (result.exit_code, "nowhere.py" in result.output) == (2, True)

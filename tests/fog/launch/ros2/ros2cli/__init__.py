@@ -1,0 +1,3 @@
+"""Stand-in for ``ros2cli``; ``ENTRY_POINTS`` is what installed distributions would name: group -> name -> object."""
+
+ENTRY_POINTS = {}

@@ -1,0 +1,54 @@
+"""Commands and their sub-commands; arguments are known a step at a time, so each parser is asked twice."""
+
+import argparse
+import importlib
+
+import ros2cli
+from ros2cli.plugin_system import PLUGIN_SYSTEM_VERSION, satisfies_version
+
+
+class CommandExtension:
+    NAME = None
+
+    def __init__(self):
+        satisfies_version(PLUGIN_SYSTEM_VERSION, "^0.1")
+
+    def add_arguments(self, parser, cli_name):
+        pass
+
+
+def add_subparsers_on_demand(parser, cli_name, dest, group_name, hide_extensions=None, required=True, argv=None):
+    chosen = parser.add_subparsers(title="Commands", metavar=f"Call `{cli_name} <command> -h` for more detailed usage.")
+    chosen.dest = " " + dest.lstrip("_")
+    chosen.required = required
+    points = ros2cli.ENTRY_POINTS[group_name]
+    parsers = {name: chosen.add_parser(name) for name in sorted(points)}
+    root = getattr(parser, "_root_parser", parser)
+    quiet = [(each, each.print_help, each.exit) for each in (parser, *parsers.values())]
+    for each, _, leave in quiet:
+        each.print_help = lambda: None
+        each.exit = lambda status=0, message=None, leave=leave: leave(status, message) if status else None
+    known, _ = root.parse_known_args(argv)
+    for each, show, leave in quiet:
+        each.print_help, each.exit = show, leave
+    name = getattr(known, chosen.dest)
+    for each in [name] if name else points:
+        module, _, attribute = points[each].partition(":")
+        extension = getattr(importlib.import_module(module), attribute)()
+        extension.NAME = each
+        parsers[each].set_defaults(**{dest: extension})
+        parser.epilog = f"{parser.epilog or ''}  {each}: {extension.__doc__.strip()}  "
+        if name:
+            parsers[each]._root_parser = root
+            extension.add_arguments(parsers[each], f"{cli_name} {each}")
+            del parsers[each]._root_parser
+
+
+def ros2(argv):
+    parser = argparse.ArgumentParser(prog="ros2")
+    import sys
+
+    sys.argv[1:] = argv
+    add_subparsers_on_demand(parser, "ros2", "_command", "ros2cli.command", required=False)
+    args = parser.parse_args(argv)
+    return args._command.main(parser=parser, args=args)

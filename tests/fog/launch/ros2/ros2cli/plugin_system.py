@@ -1,0 +1,8 @@
+"""The version that plug-ins are made for."""
+
+PLUGIN_SYSTEM_VERSION = "0.1"
+
+
+def satisfies_version(version, caret_range):
+    if caret_range != f"^{version}":
+        raise RuntimeError(f"expected plug-in system {caret_range}, not {version}")

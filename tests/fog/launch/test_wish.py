@@ -1,0 +1,77 @@
+import pytest
+
+from fog.cluster import Carried, CloudNode, ClusterPlan
+from fog.launch.entity import FogCluster
+from fog.launch.machines import CloudMachine
+from gdp.errors import LocalError
+from gdp.service.replication import Mode, Replication
+
+NODE = CloudNode("detection", "object_detector")
+
+
+def cluster(**keywords: object) -> FogCluster:
+    return FogCluster(**{"cloud_nodes": [NODE], "deployments": [CloudMachine()], **keywords})  # type: ignore[arg-type]
+
+
+def test_a_cluster_is_called_after_its_first_node() -> None:
+    assert cluster().wish.plan([NODE]).name == "object-detector"
+
+
+def test_a_plan_survives_its_journal() -> None:
+    plan = cluster(services={"/plan": "nav_msgs/srv/GetPlan"}, idle="30min", budget_usd=5).wish.plan([NODE])
+    assert ClusterPlan.from_json(plan.to_json()) == plan
+    assert (plan.idle_s, plan.budget_usd) == (1800.0, 5.0)
+
+
+def test_keys_for_all_go_where_they_mean_something() -> None:
+    wish = cluster(
+        services={"/plan": {"type": "nav_msgs/srv/GetPlan", "stop": "/plan/stop", "at_once": 1, "timeout_s": 60}},
+        actions={"/fold": "test_msgs/action/Fibonacci"},
+        topics={"/map": "nav_msgs/msg/OccupancyGrid"},
+        replication="hedged",
+        timeout_s=2,
+    ).wish
+    hedged = {"mode": "hedged"}
+    assert wish.carried == (
+        Carried(
+            "service",
+            "/plan",
+            "nav_msgs/srv/GetPlan",
+            {"replication": hedged, "timeout_s": 60},
+            {"at_once": 1, "stop": "/plan/stop"},
+        ),
+        Carried("action", "/fold", "test_msgs/action/Fibonacci", {"replication": hedged, "timeout_s": 2.0}),
+        Carried("topic", "/map", "nav_msgs/msg/OccupancyGrid"),
+    )
+
+
+def test_what_is_found_out_gets_the_keys_for_all() -> None:
+    wish = cluster(replication=Replication(Mode.SOME, copies=2)).wish
+    assert wish.carried is None
+    assert wish.carry([("service", "/echo", "std_srvs/srv/SetBool")]) == (
+        Carried("service", "/echo", "std_srvs/srv/SetBool", {"replication": {"mode": "some", "copies": 2}}),
+    )
+
+
+@pytest.mark.parametrize(
+    ("keywords", "says"),
+    [
+        ({"name": "Über"}, "name 'Über'"),
+        ({"services": {"plan": "nav_msgs/srv/GetPlan"}}, "full name"),
+        ({"services": {"/plan": "nav_msgs/msg/Path"}}, "expected one such as nav_msgs/srv/GetPlan"),
+        ({"services": {"/plan": {"type": "nav_msgs/srv/GetPlan", "stpo": "/x"}}}, "stpo: expected type"),
+        ({"replication": "twice"}, "expected all, some, hedged"),
+        ({"replication": {"mode": "all", "copy": 2}}, "copy: expected mode"),
+        ({"timeout_s": 0}, "timeout_s=0"),
+        ({"idle": "soon"}, "span of time"),
+        ({"budget_usd": -1}, "budget_usd=-1"),
+    ],
+)
+def test_a_wrong_keyword_is_named(keywords: dict[str, object], says: str) -> None:
+    with pytest.raises(LocalError, match=says):
+        cluster(**keywords)
+
+
+def test_a_cluster_without_nodes_is_refused() -> None:
+    with pytest.raises(LocalError, match="cloud_nodes is empty"):
+        cluster().wish.plan([])

@@ -1,0 +1,155 @@
+"""The supervisor with a provider in memory: what it must not forget, it sees again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from fog.cluster import Carried, CloudNode, ClusterPlan
+from fog.hardware import Hardware
+from fog.machine import Boot, Machine, MachineSpec, MachineState
+from fog.offer import Offer
+from fog.site import Site, open_site
+from fog.supervisor.journal import Journal
+from fog.supervisor.supervisor import Supervisor
+from gdp.errors import StoreError
+from tests.fog.supervisor.machines import OFFERS, SPOT
+
+PLAN = ClusterPlan("c", (CloudNode("p", "e"),), (SPOT, SPOT), (Carried("topic", "/t", "std_msgs/msg/Empty"),))
+
+
+class Memory:
+    """A provider whose machines are up at once."""
+
+    name = "memory"
+    poll_s = 0.01
+
+    def __init__(self) -> None:
+        self.machines: dict[str, Machine] = {}
+        self.refuses = 0  # so many more
+        self.spent: list[str] = []
+
+    def offers(self, hardware: Hardware, *, spot: bool) -> list[Offer]:
+        return OFFERS
+
+    def create(self, spec: MachineSpec, boot: Boot) -> str:
+        if self.refuses:
+            self.refuses -= 1
+            raise StoreError("no room")
+        self.machines[spec.name] = Machine(f"id-{spec.name}", spec, MachineState.RUNNING, time.time())
+        return f"id-{spec.name}"
+
+    def describe(self, cluster: str) -> list[Machine]:
+        return list(self.machines.values())
+
+    def terminate(self, ids: Sequence[str]) -> None:
+        self.machines = {name: each for name, each in self.machines.items() if each.id not in ids}
+        self.spent += ids
+
+    def drain(self, machine: str) -> None:
+        self.terminate([machine])
+
+    def log(self, machine: str, program: str, lines: int) -> str:
+        return ""
+
+    def shell(self, machine: str) -> list[str]:
+        return []
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Site:
+    return open_site(None, tmp_path / "state")
+
+
+@pytest.fixture
+def journal(site: Site) -> Iterator[Journal]:
+    journal = Journal(site.journal)
+    yield journal
+    journal.close()
+
+
+def supervisor(site: Site, journal: Journal, provider: Memory) -> Supervisor:
+    return Supervisor(site, journal, provider, lambda _: ("run",), lambda: None)
+
+
+def work(each: Supervisor, is_met: Callable[[], object]) -> None:
+    end_s = time.monotonic() + 20.0
+    while not is_met():
+        assert time.monotonic() < end_s
+        each.look()
+        each.wait()
+
+
+def serving(journal: Journal) -> list[str]:
+    return [each.name for each in journal.machines("c", gone=False) if each.is_serving]
+
+
+def test_what_is_wanted_is_launched_and_what_is_not_is_given_back(site: Site, journal: Journal) -> None:
+    provider = Memory()
+    ours = supervisor(site, journal, provider)
+    journal.want(PLAN, time.time())
+    work(ours, lambda: len(serving(journal)) == 2)
+    journal.unwant("c", "test", time.time())
+    work(ours, lambda: ours.is_done)
+    assert provider.machines == {}
+    ours.close()
+
+
+def test_a_machine_whose_supervisor_died_before_noting_its_id_is_found_again(site: Site, journal: Journal) -> None:
+    provider = Memory()
+    first = supervisor(site, journal, provider)
+    journal.want(PLAN, time.time())
+    work(first, lambda: len(serving(journal)) == 2)
+    first.close()
+    record = journal.machines("c")[0]
+    journal.put(replace(record, id="", up_unix_s=None, served_unix_s=None), time.time())
+    second = supervisor(site, journal, provider)
+    work(second, lambda: len(serving(journal)) == 2)
+    second.close()
+    assert journal.machines("c")[0].id == record.id
+    assert len(journal.machines("c")) == 2
+
+
+def test_a_machine_that_no_journal_knows_is_given_back(site: Site, journal: Journal) -> None:
+    provider = Memory()
+    provider.create(MachineSpec("c", "m99", OFFERS[0]), Boot({}, ()))
+    ours = supervisor(site, journal, provider)
+    journal.want(PLAN, time.time())
+    work(ours, lambda: len(serving(journal)) == 2 and "m99" not in provider.machines)
+    ours.close()
+
+
+def test_a_lost_machine_is_replaced_and_told(site: Site, journal: Journal) -> None:
+    provider = Memory()
+    ours = supervisor(site, journal, provider)
+    journal.want(PLAN, time.time())
+    work(ours, lambda: len(serving(journal)) == 2)
+    del provider.machines["m1"]
+    work(ours, lambda: serving(journal) == ["m2", "m3"])
+    ours.close()
+    assert [each.what for each in journal.events("c") if each.machine == "m1"][-1] == "taken"
+
+
+def test_a_refusal_is_told_and_tried_elsewhere(site: Site, journal: Journal) -> None:
+    provider = Memory()
+    provider.refuses = 1
+    ours = supervisor(site, journal, provider)
+    journal.want(PLAN, time.time())
+    work(ours, lambda: len(serving(journal)) == 2)
+    ours.close()
+    assert next(each for each in journal.events("c") if each.what == "refused").detail == "no room"
+
+
+def test_a_spent_budget_ends_a_cluster(site: Site, journal: Journal) -> None:
+    ours = supervisor(site, journal, Memory())
+    journal.want(replace(PLAN, budget_usd=1e-6), time.time())
+    work(ours, lambda: not journal.cluster("c").is_up and ours.is_done)
+    ours.close()
+    assert "budget" in journal.cluster("c").why
