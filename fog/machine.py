@@ -46,7 +46,7 @@ class Program:
         name: of its log, such as ``switch``.
         argv: ``{home}`` in a word stands for the machine's folder, ``{python}`` for its Python.
         ready: what a line of its output contains when it is up; empty: it is up when it runs.
-        environment: beside the machine's own.
+        environment: beside the machine's own; ``{home}`` as in ``argv``.
         restarts: whether it is started again when it ends; else its end ends the machine.
     """
 
@@ -63,7 +63,8 @@ class Boot:
 
     Args:
         files: path below the machine's folder -> content. They hold private keys: mode 0600, folders 0700.
-        programs: started in this order, each when the one before is ready; ended in the reverse one.
+        programs: started all at once, the first first; what one needs of another it waits for. Ended in the reverse
+            order.
     """
 
     files: Mapping[str, bytes]
@@ -79,6 +80,7 @@ class Machine:
         address: where people reach it; empty while there is none.
         leaves_at_unix_s: when the provider will take it, once it has given notice.
         reason: why it is leaving or gone, in a few words.
+        since_unix_s: when it came into this state; None: the provider does not say.
     """
 
     id: str
@@ -88,3 +90,4 @@ class Machine:
     address: str = ""
     leaves_at_unix_s: float | None = None
     reason: str = ""
+    since_unix_s: float | None = None

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import threading
 
 import pytest
 
 from gdp.errors import LocalError
 from gdp.names import Name
+from gdp.nodes.awaiting import await_device
 from gdp.nodes.pairs import attach_pairs
 from gdp.ports.link import LinkWatch
 from netns_tests.spaces import Space
@@ -50,3 +52,20 @@ def test_somebody_elses_device_is_refused_and_what_was_made_before_it_is_gone(sp
     with pytest.raises(LocalError, match="rib0-s exists"), attach_pairs(["px0", "rib0"], ONE, 1_500):
         pass
     assert devices().keys() == {"rib0-s"}
+
+
+def test_a_node_waits_for_the_device_that_its_switch_is_just_making() -> None:
+    waiting = threading.Thread(target=await_device, args=("rib0", 600.0))
+    waiting.start()
+    with attach_pairs(["px0", "rib0"], ONE, 1_500):
+        waiting.join(20.0)
+        assert not waiting.is_alive()
+
+
+def test_a_device_that_is_there_is_not_waited_for() -> None:
+    with attach_pairs(["rib0"], ONE, 1_500):
+        await_device("rib0", 600.0)
+
+
+def test_whoever_waits_for_no_device_in_vain_goes_on() -> None:
+    await_device("rib0", 0.01)

@@ -1,17 +1,15 @@
 """The ``gdp-proxy`` command.
 
-Place: command.
+Place: command. Of what it can do only that is imported which is asked for: that is most of the time to its start.
 """
 
 from __future__ import annotations
 
 import typer
 
-from gdp.cli.node import Check, Config, Json, Verbose, failing_clearly, set_up_logging
-from proxy.checking import check_proxy
+from gdp.cli.node import AwaitIface, Check, Config, Json, Verbose, failing_clearly, set_up_logging
+from gdp.nodes.awaiting import await_device
 from proxy.config import ProxyConfig
-from proxy.live import carry
-from proxy.recording import record
 from proxy.schema_cli import Schema
 
 __all__ = ["main"]
@@ -21,7 +19,12 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 @app.command(epilog="Example: gdp-proxy --config proxy.yaml --check")
 def proxy(
-    config: Config, check: Check = False, json: Json = False, verbose: Verbose = False, schema: Schema = False
+    config: Config,
+    await_iface: AwaitIface = 0.0,
+    check: Check = False,
+    json: Json = False,
+    verbose: Verbose = False,
+    schema: Schema = False,
 ) -> None:
     """Carry what the configuration names between ROS and the overlay, until Ctrl-C; SIGHUP reads it again.
 
@@ -32,10 +35,19 @@ def proxy(
     with failing_clearly():
         settings = ProxyConfig.load(config)
         if check:
+            from proxy.checking import check_proxy
+
             check_proxy(settings, json=json)
-        elif settings.ros:
+            return
+        if settings.ros:
+            from proxy.live import carry
+
+            await_device(settings.iface, await_iface)
             carry(config, settings, json=json)
         else:
+            from proxy.recording import record
+
+            await_device(settings.iface, await_iface)
             record(settings, json=json)
 
 

@@ -21,8 +21,7 @@ from proxy.config import ProxyConfig
 from proxy.endpoints.endpoint import proxy_node_name
 from proxy.endpoints.live import open_endpoints
 from proxy.held import Held
-from proxy.node import ProxyNode, run_node
-from proxy.recording import GOODBYE_S, tell_refusals
+from proxy.node import GOODBYE_S, ProxyNode, run_node
 from proxy.tally import percentile
 
 __all__ = ["carry"]
@@ -31,6 +30,7 @@ log = logging.getLogger(__name__)
 
 TICK_S: Final = 0.5
 _LOOK_S: Final = 2.0  # who begins sooner may not see yet that another proxy of its graph carries the same
+DRAIN_MAX_S: Final = 10.0  # a server that leaves gives up then what it has not answered
 _TURN_S: Final = 0.0002  # what an endpoint's thread may have to wait for the interpreter; Python's own is 5 ms
 
 
@@ -48,7 +48,9 @@ def carry(path: Path, settings: ProxyConfig, *, json: bool) -> None:
         name = proxy_node_name(node.identity.name.to_text())
         with open_endpoints(settings.ros, name) as endpoints:
             held = Held(settings.delegations, node.identity)
-            bridge = Bridge(Site(node.member, node.traffic, node.faults), settings, endpoints, held, look_s=_LOOK_S)
+            look_s = 0.0 if all(end.alone for end in settings.ros) else _LOOK_S
+            bridge = Bridge(Site(node.member, node.traffic, node.faults), settings, endpoints, held, look_s=look_s)
+            node.drains = True
             node.on_reload = lambda: _reload(path, settings, node, bridge)
             for endpoint in endpoints:
                 node.runtime.watch(endpoint)
@@ -74,15 +76,23 @@ def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
     """Carry until stopped, telling of progress."""
     is_ready = False
     tick_at_s = 0.0
+    leave_at_s: float | None = None
     while not node.runtime.is_stopped:
         due_s = bridge.next_timeout()
         node.runtime.step(tick_at_s if due_s is None else min(due_s, tick_at_s))
         now_s = time.monotonic()
         bridge.work(now_s)
         node.member.flush(now_s)  # once for all that waited: small messages share a seal
+        if node.is_leaving:
+            if leave_at_s is None:
+                log.info("leaving; what is under way is answered")
+                leave_at_s = now_s + DRAIN_MAX_S
+            bridge.drain(now_s)  # again and again: a local server may appear meanwhile
+            if now_s >= leave_at_s or bridge.is_drained(now_s):
+                return
         if not is_ready and node.member.attachment.is_attached and bridge.is_settled:
             is_ready = True
-            tell_refusals(node)
+            node.tell_refusals()
             _tell_ready(node, bridge, json=json)
         if now_s >= tick_at_s:
             tick_at_s = now_s + TICK_S

@@ -8,9 +8,12 @@ from __future__ import annotations
 import contextlib
 import logging
 import secrets
+import signal
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from types import FrameType
+from typing import Final
 
 from gdp.client.member import Member, Topic
 from gdp.control.settings import NodeSettings
@@ -18,20 +21,22 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import GdpError, LocalError
 from gdp.names import Name
+from gdp.nodes.counts import count_list
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.nodes.runtime import Runtime
-from gdp.nodes.switch import count_list
 from gdp.ports.plane import Plane
 from gdp.ports.raw import RawPlane
-from gdp.telemetry.metrics import Metrics, Sources
+from gdp.telemetry.sources import Sources
 from proxy.config import ProxyConfig
 from proxy.faults import Faults
 from proxy.held import Held
 from proxy.traffic import Traffic
 
-__all__ = ["ProxyNode", "open_topics", "renew_topics", "run_node"]
+__all__ = ["GOODBYE_S", "ProxyNode", "open_topics", "renew_topics", "run_node"]
 
 log = logging.getLogger(__name__)
+
+GOODBYE_S: Final = 0.2  # how long a node that leaves works on
 
 
 @dataclass(slots=True)
@@ -40,6 +45,8 @@ class ProxyNode:
 
     Attributes:
         on_reload: called after a SIGHUP; None: nothing is read anew.
+        is_leaving: a SIGUSR1 came: answer what is under way, then end.
+        drains: whether the command looks at that; else a SIGUSR1 ends it at once.
     """
 
     identity: Identity
@@ -47,6 +54,8 @@ class ProxyNode:
     runtime: Runtime
     plane: Plane
     on_reload: Callable[[], None] | None = None
+    is_leaving: bool = False
+    drains: bool = False
     traffic: Traffic = field(default_factory=Traffic)
     faults: Faults = field(default_factory=Faults)
 
@@ -55,9 +64,23 @@ class ProxyNode:
         if self.on_reload is not None:
             self.on_reload()
 
+    def leave_soon(self, number: int, frame: FrameType | None) -> None:
+        """Take a SIGUSR1, which wakes the loop."""
+        del number, frame
+        self.is_leaving = True
+        if not self.drains:
+            self.runtime.stop()
+
     def linger(self, duration_s: float) -> None:
         """Work on for a while, so that a goodbye is heard."""
         self.runtime.run(lambda: False, time.monotonic() + duration_s)
+
+    def tell_refusals(self) -> None:
+        """Warn of each claim that the overlay has refused."""
+        for each in self.member.attachment.claims:
+            if each.refused is not None:
+                name, right, reason = each.subject.name.short, each.right.value, each.refused.label
+                log.warning("claim refused name=%s right=%s reason=%s", name, right, reason)
 
     def sources(self) -> Sources:
         """Return what the metrics show."""
@@ -88,8 +111,11 @@ def run_node(config: ProxyConfig) -> Iterator[ProxyNode]:
         stack.callback(plane.close)
         runtime = Runtime(member, plane, spin_s=config.spin_us / 1e6)
         node = ProxyNode(identity, member, runtime, plane)
+        stack.callback(signal.signal, signal.SIGUSR1, signal.signal(signal.SIGUSR1, node.leave_soon))
         stack.enter_context(runtime.signals(node.reload))
         if config.metrics is not None:
+            from gdp.telemetry.metrics import Metrics
+
             metrics = Metrics(node.sources())
             metrics.serve(config.metrics.port)
             stack.callback(metrics.close)

@@ -6,7 +6,6 @@ Place: shell.
 from __future__ import annotations
 
 import contextlib
-import logging
 import time
 from functools import partial
 from typing import Final
@@ -18,14 +17,11 @@ from proxy.config import ProxyConfig
 from proxy.endpoints.bag import BagWriter
 from proxy.held import Held
 from proxy.inbound import Inbound
-from proxy.node import ProxyNode, open_topics, renew_topics, run_node
+from proxy.node import GOODBYE_S, ProxyNode, open_topics, renew_topics, run_node
 
-__all__ = ["GOODBYE_S", "record", "tell_refusals"]
-
-log = logging.getLogger(__name__)
+__all__ = ["record"]
 
 TICK_S: Final = 0.5
-GOODBYE_S: Final = 0.2
 
 
 def record(settings: ProxyConfig, *, json: bool) -> None:
@@ -54,14 +50,6 @@ def record(settings: ProxyConfig, *, json: bool) -> None:
             typer.echo(f"{inbound.received} messages received, {inbound.lost} lost")
 
 
-def tell_refusals(node: ProxyNode) -> None:
-    """Warn of each claim that the overlay has refused."""
-    for each in node.member.attachment.claims:
-        if each.refused is not None:
-            name, right, reason = each.subject.name.short, each.right.value, each.refused.label
-            log.warning("claim refused name=%s right=%s reason=%s", name, right, reason)
-
-
 def _work(node: ProxyNode, inbound: Inbound, *, json: bool) -> None:
     """Receive until stopped, telling of progress."""
     is_ready = False
@@ -71,7 +59,7 @@ def _work(node: ProxyNode, inbound: Inbound, *, json: bool) -> None:
         inbound.take()
         if not is_ready and node.member.attachment.is_attached:
             is_ready = True
-            tell_refusals(node)
+            node.tell_refusals()
             if json:
                 emit("ready", name=node.member.name.to_text())
             else:

@@ -19,9 +19,8 @@ from proxy.checking import check_proxy
 from proxy.config import ProxyConfig
 from proxy.endpoints.bag import BagReader
 from proxy.held import Held
-from proxy.node import ProxyNode, open_topics, renew_topics, run_node
+from proxy.node import GOODBYE_S, ProxyNode, open_topics, renew_topics, run_node
 from proxy.outbound import Outbound
-from proxy.recording import GOODBYE_S
 from proxy.replayer import Played, Replayer
 
 __all__ = ["main"]

@@ -17,12 +17,16 @@ import typer
 
 from gdp.errors import ConfigError, GdpError
 
-__all__ = ["WRONG", "Check", "Config", "Json", "Verbose", "emit", "failing_clearly", "set_up_logging"]
+__all__ = ["WRONG", "AwaitIface", "Check", "Config", "Json", "Verbose", "emit", "failing_clearly", "set_up_logging"]
 
 WRONG: Final = 2  # exit code of a wrong configuration
 
 Config = Annotated[Path, typer.Option("--config", help="The YAML file; see docs/configuration.md.")]
 Check = Annotated[bool, typer.Option("--check", help="Validate the configuration and end.")]
+AwaitIface = Annotated[
+    float,
+    typer.Option(min=0.0, metavar="SECONDS", help="Wait so long for the device, which a switch may just be making."),
+]
 Json = Annotated[bool, typer.Option("--json", help="Say what happens as lines of JSON on standard output.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Log decisions, too.")]
 

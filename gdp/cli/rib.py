@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import typer
 
-from gdp.cli.node import Check, Config, Json, Verbose, emit, failing_clearly, set_up_logging
+from gdp.cli.node import AwaitIface, Check, Config, Json, Verbose, emit, failing_clearly, set_up_logging
 from gdp.crypto.certificates import Role
 from gdp.names import Name
+from gdp.nodes.awaiting import await_device
 from gdp.nodes.config import RibConfig
 from gdp.nodes.membership import load_member
 from gdp.nodes.rib import run_rib
@@ -20,7 +21,13 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
 @app.command(epilog="Example: gdp-rib --config rib.yaml")
-def rib(config: Config, check: Check = False, json: Json = False, verbose: Verbose = False) -> None:
+def rib(
+    config: Config,
+    await_iface: AwaitIface = 0.0,
+    check: Check = False,
+    json: Json = False,
+    verbose: Verbose = False,
+) -> None:
     """Answer who advertises a name, and where, for one trust domain, until Ctrl-C."""
     set_up_logging(verbose=verbose)
     with failing_clearly():
@@ -29,6 +36,7 @@ def rib(config: Config, check: Check = False, json: Json = False, verbose: Verbo
             identity, _ = load_member(settings.identity, settings.domain, Role.RIB)
             _report("checked", f"configuration good: RIB {identity.name.short}", identity.name, json=json)
             return
+        await_device(settings.iface, await_iface)
         run_rib(settings, lambda name: _report("ready", f"RIB {name.short} is up; Ctrl-C ends it", name, json=json))
 
 

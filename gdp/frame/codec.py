@@ -9,6 +9,7 @@ tests hold the two together. Offsets count from the first byte after the EtherTy
 
 from __future__ import annotations
 
+import re
 import struct
 from typing import Final, NamedTuple
 
@@ -33,6 +34,7 @@ __all__ = [
     "decode",
     "encode",
     "ethernet",
+    "layout",
 ]
 
 ETHER_BYTES: Final = 14
@@ -67,6 +69,15 @@ class Header(NamedTuple):
     incarnation: int
     destination: bytes
     source: bytes
+
+
+def layout() -> dict[str, tuple[int, int]]:
+    """Return offset and size in bytes of every header field; that of the Scapy layer is the same, as a test holds."""
+    sizes = [struct.calcsize(f"!{each}") for each in re.findall("[0-9]*[A-Zs]", _HEADER.format)]
+    return {
+        name: (sum(sizes[:index]), size)
+        for index, (name, size) in enumerate(zip(("version", *Header._fields), sizes, strict=True))
+    }
 
 
 def encode(header: Header) -> bytes:

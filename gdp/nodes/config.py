@@ -33,9 +33,10 @@ AttachName = Annotated[Ifname, AfterValidator(_attach_name)]
 
 
 class PortConfig(Section):
-    """A layer-2 device towards neighbours."""
+    """A layer-2 device towards neighbours; one that is ``optional`` may appear later."""
 
     iface: Ifname
+    optional: bool = False
     cost: int = Field(default=COST_DEFAULT, ge=1, le=1_000_000)
 
 

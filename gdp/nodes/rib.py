@@ -15,14 +15,14 @@ from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.names import Name
 from gdp.nodes.config import RibConfig
+from gdp.nodes.counts import count_list
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.nodes.runtime import Runtime
-from gdp.nodes.switch import count_list
 from gdp.ports.plane import Plane
 from gdp.ports.raw import RawPlane
 from gdp.rib.machine import Rib, RibSettings
 from gdp.rib.store import MemoryStore
-from gdp.telemetry.metrics import Metrics, Sources
+from gdp.telemetry.sources import Sources
 
 __all__ = ["run_rib"]
 
@@ -52,6 +52,8 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None]) -> None:
         runtime = Runtime(host, plane)
         stack.enter_context(runtime.signals())
         if config.metrics is not None:
+            from gdp.telemetry.metrics import Metrics
+
             metrics = Metrics(_sources(host, plane))
             metrics.serve(config.metrics.port)
             stack.callback(metrics.close)

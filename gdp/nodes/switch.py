@@ -8,14 +8,15 @@ from __future__ import annotations
 import contextlib
 import logging
 import secrets
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
-from gdp.errors import DropReason, LocalError, StatementError
+from gdp.errors import LocalError, StatementError
 from gdp.names import Name
 from gdp.nodes.config import SwitchConfig
+from gdp.nodes.counts import count_list
 from gdp.nodes.data_plane import Chosen, choose_plane
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.nodes.pairs import attach_pairs, switch_end
@@ -23,9 +24,9 @@ from gdp.nodes.runtime import Runtime, now
 from gdp.ports.link import LinkWatch
 from gdp.switch.machine import Switch
 from gdp.switch.table import Table
-from gdp.telemetry.metrics import Metrics, Sources
+from gdp.telemetry.sources import Sources
 
-__all__ = ["count_list", "run_switch"]
+__all__ = ["run_switch"]
 
 log = logging.getLogger(__name__)
 
@@ -52,14 +53,20 @@ def run_switch(config: SwitchConfig, ready: Callable[[Name, str, str], None]) ->
     ifaces = [port.iface for port in config.ports]
     with contextlib.ExitStack() as stack:
         stack.enter_context(attach_pairs(config.attach, identity.name, _widest(ifaces)))
-        devices = [*ifaces, *map(switch_end, config.attach)]
+        wanted = [port.iface for port in config.ports if not port.optional]
+        devices = [*wanted, *map(switch_end, config.attach)]
         chosen = choose_plane(config.data_plane, devices, table, config.table_max)
         plane = chosen.plane
         stack.callback(plane.close)
+        for iface in ifaces:
+            if iface not in wanted:
+                plane.add_port(iface, may_be_absent=True)
         runtime = Runtime(switch, plane, {port.iface: port.cost for port in config.ports})
         stack.enter_context(runtime.signals(lambda: _revoke(switch, config.revocations)))
         _revoke(switch, config.revocations)
         if config.metrics is not None:
+            from gdp.telemetry.metrics import Metrics
+
             metrics = Metrics(_sources(switch, chosen))
             metrics.serve(config.metrics.port)
             stack.callback(metrics.close)
@@ -68,11 +75,6 @@ def run_switch(config: SwitchConfig, ready: Callable[[Name, str, str], None]) ->
             log.warning("not the best data plane plane=%s reason=%s", chosen.name, chosen.reason)
         ready(identity.name, chosen.name, chosen.reason)
         runtime.run()
-
-
-def count_list(counts: Mapping[DropReason, int]) -> list[int]:
-    """Return counts by reason as a list in the order of the reasons."""
-    return [counts.get(reason, 0) for reason in DropReason]
 
 
 def _revoke(switch: Switch, directory: Path | None) -> None:

@@ -8,13 +8,14 @@ the borders only, so the way to a switch behind them is the way to the nearest b
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple
-
-import networkx as nx
+from typing import TYPE_CHECKING, NamedTuple
 
 from gdp.control.link_state import LinkState, Scope
 from gdp.names import Name
 from gdp.switch.link_states import LinkStates
+
+if TYPE_CHECKING:
+    import networkx as nx
 
 __all__ = ["Paths", "Way"]
 
@@ -36,7 +37,7 @@ class Paths:
         self._domain = domain
         self._link_states = link_states
         self._version = -1
-        self._graph: nx.DiGraph[Name] = nx.DiGraph()
+        self._graph: nx.DiGraph[Name] | None = None
         self._domains: dict[Name, Name] = {}
         self._ribs: dict[Name, set[Name]] = {}
         self._ways: dict[frozenset[Name], dict[Name, Way]] = {}
@@ -99,14 +100,16 @@ class Paths:
         return ways
 
     def _compute(self, allowed: frozenset[Name]) -> dict[Name, Way]:
-        if self._me not in self._graph:
+        if self._graph is None or self._me not in self._graph:
             return {}
+        from networkx import dijkstra_predecessor_and_distance
+
         open_ = {name for name, domain in self._domains.items() if domain in allowed or domain == self._domain}
 
         def cost(_from: Name, to: Name, edge: dict[str, int]) -> int | None:
             return edge["weight"] if to in open_ else None  # None hides an edge
 
-        before, distances = nx.dijkstra_predecessor_and_distance(self._graph, self._me, weight=cost)
+        before, distances = dijkstra_predecessor_and_distance(self._graph, self._me, weight=cost)
         ways: dict[Name, Way] = {}
         for to, distance in distances.items():  # the nearest first: whoever comes before ``to`` is there already
             if to != self._me:
@@ -136,7 +139,9 @@ def _graph(states: Iterable[LinkState], home: Name) -> nx.DiGraph[Name]:
         for link in state.links if state.domain == home else [*state.links, *state.inside]:
             edge = (state.origin, link.name)
             cost[edge] = min(cost.get(edge, link.cost), link.cost)
-    graph: nx.DiGraph[Name] = nx.DiGraph()
+    from networkx import DiGraph  # large; nothing is asked before there is a neighbour
+
+    graph: nx.DiGraph[Name] = DiGraph()
     # sorted: among ways of one length every switch picks by the same order
     graph.add_weighted_edges_from((a, b, cost[a, b]) for a, b in sorted(cost) if (b, a) in cost)
     return graph

@@ -8,9 +8,7 @@ Source: Prometheus text exposition format, version 0.0.4.
 from __future__ import annotations
 
 import threading
-from bisect import bisect_left
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from itertools import accumulate
 from typing import Final
 from wsgiref.simple_server import WSGIServer
@@ -21,71 +19,12 @@ from prometheus_client.registry import Collector
 
 from gdp.errors import DropReason, LocalError
 from gdp.names import NAME_BYTES, Name
+from gdp.telemetry.sources import Counts, EntryCounts, Gauge, Histogram, Sources
 
-__all__ = ["LATENCY_BOUNDS_S", "Histogram", "Metrics", "Sources"]
+__all__ = ["Metrics"]
 
-LATENCY_BOUNDS_S: Final = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 _LOOPBACK: Final = "127.0.0.1"
 _ANY: Final = "any"  # an entry for every source
-
-
-class Histogram:
-    """How often which duration came.
-
-    Attributes:
-        bounds_s: upper ends of the buckets, ascending, each included.
-        counts: one a bucket, and one for what lies above them all.
-        total_s: sum of all durations.
-    """
-
-    __slots__ = ("bounds_s", "counts", "total_s")
-
-    def __init__(self, bounds_s: Sequence[float] = LATENCY_BOUNDS_S) -> None:
-        self.bounds_s = tuple(bounds_s)
-        self.counts = [0] * (len(self.bounds_s) + 1)
-        self.total_s = 0.0
-
-    def observe(self, duration_s: float) -> None:
-        self.counts[bisect_left(self.bounds_s, duration_s)] += 1
-        self.total_s += duration_s
-
-
-Counts = Callable[[], Mapping[str, int]]  # label value to count
-Gauge = Callable[[], float]
-EntryCounts = Callable[[], Mapping[bytes, tuple[int, int]]]  # table key to frames and bytes
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sources:
-    """Whom to ask, on each scrape and from another thread, for what a node counts; None: it has no such number.
-
-    Attributes:
-        frames: by direction: in, out, forwarded, handed-up.
-        drops: lists of counts by ``DropReason``, added up.
-        table_entries: entries of the forwarding table.
-        entries: frames and bytes forwarded by the busiest entries, by the table's key.
-        parked_frames: frames that wait for an answer.
-        rib_answers: a RIB's answers by what they said.
-        rib_refusals: a RIB's refusals by reason.
-        messages: whole messages by direction.
-        message_bytes: their bytes by direction, before sealing.
-        repairs: lost parts by what happened to them: asked, sent, given-up.
-        faults: what a proxy could not carry, or not as it should be, by what was wrong.
-        latency: one-way, from the source's stamp to delivery.
-    """
-
-    frames: Counts | None = None
-    drops: Sequence[Callable[[], Sequence[int]]] = ()
-    table_entries: Gauge | None = None
-    entries: EntryCounts | None = None
-    parked_frames: Gauge | None = None
-    rib_answers: Counts | None = None
-    rib_refusals: Counts | None = None
-    messages: Counts | None = None
-    message_bytes: Counts | None = None
-    repairs: Counts | None = None
-    faults: Counts | None = None
-    latency: Callable[[], Histogram] | None = None
 
 
 class Metrics(Collector):

@@ -16,8 +16,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, TypeVar
 
-from pyroute2 import netns
-
 from gdp.errors import LocalError
 
 __all__ = ["IP_NETNS_DIRECTORY", "create", "inside", "release"]
@@ -34,6 +32,8 @@ def create(path: Path) -> None:
     Raises:
         LocalError: the kernel refuses.
     """
+    from pyroute2 import netns  # 0.2 s to load, which whoever only asks for a namespace's file need not wait for
+
     try:
         netns.create(str(path))
     except OSError as error:
@@ -46,6 +46,8 @@ def inside(path: Path, work: Callable[[], T]) -> T:
     Raises:
         OSError: no such namespace, or what ``work`` raises.
     """
+    from pyroute2 import netns
+
     results: list[T] = []
     failures: list[BaseException] = []
 

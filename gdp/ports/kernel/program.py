@@ -2,8 +2,8 @@
 
 Place: pure; map descriptors in, instructions out.
 Source: ``gdp.switch.forwarder.decide``, which it must never differ from; Linux, include/uapi/linux/bpf.h, for the
-helpers and ``struct __sk_buff``; linux/pkt_sched.h for the priority. The header's offsets are read from the Scapy
-layer, so that the normative format is the source of this program too.
+helpers and ``struct __sk_buff``; linux/pkt_sched.h for the priority. The header's offsets are read from the
+codec, which tests hold to the normative Scapy layer: Scapy takes longer to load than all else that a switch loads.
 
 A frame is taken (forwarded, or dropped and counted) where the program is sure; any other goes *up*: it continues to
 the port's packet socket, where Python decides by the same table and counts. So the program needs no word for what is
@@ -21,9 +21,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from gdp.errors import DropReason
-from gdp.frame.codec import ETHER_BYTES, OVERHEAD_BYTES
+from gdp.frame.codec import ETHER_BYTES, OVERHEAD_BYTES, layout
 from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION, Flag
-from gdp.frame.layers import layout
 from gdp.names import NAME_BYTES
 from gdp.ports.kernel.assembler import Assembler, Reg
 from gdp.ports.kernel.shapes import (

@@ -8,6 +8,7 @@ from scapy.layers.l2 import Ether
 from scapy.packet import Padding, Raw
 
 from gdp.errors import DropReason, FrameError, LocalError
+from gdp.frame import codec
 from gdp.frame.codec import (
     DESTINATION_AT,
     HEADER_BYTES,
@@ -127,6 +128,10 @@ def test_the_codec_knows_where_the_layer_puts_its_fields() -> None:
     assert (places["kind"][0], places["hops_left"][0]) == (KIND_AT, HOPS_AT)
     assert (places["destination"], places["source"]) == ((DESTINATION_AT, 32), (SOURCE_AT, 32))
     assert tuple(places)[1:] == Header._fields
+
+
+def test_the_codec_has_the_layout_of_the_layer() -> None:
+    assert codec.layout() == layout()
 
 
 def test_the_defaults_make_a_frame_that_decodes() -> None:

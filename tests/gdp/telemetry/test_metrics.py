@@ -8,7 +8,8 @@ import pytest
 
 from gdp.errors import DropReason, LocalError
 from gdp.names import Name
-from gdp.telemetry.metrics import Histogram, Metrics, Sources
+from gdp.telemetry.metrics import Metrics
+from gdp.telemetry.sources import Histogram, Sources
 
 
 def drops(**counts: int) -> list[int]:

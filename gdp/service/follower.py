@@ -1,0 +1,262 @@
+"""A replica of a service that keeps state: it gives its server one log's entries, in order, one at a time, each once.
+
+Place: pure; what is to be done comes out of ``take``.
+
+The server does one thing at a time: an entry, or telling its state, or taking one on. What comes meanwhile waits. Where
+it fails at one of these its state is unknown, and stays so until it takes on a told one, or is started anew.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Final, NamedTuple, TypeAlias
+
+from gdp.names import Name
+from gdp.service.ordered import NO_LOG, Follow, FollowerWord, Keep, Log, Position, State, Tell, place_of
+
+__all__ = ["Apply", "Doing", "Fetch", "Follower", "Load", "Refuse", "Say"]
+
+HELD_MAX: Final = 1_024  # how far ahead of its server it takes entries
+HELD_MAX_BYTES: Final = 64 << 20
+UNKEPT: Final = "requests to this service are kept in order: the client's rule must say so (state: ordered)"
+
+
+class Apply(NamedTuple):
+    """Give the server an entry."""
+
+    client: Name
+    call: int
+    request: bytes
+
+
+class Fetch(NamedTuple):
+    """Read the server's state."""
+
+
+class Load(NamedTuple):
+    """Write the server's state."""
+
+    state: bytes
+
+
+class Say(NamedTuple):
+    """Tell a client."""
+
+    client: Name
+    word: FollowerWord
+
+
+class Refuse(NamedTuple):
+    """Fail a client's request."""
+
+    client: Name
+    call: int
+    reason: str
+
+
+Effect: TypeAlias = "Apply | Fetch | Load | Say | Refuse"
+
+
+class Doing(Enum):
+    """What the server is at."""
+
+    NOTHING = "nothing"
+    APPLYING = "applying"
+    TELLING = "telling"
+    LOADING = "loading"
+
+
+class Follower:
+    """Where one server is.
+
+    Args:
+        tells: whether its state can be read and written.
+    """
+
+    def __init__(self, *, tells: bool) -> None:
+        self._tells = tells
+        self._can_tell = tells
+        self._log = NO_LOG
+        self._index = 0
+        self._is_lost = False
+        self._keeper: Name | None = None
+        self._held: dict[int, tuple[int, bytes]] = {}  # index -> call and request; of this log, not done yet
+        self._held_bytes = 0
+        self._gap_told = -1
+        self._follow: Follow | None = None  # with a state that waits, or is being taken on
+        self._asked_state = False
+        self._effects: list[Effect] = []
+        self.doing = Doing.NOTHING
+
+    @property
+    def keeper(self) -> Name | None:
+        """Return whose log it follows."""
+        return self._keeper
+
+    def take(self) -> list[Effect]:
+        """Return, once, what is to be done, in order."""
+        effects, self._effects = self._effects, []
+        return effects
+
+    def heard(self, client: Name, word: Keep | Follow | Tell) -> None:
+        """Take a keeper's word."""
+        if isinstance(word, Keep):
+            if client == self._keeper and word.life != self._log.life and self._follow is None:
+                self._keeper = None  # it keeps this log no more
+            if self._follow is None or client != self._keeper:
+                self._say(client)
+        elif isinstance(word, Follow):
+            self._take_follow(client, word)
+        elif client != self._keeper or word.log != self._log or not self._can_tell or self._is_lost:
+            self._effects.append(Say(client, State(word.log, 0, None)))
+        else:
+            self._asked_state = True
+        self._go_on()
+
+    def entry(self, client: Name, call: int, request: bytes) -> None:
+        """Take an entry, or what somebody takes for one."""
+        life, index = place_of(call)
+        if client != self._keeper:
+            reason = UNKEPT if self._keeper is None else f"kept in order by {self._keeper.short}"
+            self._effects.append(Refuse(client, call, reason))
+            return
+        if life != self._log.life or self._is_lost or index <= self._index or index in self._held:
+            return  # of a log that is over or not begun here, or there already
+        if index > self._index + HELD_MAX:
+            return  # the keeper sees that it is not done, and sends it again
+        if index > self._index + 1 and self._held_bytes + len(request) > HELD_MAX_BYTES:
+            return  # likewise; the next one always has room
+        self._held[index] = call, request
+        self._held_bytes += len(request)
+        self._go_on()
+        reach = self._reach()
+        if index > reach and self._gap_told != reach:
+            self._gap_told = reach
+            self._say(client)
+
+    def applied(self) -> None:
+        """Learn that the server has done the entry."""
+        self._end(Doing.APPLYING)
+        self._index += 1
+        self._held_bytes -= len(self._held.pop(self._index)[1])
+        self._go_on()
+
+    def failed(self) -> None:
+        """Learn that the server failed at the entry: whether it has done it is not known."""
+        self._end(Doing.APPLYING)
+        self._lose()
+        self._go_on()
+
+    def told(self, state: bytes | None) -> None:
+        """Learn the server's state; None: it has none to tell."""
+        self._end(Doing.TELLING)
+        self._asked_state = False
+        self._can_tell = self._can_tell and state is not None
+        if self._keeper is not None:
+            self._effects.append(Say(self._keeper, State(self._log, self._index, state)))
+        self._go_on()
+
+    def loaded(self, *, is_done: bool) -> None:
+        """Learn whether the server has taken on the state."""
+        self._end(Doing.LOADING)
+        follow, self._follow = self._follow, None
+        if follow is None:
+            return
+        if is_done:
+            self._stand(follow.log, follow.at)
+        else:
+            self._can_tell = False
+            self._lose()
+        self._go_on()
+
+    def renewed(self, *, is_doubtful: bool) -> None:
+        """Learn that the server was started anew.
+
+        Args:
+            is_doubtful: it may have been given an entry since.
+        """
+        self.doing = Doing.NOTHING
+        self._follow, self._asked_state, self._can_tell = None, False, self._tells
+        self._log, self._index, self._is_lost = NO_LOG, 0, is_doubtful
+        self._clear()
+        if self._keeper is not None:
+            self._say(self._keeper)
+
+    def gone(self) -> None:
+        """Learn that the keeper is no more: another may come. What is held is done all the same."""
+        self._keeper = None
+
+    def _take_follow(self, client: Name, word: Follow) -> None:
+        if self._keeper not in {None, client}:
+            self._say(client)
+        elif self._follow is not None:
+            pass  # it hears when the state is taken on that it brought
+        elif word.state is None:
+            at = (self._log, self._index) == (word.log_before, word.at_before)
+            if at and not self._is_lost and self.doing is Doing.NOTHING:
+                self._keeper = client
+                self._stand(word.log, word.at)
+            else:
+                self._say(client)
+        elif not self._can_tell or word.log < self._log or (word.log == self._log and word.at < self._index):
+            self._say(client)
+        else:
+            self._keeper, self._follow = client, word
+            self._clear()
+
+    def _go_on(self) -> None:
+        """Let the server do the next thing."""
+        if self.doing is not Doing.NOTHING:
+            return
+        if self._follow is not None and self._follow.state is not None:
+            self.doing = Doing.LOADING
+            self._effects.append(Load(self._follow.state))
+        elif self._asked_state:
+            self.doing = Doing.TELLING
+            self._effects.append(Fetch())
+        elif self._index + 1 in self._held:
+            self.doing = Doing.APPLYING
+            call, request = self._held[self._index + 1]
+            # One whose client is gone is done as well, and answered to nobody.
+            self._effects.append(Apply(self._keeper or _NOBODY, call, request))
+
+    def _stand(self, log: Log, index: int) -> None:
+        """Stand in a log; what is held of it stays."""
+        if log != self._log:
+            self._clear()
+        self._log, self._index, self._is_lost = log, index, False
+        for done in [each for each in self._held if each <= index]:
+            self._held_bytes -= len(self._held.pop(done)[1])
+        if self._keeper is not None:
+            self._say(self._keeper)
+
+    def _lose(self) -> None:
+        self._log, self._index, self._is_lost = NO_LOG, 0, True
+        self._clear()
+        if self._keeper is not None and self._follow is None:
+            self._say(self._keeper)
+
+    def _clear(self) -> None:
+        """Forget what is held, but for the entry that the server is at."""
+        now = self._index + 1
+        self._held = {now: self._held[now]} if self.doing is Doing.APPLYING else {}
+        self._held_bytes = sum(len(request) for _, request in self._held.values())
+        self._gap_told = -1
+
+    def _end(self, doing: Doing) -> None:
+        assert self.doing is doing, f"{self.doing} ended as {doing}"
+        self.doing = Doing.NOTHING
+
+    def _reach(self) -> int:
+        reach = self._index
+        while reach + 1 in self._held:
+            reach += 1
+        return reach
+
+    def _say(self, client: Name) -> None:
+        kept_by = None if self._keeper in {None, client} else self._keeper
+        said = Position(self._log, self._index, self._reach(), self._is_lost, self._can_tell, kept_by)
+        self._effects.append(Say(client, said))
+
+
+_NOBODY: Final = Name(bytes(32))

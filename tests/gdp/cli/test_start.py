@@ -1,0 +1,20 @@
+"""What a node loads until it is up: a machine that replaces another is to serve within seconds."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+LARGE = {"networkx", "prometheus_client", "pyroute2", "rich.console", "rosbags.rosbag1", "rosbags.rosbag2", "scapy"}
+
+
+@pytest.mark.parametrize(
+    "modules",
+    ["gdp.cli.switch, gdp.ports.kernel.plane", "gdp.cli.rib", "proxy.cli, proxy.live", "fog.agent.cli"],
+)
+def test_a_node_starts_without_large_libraries_that_it_does_not_need(modules: str) -> None:
+    code = f"import sys, {modules}; print(*sys.modules)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert LARGE & set(said.split()) == set()
