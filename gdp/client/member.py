@@ -151,8 +151,13 @@ class Member:
         publisher = self._publications.get(service)
         if publisher is None:
             return []
-        heard = [feed.publisher for feed in self.feeds_of(service) if feed.state is FeedState.LIVE]
-        return [party for party in heard if publisher.is_followed_by(party, self._now_s, self._awake_s)]
+        return [party for party in self.heard(service) if publisher.is_followed_by(party, self._now_s, self._awake_s)]
+
+    def heard(self, service: Name) -> list[Name]:
+        """Return those of whom ``peers`` are some: whoever has joined us and is joined, keeping up or not."""
+        publisher = self._publications.get(service)
+        feeds = [feed for feed in self.feeds_of(service) if feed.state is FeedState.LIVE]
+        return [feed.publisher for feed in feeds if publisher is not None and publisher.is_read_by(feed.publisher)]
 
     def withdraw(self, name: Name) -> None:
         """Publish, serve or call a name no more; what is not, is not.

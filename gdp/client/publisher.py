@@ -108,6 +108,10 @@ class Publisher:
         keeps_up = self._window.has_reader(name) or not self._repairs_wanted
         return self.mtu is not None and keeps_up and self._readers.is_heard(name, now_s, awake_s)
 
+    def is_read_by(self, name: Name) -> bool:
+        """Return whether a tree stands, and somebody is a reader, keeping up or not."""
+        return self.mtu is not None and name in self._readers
+
     @property
     def past(self) -> Past:
         """Return where it is, for another one that goes on with the same."""

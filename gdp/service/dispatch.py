@@ -113,6 +113,7 @@ class Dispatch(Generic[A]):
         self._latencies = Latencies()
         self._budget = HedgeBudget(replication.budget)
         self._hedges: list[tuple[float, int]] = []  # a heap; of ended calls, too
+        self._late: dict[int, None] = {}  # whose second copy waits for the budget, the oldest first
         self._ended: dict[int, _Ended] = {}  # in the order of their time
         self._effects: list[Effect] = []
         self.late = 0
@@ -176,6 +177,7 @@ class Dispatch(Generic[A]):
             self._ask(number, call, chosen or self._untried(call, now_s)[:copies], now_s)
         if mode is Mode.HEDGED and not chosen:
             heapq.heappush(self._hedges, (now_s + self._hedge_after_s(), number))
+        self._hedge(now_s)
         return number
 
     def came(self, server: Name, now_s: float) -> None:
@@ -212,21 +214,21 @@ class Dispatch(Generic[A]):
             return
         self._latencies.ended(now_s - call.begun_s)
         self._calls.end(number)
-        self._held_bytes -= len(call.request)
+        self._release(number, call)
         if call.owing and self._stops:
             self._ended[number] = _Ended(now_s + GATHER_S, call.owing)
         call.answered(answer)
 
     def refused(self, number: int, server: Name, reason: str, now_s: float) -> None:
         """Take a server's word that it has no answer."""
-        call = self._take(number, server, now_s)
+        call = self._take(number, server, now_s, says_no=True)
         if call is not None:
             call.refused.add(server)
             self._go_on(number, call, Failure.REFUSED, reason, now_s)
 
     def declined(self, number: int, server: Name, answer: A, now_s: float) -> None:
         """Take an answer that says no: it counts if nobody says yes."""
-        call = self._take(number, server, now_s)
+        call = self._take(number, server, now_s, says_no=True)
         if call is not None:
             call.refused.add(server)
             call.declined.append(answer)
@@ -234,10 +236,12 @@ class Dispatch(Generic[A]):
 
     def timeout(self, now_s: float) -> None:
         """Do what is due."""
-        for _, call in self._calls.expired(now_s):
-            self._fail(call, Failure.TIMED_OUT, "")
+        for number, call in self._calls.expired(now_s):
+            self._fail(number, call, Failure.TIMED_OUT, "")
         while self._hedges and self._hedges[0][0] <= now_s:
-            self._hedge(heapq.heappop(self._hedges)[1], now_s)
+            if (number := heapq.heappop(self._hedges)[1]) in self._calls:
+                self._late[number] = None
+        self._hedge(now_s)
         self._tell_stops(now_s)
 
     def next_timeout(self) -> float | None:
@@ -252,7 +256,7 @@ class Dispatch(Generic[A]):
         """End every call, for nobody is asked any more."""
         for number, call in self._calls:
             if self._calls.end(number) is not None:
-                self._fail(call, Failure.NO_SERVER, reason)
+                self._fail(number, call, Failure.NO_SERVER, reason)
         self._hedges.clear()
         self._ended.clear()
 
@@ -261,7 +265,7 @@ class Dispatch(Generic[A]):
         effects, self._effects = self._effects, []
         return effects
 
-    def _take(self, number: int, server: Name, now_s: float) -> _Call[A] | None:
+    def _take(self, number: int, server: Name, now_s: float, *, says_no: bool = False) -> _Call[A] | None:
         """Return the call to which this server owed an answer, and note that it owes none any more."""
         call = self._calls.get(number)
         if call is None:
@@ -275,7 +279,10 @@ class Dispatch(Generic[A]):
             self.strange += since_s is None
         if since_s is None:
             return None
-        self._latencies.answered(server, now_s - since_s, now_s)
+        if says_no:
+            self._latencies.refused(server, now_s)
+        else:
+            self._latencies.answered(server, now_s - since_s, now_s)
         return call
 
     def _go_on(self, number: int, call: _Call[A], failure: Failure, reason: str, now_s: float) -> None:
@@ -285,7 +292,7 @@ class Dispatch(Generic[A]):
         self._ask(number, call, self._untried(call, now_s)[:1], now_s)
         if not call.owing:
             self._calls.end(number)
-            self._fail(call, failure, reason)
+            self._fail(number, call, failure, reason)
 
     def _untried(self, call: _Call[A], now_s: float) -> list[Name]:
         """Return whom to ask next, the best first; those that leave come last."""
@@ -299,16 +306,18 @@ class Dispatch(Generic[A]):
         if servers:
             self._effects.append(Ask(number, call.request, tuple(servers)))
 
-    def _hedge(self, number: int, now_s: float) -> None:
-        call = self._calls.get(number)
-        others = self._untried(call, now_s)[:1] if call is not None else []
-        if call is None or not others:
-            return
-        if self._budget.spend():
-            self.hedged += 1
-            self._ask(number, call, others, now_s)
-        else:
-            heapq.heappush(self._hedges, (now_s + self._hedge_after_s(), number))
+    def _hedge(self, now_s: float) -> None:
+        """Send second copies of late calls, as far as the budget goes; what it lacks, requests to come will bring."""
+        while self._late:
+            number = next(iter(self._late))
+            call = self._calls.get(number)
+            others = self._untried(call, now_s)[:1] if call is not None else []
+            if call is not None and others:
+                if not self._budget.spend():
+                    return
+                self.hedged += 1
+                self._ask(number, call, others, now_s)
+            del self._late[number]
 
     def _hedge_after_s(self) -> float:
         """Return how long a first copy has."""
@@ -318,8 +327,12 @@ class Dispatch(Generic[A]):
             return HEDGE_FIRST_S
         return max(min(late_s, HEDGE_LATER_MAX * soon_s), _HEDGE_MIN_S)
 
-    def _fail(self, call: _Call[A], failure: Failure, reason: str) -> None:
+    def _release(self, number: int, call: _Call[A]) -> None:
         self._held_bytes -= len(call.request)
+        self._late.pop(number, None)
+
+    def _fail(self, number: int, call: _Call[A], failure: Failure, reason: str) -> None:
+        self._release(number, call)
         if call.declined:
             call.answered(call.declined[0])
         else:
@@ -335,7 +348,7 @@ class Dispatch(Generic[A]):
         for number, owing in due:
             del self._ended[number]
             for server, since_s in owing.items():
-                self._latencies.answered(server, now_s - since_s, now_s)
+                self._latencies.stopped(server, now_s - since_s, now_s)
             by_tree = self._replication.mode is Mode.ALL and bool(owing)
             for each in [None] if by_tree else owing:
                 told.setdefault(each, []).append(number)

@@ -18,7 +18,7 @@ __all__ = ["Apply", "Doing", "Fetch", "Follower", "Load", "Refuse", "Say"]
 
 HELD_MAX: Final = 1_024  # how far ahead of its server it takes entries
 HELD_MAX_BYTES: Final = 64 << 20
-UNKEPT: Final = "requests to this service are kept in order: the client's rule must say so (state: ordered)"
+UNKEPT: Final = "this service takes requests in order, and follows nobody's yet"
 
 
 class Apply(NamedTuple):

@@ -314,7 +314,7 @@ class Keeper(Generic[A]):
             each.position is not None and each.position.kept_by is not None for each in self._replicas.values()
         ):
             self._kept_by = None
-        has_rest = position.held >= self._last - len(self._entries)  # or can get it
+        has_rest = self._last - len(self._entries) <= position.held <= self._last  # or can get it
         replica.follows = self._is_keeping and position.log == self._log and has_rest
         if replica.follows:
             replica.quiet_until_s = now_s + STALL_S
@@ -371,7 +371,7 @@ class Keeper(Generic[A]):
 
     def _admit(self, server: Name, replica: _Replica, position: Position, now_s: float) -> None:
         """Let a replica follow, from where it can."""
-        state, is_level = self._state, self._is_level(position)
+        state, is_level = self._state, self._is_level(position) and len(self._entries) == self._last
         if not any(each.follows for each in self._replicas.values()) and not self._is_sent:
             return  # first comes the one with which it begins
         if position.tells and (position.is_fresh or not is_level):
@@ -381,7 +381,7 @@ class Keeper(Generic[A]):
                 return
             if self._state_asked is not None or self._ask_state(now_s):
                 return  # it is let in when the state is here
-        if is_level and len(self._entries) == self._last:
+        if is_level:
             self._follow(server, replica, Follow(self._log, 0, position.log, position.at, None), now_s)
         else:
             replica.why_not = _UNKNOWN if position.is_lost else _UNLIKE
@@ -415,7 +415,9 @@ class Keeper(Generic[A]):
 
     def _done(self, number: int, server: Name, now_s: float) -> _Replica | None:
         replica, (life, index) = self._replicas.get(server), place_of(number)
-        if replica is None or not replica.follows or replica.position is None or life != self._log.life:
+        if replica is None or not replica.follows or replica.position is None:
+            return None
+        if life != self._log.life or index > self._last:
             return None
         if index > replica.position.at:
             replica.position = replica.position._replace(at=index, held=max(index, replica.position.held))
@@ -444,7 +446,7 @@ class Keeper(Generic[A]):
         return True
 
     def _take_state(self, server: Name, replica: _Replica, word: State, now_s: float) -> None:
-        if server != self._state_asked or word.log != self._log:
+        if server != self._state_asked or word.log != self._log or word.at > self._last:
             return
         self._state_asked = None
         if word.state is None:

@@ -20,6 +20,7 @@ ENOUGH: Final = 32  # of them; fewer say nothing of a tail
 LATELY_S: Final = 10.0  # a server without an answer for so long is tried again, however slow it was
 _WEIGHT: Final = 0.2  # of the newest answer in a server's average
 _SORT_EVERY: Final = 16  # answers
+_UNANSWERED_MAX: Final = 3  # requests that were stopped, one after the other, before a server is asked last
 
 
 @dataclass(slots=True)
@@ -27,6 +28,7 @@ class _Server:
     average_s: float | None = None
     seen_s: float = -inf  # when it was asked or answered last
     owing_s: float | None = None  # since when it is asked without an answer to anything
+    unanswered: int = 0  # stopped since its last answer
 
 
 class Latencies:
@@ -45,11 +47,17 @@ class Latencies:
         entry.owing_s = now_s if entry.owing_s is None else entry.owing_s
 
     def answered(self, server: Name, seconds: float, now_s: float) -> None:
-        """Note how long a server took; of one that was stopped, how long it had."""
+        """Note how long a server took."""
+        self._learn(server, seconds, now_s).unanswered = 0
+
+    def stopped(self, server: Name, seconds: float, now_s: float) -> None:
+        """Note how long a server had before another one answered: it may be nearly as fast, or dead."""
+        self._learn(server, seconds, now_s).unanswered += 1
+
+    def refused(self, server: Name, now_s: float) -> None:
+        """Note that a server said no, which is no feat however fast it was."""
         entry = self._servers.setdefault(server, _Server())
-        before = seconds if entry.average_s is None else entry.average_s
-        entry.average_s, entry.seen_s = before + _WEIGHT * (seconds - before), now_s
-        entry.owing_s = None
+        entry.seen_s, entry.owing_s, entry.unanswered = now_s, None, _UNANSWERED_MAX
 
     def ended(self, seconds: float) -> None:
         """Note how long the first copy of a request took, or had when another was answered."""
@@ -69,12 +77,21 @@ class Latencies:
         return self._sorted[min(int(share * len(self._sorted)), len(self._sorted) - 1)]
 
     def ranked(self, servers: Iterable[Name], now_s: float) -> list[Name]:
-        """Return servers in the order in which to ask them: untried ones, then the fastest lately."""
-        return sorted(servers, key=lambda server: self._expected_s(server, now_s))
+        """Return servers in the order in which to ask them: untried ones, the fastest lately, those without answers."""
+        return sorted(servers, key=lambda server: self._expected(server, now_s))
 
-    def _expected_s(self, server: Name, now_s: float) -> float:
+    def _expected(self, server: Name, now_s: float) -> tuple[bool, float]:
+        """Return whether a server seems to answer nothing, and after how many seconds it would."""
         entry = self._servers.get(server)
         if entry is None or now_s - entry.seen_s > LATELY_S:
-            return -1.0
+            return False, -1.0
         silent_s = 0.0 if entry.owing_s is None else now_s - entry.owing_s  # it may have died
-        return inf if entry.average_s is None else max(entry.average_s, silent_s)
+        seconds = inf if entry.average_s is None else max(entry.average_s, silent_s)
+        return entry.unanswered >= _UNANSWERED_MAX, seconds
+
+    def _learn(self, server: Name, seconds: float, now_s: float) -> _Server:
+        entry = self._servers.setdefault(server, _Server())
+        before = seconds if entry.average_s is None else entry.average_s
+        entry.average_s, entry.seen_s = before + _WEIGHT * (seconds - before), now_s
+        entry.owing_s = None
+        return entry

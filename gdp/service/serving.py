@@ -5,22 +5,27 @@ Place: pure; time comes in as ``now_s`` (monotonic seconds).
 A client may send one request twice (by the tree, and again to one that it takes for new): the second time the answer is
 given again, or nothing happens while the first is under way. And it may end a call: what waits then is never given to
 the local server; what that has already keeps its place until the server is done with it, for it works all the same.
+
+Clients take turns, and one may take as much room as it leaves free: half of it alone, and the next always finds some.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import Counter, OrderedDict
+from collections.abc import Sized
 from dataclasses import dataclass
 from typing import Final, Generic, NamedTuple, TypeVar
 
+from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.service.calls import Calls
 
 __all__ = ["Asked", "Expired", "Serving", "Turn"]
 
-R = TypeVar("R")
+R = TypeVar("R", bound=Sized)
 
 CALLS_MAX: Final = 65_536
+WAITING_MAX_BYTES: Final = 128 << 20  # of requests that the local server has not got yet
 ENDED_MAX: Final = 4_096  # ended calls that are remembered
 ANSWER_KEPT_BYTES: Final = 4_096  # larger answers are not: the request is served again
 
@@ -57,6 +62,8 @@ class Expired(NamedTuple):
 class _Served(Generic[R]):
     asked: Asked
     request: R | None  # None: the local server has it
+    size_bytes: int
+    after: Asked | None
     is_wanted: bool = True
 
 
@@ -68,12 +75,23 @@ class Serving(Generic[R]):
         at_once: how many the local server has at one time; None: all.
     """
 
-    def __init__(self, start: int, at_once: int | None = None, limit: int = CALLS_MAX) -> None:
+    def __init__(
+        self,
+        start: int,
+        at_once: int | None = None,
+        limit: int = CALLS_MAX,
+        waiting_max_bytes: int = WAITING_MAX_BYTES,
+    ) -> None:
         self._calls: Calls[_Served[R]] = Calls(limit, start)
         self._numbers: dict[Asked, int] = {}
-        self._waiting: OrderedDict[int, None] = OrderedDict()
-        self._held_back: dict[Asked, list[int]] = {}  # call -> those that wait for its end
-        self._ended: OrderedDict[Asked, bytes] = OrderedDict()
+        self._waiting: OrderedDict[Name, OrderedDict[int, None]] = OrderedDict()  # by client, whose turn is next first
+        self._held_back: dict[Asked, dict[int, None]] = {}  # call -> those that wait for its end
+        self._ended: dict[Name, OrderedDict[Asked, bytes]] = {}  # by client
+        self._ended_count = 0
+        self._limit = limit
+        self._shares: Counter[Name] = Counter()  # calls of each client
+        self._waiting_max_bytes = waiting_max_bytes
+        self._waiting_bytes: Counter[Name] = Counter()  # by client
         self._at_once = at_once
         self._given = 0
 
@@ -85,7 +103,8 @@ class Serving(Generic[R]):
 
     def answer_of(self, asked: Asked) -> bytes | None:
         """Return what a call that ended lately was answered: nothing where it was stopped. None: it did not."""
-        return self._ended.get(asked)
+        ended = self._ended.get(asked.client)
+        return None if ended is None else ended.get(asked)
 
     def begin(
         self, now_s: float, patience_s: float | None, asked: Asked, request: R, after: Asked | None = None
@@ -97,24 +116,36 @@ class Serving(Generic[R]):
             after: a call whose end it waits for, if that is under way.
 
         Raises:
-            LocalError: as many as there may be are under way.
+            LocalError: this client has as many under way, or as much waiting, as there is room left for others.
         """
-        number = self._calls.begin(now_s, patience_s, _Served(asked, request))
+        client, size = asked.client, len(request)
+        room, room_bytes = self._limit - len(self._calls), self._waiting_max_bytes - self._waiting_bytes.total()
+        if self._shares[client] >= room or self._waiting_bytes[client] + size > room_bytes:
+            raise LocalError(f"{self._shares[client]} requests of this client are under way: no more at once")
+        after = after if after in self._numbers else None
+        number = self._calls.begin(now_s, patience_s, _Served(asked, request, size, after))
         self._numbers[asked] = number
-        if after is not None and after in self._numbers:
-            self._held_back.setdefault(after, []).append(number)
+        self._shares[client] += 1
+        self._waiting_bytes[client] += size
+        if after is None:
+            self._wait(number, client)
         else:
-            self._waiting[number] = None
+            self._held_back.setdefault(after, {})[number] = None
         return number
 
     def take(self) -> list[Turn[R]]:
         """Return, once, the requests whose turn it is."""
         turns: list[Turn[R]] = []
         while self._waiting and (self._at_once is None or self._given < self._at_once):
-            number = self._waiting.popitem(last=False)[0]
+            client, numbers = next(iter(self._waiting.items()))
+            number = next(iter(numbers))
+            self._wait_no_more(number, client)
+            if numbers:
+                self._waiting.move_to_end(client)
             served = self._calls.get(number)
             if served is not None and served.request is not None:
                 turns.append(Turn(number, served.asked, served.request))
+                _take_off(self._waiting_bytes, client, served.size_bytes)
                 served.request = None
                 self._given += 1
         return turns
@@ -130,15 +161,21 @@ class Serving(Generic[R]):
     def remember(self, asked: Asked, answer: bytes) -> None:
         """Keep what was answered for a while; nothing: the call was stopped."""
         if len(answer) <= ANSWER_KEPT_BYTES:
-            self._ended[asked] = answer
-            if len(self._ended) > ENDED_MAX:
-                self._ended.popitem(last=False)
+            ended = self._ended.setdefault(asked.client, OrderedDict())
+            self._ended_count += asked not in ended
+            ended[asked] = answer
+            if self._ended_count > ENDED_MAX:
+                client, most = max(self._ended.items(), key=lambda each: len(each[1]))
+                most.popitem(last=False)
+                self._ended_count -= 1
+                if not most:
+                    del self._ended[client]
 
     def stop(self, asked: Asked) -> int | None:
         """Learn that a client's call has ended, known here or on its way; return its number if the server has it."""
         number = self._numbers.pop(asked, None)
         if number is None:
-            if asked not in self._ended:
+            if self.answer_of(asked) is None:
                 self.remember(asked, b"")
             return None
         self.remember(asked, b"")
@@ -170,14 +207,40 @@ class Serving(Generic[R]):
         self._numbers.clear()
         self._waiting.clear()
         self._held_back.clear()
+        self._shares.clear()
+        self._waiting_bytes.clear()
         self._given = 0
         return ended
 
     def _forget(self, number: int, served: _Served[R]) -> None:
         if self._numbers.get(served.asked) == number:
             del self._numbers[served.asked]
-        self._waiting.pop(number, None)
-        self._given -= served.request is None
+        client = served.asked.client
+        _take_off(self._shares, client, 1)
+        if served.request is None:
+            self._given -= 1
+        else:
+            _take_off(self._waiting_bytes, client, served.size_bytes)
+            self._wait_no_more(number, client)
+            if served.after is not None:
+                self._held_back.get(served.after, {}).pop(number, None)
         for each in self._held_back.pop(served.asked, ()):
-            if each in self._calls:
-                self._waiting[each] = None
+            other = self._calls.get(each)
+            if other is not None:
+                self._wait(each, other.asked.client)
+
+    def _wait(self, number: int, client: Name) -> None:
+        self._waiting.setdefault(client, OrderedDict())[number] = None
+
+    def _wait_no_more(self, number: int, client: Name) -> None:
+        numbers = self._waiting.get(client)
+        if numbers is not None:
+            numbers.pop(number, None)
+            if not numbers:
+                del self._waiting[client]
+
+
+def _take_off(counts: Counter[Name], client: Name, count: int) -> None:
+    counts[client] -= count
+    if not counts[client]:
+        del counts[client]

@@ -146,7 +146,7 @@ class Planter:
         self._plant(tree)
         if self._follow(tree, now_s):
             return
-        if before is None or not is_same_place:
+        if before is None or not is_same_place or tree.is_doubted:
             self._ask_above(tree, now_s)
         else:
             self._resize(tree)
@@ -181,13 +181,14 @@ class Planter:
     def doubt(self, proves: Callable[[bytes], bool], until_s: float, now_s: float) -> None:
         """Let branches whose evidence holds no more end at ``until_s``, unless another reader's is shown by then.
 
-        Where another branch's evidence still holds, the next switch is shown that one at once.
+        The next switch is shown another branch's evidence at once, or when one is shown here.
         """
         for tree in self.trees.all():
             for branch in tree.branches.values():
                 if not proves(branch.evidence):
                     branch.expires_s = min(branch.expires_s, until_s)
-                    tree.renew_at_s = now_s
+            if not proves(tree.shown):
+                tree.is_doubted, tree.renew_at_s = True, now_s
             self._plant(tree)
 
     def reroute(self, now_s: float) -> None:
@@ -267,7 +268,7 @@ class Planter:
             return
         tree.above, tree.above_name = above[:2], above[2]
         tree.asked_mtu = min(tree.mtu, self._outbox.mtu_of(above[0]))
-        self._say(tree, tree.asked_mtu, JOIN_LEASE_S, tree.evidence)
+        self._show(tree)
 
     def _resize(self, tree: Tree) -> None:
         """Say at once, to the one above, that what fits its tree has changed."""
@@ -276,7 +277,14 @@ class Planter:
         mtu = min(tree.mtu, self._outbox.mtu_of(tree.above[0]))
         if mtu != tree.asked_mtu:
             tree.asked_mtu = mtu
-            self._say(tree, mtu, JOIN_LEASE_S, tree.evidence)
+            self._show(tree)
+
+    def _show(self, tree: Tree) -> None:
+        """Join the one above, with the evidence of a reader below."""
+        evidence = tree.evidence
+        tree.is_doubted = tree.is_doubted and evidence == tree.shown
+        tree.shown = evidence
+        self._say(tree, tree.asked_mtu, JOIN_LEASE_S, evidence)
 
     def _leave(self, tree: Tree) -> None:
         if tree.above is not None:

@@ -46,6 +46,8 @@ class Tree:
     above_name: Name | None = None
     renew_at_s: float = 0.0
     asked_mtu: int = 0  # what the last join said
+    shown: bytes = b""  # the evidence that it carried
+    is_doubted: bool = False  # that proves nothing any more
 
     @property
     def key(self) -> bytes:

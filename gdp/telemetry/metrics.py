@@ -55,6 +55,7 @@ class Metrics(Collector):
         yield from _counter("gdp_message_bytes", "Their bytes before sealing", "direction", of.message_bytes)
         yield from _counter("gdp_repairs", "Lost parts by what happened to them", "step", of.repairs)
         yield from _counter("gdp_proxy_faults", "What was not carried as it should be, by fault", "fault", of.faults)
+        yield from _counter("gdp_calls", "Calls of several servers by what came of it", "event", of.calls)
         if of.latency is not None:
             yield _histogram("gdp_latency_seconds", "One-way latency of messages", of.latency())
 

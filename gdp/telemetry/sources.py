@@ -57,6 +57,7 @@ class Sources:
         message_bytes: their bytes by direction, before sealing.
         repairs: lost parts by what happened to them: asked, sent, given-up.
         faults: what a proxy could not carry, or not as it should be, by what was wrong.
+        calls: what several servers of one service bring with them: late and strange answers, hedged requests.
         latency: one-way, from the source's stamp to delivery.
     """
 
@@ -71,4 +72,5 @@ class Sources:
     message_bytes: Counts | None = None
     repairs: Counts | None = None
     faults: Counts | None = None
+    calls: Counts | None = None
     latency: Callable[[], Histogram] | None = None

@@ -8,6 +8,7 @@ cgroup-v1/ (cpu.cfs_quota_us, memory.limit_in_bytes).
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import time
@@ -25,6 +26,7 @@ _OLD_CONTROLLERS: Final = frozenset({"cpu", "memory"})
 _PERIOD_US: Final = 20_000  # a fifth of the kernel's own, so that a slow machine is slow rather than jerky
 _PATIENCE_S: Final = 3.0
 _LOOK_S: Final = 0.005
+_GONE: Final = (errno.ENOENT, errno.ENODEV)
 
 
 class Cgroup:
@@ -95,9 +97,17 @@ class Cgroup:
         return path is not None
 
     def kill(self) -> None:
-        """Kill every process of the group."""
+        """Kill every process of the group; fine if somebody else removes it meanwhile.
+
+        Raises:
+            LocalError: the kernel refuses.
+        """
         if (path := self._find(("cgroup.kill",))) is not None:
-            self._write(path, "1")
+            try:
+                path.write_text("1", encoding="ascii")
+            except OSError as error:
+                if error.errno not in _GONE:
+                    raise LocalError(f"{path}: {error.strerror}") from error
             return
         for folder in self._standing():
             for pid in _pids(folder):

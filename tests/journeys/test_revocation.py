@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
@@ -103,3 +105,19 @@ def test_a_switch_that_was_away_learns_what_was_revoked_meanwhile() -> None:
     world.network.run(5)
     assert world.switches["nuc1"].drops()[DropReason.REVOKED] > 0
     assert not world.switches["nuc1"].attached.get(flow.topic.name, flow.member.name)
+
+
+@pytest.mark.parametrize("revoked", [0, 1])
+def test_the_whole_way_to_another_reader_stands_while_one_is_taken_back(revoked: int) -> None:
+    world = ring()
+    world.add_member("nuc5/other", "nuc5")
+    assert world.settle()
+    readers = (SERVER, "nuc5/other")
+    flow = flowing(world, readers=readers)
+    reader = next(s for s in world.members[readers[revoked]].subscribed() if s.name == flow.topic.name)
+    until = int(world.network.now.unix_s) + 100_000
+    fingerprint = parse(reader.delegation.chain[-1]).fingerprint
+    world.switches["nuc5"].revoke(world.owner.revoke(reader.delegation.subject, fingerprint, until), world.network.now)
+    world.network.touch("nuc5")
+    way = [world.switches[node] for node in ("nuc1", "nuc2", "nuc3", "nuc4", "nuc5")]
+    assert not world.network.run(3, lambda: not all(switch.planter.trees.all() for switch in way))
