@@ -32,19 +32,21 @@ if [[ $# -gt 0 ]]; then
     run "$@"
     exit
 fi
-# Tests with namespaces mostly wait for processes; what runs in one process alone runs beside them. Timers of nodes that
+# Tests with namespaces mostly wait for processes, so two lanes run side by side, equally long. Timers of nodes that
 # share two cores with other tests may starve: what failed runs once more with nothing beside it, and is told.
-lane() { run -o "cache_dir=.pytest_cache/$1" "${@:2}"; }
-lane beside tests >"$beside" 2>&1 &
+clusters=(netns_tests/test_{bench_replicas,experiments,fog,fog_demo,leaving,local_provider}.py)
+declare -A lanes=(["clusters"]="tests ${clusters[*]}" ["spaces"]="netns_tests ${clusters[*]/#/--ignore=}")
+# shellcheck disable=SC2086  # words
+lane() { run -o "cache_dir=.pytest_cache/$1" ${lanes[$1]} "${@:2}"; }
+lane clusters >"$beside" 2>&1 &
 others=$!
 trap 'kill "$others" 2>/dev/null || true; exit 130' INT TERM
 failed=()
-lane spaces netns_tests || failed+=("spaces netns_tests")
-wait "$others" || failed+=("beside tests")
+lane spaces || failed+=(spaces)
+wait "$others" || failed+=(clusters)
 cat "$beside"
 for which in "${failed[@]}"; do
-    printf 'failed beside other tests, so once more alone: %s\n' "${which#* }"
-    # shellcheck disable=SC2086  # two words
-    lane $which --last-failed --last-failed-no-failures none
+    printf 'failed beside other tests, so once more alone: %s\n' "$which"
+    lane "$which" --last-failed --last-failed-no-failures none
     printf 'passed alone: unsteady, look at the failures above\n'
 done

@@ -7,15 +7,19 @@ its time is up; a later answer finds nobody, and servers that still work on it a
 
 from __future__ import annotations
 
+import secrets
 from collections import deque
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 from gdp.client.member import Message, Topic
 from gdp.errors import GdpError, LocalError, RemoteError
 from gdp.names import Name
-from gdp.service.dispatch import Ask, Dispatch, Effect, Failure
+from gdp.service.dispatch import Ask, Dispatch, Failure
+from gdp.service.dispatch import Effect as DispatchEffect
+from gdp.service.keeper import Keeper, Word
+from gdp.service.ordered import LIFE_BITS
 from gdp.service.replication import ALL, Mode
 from proxy.bridge.far_server import FarServer
 from proxy.bridge.goals import Goals, goal_of, says_yes
@@ -26,9 +30,12 @@ from proxy.bridge.wishes import Wish
 from proxy.endpoints.endpoint import Asked, Event, Faulted
 from proxy.exchange import PATIENCE_MAX_MS, Answer, Exchange, News, Outcome, Request, Stop, too_large
 from proxy.faults import Fault
+from proxy.ordering import follower_word, is_word, to_wire
 from proxy.serial.serializer import Serializer
 
 __all__ = ["ImportedService"]
+
+Effect: TypeAlias = "DispatchEffect | Word"
 
 _GONE: Final = "the far server is gone"
 _FAULTS: Final = {
@@ -69,8 +76,14 @@ class ImportedService:
         self._topic = topic
         self._parts = Parts.of(wish.rule.kind, wish.local, wish.type_name)
         self._goals = Goals() if wish.rule.kind == "action" else None
-        self._calls = tuple(
-            Dispatch[_Won](
+        self._keeper: Keeper[_Won] | None = None
+        self._outside: dict[Name, str] = {}  # servers that cannot be kept in order, as told
+        if wish.rule.is_ordered:
+            self._keeper = Keeper(life=lambda: secrets.randbits(LIFE_BITS))
+        self._calls: tuple[Dispatch[_Won] | Keeper[_Won], ...] = tuple(
+            self._keeper
+            if self._keeper is not None
+            else Dispatch[_Won](
                 ALL if self._goals is not None and part == CANCEL else wish.rule.spread,
                 start=random_start,
                 stops=self._goals is None or part == RESULT,  # a goal is every server's, until one has its result
@@ -79,6 +92,7 @@ class ImportedService:
         )
         self._about: dict[tuple[int, int], bytes] = {}  # part and call -> goal, while under way
         self._for_all = deque[tuple[int, Effect]]()  # waits until the stream to all servers has room
+        self._counted: tuple[int, ...] = (0, 0, 0)  # late, strange and hedged, as told
         self._servers: dict[Name, FarServer] = {}
         self._requests: tuple[Serializer, ...] = ()
         self._handles: list[int] = []
@@ -91,7 +105,10 @@ class ImportedService:
         """Take a far server's answer, or what its action's topics say."""
         self._site.traffic.received(len(message.delivered.message))
         try:
-            if message.private:
+            if message.private and self._keeper is not None and is_word(message.delivered.message):
+                word = follower_word(message.delivered.message)
+                self._keeper.positioned(self._heard_of(message, now_s), word, now_s)
+            elif message.private:
                 self._take_answer(message, now_s)
             else:
                 self._take_news(message)
@@ -111,6 +128,12 @@ class ImportedService:
         """Open or close the virtual server as far ones come and go."""
         self._follow(now_s)
         self.timeout(now_s)
+        self._count()
+        if self._keeper is not None:
+            outside = dict(self._keeper.outside)
+            for name in [name for name, reason in outside.items() if self._outside.get(name) != reason]:
+                self._site.faults.tell(self._wish.local, Fault.REFUSED, f"server {name.short}: {outside[name]}")
+            self._outside = outside
 
     def timeout(self, now_s: float) -> None:
         """Do what is due, between looks at who is there."""
@@ -136,8 +159,19 @@ class ImportedService:
         self._topic = topic
         self._site.member.renew(topic)
 
+    def _count(self) -> None:
+        """Add to the proxy's counts what is new since the last time."""
+        traffic = self._site.traffic
+        now = tuple(sum(counts) for counts in zip(*((d.late, d.strange, d.hedged) for d in self._calls), strict=True))
+        traffic.late += now[0] - self._counted[0]
+        traffic.strange += now[1] - self._counted[1]
+        traffic.hedged += now[2] - self._counted[2]
+        self._counted = now
+
     def _follow(self, now_s: float) -> None:
-        peers = set(self._site.member.peers(self._topic.name))
+        member = self._site.member
+        # Where nobody keeps up, to wait for who may do so again is better than to give up.
+        peers = set(member.peers(self._topic.name) or member.heard(self._topic.name))
         feeds = self._site.member.feeds_of(self._topic.name) if peers else []
         heard = {feed.publisher: feed for feed in feeds if feed.publisher in peers}
         for name, server in list(self._servers.items()):
@@ -165,6 +199,9 @@ class ImportedService:
         endpoint = self._seat.endpoint
         try:
             server = FarServer.learn(incarnation, description, self._parts, endpoint, self._wish.rule.encoding)
+            if server.exchange is not None and server.exchange.is_ordered != (self._keeper is not None):
+                side = "the far side's" if self._keeper is not None else "this side's"
+                raise LocalError(f"'state: ordered' is missing in {side} rule")
             if not self._handles and server.ours is not None:
                 self._open(server.ours)
         except GdpError as error:
@@ -226,7 +263,8 @@ class ImportedService:
         except RemoteError as error:
             self._refuse(waiting, Fault.MALFORMED, str(error))
         except LocalError as error:
-            fault = Fault.TOO_FAST if self._calls[part].servers else Fault.NO_SERVER
+            fault = Fault.REFUSED if self._keeper is not None else Fault.TOO_FAST
+            fault = fault if self._calls[part].servers else Fault.NO_SERVER
             self._refuse(waiting, fault, str(error))
 
     def _write(self, waiting: _Waiting, body: bytes, timeout_s: float | None, call: int) -> bytes:
@@ -291,10 +329,15 @@ class ImportedService:
         if self._goals is not None and part != CANCEL:
             self._goals.holds(self._about[part, call], servers)
 
-    def _take_answer(self, message: Message, now_s: float) -> None:
-        answer, name = Answer.from_wire(message.delivered.message), Name(message.delivered.publisher)
+    def _heard_of(self, message: Message, now_s: float) -> Name:
+        """Return who sent this, which may have come just now."""
+        name = Name(message.delivered.publisher)
         if name not in self._servers:
-            self._follow(now_s)  # it may have come just now
+            self._follow(now_s)
+        return name
+
+    def _take_answer(self, message: Message, now_s: float) -> None:
+        answer, name = Answer.from_wire(message.delivered.message), self._heard_of(message, now_s)
         server = self._servers.get(name)
         if server is None or answer.part >= len(server.answers):
             return  # of a server that is gone, or that cannot be understood here: that was told
@@ -352,4 +395,6 @@ class ImportedService:
 
 
 def _wire(part: int, effect: Effect) -> bytes:
-    return effect.request if isinstance(effect, Ask) else Stop(part, effect.calls).to_wire()
+    if isinstance(effect, Ask):
+        return effect.request
+    return to_wire(effect.word) if isinstance(effect, Word) else Stop(part, effect.calls).to_wire()
