@@ -15,13 +15,13 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from fog.agent.bundle import install
 from fog.enrolment.boots import RobotDevices, robot_boot
@@ -66,7 +66,9 @@ class SiteConfig(Section):
     skypilot: SkyPilotConfig = Field(
         default=SkyPilotConfig(), description="Of provider `skypilot`; see docs/providers.md."
     )
-    machine_iface: Ifname = Field(default="eth0", description="A machine's device towards the overlay.")
+    machine_iface: Ifname | None = Field(
+        default=None, description="A machine's device towards the overlay. Default: of `local` eth0, else the tunnel's."
+    )
     uplink: Ifname | None = Field(
         default=None, description="`local`: the port of the robot's switch that leads to the machines; it is made."
     )
@@ -81,6 +83,35 @@ class SiteConfig(Section):
     )
     idle_s: float | None = Field(default=None, gt=0, description="Default of a cluster's idle limit, in seconds.")
     budget_usd: float | None = Field(default=None, gt=0, description="Default of a cluster's budget.")
+    latency_ms: Mapping[str, Annotated[float, Field(ge=0)]] = Field(
+        default_factory=dict, description="Region: round trip from the robot, in ms; weighed against the price."
+    )
+
+    @property
+    def device(self) -> str:
+        """Return a machine's device towards the overlay; empty: nobody said which."""
+        return self.machine_iface or ("eth0" if self.provider == "local" else self._tunnel)
+
+    @property
+    def _tunnel(self) -> str:
+        setups = {"aws": self.aws.setup, "skypilot": self.skypilot.setup}
+        vxlan = setups[self.provider].vxlan if self.provider in setups else None
+        return "" if vxlan is None else vxlan.device
+
+    @model_validator(mode="after")
+    def _meets_the_overlay(self) -> SiteConfig:
+        """A machine whose switch has no device to the robot boots, costs, and never serves."""
+        if not self.device:
+            raise ValueError(
+                f"machines of {self.provider} have no way to the robot: set {self.provider}.setup.vxlan, or name in"
+                " machine_iface the device of a tunnel that you install"
+            )
+        if self._tunnel not in ("", self.device):
+            raise ValueError(
+                f"machine_iface is {self.device}, but the tunnel of {self.provider}.setup.vxlan is {self._tunnel}:"
+                " leave machine_iface out, or let both say the same"
+            )
+        return self
 
     @classmethod
     def load(cls, path: Path) -> SiteConfig:
@@ -122,6 +153,7 @@ class Site:
     papers_days: float = 7.0
     idle_s: float | None = None
     budget_usd: float | None = None
+    latency_ms: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def robot(self) -> Path | None:
@@ -240,8 +272,9 @@ def _stated(config: SiteConfig, file: Path, folder: Path, identifier: str) -> Si
         aws=config.aws,
         skypilot=config.skypilot,
         topology=config.topology,
-        machine_iface=config.machine_iface,
+        machine_iface=config.device,
         papers_days=config.papers_days,
         idle_s=config.idle_s,
         budget_usd=config.budget_usd,
+        latency_ms=config.latency_ms,
     )

@@ -9,11 +9,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from fog.supervisor.journal import Journal
+from fog.supervisor.record import Record
 from netns_tests.local_site import PATIENCE_S
 from netns_tests.spaces import Space
 from tests.pages import ROOT
@@ -59,8 +62,12 @@ class Fog:
         found: dict[str, Any] = json.loads(self.run("status", "--json"))
         return found
 
+    def living(self) -> list[Record]:
+        with closing(Journal(self.state / "journal.sqlite3")) as journal:
+            return journal.machines("echo", gone=False)
+
     def serving(self) -> list[str]:
-        return [each["name"] for each in self.status()["members"] if each["serving"]]
+        return [each.name for each in self.living() if each.is_serving]
 
     def until(self, is_met: Callable[[], object], what: str) -> None:
         end_s = time.monotonic() + _MACHINES_S
@@ -90,6 +97,7 @@ def test_calls_go_on_while_machines_are_taken_and_killed_and_the_supervisor_is(f
         first, second = fog.serving()
         os.kill(fog.status()["supervisor_pid"], signal.SIGKILL)
         fog.run("local", "kill", first)  # nobody looks
+        fog.run("status")  # any command starts another one
         fog.until(lambda: len({*fog.serving()} - {first}) == 2, "a killed machine is replaced")
         fog.run("local", "notice", second, "--seconds", "5")
         fog.until(lambda: len({*fog.serving()} - {first, second}) == 2, "a machine with notice is replaced")
@@ -100,10 +108,13 @@ def test_calls_go_on_while_machines_are_taken_and_killed_and_the_supervisor_is(f
     finally:
         caller.kill()
         caller.wait()
-    what = [json.loads(line)["what"] for line in fog.run("status", "--events", "--json", "-n", "200").splitlines()]
-    assert {"taken", "notice", "draining"} <= set(what)
+    events = [json.loads(line) for line in fog.run("status", "--events", "--json", "-n", "200").splitlines()]
+    assert {"taken", "notice", "draining"} <= {each["what"] for each in events}
+    assert [each["what"] for each in events].count("reconciled") == 2
+    assert all(each["since_unix_s"] <= each["unix_s"] for each in events if each["what"] in ("taken", "notice"))
+    assert "ready" in fog.run("logs", first, "node")
     fog.run("scale", "down")
-    fog.until(lambda: len(fog.status()["members"]) == 1, "one replica is let go")
+    fog.until(lambda: len(fog.living()) == 1, "one replica is let go")
     fog.run("down")
     assert json.loads(fog.run("ls", "--json")) == []
     assert not _left(fog)

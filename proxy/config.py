@@ -112,6 +112,20 @@ class ProxyConfig(Section):
             raise ValidationError.from_exception_data("proxy.yaml", errors)
         return self
 
+    def _misplaced(self) -> Iterator[Fault]:
+        """Yield the keys that mean nothing on their side."""
+        for side, rules, only in (
+            ("expose", self.expose, {"replication": "import"}),
+            ("import", self.imports, dict.fromkeys(("stop", "at_once", "state_node"), "expose")),
+        ):
+            for index, rule in enumerate(rules):
+                for key in only.keys() & rule.model_fields_set:
+                    yield (side, index, key), f"this stands in rules under {only[key]}"
+                if rule.state_node is not None and not rule.is_ordered:
+                    yield (side, index, "state_node"), "this needs 'state: ordered'"
+                if rule.is_ordered and rule.at_once is not None:
+                    yield (side, index, "at_once"), "with 'state: ordered' it is always 1"
+
     def _faults(self) -> Iterator[Fault]:
         if self.record is not None and not self.imports:
             yield ("record",), "there is nothing to record without a rule under import"
@@ -133,4 +147,5 @@ class ProxyConfig(Section):
                     places[id(rule)] = self.endpoint_of(rule)
                 except LocalError as error:
                     yield (side, index), str(error)
+        yield from self._misplaced()
         yield from clashes(self.expose, self.imports, lambda rule: places[id(rule)])

@@ -181,12 +181,14 @@ class Exchange:
         services: by part.
         topics: of an action; their parts follow the services'.
         is_leaving: a server that answers what is under way, and then goes: ask others.
+        is_ordered: it keeps state, and takes requests in one order only.
     """
 
     encoding: Encoding
     services: tuple[Service, ...]
     topics: tuple[Channel, ...] = ()
     is_leaving: bool = False
+    is_ordered: bool = False
 
     def to_wire(self) -> bytes:
         """Return the wire form.
@@ -196,7 +198,8 @@ class Exchange:
         """
         services = [service.to_wire() for service in self.services]
         said = {"e": self.encoding, "s": services, "c": [channel.to_wire() for channel in self.topics]}
-        return encode(said | {"l": True} if self.is_leaving else said)
+        flags = {"l": self.is_leaving, "o": self.is_ordered}
+        return encode(said | {flag: True for flag, is_so in flags.items() if is_so})
 
     @classmethod
     def from_wire(cls, wire: bytes) -> Exchange:
@@ -216,5 +219,6 @@ class Exchange:
                         tuple(map(Service.from_wire, parts[: len(services)])),
                         tuple(map(Channel.from_wire, parts[len(services) :])),
                         more.get("l") is True,
+                        more.get("o") is True,
                     )
         raise RemoteError(DropReason.MALFORMED, "a description of a service")

@@ -92,6 +92,7 @@ class ProxyNode:
             message_bytes=self.traffic.message_bytes,
             repairs=lambda: {"sent": sum(publisher.repairs for publisher in member.publishers())},
             faults=lambda: self.faults.counts,
+            calls=self.traffic.calls,
             latency=lambda: self.traffic.latency,
         )
 

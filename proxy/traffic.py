@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from gdp.telemetry.metrics import Histogram
+from gdp.telemetry.sources import Histogram
 
 __all__ = ["Traffic"]
 
@@ -21,6 +21,9 @@ class Traffic:
         unread: messages that nobody was there to read.
         thinned: messages left out because their rule limits the rate.
         dropped: messages that endpoints let go because somebody local did not keep up.
+        late: answers of servers that were not the first.
+        strange: answers of servers that were not asked.
+        hedged: second copies of requests.
         latency: one-way, from the far proxy's stamp until handed over here.
     """
 
@@ -31,6 +34,9 @@ class Traffic:
     unread: int = 0
     thinned: int = 0
     dropped: int = 0
+    late: int = 0
+    strange: int = 0
+    hedged: int = 0
     latency: Histogram = field(default_factory=Histogram)
 
     def sent(self, size: int) -> None:
@@ -52,6 +58,10 @@ class Traffic:
             "thinned": self.thinned,
             "dropped": self.dropped,
         }
+
+    def calls(self) -> Mapping[str, int]:
+        """Return the counts of what several servers of one service bring with them."""
+        return {"late": self.late, "strange": self.strange, "hedged": self.hedged}
 
     def message_bytes(self) -> Mapping[str, int]:
         """Return the bytes carried, before sealing, by direction."""

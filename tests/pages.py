@@ -15,7 +15,7 @@ _FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
 _HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
 _WRAPPED = re.compile(r"\\\n\s*")
-_PROGRAM = re.compile(r"(?:gdp(?:-\w+)?|scripts/\w+\.(?:sh|py)|scripts/bench/\w+\.py)\Z")
+_PROGRAM = re.compile(r"(?:gdp(?:-\w+)?|fog|scripts/\w+\.(?:sh|py)|scripts/bench/\w+\.py)\Z")
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,12 @@ import pytest
 import typer
 import yaml
 
+from fog.cli.app import app as fog
+from fog.demo import cli as demo
+from fog.launch.load import load as load_launch_file
+from fog.providers.aws.config import AwsConfig
+from fog.providers.cloud_init import Setup
+from fog.site import SiteConfig
 from gdp import limits
 from gdp.cli import gdp, rib, switch
 from gdp.crypto.keys import SigningKey
@@ -28,6 +34,8 @@ from tests.pages import PAGES, ROOT, Block, anchors, blocks, blocks_between, com
 README = ROOT / "README.md"
 CONFIGURATION = ROOT / "docs/configuration.md"
 SECURITY = ROOT / "docs/security.md"
+FOG = ROOT / "docs/fog.md"
+PROVIDERS = ROOT / "docs/providers.md"
 
 APPS = {
     "gdp": gdp.app,
@@ -36,8 +44,11 @@ APPS = {
     "gdp-proxy": cli.app,
     "gdp-delegate": delegate_cli.app,
     "gdp-replay": replay_cli.app,
+    "fog": fog,
     "scripts/ring_topology.sh": ring.app,
+    "scripts/fog_demo.sh": demo.app,
 }
+SHELLS = ("bash", "sh")
 MODELS: dict[str, type[Section]] = {"switch.yaml": SwitchConfig, "rib.yaml": RibConfig, "proxy.yaml": ProxyConfig}
 NODES = ("gdp-switch ", "gdp-rib ", "gdp-proxy ")
 UNITS = {"": 1, "s": 1, "KiB": 1 << 10, "MiB": 1 << 20}
@@ -46,7 +57,7 @@ UNITS = {"": 1, "s": 1, "KiB": 1 << 10, "MiB": 1 << 20}
 def _every_command() -> Iterator[Any]:
     for page in PAGES:
         for block in blocks(page):
-            if block.language == "bash":
+            if block.language in SHELLS:
                 for words in commands(block.lines):
                     yield pytest.param(words, id=f"{page.name}: {' '.join(words)[:60]}")
 
@@ -60,11 +71,20 @@ def _parse(command: Any, words: list[str]) -> None:
     command.make_context(program, rest)
 
 
+def _spelled_out(words: list[str]) -> list[str]:
+    """Return what a script hands to its Python."""
+    match words[0]:
+        case "scripts/ring_topology.sh":
+            return list(ring.spelled_out(words))
+        case "scripts/fog_demo.sh":
+            return [words[0], str(ROOT / "examples/echo.launch.py"), *words[1:]]
+    return words
+
+
 @pytest.mark.parametrize("words", list(_every_command()))
 def test_a_command_that_a_page_shows_is_understood(words: list[str]) -> None:
     if words[0] in APPS:
-        spelled = ring.spelled_out(words) if APPS[words[0]] is ring.app else words
-        _parse(typer.main.get_command(APPS[words[0]]), list(spelled))
+        _parse(typer.main.get_command(APPS[words[0]]), _spelled_out(words))
     else:
         assert os.access(ROOT / words[0], os.X_OK)
 
@@ -94,7 +114,7 @@ def test_scripts_that_a_page_names_exist() -> None:
 
 def test_source_files_that_a_page_names_exist() -> None:
     text = "".join(page.read_text() for page in PAGES)
-    for path in re.findall(r"`((?:gdp|proxy)/[\w/]+\.py)`", text):
+    for path in re.findall(r"`((?:gdp|proxy|fog)/[\w/]+\.py)`", text):
         assert (ROOT / path).is_file(), path
 
 
@@ -183,6 +203,53 @@ def test_an_example_of_a_configuration_loads(block: Block, tmp_path: Path) -> No
     path.write_text(block.text)
     load: Callable[[Path], Section] = MODELS[path.name].load  # type: ignore[attr-defined]
     assert load(path)
+
+
+def _every_launch_file() -> Iterator[Any]:
+    for page in PAGES:
+        for block in blocks(page):
+            if block.language == "python" and "def generate_launch_description" in block.text:
+                yield pytest.param(block, id=page.name)
+
+
+@pytest.mark.parametrize("block", list(_every_launch_file()))
+def test_a_launch_file_that_a_page_shows_comes_to_a_plan(block: Block, tmp_path: Path) -> None:
+    path = tmp_path / "shown.launch.py"
+    path.write_text(block.text)
+    assert len(load_launch_file(path, {}).plan.machines) == 2
+
+
+@pytest.mark.parametrize(
+    ("page", "title", "model"),
+    [(FOG, "key", SiteConfig), (PROVIDERS, "key of `aws`", AwsConfig), (PROVIDERS, "key of `setup`", Setup)],
+    ids=["fog.yaml", "aws", "setup"],
+)
+def test_every_key_of_a_site_is_explained(page: Path, title: str, model: type[Section]) -> None:
+    (table,) = re.findall(rf"^\| {title} \|.*\n\|[-|]+\n((?:\|.*\n?)+)", page.read_text(), re.MULTILINE)
+    keys = [key for row in table.splitlines() for key in re.findall(r"`(\w+)`", row.split("|")[1])]
+    assert sorted(keys) == sorted(model.model_fields)
+
+
+def test_a_default_of_a_site_is_what_the_page_says() -> None:
+    stated = [row for row in rows(FOG.read_text()) if row[0] in SiteConfig.model_fields]
+    plain = {key: value for key, value in stated if isinstance(SiteConfig.model_fields[key].default, str | float)}
+    assert plain
+    for key, value in plain.items():
+        assert yaml.safe_load(value) == SiteConfig.model_fields[key].default, key
+
+
+def test_examples_of_a_site_load(tmp_path: Path) -> None:
+    (site,) = (block for block in blocks_between(FOG, "`fog.yaml`") if block.language == "yaml")
+    shown = yaml.safe_load(site.text)
+    for folder in (shown["domain"], shown["owner"]):
+        (tmp_path / folder).mkdir(parents=True)
+    for file in (*shown["robots"], shown["switch"]):
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).touch()
+    path = tmp_path / "fog.yaml"
+    for text in ("", *(block.text for block in blocks(PROVIDERS) if block.language == "yaml")):
+        path.write_text(yaml.safe_dump(shown | (yaml.safe_load(text) or {})))
+        assert SiteConfig.load(path)
 
 
 def test_the_example_of_errors_is_what_is_printed(tmp_path: Path) -> None:

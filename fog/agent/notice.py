@@ -9,7 +9,7 @@ import json
 from pathlib import Path
 from typing import Final
 
-__all__ = ["NOTICE_FILE", "read_notice", "write_notice"]
+__all__ = ["NOTICE_FILE", "given_unix_s", "read_notice", "write_notice"]
 
 NOTICE_FILE: Final = "notice.json"
 
@@ -30,4 +30,12 @@ def read_notice(home: Path) -> float | None:
     try:
         return float(json.loads((home / NOTICE_FILE).read_bytes())["leaves_at_unix_s"])
     except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def given_unix_s(home: Path) -> float | None:
+    """Return when the notice was given, as Unix time; None: there is none."""
+    try:
+        return (home / NOTICE_FILE).stat().st_mtime
+    except OSError:
         return None

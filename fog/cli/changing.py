@@ -15,12 +15,12 @@ import typer
 
 from fog.cli.launching import choices, follow
 from fog.cli.options import AsJson, ClusterOption, SiteFile, State, opened, the_cluster
-from fog.cli.views import print_json
+from fog.cli.views import print_json, stage
 from fog.enrolment.boots import PROXY
 from fog.supervisor.background import LOG, ensure
-from fog.supervisor.background import supervise as be_supervisor
 from fog.supervisor.ground import open_provider, stand
 from fog.supervisor.journal import Journal
+from fog.supervisor.last_words import MACHINE
 from fog.supervisor.record import Record
 from gdp.cli.node import Verbose, set_up_logging
 from gdp.errors import LocalError
@@ -63,7 +63,7 @@ def up(
         plan = the_cluster(journal, cluster).plan
         more = [replace(plan.machines[-1], region="")] * count
         with closing(open_provider(here)) as provider:
-            offers = choices(provider, more)
+            offers = choices(provider, more, here.latency_ms)
         usd = sum(each.usd_per_hour for each in offers if each is not None)
         if None in offers:
             raise LocalError(f"{more[0].hardware.to_text()}: not to be had")
@@ -87,7 +87,7 @@ def down(
     state: State = None,
     as_json: AsJson = False,
 ) -> None:
-    """Take replicas away: first those that do not serve, then those that would cost the most to keep.
+    """Take replicas away: first those that do not serve, then the youngest.
 
     What is under way on them is answered.
 
@@ -116,6 +116,8 @@ def logs(
 ) -> None:
     """Show the last lines that a program of a machine wrote; MACHINE may be supervisor.
 
+    Of a machine that was lost the last lines of each program are kept, and shown with a word on how it ended.
+
     \b
     Examples:
       fog logs m1 node
@@ -128,6 +130,9 @@ def logs(
             typer.echo("\n".join(text.splitlines()[-lines:]))
             return
         record = _machine(journal, cluster, machine)
+        if record.is_gone:
+            typer.echo(_last_words(journal, record, program or MACHINE, lines))
+            return
         with closing(open_provider(here)) as provider:
             typer.echo(provider.log(record.id, program, lines).rstrip("\n"))
 
@@ -141,6 +146,8 @@ def ssh(machine: Machine, cluster: ClusterOption = None, site: SiteFile = None, 
     """
     with opened(site, state) as (here, journal):
         record = _machine(journal, cluster, machine)
+        if record.is_gone:
+            raise LocalError(f"{record.name} is gone: {stage(record)}, {record.reason}")
         with closing(open_provider(here)) as provider:
             words = provider.shell(record.id)
         os.execvp(words[0], words)
@@ -155,6 +162,8 @@ def supervise(
     Example:
       fog supervise --stay
     """
+    from fog.supervisor.keeping import supervise as be_supervisor
+
     set_up_logging(verbose=verbose)
     with opened(site, state, supervised=False) as (here, _):
         be_supervisor(here, stays=stay, lock=lock)
@@ -173,6 +182,21 @@ def _machine(journal: Journal, cluster: str | None, name: str) -> Record:
         living = ", ".join(each.name for each in records if not each.is_gone) or "none"
         raise LocalError(f"{plan.name} has no machine {name}: there are {living}")
     return found
+
+
+def _last_words(journal: Journal, record: Record, program: str, lines: int) -> str:
+    """Return what was kept of a machine that is gone.
+
+    Raises:
+        LocalError: nothing was.
+    """
+    kept = journal.last_words(record.spec.cluster, record.name)
+    gone = f"{record.name} is gone: {stage(record)}, {record.reason}"
+    if not kept:
+        raise LocalError(f"{gone}; its logs went with it")
+    if program not in kept:
+        raise LocalError(f"{gone}; kept are the last lines of {', '.join(kept)}")
+    return "\n".join([f"# {gone}; its last lines:", *kept[program].splitlines()[-lines:]])
 
 
 def _say(fields: dict[str, object], *, as_json: bool) -> None:

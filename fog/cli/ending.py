@@ -23,7 +23,7 @@ from fog.supervisor.ground import fall, local_provider, open_provider
 from fog.supervisor.journal import Journal
 from gdp.errors import LocalError, StoreError
 
-__all__ = ["down", "end_cluster"]
+__all__ = ["clear", "down", "end_cluster"]
 
 _PATIENCE_S: Final = 20.0  # with a supervisor; then it is done here
 _LEAVE_S: Final = 5.0
@@ -54,13 +54,18 @@ def down(
             if len(names) > 1:
                 raise LocalError(f"which cluster? There are {', '.join(names)}; --all: every one")
         ended = [end_cluster(here, journal, name, "fog down", as_json=as_json) for name in names]
-        if all_ or not any(each.is_up for each in journal.clusters()):
-            _leave(here)
-            fall(here)
+        clear(here, journal, whatever=all_)
         if as_json:
             print_json({"ended": names, "machines": sum(ended)})
         elif not names:
             typer.echo("nothing is up")
+
+
+def clear(site: Site, journal: Journal, *, whatever: bool = False) -> None:
+    """Remove what clusters stand on, if none is up; or ``whatever`` is."""
+    if whatever or not any(each.is_up for each in journal.clusters()):
+        _leave(site)
+        fall(site)
 
 
 def end_cluster(site: Site, journal: Journal, name: str, why: str, *, as_json: bool) -> int:

@@ -22,9 +22,10 @@ from fog.launch.probe import kept, offered
 from fog.offer import Offer
 from fog.plan.duration import duration_text
 
-__all__ = ["loaded_from", "priced", "show_plan"]
+__all__ = ["BY_HAND", "loaded_from", "priced", "show_plan"]
 
 MONTH_H: Final = 730.0  # as clouds reckon
+BY_HAND: Final = "by fog down"
 
 
 def loaded_from(path: Path, words: Sequence[str], *, dry_run: bool) -> Loaded:
@@ -78,8 +79,12 @@ def priced(loaded: Loaded, choice: Sequence[Offer | None]) -> dict[str, object]:
     }
 
 
-def show_plan(loaded: Loaded, choice: Sequence[Offer | None], *, as_json: bool) -> None:
-    """Print a plan with its price, as a table or as one JSON object."""
+def show_plan(loaded: Loaded, choice: Sequence[Offer | None], ends: str = BY_HAND, *, as_json: bool) -> None:
+    """Print a plan with its price, as a table or as one JSON object.
+
+    Args:
+        ends: how the cluster ends, but for its limits.
+    """
     said = priced(loaded, choice)
     if as_json:
         typer.echo(json.dumps(said, ensure_ascii=False))
@@ -92,18 +97,18 @@ def show_plan(loaded: Loaded, choice: Sequence[Offer | None], *, as_json: bool) 
         kind = "spot" if wanted.is_spot else "on demand"
         found = (offer.region, offer.type_name, f"{offer.usd_per_hour:.4f}") if offer else (wanted.region, "none", "-")
         table.add_row(wanted.hardware.to_text(), kind, *map(Text, found), style=None if offer else "red")
-    Console(highlight=False).print(Group(table, *_lines(loaded, said)))
+    Console(highlight=False).print(Group(table, *_lines(loaded, said, ends)))
 
 
-def _lines(loaded: Loaded, said: dict[str, object]) -> list[Text]:
+def _lines(loaded: Loaded, said: dict[str, object], ends: str) -> list[Text]:
     plan = loaded.plan
-    ends = [f"after {duration_text(plan.idle_s)} without a call"] if plan.idle_s else []
-    ends += [f"after {plan.budget_usd:g} USD"] if plan.budget_usd else []
+    limits = [f"after {duration_text(plan.idle_s)} without a call"] if plan.idle_s else []
+    limits += [f"after {plan.budget_usd:g} USD"] if plan.budget_usd else []
     carried = [f"{each.kind} {each.name} ({each.type_name})" for each in plan.carried]
     unknown = "found out by starting the nodes once on this machine"
     lines = [
         ("price", f"{said['usd_per_hour']} USD/h, {said['usd_per_month']} USD/month"),
-        ("ends", ", ".join(ends) or "by fog down" if loaded.keep or ends else "with the launch, or by fog down"),
+        ("ends", ", ".join([ends, *limits])),
         *(("cloud", _words(node)) for node in plan.nodes),
         ("offers", ", ".join(carried) or "nothing" if loaded.is_known else unknown),
         *(("robot", _words(each.node)) for each in loaded.robot_nodes),

@@ -6,13 +6,10 @@ Place: command.
 from __future__ import annotations
 
 import logging
-import os
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Sequence
-from contextlib import closing, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final, Optional
@@ -20,13 +17,11 @@ from typing import Annotated, Final, Optional
 import typer
 from rich.console import Console
 
-from fog.cli.ending import end_cluster
-from fog.cli.launch import loaded_from, show_plan
+from fog.cli.ending import clear, end_cluster
 from fog.cli.options import AsJson, SiteFile, State, opened
+from fog.cli.robot_nodes import INTERRUPTED, resolved, run
 from fog.cli.views import event_line, print_json
 from fog.cluster import ClusterPlan, Wanted
-from fog.launch.load import RobotNode
-from fog.launch.resolve import PYTHON, command_line
 from fog.offer import Offer
 from fog.plan.choice import choose
 from fog.providers.provider import Provider
@@ -42,13 +37,13 @@ log = logging.getLogger(__name__)
 
 _WAIT_S: Final = 600.0
 _STEP_S: Final = 0.05
-_END_S: Final = 5.0
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help="a launch file (.py), or a plan (.json)")]
 Words = Annotated[Optional[list[str]], typer.Argument(metavar="[NAME:=VALUE]...")]  # noqa: UP045
 DryRun = Annotated[bool, typer.Option("--dry-run", help="show machines and price, start nothing")]
 Detach = Annotated[bool, typer.Option("--detach", help="end when the replicas serve; start no node of the robot")]
 Keep = Annotated[bool, typer.Option("--keep", help="leave the cluster when the robot's nodes end")]
+EndsWith = Annotated[str, typer.Option("--ends-with", hidden=True)]  # what else, such as another launch, ends it
 Wait = Annotated[float, typer.Option("--wait", metavar="S", min=0.0, help="how long the replicas may take")]
 
 
@@ -61,11 +56,13 @@ def launch(
     detach: Detach = False,
     keep: Keep = False,
     wait: Wait = _WAIT_S,
+    ends_with: EndsWith = "",
     as_json: AsJson = False,
 ) -> None:
     """Start a launch file's cluster; when its replicas serve, run the robot's nodes until they end or Ctrl-C.
 
     With the robot's nodes the cluster ends, unless it is kept. A cluster of that name that is up takes the new plan.
+    What robot's nodes with output="log" print goes to a file in the state folder, which is told.
 
     \b
     Examples:
@@ -73,6 +70,8 @@ def launch(
       fog launch demo.launch.py
       fog launch demo.launch.py rate:=10 --detach
     """
+    from fog.cli.launch import BY_HAND, loaded_from, show_plan  # rules and their messages: half a second to import
+
     with opened(site, state) as (here, journal):
         loaded = loaded_from(file, arguments or [], dry_run=dry_run)
         plan = replace(
@@ -81,30 +80,38 @@ def launch(
             budget_usd=here.budget_usd if loaded.plan.budget_usd is None else loaded.plan.budget_usd,
         )
         with closing(open_provider(here, [each.region for each in plan.machines if each.region])) as provider:
-            offers = choices(provider, plan.machines)
-        show_plan(replace(loaded, plan=plan), offers, as_json=as_json)
+            offers = choices(provider, plan.machines, here.latency_ms)
+        if not (detach or keep or loaded.keep) and loaded.robot_nodes:
+            ends_with = "the robot's nodes"
+        ends = f"with {ends_with}, or {BY_HAND}" if ends_with else BY_HAND
+        show_plan(replace(loaded, plan=plan), offers, ends, as_json=as_json)
         if dry_run:
             return
         for node in plan.nodes:
             command_of(here, node)  # complains before anything is started
-        robot = [] if detach else [_argv(each) for each in loaded.robot_nodes]
+        robot = [] if detach else [resolved(each) for each in loaded.robot_nodes]
         last = max((each.id for each in journal.events(last=1)), default=0)
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # it ends as with Ctrl-C
         try:
             begin(here, journal, plan)
             follow(here, journal, plan, last, wait, as_json=as_json)
         except KeyboardInterrupt:
             if not detach:
                 end_cluster(here, journal, plan.name, "its launch was broken off", as_json=as_json)
-            raise typer.Exit(130) from None
+                clear(here, journal)
+            raise typer.Exit(INTERRUPTED) from None
         if detach or not loaded.robot_nodes:
             return
-        code = _run(robot)
-        if not (keep or loaded.keep):
-            end_cluster(here, journal, plan.name, "its launch has ended", as_json=as_json)
+        try:
+            code = run(robot, here.state / "nodes")
+        finally:
+            if not (keep or loaded.keep):
+                end_cluster(here, journal, plan.name, "its launch has ended", as_json=as_json)
+                clear(here, journal)
         raise typer.Exit(code)
 
 
-def choices(provider: Provider, machines: Sequence[Wanted]) -> list[Offer | None]:
+def choices(provider: Provider, machines: Sequence[Wanted], latency_ms: Mapping[str, float]) -> list[Offer | None]:
     """Return for each machine what it would be now; None: nothing like it is to be had."""
     offers: dict[Offer, None] = {}
     for each in dict.fromkeys(machines):
@@ -113,7 +120,7 @@ def choices(provider: Provider, machines: Sequence[Wanted]) -> list[Offer | None
     for each in machines:
         used = [offer.region for offer in found if offer is not None]
         try:
-            found.append(choose(list(offers), [each], used=used)[0].offer)
+            found.append(choose(list(offers), [each], latency_ms, used=used)[0].offer)
         except LocalError:
             found.append(None)
     return found
@@ -175,44 +182,3 @@ def _tell(entry: Entry, console: Console, *, as_json: bool) -> None:
         print_json(entry)
     else:
         console.print(event_line(entry))
-
-
-def _argv(each: RobotNode) -> tuple[RobotNode, tuple[str, ...]]:
-    words = command_line(each.node, os.environ)
-    return each, tuple(sys.executable if word == PYTHON else word for word in words)
-
-
-def _run(nodes: Sequence[tuple[RobotNode, tuple[str, ...]]]) -> int:
-    """Run the robot's nodes until all have ended, or Ctrl-C ends them; return the worst exit code."""
-    processes = []
-    for each, words in nodes:
-        processes.append(
-            subprocess.Popen(
-                words,
-                env={**os.environ, **each.node.environment},
-                stdout=None if each.output in ("screen", "both") else subprocess.DEVNULL,
-            )
-        )
-    try:
-        codes = [process.wait() for process in processes]
-    except KeyboardInterrupt:
-        codes = _end(processes)
-    return max((abs(code) for code in codes), default=0)
-
-
-def _end(processes: Sequence[subprocess.Popen[bytes]]) -> list[int]:
-    """End them as Ctrl-C does, kindly at first."""
-    ask: Callable[[subprocess.Popen[bytes]], None] = lambda each: each.send_signal(signal.SIGINT)  # noqa: E731
-    codes = []
-    for process in processes:
-        ask(process)
-    for process in processes:
-        with suppress(KeyboardInterrupt):
-            try:
-                codes.append(process.wait(_END_S))
-                continue
-            except subprocess.TimeoutExpired:
-                pass
-        process.kill()
-        codes.append(process.wait())
-    return [0 if code in (-signal.SIGINT, 128 + signal.SIGINT) else code for code in codes]

@@ -127,14 +127,14 @@ def _status(site: Site, journal: Journal, cluster: Cluster, *, gone: bool) -> di
     return {
         **cluster_fields(cluster, records, now_s),
         "supervisor_pid": pid_of(site),
-        "members": [machine_fields(each, now_s) for each in records if gone or not each.is_gone],
+        "members": [machine_fields(each, now_s, site.latency_ms) for each in records if gone or not each.is_gone],
         "cost": cost_fields(cluster, records, now_s),
     }
 
 
 def _page(site: Site, journal: Journal, cluster: Cluster, *, gone: bool) -> Group:
     now_s, records = time.time(), journal.machines(cluster.plan.name)
-    rows = [machine_fields(each, now_s) for each in records if gone or not each.is_gone]
+    rows = [machine_fields(each, now_s, site.latency_ms) for each in records if gone or not each.is_gone]
     pid = pid_of(site)
     supervisor = f"pid {pid}" if pid is not None else "begins" if cluster.is_up else "none lives, none is needed"
     parts: list[Table | str | Group] = [

@@ -68,14 +68,15 @@ def stage(record: Record) -> str:
     return "asked" if not record.id else "booting" if record.up_unix_s is None else "up"
 
 
-def machine_fields(record: Record, now_s: float) -> dict[str, object]:
-    """Return what JSON says of a machine."""
+def machine_fields(record: Record, now_s: float, latency_ms: Mapping[str, float] | None = None) -> dict[str, object]:
+    """Return what JSON says of a machine; ``latency_ms``: of regions, as far as it is known."""
     offer = record.spec.offer
     return {
         "name": record.name,
         "stage": stage(record),
         "serving": record.is_serving,
         "region": offer.region,
+        "latency_ms": (latency_ms or {}).get(offer.region),
         "type": offer.type_name,
         "spot": offer.is_spot,
         "provider": offer.provider,
@@ -145,7 +146,7 @@ def clusters_table(rows: Sequence[Mapping[str, object]]) -> Table:
 
 def machines_table(rows: Sequence[Mapping[str, object]], now_s: float) -> Table:
     """Return a line for each machine."""
-    table = _table("machine", "stage", "region", "type", "kind", "USD/h", "age", "address", "")
+    table = _table("machine", "stage", "region", "ms", "type", "kind", "USD/h", "age", "address", "")
     for row in rows:
         began = float(str(row["asked_unix_s"]))
         age = (now_s if row["gone_unix_s"] is None else float(str(row["gone_unix_s"]))) - began
@@ -153,6 +154,7 @@ def machines_table(rows: Sequence[Mapping[str, object]], now_s: float) -> Table:
             str(row["name"]),
             Text(str(row["stage"]), style=_STYLES.get(str(row["stage"]), "")),
             str(row["region"]),
+            "-" if row["latency_ms"] is None else f"{row['latency_ms']:g}",
             str(row["type"]),
             "spot" if row["spot"] else "on demand",
             f"{row['usd_per_hour']:.4f}",
@@ -183,7 +185,7 @@ def events_table(entries: Sequence[Entry]) -> Table:
     table = _table("time", "cluster", "machine", "what", "")
     for entry in entries:
         what = Text(entry.what, style=_STYLES.get(entry.what, ""))
-        table.add_row(_moment(entry.unix_s, "%H:%M:%S.%f")[:-3], entry.cluster, entry.machine, what, entry.detail)
+        table.add_row(_moment(entry.unix_s, "%H:%M:%S.%f")[:-3], entry.cluster, entry.machine, what, _detail(entry))
     return table
 
 
@@ -194,8 +196,18 @@ def event_line(entry: Entry) -> Text:
         (time, "dim"),
         f" {entry.machine or entry.cluster:<8} ",
         (entry.what, _STYLES.get(entry.what, "")),
-        f"  {entry.detail}",
+        f"  {_detail(entry)}",
     )
+
+
+def _detail(entry: Entry) -> Text:
+    words = [entry.detail] if entry.detail else []
+    if entry.lines:
+        words.append(f"of {entry.detail}: {entry.lines.splitlines()[-1]}")
+        del words[0]
+    elif entry.since_unix_s is not None and entry.what != "reconciled":
+        words.append(f"seen after {entry.unix_s - entry.since_unix_s:.2f} s")
+    return Text("; ".join(words))
 
 
 def show(*parts: RenderableType) -> None:

@@ -22,9 +22,11 @@ from fog.machine import Boot, Program
 from fog.supervisor.record import Papers
 from gdp.crypto.certificates import Membership, Role
 
-__all__ = ["PROXY", "RobotDevices", "gateway_boot", "machine_boot", "robot_boot", "robot_rule"]
+__all__ = ["PROXY", "RobotDevices", "gateway_boot", "machine_boot", "node_names", "robot_boot", "robot_rule"]
+__all__ += ["SWITCH"]
 
 PROXY: Final = "proxy"
+SWITCH: Final = "switch"
 _PROFILES: Final = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")  # since Fast DDS 3, and before
 _DOMAINS: Final = 100  # ROS domains of machines, so that no two that lie near each other share one
 _TABLE_MAX: Final = 8_192  # a machine hears of few names, and memory for the usual 131,072 takes time to clear
@@ -103,16 +105,17 @@ def machine_boot(
     environment = {"FOG_CLUSTER": plan.name, "FOG_MACHINE": name, "ROS_DOMAIN_ID": str(domain)}
     environment |= dict.fromkeys(_PROFILES, f"{{home}}/{_PROFILE}") | (_UDP_ONLY if shares_host else {})
     nodes = [
-        Program(
-            f"node{index}" if len(plan.nodes) > 1 else "node",
-            tuple(command(node)),
-            environment={**environment, **node.environment},
-        )
-        for index, node in enumerate(plan.nodes)
+        Program(name, tuple(command(node)), environment={**environment, **node.environment})
+        for name, node in zip(node_names(plan), plan.nodes, strict=True)
     ]
     programs = (*nodes, _switch(), _proxy(environment))
     until_s = float(min(switch.member.not_after_unix_s, proxy.member.not_after_unix_s))
     return Boot(files, programs), _papers(proxy.member, until_s, switch.member)
+
+
+def node_names(plan: ClusterPlan) -> list[str]:
+    """Return what the programs of a cluster's nodes are called on each machine."""
+    return ["node"] if len(plan.nodes) == 1 else [f"node{index}" for index in range(len(plan.nodes))]
 
 
 def gateway_boot(authority: Authority, label: str, ifaces: Sequence[str], *, days: float) -> Boot:

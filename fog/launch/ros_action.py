@@ -93,7 +93,8 @@ class FogCluster(entity.FogCluster, Action):  # type: ignore[misc]  # launch has
         except GdpError as error:
             return str(error)
         file.write_text(plan.to_json(), encoding="utf-8")
-        process = await asyncio.create_subprocess_exec(*FOG, "launch", str(file), "--detach")
+        ends = () if self.wish.keep else ("--ends-with", "this launch")
+        process = await asyncio.create_subprocess_exec(*FOG, "launch", str(file), "--detach", *ends)
         try:
             code = await process.wait()
         except asyncio.CancelledError:

@@ -22,7 +22,9 @@ from fog.offer import Offer
 from fog.supervisor.record import Ending, Papers, Record
 from gdp.errors import LocalError, StoreError
 
-__all__ = ["Cluster", "Entry", "Journal"]
+__all__ = ["LAST_WORDS", "Cluster", "Entry", "Journal"]
+
+LAST_WORDS: Final = "last words"
 
 _PATIENCE_S: Final = 10.0  # for another process that is writing
 _EVENTS_MAX: Final = 10_000  # older ones go
@@ -37,9 +39,10 @@ CREATE TABLE IF NOT EXISTS machines (
 ) STRICT;
 CREATE TABLE IF NOT EXISTS events (
   id INTEGER PRIMARY KEY AUTOINCREMENT, unix_s REAL NOT NULL, cluster TEXT NOT NULL, machine TEXT NOT NULL,
-  what TEXT NOT NULL, detail TEXT NOT NULL
+  what TEXT NOT NULL, detail TEXT NOT NULL, since_unix_s REAL, lines TEXT NOT NULL DEFAULT ''
 ) STRICT;
 """
+_LATER: Final = {"since_unix_s": "REAL", "lines": "TEXT NOT NULL DEFAULT ''"}  # columns that an older journal lacks
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +63,13 @@ class Cluster:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Something that happened. ``machine`` is empty where it is about the whole cluster."""
+    """Something that happened. ``machine`` is empty where it is about the whole cluster.
+
+    Args:
+        unix_s: when it was seen.
+        since_unix_s: when it came about, as the machine's or the provider's records say; None: they do not.
+        lines: of ``LAST_WORDS``, what the program ``detail`` of a machine that is gone wrote last.
+    """
 
     id: int
     unix_s: float
@@ -68,6 +77,8 @@ class Entry:
     machine: str
     what: str
     detail: str
+    since_unix_s: float | None = None
+    lines: str = ""
 
 
 class Journal:
@@ -85,6 +96,9 @@ class Journal:
             self._file.execute("PRAGMA journal_mode=WAL")
             self._file.execute("PRAGMA synchronous=NORMAL")
             self._file.executescript(_TABLES)
+            has = {row[1] for row in self._file.execute("PRAGMA table_info(events)")}
+            for column in _LATER.keys() - has:
+                self._file.execute(f"ALTER TABLE events ADD COLUMN {column} {_LATER[column]}")
 
     def close(self) -> None:
         """Close the file."""
@@ -135,8 +149,10 @@ class Journal:
             ).fetchone()
         return f"m{number}"
 
-    def put(self, record: Record, now_s: float, what: str = "", detail: str = "") -> None:
-        """Write what is known of a machine, and with it, if given, what happened."""
+    def put(
+        self, record: Record, now_s: float, what: str = "", detail: str = "", since_unix_s: float | None = None
+    ) -> None:
+        """Write what is known of a machine, and with it, if given, what happened; see ``Entry``."""
         spec = record.spec
         with self._writing() as file:
             file.execute(
@@ -144,7 +160,7 @@ class Journal:
                 (spec.cluster, spec.name, record.is_gone, json.dumps(asdict(record), default=_plain)),
             )
             if what:
-                _tell(file, now_s, spec.cluster, spec.name, what, detail)
+                _tell(file, now_s, spec.cluster, spec.name, what, detail, since_unix_s)
 
     def machines(self, cluster: str, *, gone: bool = True) -> list[Record]:
         """Return the machines of a cluster in the order in which they were asked for.
@@ -157,10 +173,26 @@ class Journal:
             rows = self._file.execute(query, (cluster,)).fetchall()
         return sorted((_record(json.loads(row)) for (row,) in rows), key=lambda each: int(each.name[1:]))
 
-    def tell(self, now_s: float, cluster: str, machine: str, what: str, detail: str = "") -> None:
-        """Write that something happened."""
+    def tell(
+        self,
+        now_s: float,
+        cluster: str,
+        machine: str,
+        what: str,
+        detail: str = "",
+        *,
+        since_unix_s: float | None = None,
+        lines: str = "",
+    ) -> None:
+        """Write that something happened; see ``Entry``."""
         with self._writing() as file:
-            _tell(file, now_s, cluster, machine, what, detail)
+            _tell(file, now_s, cluster, machine, what, detail, since_unix_s, lines)
+
+    def last_words(self, cluster: str, machine: str) -> dict[str, str]:
+        """Return by program the last lines that were kept of a machine when it failed or was taken."""
+        query = "SELECT detail, lines FROM events WHERE what = ? AND cluster = ? AND machine = ? ORDER BY id"
+        with _translated(self._path):
+            return dict(self._file.execute(query, (LAST_WORDS, cluster, machine)).fetchall())
 
     def events(self, cluster: str = "", after: int = 0, last: int | None = None) -> list[Entry]:
         """Return what happened, the oldest first.
@@ -171,7 +203,7 @@ class Journal:
             last: only so many of the newest.
         """
         query = (
-            "SELECT id, unix_s, cluster, machine, what, detail FROM events"
+            "SELECT id, unix_s, cluster, machine, what, detail, since_unix_s, lines FROM events"
             " WHERE id > ? AND (? = '' OR cluster = ?) ORDER BY id DESC LIMIT ?"
         )
         with _translated(self._path):
@@ -186,11 +218,21 @@ class Journal:
                 yield self._file
 
 
-def _tell(file: sqlite3.Connection, now_s: float, cluster: str, machine: str, what: str, detail: str) -> None:
+def _tell(
+    file: sqlite3.Connection,
+    now_s: float,
+    cluster: str,
+    machine: str,
+    what: str,
+    detail: str,
+    since_unix_s: float | None = None,
+    lines: str = "",
+) -> None:
     with closing(file.cursor()) as cursor:
         cursor.execute(
-            "INSERT INTO events (unix_s, cluster, machine, what, detail) VALUES (?, ?, ?, ?, ?)",
-            (now_s, cluster, machine, what, detail),
+            "INSERT INTO events (unix_s, cluster, machine, what, detail, since_unix_s, lines)"
+            " VALUES (?, ?, ?, ?, ?, ?, ?)",
+            (now_s, cluster, machine, what, detail, since_unix_s, lines),
         )
         cursor.execute("DELETE FROM events WHERE id <= ?", ((cursor.lastrowid or 0) - _EVENTS_MAX,))
 

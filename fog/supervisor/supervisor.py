@@ -14,7 +14,7 @@ from functools import partial
 from typing import Final, TypeAlias
 
 from fog.cluster import CloudNode, ClusterPlan, Wanted
-from fog.enrolment.boots import PROXY, machine_boot
+from fog.enrolment.boots import PROXY, machine_boot, node_names
 from fog.enrolment.members import metadata_of
 from fog.enrolment.revoking import take_back
 from fog.enrolment.robot_side import forget_rules, introduce, reload
@@ -25,9 +25,11 @@ from fog.site import Site
 from fog.supervisor.activity import Activity, requests_in
 from fog.supervisor.acts import Acts
 from fog.supervisor.decide import Action, Drain, Launch, Patience, decide
-from fog.supervisor.journal import Cluster, Journal
+from fog.supervisor.journal import LAST_WORDS, Cluster, Journal
+from fog.supervisor.last_words import keep, kept
 from fog.supervisor.place import place
 from fog.supervisor.record import Ending, Record, cost_usd, learn
+from fog.supervisor.robot_calls import sent_by
 from fog.supervisor.story import changes
 from gdp.errors import GdpError, LocalError
 from gdp.stores.keyring import load_public_key
@@ -43,6 +45,7 @@ _OFFERS_S: Final = 60.0  # a price list holds
 _GRACE_POLLS: Final = 5  # looks in which a new machine may be missing
 _GRACE_MIN_S: Final = 2.0
 _LOG_LINES: Final = 20
+_LATE_LOGS: Final = {"aws"}  # a console as it was minutes ago, or since the last start
 _ROBOT_DAYS: Final = 365.0
 PATIENCE: Final = Patience()
 
@@ -128,15 +131,29 @@ class Supervisor:
             except GdpError as error:
                 self._trouble(name, str(error))
 
+    def reconciled(self, begun_unix_s: float) -> None:
+        """Write that all is as the journal says again, after the start at ``begun_unix_s``; not of what is in trouble.
+
+        Raises:
+            StoreError: the journal cannot be written.
+        """
+        now_s = time.time()
+        for each in self._journal.clusters():
+            name = each.plan.name
+            if each.is_up and name not in self._troubles:
+                told = f"{now_s - begun_unix_s:.2f} s after the supervisor's start"
+                self._journal.tell(now_s, name, "", "reconciled", told, since_unix_s=begun_unix_s)
+
     def _tend(self, cluster: Cluster) -> None:
         plan = cluster.plan
-        if cluster.is_up and self._plans.get(plan.name) != plan:
-            self._introduce(plan)
+        is_new = cluster.is_up and self._plans.get(plan.name) != plan
+        if is_new and not self._journal.machines(plan.name, gone=False):
+            self._introduce(plan)  # what is wrong there is told before a machine costs something
         seen = {each.spec.name: each for each in self._provider.describe(plan.name)}
         heard, now_s = self._heard(), time.time()
         names = [] if self._site.watch is None else _services(plan, self._owner_key)
         records = self._learn(plan, names, seen, heard, now_s)
-        self._end_orphans(plan.name, records, seen, now_s)
+        self._end_orphans(plan, records, seen, now_s)
         if cluster.is_up and (why := self._limit(cluster, records, now_s)):
             self._journal.unwant(plan.name, why, now_s)
             self.wake()
@@ -144,6 +161,8 @@ class Supervisor:
         wanted = plan.machines if cluster.is_up else ()
         for action in decide(wanted, records, now_s, self._patience, told=not names or heard is not None):
             self._do(plan, action, records, now_s)
+        if is_new and self._plans.get(plan.name) != plan:
+            self._introduce(plan)
         if not cluster.is_up and all(each.is_gone for each in records) and not self._acts.is_busy(plan.name):
             self._forget(plan.name)
 
@@ -163,8 +182,8 @@ class Supervisor:
                 if not names:  # of topics nobody asks: a machine that is up does what it is for
                     serves = machine is not None and machine.state is not MachineState.BOOTING
                 after = learn(before, machine, serves, now_s, grace_s=self._grace_s)
-            for what, detail in changes(before, after, now_s):
-                self._put(after, what, detail, now_s)
+            for change in changes(before, after, machine, now_s):
+                self._put(after, change.what, change.detail, now_s, change.since_unix_s)
             if after.is_gone and not before.is_gone:
                 self._revoke(after, now_s)
             elif after != before:
@@ -189,12 +208,24 @@ class Supervisor:
             known = replace(record, released_unix_s=now_s, ending=action.ending, reason=action.reason)
             self._put(known, "leaving", action.reason, now_s)
             self._revoke(known, now_s)
-            self._acts.begin(plan.name, record.name, "release", partial(self._provider.terminate, [record.id]))
+            self._release(plan, record.name, record.id, is_lost=action.ending is not Ending.RELEASED)
+
+    def _release(self, plan: ClusterPlan, name: str, machine: str, *, is_lost: bool) -> None:
+        """Begin to give a machine back; of one that was lost, what its programs said last is kept."""
+        provider, programs = self._provider, node_names(plan)
+
+        def act() -> str:
+            words = keep(provider, machine, programs) if is_lost else ""
+            provider.terminate([machine])
+            return words
+
+        self._acts.begin(plan.name, name, "release", act)
 
     def _launch(self, plan: ClusterPlan, wanted: Wanted, records: list[Record], now_s: float) -> None:
         begun_s = self._journal.cluster(plan.name).begun_unix_s
         past = [each for each in self._journal.machines(plan.name) if each.is_gone and each.asked_unix_s >= begun_s]
-        choice = place(wanted, self._offered(wanted, now_s), [*past, *records], now_s)
+        offers, latency_ms = self._offered(wanted, now_s), self._site.latency_ms
+        choice = place(wanted, offers, [*past, *records], now_s, latency_ms)
         resting = f"{plan.name} rests"
         if choice is None:
             self._trouble(plan.name, "machines fail one after another: it is too early to ask again", key=resting)
@@ -236,10 +267,16 @@ class Supervisor:
                     self._put(replace(record, id=done.result), "", "", now_s)
             elif done.error is not None:
                 self._journal.tell(now_s, done.cluster, done.machine, "trouble", f"{done.what}: {done.error}")
+            for program, lines in kept(done.result) if done.what == "release" else ():
+                self._journal.tell(now_s, done.cluster, done.machine, LAST_WORDS, program, lines=lines)
 
-    def _end_orphans(self, cluster: str, records: Sequence[Record], seen: Mapping[str, Machine], now_s: float) -> None:
+    def _end_orphans(
+        self, plan: ClusterPlan, records: Sequence[Record], seen: Mapping[str, Machine], now_s: float
+    ) -> None:
         """Give back what the journal does not know, or thought gone; and what is left of a machine that is gone."""
+        cluster = plan.name
         known = {each.name for each in records if not each.is_gone}
+        lost = {each.name for each in records if each.is_gone and each.ending is not Ending.RELEASED}
         for name, machine in seen.items():
             if name in known or machine.id in self._swept or self._acts.is_busy(cluster, name):
                 continue
@@ -247,7 +284,7 @@ class Supervisor:
                 self._swept.add(machine.id)
             else:
                 self._journal.tell(now_s, cluster, name, "orphan", "nobody wants it: given back")
-            self._acts.begin(cluster, name, "release", partial(self._provider.terminate, [machine.id]))
+            self._release(plan, name, machine.id, is_lost=name in lost)
 
     def _limit(self, cluster: Cluster, records: Sequence[Record], now_s: float) -> str:
         """Return which limit of the cluster is reached; empty: none."""
@@ -260,7 +297,10 @@ class Supervisor:
         if plan.idle_s is None or now_s - self._asked_s.get(plan.name, 0.0) < _ACTIVITY_S:
             return ""
         self._asked_s[plan.name] = now_s
-        counts = {each.name: self._requests(each) for each in records if each.is_serving}
+        if self._provider.name in _LATE_LOGS:
+            counts = {str(path): sent_by(path) for path in self._site.robots} or {"": None}
+        else:
+            counts = {each.name: self._requests(each) for each in records if each.is_serving}
         idle_s = self._activities.setdefault(plan.name, Activity(now_s)).idle_s(counts, now_s)
         return f"not called for {idle_s:.0f} s" if idle_s >= plan.idle_s else ""
 
@@ -306,8 +346,8 @@ class Supervisor:
         except LocalError as error:
             self._journal.tell(now_s, record.spec.cluster, record.name, "trouble", f"not revoked: {error}")
 
-    def _put(self, record: Record, what: str, detail: str, now_s: float) -> None:
-        self._journal.put(record, now_s, what, detail)
+    def _put(self, record: Record, what: str, detail: str, now_s: float, since_unix_s: float | None = None) -> None:
+        self._journal.put(record, now_s, what, detail, since_unix_s)
         if what:
             log.info("machine %s cluster=%s machine=%s %s", what, record.spec.cluster, record.name, detail)
 

@@ -32,7 +32,7 @@ __all__ = ["Ask", "Dispatch", "Effect", "Failure", "Stop"]
 A = TypeVar("A")
 
 CALLS_MAX: Final = 65_536  # under way at once
-HELD_MAX_BYTES: Final = 128 << 20  # of their requests, kept for servers that are asked later
+HELD_MAX_BYTES: Final = 128 << 20  # of their requests, kept for servers that are asked later; the last may pass it
 GATHER_S: Final = 0.004  # servers that answer so soon after the first need no word
 STOP_MAX: Final = 1_024  # calls in one word
 HEDGE_PERCENTILE: Final = 0.95  # of recent answers, after which a second copy may go
@@ -148,7 +148,7 @@ class Dispatch(Generic[A]):
         """Return the number of a new call; one of the callbacks is called, once, and never from here.
 
         Args:
-            write: returns the request under its number.
+            write: returns the request under its number; not called where this raises.
             timeout_s: how long it may take; None: as long as it likes.
             answered: called with the first valid answer.
             failed: called with why there is none, and the last server's words.
@@ -160,12 +160,11 @@ class Dispatch(Generic[A]):
         chosen = [server for server in first if server in self._servers]
         if not self._servers:
             raise LocalError("no server is there")
+        if self._held_bytes >= self._held_max_bytes:
+            raise LocalError(f"requests of {self._held_bytes} bytes are under way: no more at once")
         call = _Call(answered, failed, now_s)
         number = self._calls.begin(now_s, timeout_s, call)
         call.request = write(number)
-        if self._held_bytes + len(call.request) > self._held_max_bytes:
-            self._calls.end(number)
-            raise LocalError(f"requests of {self._held_bytes} bytes are under way: no more at once")
         self._held_bytes += len(call.request)
         self._budget.earn()
         mode = self._replication.mode
@@ -261,9 +260,9 @@ class Dispatch(Generic[A]):
         self._ended.clear()
 
     def take(self) -> list[Effect]:
-        """Return, once, what is to be sent, in order."""
+        """Return, once, what is to be sent, in order; no request of a call that has ended meanwhile."""
         effects, self._effects = self._effects, []
-        return effects
+        return [each for each in effects if isinstance(each, Stop) or each.call in self._calls]
 
     def _take(self, number: int, server: Name, now_s: float, *, says_no: bool = False) -> _Call[A] | None:
         """Return the call to which this server owed an answer, and note that it owes none any more."""

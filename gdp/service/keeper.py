@@ -13,37 +13,35 @@ once one gets it. The others get its state; without states that can be told, onl
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Final, Generic, TypeAlias, TypeVar
 
 from gdp.errors import LocalError
 from gdp.names import Name
-from gdp.service.calls import Calls
 from gdp.service.dispatch import Ask, Failure
+from gdp.service.entries import Entries
 from gdp.service.ordered import (
     LIFE_BITS,
     NO_LOG,
     Follow,
     FollowerWord,
     Keep,
-    KeeperWord,
     Log,
     Position,
     State,
     Tell,
+    Word,
     call_of,
     place_of,
 )
+from gdp.service.pending import Pending
+from gdp.service.replicas import Replica, Replicas
 
-__all__ = ["Effect", "Keeper", "Word"]
+__all__ = ["Effect", "Keeper"]
 
 A = TypeVar("A")
 
-ENTRIES_MAX: Final = 65_536  # in the log
-LOG_MAX_BYTES: Final = 64 << 20
-STATE_EVERY: Final = 1_024  # entries after which a state is asked for, that stands for all before
-STATE_EVERY_BYTES: Final = 4 << 20
 WINDOW: Final = 256  # entries sent to one replica ahead of what it has done
+GENERATION_MAX: Final = 1 << 63  # no log comes so far; the next one must still fit into 64 bits
 COLLECT_S: Final = 1.0  # after the last replica came, before the log begins without those that are silent
 AGAIN_S: Final = 0.25  # between questions to one that does not follow
 STALL_S: Final = 1.0  # without progress of one that follows, before it is asked
@@ -52,32 +50,7 @@ _UNLIKE: Final = "its state differs from the others', and theirs cannot be told 
 _UNKNOWN: Final = "what state its server is in is not known; start it anew"
 
 
-@dataclass(frozen=True, slots=True)
-class Word:
-    """Tell a replica."""
-
-    server: Name
-    word: KeeperWord
-
-
 Effect: TypeAlias = "Ask | Word"
-
-
-@dataclass(slots=True, eq=False)
-class _Call(Generic[A]):
-    answered: Callable[[A], None]
-    failed: Callable[[Failure, str], None]
-    refused: set[Name] = field(default_factory=set)
-
-
-@dataclass(slots=True, eq=False)
-class _Replica:
-    quiet_until_s: float  # until when it is not asked again
-    position: Position | None = None
-    follows: bool = False
-    is_offered: bool = False  # was told to follow, and has not said yet whether it does
-    sent: int = 0  # entries up to here
-    why_not: str = ""
 
 
 class Keeper(Generic[A]):
@@ -85,7 +58,7 @@ class Keeper(Generic[A]):
 
     Args:
         life: returns 32 random bits.
-        entries_max: in the log, where no state stands for the older ones.
+        entries: returns an empty log.
 
     Attributes:
         late: answers that came for a call that had ended: those of all replicas but the first.
@@ -97,15 +70,11 @@ class Keeper(Generic[A]):
         self,
         *,
         life: Callable[[], int],
-        entries_max: int = ENTRIES_MAX,
-        log_max_bytes: int = LOG_MAX_BYTES,
-        state_every: int = STATE_EVERY,
+        entries: Callable[[], Entries] = Entries,
     ) -> None:
         self._life = life
-        self._entries_max = entries_max
-        self._log_max_bytes = log_max_bytes
-        self._state_every = state_every
-        self._replicas: dict[Name, _Replica] = {}
+        self._new_entries = entries
+        self._replicas = Replicas()
         self._effects: list[Effect] = []
         self._collect_until_s = 0.0
         self._kept_by: Name | None = None
@@ -117,21 +86,15 @@ class Keeper(Generic[A]):
     def _begin_anew(self) -> None:
         """Forget the log; nobody follows it."""
         self._log = Log(0, self._life() or 1)
-        self._calls: Calls[_Call[A]] = Calls(self._entries_max, call_of(self._log, 1))
-        self._entries: dict[int, bytes] = {}  # by index, without a gap
-        self._bytes = 0
-        self._bytes_after_state = 0
-        self._last = 0
-        self._state: State | None = None
+        self._calls = Pending[A](call_of(self._log, 1))
+        self._entries = self._new_entries()
         self._state_asked: Name | None = None
         self._state_until_s = 0.0
         self._base = (NO_LOG, 0)  # where a replica was that is where the log begins
         self._is_keeping = False
         self._is_sent = False  # an entry of it
         for replica in self._replicas.values():
-            replica.follows, replica.is_offered, replica.quiet_until_s = False, False, 0.0
-            if replica.position is not None and replica.position.kept_by is None:
-                replica.position = None
+            replica.begin_anew()
 
     def __len__(self) -> int:
         return len(self._calls)
@@ -176,22 +139,21 @@ class Keeper(Generic[A]):
             raise LocalError("no server is there")
         if self._kept_by is not None:
             raise LocalError(f"kept in order by {self._kept_by.short}")
-        if len(self._entries) >= self._entries_max or self._bytes >= self._log_max_bytes:
+        if self._entries.is_full:
             raise LocalError(f"the log is full: {len(self._entries)} requests, and no state that stands for them")
-        if self._last + 1 >> LIFE_BITS:
+        if self._entries.last + 1 >> LIFE_BITS:
             raise LocalError("the log is at its end; start this proxy anew")
-        number = self._calls.begin(now_s, timeout_s, _Call(answered, failed))
-        self._last = place_of(number)[1]
-        request = self._entries[self._last] = write(number)
-        self._bytes += len(request)
-        self._bytes_after_state += len(request)
+        number = self._calls.begin(now_s, timeout_s, answered, failed)
+        request = write(number)
+        self._entries.append(request)
+        last = self._entries.last
         if any(self._is_ready(replica) for replica in self._replicas.values()):
             self._effects.append(Ask(number, request, None))
             self._is_sent = True
         for server, replica in self._replicas.items():
-            if self._is_ready(replica) and replica.sent == self._last - 1:
-                replica.sent = self._last
-                if replica.position is not None and replica.position.at == self._last - 1:
+            if self._is_ready(replica) and replica.sent == last - 1:
+                replica.sent = last
+                if replica.position is not None and replica.position.at == last - 1:
                     replica.quiet_until_s = now_s + STALL_S
             self._feed(server, replica)
         self._keep_small(now_s)
@@ -200,7 +162,7 @@ class Keeper(Generic[A]):
     def came(self, server: Name, now_s: float) -> None:
         """Learn of a replica."""
         if server not in self._replicas:
-            self._replicas[server] = _Replica(0.0)
+            self._replicas[server] = Replica(0.0)
             self._collect_until_s = now_s + COLLECT_S
             self._look(now_s)
 
@@ -218,7 +180,7 @@ class Keeper(Generic[A]):
     def positioned(self, server: Name, word: FollowerWord, now_s: float) -> None:
         """Take a replica's word about itself."""
         replica = self._replicas.get(server)
-        if replica is None:
+        if replica is None or word.log.generation >= GENERATION_MAX:
             self.strange += 1
         elif isinstance(word, State):
             self._take_state(server, replica, word, now_s)
@@ -231,25 +193,15 @@ class Keeper(Generic[A]):
         replica = self._done(number, server, now_s)
         if replica is None:
             self.strange += 1
-            return
-        call = self._calls.end(number)
-        self.late += call is None
-        if call is not None:
-            call.answered(answer)
+        else:
+            self.late += not self._calls.answer(number, answer)
 
     def refused(self, number: int, server: Name, reason: str, now_s: float) -> None:
         """Take a replica's word that it has no answer: perhaps it follows another by now."""
         replica = self._replicas.get(server)
-        call = self._calls.get(number)
-        if replica is None or not replica.follows:
-            return
-        self._ask(server, replica, now_s)
-        if call is None:
-            return
-        call.refused.add(server)
-        if call.refused >= {name for name, each in self._replicas.items() if each.follows}:
-            self._calls.end(number)
-            call.failed(Failure.REFUSED, reason)
+        if replica is not None and replica.follows:
+            self._ask(server, replica, now_s)
+            self._calls.refuse(number, server, reason, self._replicas.following().keys())
 
     def declined(self, number: int, server: Name, answer: A, now_s: float) -> None:
         """Take an answer; a service's are all the same."""
@@ -257,8 +209,7 @@ class Keeper(Generic[A]):
 
     def timeout(self, now_s: float) -> None:
         """Do what is due."""
-        for _, call in self._calls.expired(now_s):
-            call.failed(Failure.TIMED_OUT, "")
+        self._calls.expire(now_s)
         self._look(now_s)
 
     def next_timeout(self) -> float | None:
@@ -267,8 +218,7 @@ class Keeper(Generic[A]):
 
     def fail_all(self, reason: str) -> None:
         """End every call. The log stays: whoever comes gets it."""
-        for _, call in self._calls.fail_all():
-            call.failed(Failure.NO_SERVER, reason)
+        self._calls.fail_all(Failure.NO_SERVER, reason)
 
     def take(self) -> list[Effect]:
         """Return, once, what is to be sent, in order."""
@@ -278,7 +228,7 @@ class Keeper(Generic[A]):
     def _look(self, now_s: float) -> None:
         """Ask whoever owes a word; begin the log when all have said where they are."""
         for server, replica in self._replicas.items():
-            is_behind = replica.follows and replica.position is not None and replica.position.at < self._last
+            is_behind = replica.follows and replica.position is not None and replica.position.at < self._entries.last
             if now_s >= replica.quiet_until_s and (is_behind or not replica.follows):
                 self._ask(server, replica, now_s)
         if self._state_asked is not None and now_s >= self._state_until_s:
@@ -289,7 +239,7 @@ class Keeper(Generic[A]):
             self._begin_log(now_s)
         self._keep_small(now_s)
 
-    def _ask(self, server: Name, replica: _Replica, now_s: float) -> None:
+    def _ask(self, server: Name, replica: Replica, now_s: float) -> None:
         replica.quiet_until_s = now_s + (STALL_S if replica.follows else AGAIN_S)
         replica.is_offered = False
         self._effects.append(Word(server, Keep(self._log.life)))
@@ -301,27 +251,24 @@ class Keeper(Generic[A]):
         if not self._replicas:
             self._kept_by = None
 
-    def _take_position(self, server: Name, replica: _Replica, position: Position, now_s: float) -> None:
+    def _take_position(self, server: Name, replica: Replica, position: Position, now_s: float) -> None:
         replica.position = position
-        replica.why_not = ""
-        replica.is_offered = False
+        replica.why_not, replica.is_offered = "", False
         replica.quiet_until_s = now_s + AGAIN_S
         if position.kept_by is not None:
             replica.follows = False
             self._yield_to(position.kept_by, position.log, now_s)
             return
-        if self._kept_by is not None and not any(
-            each.position is not None and each.position.kept_by is not None for each in self._replicas.values()
-        ):
+        if not self._replicas.is_kept_otherwise():
             self._kept_by = None
-        has_rest = self._last - len(self._entries) <= position.held <= self._last  # or can get it
+        has_rest = self._entries.forgotten <= position.held <= self._entries.last  # or can get it
         replica.follows = self._is_keeping and position.log == self._log and has_rest
         if replica.follows:
             replica.quiet_until_s = now_s + STALL_S
             replica.sent = position.held
             self._feed(server, replica)
         elif self._is_keeping and position.log > self._log:
-            self._fail_pending("another kept this service in order meanwhile")
+            self._calls.fail_all(Failure.REFUSED, "another kept this service in order meanwhile")
             self._collect_until_s = now_s + COLLECT_S
             self._begin_anew()
         elif self._is_keeping:
@@ -329,23 +276,18 @@ class Keeper(Generic[A]):
 
     def _yield_to(self, other: Name, log: Log, now_s: float) -> None:
         """Learn that a replica follows another: that log holds, unless ours is begun and greater."""
-        is_followed = any(replica.follows for replica in self._replicas.values())
-        if is_followed and log < self._log:
+        if self._replicas.following() and log < self._log:
             return  # it is the other that yields
         self._kept_by = other
-        self._fail_pending(f"kept in order by {other.short}")
-        if self._is_keeping or self._last:
+        self._calls.fail_all(Failure.REFUSED, f"kept in order by {other.short}")
+        if self._is_keeping or self._entries.last:
             self._collect_until_s = now_s + COLLECT_S
             self._begin_anew()
 
-    def _fail_pending(self, reason: str) -> None:
-        for _, call in self._calls.fail_all():
-            call.failed(Failure.REFUSED, reason)
-
     def _begin_log(self, now_s: float) -> None:
         """Begin the log from the replica that is furthest, if nobody follows another."""
-        known = {name: each.position for name, each in self._replicas.items() if each.position is not None}
-        if any(position.kept_by is not None for position in known.values()):
+        known = self._replicas.known()
+        if self._replicas.is_kept_otherwise():
             return
         sound = {name: position for name, position in known.items() if not position.is_lost}
         for name in known.keys() - sound.keys():
@@ -364,15 +306,14 @@ class Keeper(Generic[A]):
             replica.why_not = ""
         self._follow(root, self._replicas[root], Follow(self._log, 0, best.log, best.at, None), now_s)
 
-    def _follow(self, server: Name, replica: _Replica, word: Follow, now_s: float) -> None:
-        replica.quiet_until_s = now_s + SILENT_S
-        replica.is_offered = True
+    def _follow(self, server: Name, replica: Replica, word: Follow, now_s: float) -> None:
+        replica.quiet_until_s, replica.is_offered = now_s + SILENT_S, True
         self._effects.append(Word(server, word))
 
-    def _admit(self, server: Name, replica: _Replica, position: Position, now_s: float) -> None:
+    def _admit(self, server: Name, replica: Replica, position: Position, now_s: float) -> None:
         """Let a replica follow, from where it can."""
-        state, is_level = self._state, self._is_level(position) and len(self._entries) == self._last
-        if not any(each.follows for each in self._replicas.values()) and not self._is_sent:
+        state, is_level = self._entries.state, self._is_level(position) and not self._entries.forgotten
+        if not self._replicas.following() and not self._is_sent:
             return  # first comes the one with which it begins
         if position.tells and (position.is_fresh or not is_level):
             if state is not None:
@@ -391,20 +332,15 @@ class Keeper(Generic[A]):
         is_begun = position.log.life == self._log.life and position.at == 0
         return not position.is_lost and (is_begun or (position.log, position.at) == self._base)
 
-    def _is_ready(self, replica: _Replica) -> bool:
+    def _is_ready(self, replica: Replica) -> bool:
         """Return whether it may have entries: where states can be told, none goes before one of them is here."""
-        return replica.follows and (self._state is not None or not self._tellers())
+        return replica.follows and (self._entries.state is not None or not self._replicas.tellers())
 
-    def _tellers(self) -> dict[Name, int]:
-        """Return those that follow and can tell their state, and after which entry."""
-        replicas = ((name, each.position) for name, each in self._replicas.items() if each.follows)
-        return {name: position.at for name, position in replicas if position is not None and position.tells}
-
-    def _feed(self, server: Name, replica: _Replica) -> None:
+    def _feed(self, server: Name, replica: Replica) -> None:
         """Send a replica the entries that it lacks, a few ahead of what it has done."""
         if not self._is_ready(replica) or replica.position is None:
             return
-        until = min(self._last, replica.position.at + WINDOW)
+        until = min(self._entries.last, replica.position.at + WINDOW)
         if replica.sent < until and replica.sent + 1 not in self._entries:
             replica.follows, replica.position, replica.quiet_until_s = False, None, 0.0  # it must take on a state
             return
@@ -413,11 +349,11 @@ class Keeper(Generic[A]):
             self._is_sent = True
         replica.sent = max(replica.sent, until)
 
-    def _done(self, number: int, server: Name, now_s: float) -> _Replica | None:
+    def _done(self, number: int, server: Name, now_s: float) -> Replica | None:
         replica, (life, index) = self._replicas.get(server), place_of(number)
         if replica is None or not replica.follows or replica.position is None:
             return None
-        if life != self._log.life or index > self._last:
+        if life != self._log.life or index > self._entries.last:
             return None
         if index > replica.position.at:
             replica.position = replica.position._replace(at=index, held=max(index, replica.position.held))
@@ -429,33 +365,30 @@ class Keeper(Generic[A]):
 
     def _keep_small(self, now_s: float) -> None:
         """Ask for a state when the log has grown, or to begin with."""
-        after = self._last - (self._state.at if self._state is not None else 0)
-        is_long = after >= self._state_every or self._bytes_after_state >= STATE_EVERY_BYTES
-        if self._is_keeping and self._state_asked is None and (self._state is None or is_long):
+        if self._is_keeping and self._state_asked is None and self._entries.wants_state:
             self._ask_state(now_s)
 
     def _ask_state(self, now_s: float) -> bool:
         """Ask the replica that is furthest for its state; return whether there is one to ask."""
-        tellers = self._tellers()
+        tellers = self._replicas.tellers()
         server = max(tellers, key=lambda name: tellers[name], default=None)
-        if server is None or (self._state is not None and tellers[server] <= self._state.at):
+        if server is None or (self._entries.state is not None and tellers[server] <= self._entries.state.at):
             return False
         self._state_asked = server
         self._state_until_s = now_s + SILENT_S
         self._effects.append(Word(server, Tell(self._log)))
         return True
 
-    def _take_state(self, server: Name, replica: _Replica, word: State, now_s: float) -> None:
-        if server != self._state_asked or word.log != self._log or word.at > self._last:
+    def _take_state(self, server: Name, replica: Replica, word: State, now_s: float) -> None:
+        if server != self._state_asked or word.log != self._log or word.at > self._entries.last:
             return
         self._state_asked = None
         if word.state is None:
             if replica.position is not None:
                 replica.position = replica.position._replace(tells=False)
             self._ask(server, replica, now_s)
-        elif self._state is None or word.at > self._state.at:
-            self._state = word
-            self._bytes_after_state = sum(len(each) for at, each in self._entries.items() if at > word.at)
+        else:
+            self._entries.learn(word)
         self._trim()
         for name, each in self._replicas.items():
             if each.follows:
@@ -464,12 +397,4 @@ class Keeper(Generic[A]):
                 self._admit(name, each, each.position, now_s)
 
     def _trim(self) -> None:
-        """Forget entries that a state stands for; those that a replica still lacks stay while there is room."""
-        if self._state is None:
-            return
-        done = [each.position.at for each in self._replicas.values() if each.follows and each.position is not None]
-        is_tight = len(self._entries) > self._entries_max // 2 or self._bytes > self._log_max_bytes // 2
-        until = self._state.at if is_tight else min([self._state.at, *done])
-        first = self._last - len(self._entries) + 1
-        for index in range(first, until + 1):
-            self._bytes -= len(self._entries.pop(index))
+        self._entries.trim(position.at for position in self._replicas.following().values())

@@ -35,6 +35,7 @@ __all__ = [
     "Position",
     "State",
     "Tell",
+    "Word",
     "call_of",
     "place_of",
 ]
@@ -82,6 +83,13 @@ class Tell(NamedTuple):
 
 
 KeeperWord: TypeAlias = "Keep | Follow | Tell"
+
+
+class Word(NamedTuple):
+    """What a keeper tells one replica."""
+
+    server: Name
+    word: KeeperWord
 
 
 class Position(NamedTuple):

@@ -217,7 +217,7 @@ class Bridge:
                 if key not in self._flows and key not in self._failed and self._is_our_turn(key, view, now_s):
                     self._begin(key, wish, view)
                 try:
-                    self._follow(key, wish, view)
+                    self._follow(key, wish, view, now_s)
                 except LocalError as error:
                     self._end(key)
                     self._failed[key] = Complaint(wish.local, Fault.NO_GRAPH, str(error))
@@ -236,12 +236,14 @@ class Bridge:
         del self._since[key]
         return True
 
-    def _follow(self, key: _Key, wish: Wish, view: _View) -> None:
+    def _follow(self, key: _Key, wish: Wish, view: _View, now_s: float) -> None:
         _, flow = self._flows.get(key, (wish, None))
         if isinstance(flow, ExposedTopic):
             flow.follow(view.ends(Role.PUBLISHES, wish))
         elif isinstance(flow, ImportedTopic):
             flow.follow(view.ends(Role.SUBSCRIBES, wish))
+        elif isinstance(flow, ExposedService):
+            flow.follow(view.ends(Role.SERVES, wish), now_s)
 
     def _wishes(self, at: int, graph: Graph, complaints: list[Complaint]) -> Iterator[Wish]:
         config = self._config

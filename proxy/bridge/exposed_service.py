@@ -7,23 +7,28 @@ their parts; and what nobody waits for any more is broken off by cancelling its 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
 from gdp.client.member import Message, Topic
 from gdp.errors import LocalError, RemoteError
 from gdp.names import Name
+from gdp.service.follower import Refuse
+from gdp.service.ordered import FollowerWord
 from gdp.service.serving import Asked, Serving
 from proxy.bridge.goals import cancel_of, goal_of
 from proxy.bridge.incoming import Incoming
+from proxy.bridge.kept_server import KeptServer
 from proxy.bridge.parts import CANCEL, GOAL, PROFILES, RESULT, Parts
 from proxy.bridge.rivals import mark_of, sign
 from proxy.bridge.seat import Seat
 from proxy.bridge.site import Site
 from proxy.bridge.wishes import Wish
-from proxy.endpoints.endpoint import Answered, Described, Event, Failed, Faulted, Heard
+from proxy.endpoints.endpoint import Answered, Described, End, Event, Failed, Faulted, Heard
 from proxy.exchange import Answer, Exchange, News, Outcome, Request, Stop, too_large
 from proxy.faults import Fault
+from proxy.ordering import is_word, keeper_word, to_wire
 from proxy.serial.schema import DefinitionError
 from proxy.serial.serializer import Serializer
 
@@ -61,12 +66,13 @@ class ExposedService:
         self._early = deque[Message](maxlen=_EARLY_MAX)
         endpoint, rule = seat.endpoint, wish.rule
         parts = Parts.of(rule.kind, wish.local, wish.type_name)
-        self._exchange = parts.known(endpoint, rule.encoding)
+        self._exchange = replace(parts.known(endpoint, rule.encoding), is_ordered=rule.is_ordered)
         self._answers = [Serializer(each.response, rule.encoding) for each in self._exchange.services]
         self._news = [Serializer(each, rule.encoding) for each in self._exchange.topics]
         self._mark = seat.advertise(self, sign(mark_of(wish.local), endpoint.ros))
         self._servers = [seat.dial(self, *part) for part in parts.services]
         self._stopper = None if rule.stop is None else seat.dial(self, rule.stop, _TRIGGER)
+        self._kept = None if not rule.is_ordered else self._keep(random_start)
         self._topics = [
             seat.subscribe(self, *part, profile) for part, profile in zip(parts.topics, PROFILES, strict=False)
         ]
@@ -80,7 +86,10 @@ class ExposedService:
             self._early.append(message)
             return
         try:
-            if Stop.is_in(message.delivered.message):
+            if self._kept is not None and is_word(message.delivered.message):
+                client = Name(message.delivered.publisher)
+                self._kept.heard(client, keeper_word(message.delivered.message), now_s)
+            elif Stop.is_in(message.delivered.message):
                 self._stop(Name(message.delivered.publisher), Stop.from_wire(message.delivered.message), now_s)
             else:
                 self._ask(message, now_s)
@@ -90,8 +99,9 @@ class ExposedService:
 
     def take(self, event: Event, now_s: float) -> None:
         """Take what the local server, or an action's topics, say."""
-        del now_s
-        if isinstance(event, Answered | Failed) and event.handle == self._stopper:
+        if self._kept is not None and isinstance(event, Answered | Failed) and event.handle != self._stopper:
+            self._take_in_order(self._kept, event, now_s)
+        elif isinstance(event, Answered | Failed) and event.handle == self._stopper:
             if isinstance(event, Failed):
                 self._site.faults.tell(f"{self._wish.rule.stop}", Fault.REFUSED, event.reason)
         elif isinstance(event, Answered | Failed):
@@ -112,7 +122,14 @@ class ExposedService:
         """Take what came before its description."""
         if self._early:
             self._take_early(now_s)
+        if self._kept is not None:
+            self._kept.look(self._site.member.peers(self._topic.name), now_s)
         self.timeout(now_s)
+
+    def follow(self, ends: Sequence[End], now_s: float) -> None:
+        """Take the local servers of the name: where state is kept it matters which one it is."""
+        if self._kept is not None:
+            self._kept.follow(ends, now_s)
 
     def timeout(self, now_s: float) -> None:
         """Give up what its client no longer waits for."""
@@ -137,14 +154,17 @@ class ExposedService:
     def is_drained(self, now_s: float) -> bool:
         """Return whether nothing is under way any more, and nothing new will be."""
         is_closed = self._refuses_from_s is not None and now_s >= self._refuses_from_s
-        return is_closed and not self._serving and not self._early
+        if is_closed and self._kept is not None:
+            self._kept.close()
+        return is_closed and not self._serving and not self._early and (self._kept is None or self._kept.is_idle)
 
     def close(self, now_s: float) -> None:
         """Serve nobody any more; calls under way fail."""
         for asked in self._serving.fail_all():
             self._fail(asked, Fault.NO_SERVER, "the server is gone")
         stopper = [] if self._stopper is None else [self._stopper]
-        for handle in [self._mark, *self._servers, *stopper, *self._topics]:
+        kept = [] if self._kept is None else self._kept.handles
+        for handle in [self._mark, *self._servers, *stopper, *kept, *self._topics]:
             self._seat.close(handle)
         self._site.member.flush(now_s)  # what was said last must not wait: it would go with its stream
         self._site.member.withdraw(self._topic.name)
@@ -167,12 +187,12 @@ class ExposedService:
         request = Request.from_wire(delivered.message)
         asked = Asked(Name(delivered.publisher), request.part, request.call)
         self._site.traffic.received(len(delivered.message))
-        before = self._serving.answer_of(asked)
+        before = None if self._kept is not None else self._serving.answer_of(asked)
         if before is not None or asked in self._serving:
             if before:
                 self._send_wire(asked.client, before)
             return
-        if self._refuses_from_s is not None and now_s >= self._refuses_from_s:
+        if self._kept is None and self._refuses_from_s is not None and now_s >= self._refuses_from_s:
             self._send(asked, Answer.failed(asked.part, asked.call, "the server is leaving"))
             return
         try:
@@ -180,12 +200,38 @@ class ExposedService:
             if request.part >= len(incoming):
                 raise DefinitionError("the client asks for a part that this service has not")
             raw = incoming[request.part].decode(request.body)
+            if self._kept is not None:
+                self._kept.entry(asked.client, asked.call, raw, now_s)
+                return
             patience_s = request.patience_ms / 1e3 + _GRACE_S if request.patience_ms else None
             self._begin(now_s, patience_s, asked, raw)
         except LocalError as error:
             self._fail(asked, Fault.OTHER_TYPE, str(error))
         except RemoteError as error:
             self._fail(asked, Fault.MALFORMED, str(error))
+
+    def _keep(self, number: int) -> KeptServer:
+        rule, what = self._wish.rule, self._wish.local
+        return KeptServer(
+            self._seat, self, rule.state_node, number,
+            give=lambda number, raw: self._seat.endpoint.call(self._servers[0], number, raw),
+            tell=self._tell,
+            complain=lambda reason: self._site.faults.tell(what, Fault.REFUSED, reason),
+        )  # fmt: skip
+
+    def _tell(self, client: Name, word: FollowerWord | Refuse) -> None:
+        if isinstance(word, Refuse):
+            self._site.faults.tell(self._wish.local, Fault.REFUSED, word.reason)
+            self._send_wire(client, Answer.failed(0, word.call, word.reason).to_wire())
+        else:
+            self._send_wire(client, to_wire(word))
+
+    def _take_in_order(self, kept: KeptServer, event: Answered | Failed, now_s: float) -> None:
+        entry = kept.done(event, now_s)
+        if entry is not None and isinstance(event, Answered):
+            self._answer(Asked(entry.client, 0, entry.call), event.raw)
+        elif entry is not None and isinstance(event, Failed):
+            self._fail(Asked(entry.client, 0, entry.call), Fault.REFUSED, event.reason)
 
     def _begin(self, now_s: float, patience_s: float | None, asked: Asked, raw: bytes) -> None:
         """Take a request; what is about a goal waits until the local server knows whether it accepts that one."""

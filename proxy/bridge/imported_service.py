@@ -18,8 +18,8 @@ from gdp.errors import GdpError, LocalError, RemoteError
 from gdp.names import Name
 from gdp.service.dispatch import Ask, Dispatch, Failure
 from gdp.service.dispatch import Effect as DispatchEffect
-from gdp.service.keeper import Keeper, Word
-from gdp.service.ordered import LIFE_BITS
+from gdp.service.keeper import Keeper
+from gdp.service.ordered import LIFE_BITS, Word
 from gdp.service.replication import ALL, Mode
 from proxy.bridge.far_server import FarServer
 from proxy.bridge.goals import Goals, goal_of, says_yes

@@ -51,7 +51,7 @@ _TYPES: Final[dict[Kind, tuple[str, str]]] = {
 _OWN_KEYS: Final = ("kind", "name", "type")
 _OF_TOPICS: Final = ("reliable", "latched", "max_hz")
 _OF_CALLS: Final = ("timeout_s", "replication")
-_OF_SERVICES: Final = ("stop", "at_once")
+_OF_SERVICES: Final = ("stop", "at_once", "state", "state_node")
 _FOREIGN: Final[dict[Kind, tuple[str, ...]]] = {
     "topic": (*_OF_CALLS, *_OF_SERVICES),
     "service": _OF_TOPICS,
@@ -186,6 +186,17 @@ class Rule(Section):
         description="Services, under `expose`: how many requests the local server gets at one time; the others wait"
         " in the proxy, in order. `null`: all.",
     )
+    state: Literal["none", "ordered"] = Field(
+        default="none",
+        description="Services, on both sides: `ordered` where answers depend on requests before: every server gets all"
+        " of them in one order.",
+    )
+    state_node: str | None = Field(
+        default=None,
+        description="Services, under `expose` with `state: ordered`: the local node whose parameter `state`, a byte"
+        " array, is the server's state. `null`: it tells none.",
+        json_schema_extra={"pattern": f"^{NAME_FORM}$", "maxLength": NAME_MAX_CHARS},
+    )
     priority: Literal["normal", "urgent"] = Field(
         default="normal", description="`urgent`: goes before everything `normal`, wherever frames queue."
     )
@@ -244,6 +255,11 @@ class Rule(Section):
             LocalError: as ``overlay_metadata``.
         """
         return self.overlay_metadata.name(self.owner.compressed)
+
+    @property
+    def is_ordered(self) -> bool:
+        """Return whether it is about a service that keeps state."""
+        return self.state == "ordered"
 
     @property
     def spread(self) -> Replication:
@@ -328,16 +344,16 @@ class Rule(Section):
             raise ValueError("only services and actions have this")
         return value
 
-    @field_validator("stop", "at_once")
+    @field_validator("stop", "at_once", "state", "state_node")
     @classmethod
     def _is_of_services(cls, value: object, info: ValidationInfo) -> object:
         if info.data.get("kind", "service") != "service":
             raise ValueError("only services have this")
         return value
 
-    @field_validator("stop")
+    @field_validator("stop", "state_node")
     @classmethod
-    def _stop(cls, text: str | None) -> str | None:
+    def _local_name(cls, text: str | None) -> str | None:
         if text is not None and not is_name(text):
             raise ValueError("expected a full ROS name, such as /plan/stop")
         return text

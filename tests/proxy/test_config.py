@@ -188,3 +188,19 @@ def test_one_name_may_be_used_in_two_graphs_if_it_is_two_names_elsewhere(place: 
 def test_every_error_of_a_file_is_told_in_its_order(place: Path) -> None:
     told = refusals(place, f"{THREE}expose:\n{rules('name: /a', 'name: /b, domain: 3')}record: {{path: x.mcap}}\n")
     assert [line.split(":")[1] for line in told] == ["7", "8", "9"]
+
+
+@pytest.mark.parametrize(
+    ("side", "keys", "complaint"),
+    [
+        ("expose", "replication: {mode: some}", "replication: this stands in rules under import"),
+        ("import", "at_once: 1", "at_once: this stands in rules under expose"),
+        ("import", "stop: /halt", "stop: this stands in rules under expose"),
+        ("import", "state: ordered, state_node: /node", "state_node: this stands in rules under expose"),
+        ("expose", "state_node: /node", "state_node: this needs 'state: ordered'"),
+        ("expose", "state: ordered, at_once: 2", "at_once: with 'state: ordered' it is always 1"),
+    ],
+)
+def test_a_key_of_the_other_side_is_refused(place: Path, side: str, keys: str, complaint: str) -> None:
+    text = f"ros: {{endpoint: ros2, domain: 0}}\n{side}:\n{rules(f'name: /a, kind: service, {keys}')}"
+    assert f": {side}[0].{complaint}" in refusal(place, text)

@@ -31,8 +31,8 @@ GOOD = [
     "name: /set, kind: service, timeout_s: null",
     "name: /set, kind: service, timeout_s: 0.5, priority: urgent, max_bytes: 100",
     "name: /set, kind: service, stop: /set/stop, at_once: 1",
-    "name: /set, kind: service, replication: {mode: some, copies: 3}",
-    "name: /fold, kind: action, replication: {mode: hedged, budget: 0.1}",
+    "name: /set, kind: service, state: ordered",
+    "name: /set, kind: service, state: ordered, state_node: /counter",
     "name: /fold, kind: action, type: test_msgs/action/Fibonacci, timeout_s: 10",
     "name: /a, remap: /b/c",
     "name: /a, max_hz: 10",
@@ -79,6 +79,9 @@ BAD = [
     ("name: /a, kind: service, at_once: 0", "at_once: expected greater than or equal to 1"),
     ("name: /a, kind: action, stop: /halt", "stop: only services have this"),
     ("name: /a, kind: action, at_once: 1", "at_once: only services have this"),
+    ("name: /a, kind: action, state: ordered", "state: only services have this"),
+    ("name: /a, kind: service, state: kept", "state: expected 'none' or 'ordered'"),
+    ("name: /a, kind: service, state: ordered, state_node: node", "state_node: expected a full ROS name"),
     ("name: /a, ros: 3", "ros: expected 1 or 2, not 3"),
     ("name: /a, domain: 233", "domain: expected less than or equal to 232"),
     ("name: /a, metadata: {name: /b}", "metadata: name: state it as a key of the rule itself"),
@@ -148,8 +151,14 @@ def test_what_a_rule_leaves_open_follows_the_source(place: Path) -> None:
 
 
 def test_a_rule_says_how_requests_are_spread(place: Path) -> None:
-    given = [rule(place, f"name: /a, kind: service{more}").spread for more in ("", ", replication: {mode: some}")]
-    assert given == [Replication(copies=2), Replication(Mode.SOME, copies=2)]
+    spreads = ["service", "service, replication: {mode: some}", "action, replication: {mode: hedged, budget: 0.1}"]
+    texts = [f"name: /a, kind: {spread}" for spread in spreads]
+    given = [proxy(place, f"ros: {{endpoint: ros2}}\nimport:\n{rules(text)}").imports[0].spread for text in texts]
+    assert given == [
+        Replication(copies=2),
+        Replication(Mode.SOME, copies=2),
+        Replication(Mode.HEDGED, copies=2, budget=0.1),
+    ]
 
 
 def test_a_remapped_rule_knows_both_names(place: Path) -> None:

@@ -63,13 +63,14 @@ def machine_of(region: str, instance: InstanceTypeDef, request: SpotInstanceRequ
     code = status.get("Code", "")
     name = instance["State"]["Name"]
     state = _STATES.get(name, MachineState.BOOTING)
-    reason, leaves_at = "", None
+    reason, leaves_at, since = "", None, None
     if state is MachineState.GONE:
         reason = _why_gone(code, instance)
     elif code.startswith("marked-for-"):
         state, reason = MachineState.LEAVING, code
         if marked := status.get("UpdateTime"):
-            leaves_at = marked.timestamp() + NOTICE_S
+            since = marked.timestamp()
+            leaves_at = since + NOTICE_S
     elif state is MachineState.LEAVING:
         reason = name
     elif DRAIN in tags:
@@ -82,6 +83,7 @@ def machine_of(region: str, instance: InstanceTypeDef, request: SpotInstanceRequ
         instance.get("PublicIpAddress") or instance.get("PrivateIpAddress") or "",
         leaves_at,
         reason,
+        since,
     )
 
 

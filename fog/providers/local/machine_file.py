@@ -26,7 +26,7 @@ class MachineFile:
     Args:
         gateway: the file that holds the namespace of the gateway it is next to.
         is_bounded: its processes take no more processor time and memory than its hardware has.
-        gone_unix_s: when it was first seen to be gone.
+        gone_unix_s: when it was killed, or first seen to be gone.
     """
 
     spec: MachineSpec

@@ -101,9 +101,9 @@ class LocalProvider:
 
     def sweep(self) -> list[str]:
         """Remove what ended, or was begun by somebody who is gone; return the ids."""
+        gone = [each.id for each in standing(self._runs) if not each.is_alive]
+        self._end(gone)
         with self._alone():
-            gone = [each.id for each in standing(self._runs) if not each.is_alive]
-            self._end(gone)
             return [*gone, *self._runs.sweep()]
 
     # the Provider protocol
@@ -218,8 +218,9 @@ class LocalProvider:
         for each in machines:
             for device in (each.plug, each.relay_out):
                 delete(each.gateway, device)  # by itself it would go some time after its namespace
-            if each.id in {record.run for record in self._runs.all()}:
-                self._runs.resume(each.id).end()
+            with self._alone():  # a command may end what the supervisor just ends
+                if each.id in {record.run for record in self._runs.all()}:
+                    self._runs.resume(each.id).end()
 
     def _tell(self, machine: str, number: signal.Signals) -> None:
         found = find(self._runs, machine)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from fog.agent.notice import read_notice
+from fog.agent.notice import given_unix_s, read_notice
 from fog.agent.status import Status
 from fog.machine import Machine, MachineState
 from fog.providers.local.machine_file import MachineFile
@@ -91,8 +91,24 @@ class Standing:
         """Return what the provider says of it."""
         state, reason = self._state()
         return Machine(
-            self.id, self.file.spec, state, self.file.started_unix_s, self.address, read_notice(self.home), reason
+            self.id,
+            self.file.spec,
+            state,
+            self.file.started_unix_s,
+            self.address,
+            read_notice(self.home),
+            reason,
+            self._since_unix_s(state),
         )
+
+    def _since_unix_s(self, state: MachineState) -> float | None:
+        """Return since when it has been so: by its own word, by whoever killed it, or by its notice."""
+        if state is MachineState.LEAVING and (given_s := given_unix_s(self.home)) is not None:
+            return given_s
+        said = Status.read(self.home)
+        if said is not None and said.state is state:
+            return said.changed_unix_s
+        return (self.file.gone_unix_s or read_notice(self.home)) if state is MachineState.GONE else None
 
     def _state(self) -> tuple[MachineState, str]:
         said, notice = Status.read(self.home), read_notice(self.home)

@@ -11,6 +11,7 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 
 from fog.agent.notice import write_notice
 from fog.agent.status import Status
@@ -35,6 +36,8 @@ def kill(runs: Runs, machine: str) -> None:
     """Kill all processes of the machine at once, without a goodbye, and unplug it: what a power cut does."""
     found = find(runs, machine)
     groups = list(_groups(found))
+    if found.is_alive and found.file.gone_unix_s is None:
+        replace(found.file, gone_unix_s=time.time()).write(found.directory)  # whoever notices knows how late it is
     found.cgroup.kill()
     for group in groups:
         with suppress(ProcessLookupError):

@@ -13,7 +13,9 @@ from typer.testing import CliRunner
 from fog.cli import options
 from fog.cli.app import app
 from fog.cluster import ClusterPlan
-from fog.supervisor.journal import Journal
+from fog.site import open_site
+from fog.supervisor.journal import LAST_WORDS, Journal
+from fog.supervisor.record import Ending
 from tests.fog.supervisor.machines import record, serving
 from tests.fog.supervisor.test_journal import PLAN
 from tests.pages import ROOT
@@ -110,3 +112,41 @@ def test_a_wrong_key_of_fog_yaml_is_told_with_its_place(fog: Run, tmp_path: Path
 def test_a_launch_file_that_is_not_there_is_told(fog: Run) -> None:
     result = fog("launch", "nowhere.py", "--dry-run")
     assert (result.exit_code, "nowhere.py" in result.output) == (2, True)
+
+
+def test_the_last_words_of_a_machine_that_is_gone_are_shown(fog: Run, journal: Journal) -> None:
+    up(journal)
+    gone = serving("m3").ended(Ending.TAKEN, "killed", time.time())
+    journal.put(gone, time.time(), "taken", "killed", time.time() - 0.25)
+    journal.tell(time.time(), "c", "m3", LAST_WORDS, "node", lines="one\nout of memory")
+    said = fog("logs", "m3", "node", "-n", "1").output.splitlines()
+    assert said == ["# m3 is gone: taken, killed; its last lines:", "out of memory"]
+    assert "kept are the last lines of node" in fog("logs", "m3", "switch").output
+    assert "of node: out of memory" in fog("status", "--events").output
+    assert "seen after 0.2" in fog("status", "--events").output
+    assert "m3 is gone" in fog("ssh", "m3").output
+
+
+def test_a_regions_latency_is_shown(fog: Run, journal: Journal, tmp_path: Path) -> None:
+    up(journal)
+    site = open_site(None)
+    (tmp_path / "fog.yaml").write_text(
+        f"domain: {site.authority.domain}\nowner: {site.authority.owner}\nlatency_ms: {{east: 12, west: 80.5}}\n"
+    )
+    told = json.loads(fog("status", "--json").output)
+    assert [each["latency_ms"] for each in told["members"]] == [12, 80.5]
+    assert "80.5" in fog("status").output
+
+
+@pytest.mark.parametrize(
+    ("more", "how"), [((), "with the robot's nodes, or by fog down"), (("--detach",), "by fog down")]
+)
+def test_how_a_cluster_will_end_is_told_before_it_begins(fog: Run, more: tuple[str, ...], how: str) -> None:
+    said = fog("launch", str(ROOT / "examples" / "echo.launch.py"), "--dry-run", *more).output
+    assert f"ends    {how}, after 30min" in said
+
+
+def test_ros_launch_is_named_as_what_ends_its_cluster(fog: Run, tmp_path: Path) -> None:
+    (tmp_path / "plan.json").write_text(PLAN.to_json())
+    said = fog("launch", "plan.json", "--detach", "--dry-run", "--ends-with", "this launch").output
+    assert "ends    with this launch, or by fog down" in said

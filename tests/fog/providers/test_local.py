@@ -96,7 +96,7 @@ def test_a_machine_long_gone_is_forgotten(provider: LocalProvider, tmp_path: Pat
     assert len(provider.describe("c")) == 1
     MachineFile(SPEC, 1.0, "/run/netns/none", gone_unix_s=1.0).write(run.directory)
     assert provider.describe("c") == []
-    assert [path.name for path in tmp_path.rglob("*")] == ["local"]
+    assert [path.name for path in tmp_path.rglob("*")] == ["local", ".lock"]
 
 
 def test_another_clusters_machines_are_not_told(provider: LocalProvider) -> None:

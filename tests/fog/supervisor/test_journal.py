@@ -76,3 +76,18 @@ def test_a_journal_that_cannot_be_read_may_be_tried_again(journal: Journal, tmp_
     file.close()
     with pytest.raises(StoreError):
         journal.clusters()
+
+
+def test_a_journal_of_an_earlier_version_is_gone_on_with(tmp_path: Path) -> None:
+    path = tmp_path / "old.sqlite3"
+    with sqlite3.connect(path) as file:
+        file.execute(
+            "CREATE TABLE events (id INTEGER PRIMARY KEY AUTOINCREMENT, unix_s REAL NOT NULL, cluster TEXT NOT NULL,"
+            " machine TEXT NOT NULL, what TEXT NOT NULL, detail TEXT NOT NULL) STRICT"
+        )
+        file.execute("INSERT INTO events (unix_s, cluster, machine, what, detail) VALUES (1, 'c', 'm1', 'up', '')")
+    file.close()
+    journal = Journal(path)
+    journal.tell(NOW_S, "c", "m1", "taken", since_unix_s=NOW_S - 1)
+    assert [(each.what, each.since_unix_s) for each in journal.events()] == [("up", None), ("taken", NOW_S - 1)]
+    journal.close()

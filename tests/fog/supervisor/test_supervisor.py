@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from fog.cluster import Carried, CloudNode, ClusterPlan
+from fog.enrolment.boots import PROXY
 from fog.hardware import Hardware
 from fog.machine import Boot, Machine, MachineSpec, MachineState
 from fog.offer import Offer
@@ -29,6 +30,7 @@ class Memory:
     poll_s = 0.01
 
     def __init__(self) -> None:
+        self.said: dict[str, str] = {}
         self.machines: dict[str, Machine] = {}
         self.refuses = 0  # so many more
         self.spent: list[str] = []
@@ -54,7 +56,7 @@ class Memory:
         self.terminate([machine])
 
     def log(self, machine: str, program: str, lines: int) -> str:
-        return ""
+        return self.said.get(program, "")
 
     def shell(self, machine: str) -> list[str]:
         return []
@@ -153,3 +155,89 @@ def test_a_spent_budget_ends_a_cluster(site: Site, journal: Journal) -> None:
     work(ours, lambda: not journal.cluster("c").is_up and ours.is_done)
     ours.close()
     assert "budget" in journal.cluster("c").why
+
+
+def test_a_cluster_that_nobody_calls_is_ended_and_one_that_is_called_is_not(
+    site: Site, journal: Journal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    provider, now_s = Memory(), time.time()
+    provider.said = {PROXY: '{"event":"progress","received":1}'}
+    ours = supervisor(site, journal, provider)
+    journal.want(replace(PLAN, idle_s=60.0), now_s)
+    work(ours, lambda: len(serving(journal)) == 2)
+    for later_s, requests in ((40.0, 2), (80.0, 3), (120.0, 3)):
+        provider.said = {PROXY: f'{{"event":"progress","received":{requests}}}'}
+        monkeypatch.setattr(time, "time", lambda at_s=now_s + later_s: at_s)
+        ours.look()
+        assert journal.cluster("c").is_up
+    monkeypatch.setattr(time, "time", lambda: now_s + 145.0)
+    work(ours, lambda: ours.is_done)
+    ours.close()
+    assert journal.cluster("c").why == "not called for 65 s"
+    assert provider.machines == {}
+
+
+def test_what_the_programs_of_a_lost_machine_said_last_is_kept(site: Site, journal: Journal) -> None:
+    provider = Memory()
+    ours = supervisor(site, journal, provider)
+    journal.want(PLAN, time.time())
+    work(ours, lambda: len(serving(journal)) == 2)
+    provider.said = {"node": "one\nout of memory\n"}
+    lost = provider.machines["m1"]
+    provider.machines["m1"] = replace(lost, state=MachineState.GONE, reason="killed", since_unix_s=7.0)
+    work(ours, lambda: journal.last_words("c", "m1"))
+    ours.close()
+    assert journal.last_words("c", "m1") == {"node": "one\nout of memory"}
+    (taken,) = (each for each in journal.events("c") if each.what == "taken")
+    assert (taken.detail, taken.since_unix_s) == ("killed", 7.0)
+
+
+def test_what_a_machine_that_was_given_back_said_is_not_kept(site: Site, journal: Journal) -> None:
+    provider = Memory()
+    provider.said = {"node": "word"}
+    ours = supervisor(site, journal, provider)
+    journal.want(PLAN, time.time())
+    work(ours, lambda: len(serving(journal)) == 2)
+    journal.unwant("c", "test", time.time())
+    work(ours, lambda: ours.is_done)
+    ours.close()
+    assert journal.last_words("c", "m1") == {}
+
+
+def test_after_its_start_a_supervisor_says_when_all_was_looked_at(site: Site, journal: Journal) -> None:
+    ours = supervisor(site, journal, Memory())
+    journal.want(PLAN, time.time())
+    ours.look()
+    begun_s = time.time() - 1.5
+    ours.reconciled(begun_s)
+    ours.close()
+    told = journal.events("c")[-1]
+    assert (told.what, told.since_unix_s, told.detail[:3]) == ("reconciled", begun_s, "1.5")
+
+
+def test_a_region_that_is_nearer_is_taken_and_said(site: Site, journal: Journal) -> None:
+    near = replace(site, latency_ms={"east": 90.0, "west": 12.0, "south": 80.0})
+    ours = supervisor(near, journal, Memory())
+    journal.want(replace(PLAN, machines=(SPOT,)), time.time())
+    work(ours, lambda: len(serving(journal)) == 1)
+    ours.close()
+    (asked,) = (each for each in journal.events("c") if each.what == "asked")
+    assert asked.detail.startswith("west")
+    assert "12 ms away" in asked.detail
+
+
+@pytest.mark.parametrize(("sent", "is_up"), [(7, False), (None, True)])
+def test_where_logs_come_late_the_robot_tells_whether_it_calls_and_else_it_counts_as_used(
+    site: Site, journal: Journal, monkeypatch: pytest.MonkeyPatch, sent: int | None, is_up: bool
+) -> None:
+    provider, now_s = Memory(), time.time()
+    provider.name = "aws"
+    monkeypatch.setattr("fog.supervisor.supervisor.sent_by", lambda path: sent)
+    ours = supervisor(site, journal, provider)
+    journal.want(replace(PLAN, idle_s=60.0), now_s)
+    work(ours, lambda: len(serving(journal)) == 2)
+    for later_s in (30.0, 60.0, 100.0):
+        monkeypatch.setattr(time, "time", lambda at_s=now_s + later_s: at_s)
+        ours.look()
+    ours.close()
+    assert journal.cluster("c").is_up is is_up

@@ -223,8 +223,10 @@ def test_what_is_held_is_bounded_in_number_and_in_bytes() -> None:
     with pytest.raises(LocalError, match="8 calls"):
         bench.begin()
     bench.dispatch.fail_all("closed")
+    bench.dispatch.begin(0.0, lambda _: bytes(101), 1.0, lambda _: None, lambda *_: None)
     with pytest.raises(LocalError, match="bytes are under way"):
-        bench.dispatch.begin(0.0, lambda _: bytes(101), 1.0, print, print)
+        bench.begin()
+    bench.dispatch.fail_all("closed")
     assert (len(bench.dispatch), bench.dispatch.held_bytes) == (0, 0)
     bench.begin()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections import deque
 from dataclasses import dataclass, field
+from functools import partial
 
 import pytest
 from hypothesis import given, settings
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.service.dispatch import Ask, Failure
+from gdp.service.entries import Entries
 from gdp.service.follower import Apply, Fetch, Follower, Load, Refuse, Say
 from gdp.service.keeper import Keeper
 from gdp.service.ordered import Follow, Keep, Position, State, Tell
@@ -54,13 +56,16 @@ class World:
         self.clients: dict[Name, Client] = {}
         self.ways: dict[tuple[Name, Name, str], deque[object]] = {}
         self.asked = 0
+        self.failing: set[Name] = set()
         for server in SERVERS[:replicas]:
             self.start(server)
         self.open(KEEPERS[0])
 
     def open(self, name: Name) -> None:
         self.cut(name)
-        keeper = Keeper[bytes](life=lambda: self.dice.getrandbits(32), state_every=8, entries_max=256)
+        keeper = Keeper[bytes](
+            life=lambda: self.dice.getrandbits(32), entries=partial(Entries, state_every=8, entries_max=256)
+        )
         self.clients[name] = Client(keeper)
         for server in self.replicas:
             keeper.came(server, self.now_s)
@@ -162,7 +167,11 @@ class World:
     def work(self, server: Name) -> None:
         replica = self.replicas[server]
         job = replica.at.pop(0)
-        if isinstance(job, Apply):
+        if isinstance(job, Apply) and server in self.failing:
+            self.failing.remove(server)
+            replica.done.append(b"half")
+            replica.follower.failed()
+        elif isinstance(job, Apply):
             replica.done.append(job.request)
             self.way(server, job.client, "back").append((job.call, job.request))
             replica.follower.applied()
@@ -203,7 +212,7 @@ def answered_are_done(world: World, client: Client) -> None:
 
 
 @pytest.mark.parametrize("tells", [True, False])
-@settings(max_examples=1500, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(seed=st.integers(0, 1 << 32), loss=st.sampled_from([0.0, 0.1]))
 def test_whatever_replica_dies_those_that_live_hold_the_answered_requests_in_order(
     tells: bool, seed: int, loss: float
@@ -232,25 +241,21 @@ def test_whatever_replica_dies_those_that_live_hold_the_answered_requests_in_ord
     assert world.clients[KEEPERS[0]].failed == []
 
 
-@settings(max_examples=1500, deadline=None)
-@given(seed=st.integers(0, 1 << 32))
-def test_a_keeper_that_restarts_goes_on_from_the_replica_that_is_furthest(seed: int) -> None:
+@settings(max_examples=100, deadline=None)
+@given(seed=st.integers(0, 1 << 32), loss=st.sampled_from([0.0, 0.1]))
+def test_a_keeper_that_restarts_goes_on_from_the_replica_that_is_furthest(seed: int, loss: float) -> None:
     world = World(seed, tells=True)
-    answered: list[bytes] = []
+    answered: set[bytes] = set()
     for _ in range(5):
         for _ in range(12):
             world.ask()
-            world.run(world.dice.randrange(30))
-            if world.dice.random() < 0.1:
-                world.start(SERVERS[2])
-        answered += world.clients[KEEPERS[0]].answered
+            world.run(world.dice.randrange(30), loss)
+        answered |= set(world.clients[KEEPERS[0]].answered)
         world.open(KEEPERS[0])
     world.settle()
     done = world.agreed()
-    held_by_one = [each for each in answered if each in done]
     assert done == sorted(done, key=int)
-    # What only the third had done is gone where that died at the same time; the others never do.
-    assert len(held_by_one) >= len(answered) - 12
+    assert answered <= set(done)
     assert world.ask() == ""
     world.settle()
     assert world.agreed()[-1] == b"%d" % (world.asked - 1)
@@ -272,7 +277,7 @@ def test_a_second_client_is_told_who_keeps_the_order_until_that_one_is_gone() ->
     assert world.agreed() == [b"0", b"2", b"3"]
 
 
-@settings(max_examples=1500, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(seed=st.integers(0, 1 << 32))
 def test_of_two_clients_that_begin_at_once_one_keeps_the_order(seed: int) -> None:
     world = World(seed, tells=True)
@@ -301,14 +306,10 @@ def test_a_server_that_failed_is_out_until_it_takes_on_a_state() -> None:
     world = World(1, tells=True, replicas=2)
     world.ask()
     world.settle()
+    world.failing = {SERVERS[0]}
     world.ask()
-    one = world.replicas[SERVERS[0]]
-    while not any(isinstance(each, Apply) for each in one.at):
-        world.step()
-    one.at.clear()
-    one.done.append(b"half")
-    one.follower.failed()
     world.settle()
+    assert not world.failing
     assert world.agreed() == [b"0", b"1"]
 
 

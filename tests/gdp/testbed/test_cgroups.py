@@ -76,6 +76,14 @@ def test_what_was_never_made_is_removed_without_complaint() -> None:
     Cgroup("gdp-never-made").remove()
 
 
+def test_a_group_that_somebody_else_removes_meanwhile_is_killed_without_complaint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    group = Cgroup("gdp-never-made")
+    monkeypatch.setattr(group, "_find", lambda _: tmp_path / "removed" / "cgroup.kill")
+    group.kill()
+
+
 def test_a_run_takes_its_group_down(
     group: Cgroup, sleeper: subprocess.Popen[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,0 +1,96 @@
+"""The robot's nodes of a launch file: started beside the robot, ended with the command.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+import typer
+
+from fog.launch.resolve import PYTHON, command_line
+from gdp.errors import LocalError
+
+if TYPE_CHECKING:
+    from fog.launch.load import RobotNode
+
+__all__ = ["INTERRUPTED", "Started", "resolved", "run"]
+
+INTERRUPTED: Final = 130  # exit code after Ctrl-C
+_OWN_S: Final = 1.0  # at a terminal Ctrl-C reaches the nodes as well: a second one would break off how they end
+_END_S: Final = 5.0
+
+Started: TypeAlias = "tuple[RobotNode, tuple[str, ...]]"
+
+
+def resolved(each: RobotNode) -> Started:
+    """Return a node with its command line.
+
+    Raises:
+        LocalError: there is no such node here.
+    """
+    words = command_line(each.node, os.environ)
+    return each, tuple(sys.executable if word == PYTHON else word for word in words)
+
+
+def run(nodes: Sequence[Started], logs: Path) -> int:
+    """Run nodes until all have ended, or Ctrl-C ends them; return the worst exit code.
+
+    Args:
+        logs: folder for what nodes print that are not to print here. Their errors come here, as with ``ros2 launch``.
+
+    Raises:
+        LocalError: one cannot be started.
+    """
+    processes: list[subprocess.Popen[bytes]] = []
+    try:
+        for index, (each, words) in enumerate(nodes):
+            processes.append(_start(each, words, logs / f"{index}-{each.node.executable.rpartition('/')[2]}.log"))
+        return max((abs(process.wait()) for process in processes), default=0)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except OSError as error:
+        raise LocalError(f"{error.filename}: {error.strerror}") from error
+    finally:
+        _end(processes)
+
+
+def _start(each: RobotNode, words: Sequence[str], path: Path) -> subprocess.Popen[bytes]:
+    environment = {**os.environ, **each.node.environment}
+    if each.output in ("screen", "both"):
+        return subprocess.Popen(words, env=environment)
+    path.parent.mkdir(mode=0o700, exist_ok=True)
+    typer.echo(f"{each.node.executable} prints to {path}", err=True)
+    with path.open("wb") as file:
+        return subprocess.Popen(words, env=environment, stdout=file)
+
+
+def _end(processes: Sequence[subprocess.Popen[bytes]]) -> None:
+    """Let nodes end, ask those that do not, and at last kill them; a further Ctrl-C kills at once."""
+    with suppress(KeyboardInterrupt):
+        if _await(processes, _OWN_S):
+            return
+        for process in processes:
+            process.send_signal(signal.SIGINT)  # nothing, if it has ended
+        _await(processes, _END_S)
+    for process in processes:
+        process.kill()
+        process.wait()
+
+
+def _await(processes: Sequence[subprocess.Popen[bytes]], patience_s: float) -> bool:
+    """Return whether all have ended within ``patience_s``, each."""
+    try:
+        for process in processes:
+            process.wait(patience_s)
+    except subprocess.TimeoutExpired:
+        return False
+    return True

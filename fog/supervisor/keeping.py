@@ -1,0 +1,113 @@
+"""The process that is a site's supervisor: what it is made of, its signals, its end.
+
+Place: shell. Apart from ``background``, for what it imports takes longer than most commands need in all.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+import time
+from contextlib import closing
+from functools import partial
+from types import FrameType
+from typing import Final
+
+from fog.site import Site
+from fog.supervisor.background import held
+from fog.supervisor.decide import Patience
+from fog.supervisor.ground import command_of, open_provider, stand
+from fog.supervisor.journal import Journal
+from fog.supervisor.supervisor import Supervisor
+from fog.supervisor.watch import Watch
+from gdp.errors import StoreError
+from gdp.testbed.processes import Process
+
+__all__ = ["supervise"]
+
+log = logging.getLogger(__name__)
+
+_ELSEWHERE_S: Final = 900.0  # a machine of a cloud has an image to boot and packages to install
+_DONE_S: Final = 2.0  # nothing is wanted for so long: it ends
+
+
+def supervise(site: Site, *, stays: bool = False, lock: int | None = None) -> None:
+    """Be the supervisor, until SIGTERM or, unless ``stays``, until nothing is wanted any more.
+
+    Args:
+        lock: descriptor of the lock, where it was taken already.
+
+    Raises:
+        LocalError: another one lives, or the provider cannot be had.
+    """
+    with held(site, lock), closing(Journal(site.journal)) as journal:
+        _run(site, journal, stays=stays)
+
+
+def _run(site: Site, journal: Journal, *, stays: bool) -> None:
+    ended = threading.Event()
+    watch = Watch(*site.watch) if site.watch is not None else None
+    regions = _regions(journal)
+    provider = open_provider(site, regions)
+    supervisor = Supervisor(
+        site,
+        journal,
+        provider,
+        partial(command_of, site),
+        watch.heard if watch is not None else lambda: None,
+        watch.reload if watch is not None else lambda: None,
+        Patience() if provider.name == "local" else Patience(boot_s=_ELSEWHERE_S),
+    )
+
+    def end(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        ended.set()
+        supervisor.wake()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, end)
+    log.info("supervisor begins site=%s provider=%s pid=%d", site.state, provider.name, os.getpid())
+    done_at_s: float | None = None
+    is_reconciled = False
+    try:
+        if any(each.is_up for each in journal.clusters()):
+            stand(site)  # after a crash of this machine nothing stands
+        while not ended.is_set():
+            try:
+                if (now := _regions(journal)) != regions:
+                    regions = now
+                    supervisor.use(open_provider(site, regions))
+                supervisor.look()
+                if not is_reconciled:
+                    supervisor.reconciled(_begun_unix_s())
+                    is_reconciled = True
+                is_done = supervisor.is_done and not stays
+            except StoreError as error:
+                log.error("look failed reason=%s", error)
+                is_done = False
+            if not is_done:
+                done_at_s = None
+            elif done_at_s is None:
+                done_at_s = time.monotonic()
+            elif time.monotonic() - done_at_s >= _DONE_S:
+                break
+            supervisor.wait()
+    finally:
+        supervisor.close()
+        if watch is not None:
+            watch.close()
+        provider.close()
+    log.info("supervisor ends")
+
+
+def _regions(journal: Journal) -> tuple[str, ...]:
+    wanted = (each for cluster in journal.clusters() for each in cluster.plan.machines)
+    return tuple(dict.fromkeys(each.region for each in wanted if each.region))
+
+
+def _begun_unix_s() -> float:
+    """Return when this process was started, its imports included."""
+    started_s = Process.of(os.getpid()).started / os.sysconf("SC_CLK_TCK")
+    return time.time() - (time.clock_gettime(time.CLOCK_BOOTTIME) - started_s)

@@ -1,0 +1,85 @@
+"""The calls that wait for an entry of a log to be done by somebody.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Set
+from dataclasses import dataclass, field
+from typing import Final, Generic, TypeVar
+
+from gdp.names import Name
+from gdp.service.calls import Calls
+from gdp.service.dispatch import Failure
+
+__all__ = ["Pending"]
+
+A = TypeVar("A")
+
+CALLS_MAX: Final = 65_536
+
+
+@dataclass(slots=True, eq=False)
+class _Call(Generic[A]):
+    answered: Callable[[A], None]
+    failed: Callable[[Failure, str], None]
+    refused: set[Name] = field(default_factory=set)
+
+
+class Pending(Generic[A]):
+    """Calls under way; each ends once.
+
+    Args:
+        start: the first call's number.
+    """
+
+    def __init__(self, start: int) -> None:
+        self._calls: Calls[_Call[A]] = Calls(CALLS_MAX, start)
+
+    def __len__(self) -> int:
+        return len(self._calls)
+
+    def begin(
+        self,
+        now_s: float,
+        timeout_s: float | None,
+        answered: Callable[[A], None],
+        failed: Callable[[Failure, str], None],
+    ) -> int:
+        """Return the number of a new call, one above the last.
+
+        Raises:
+            LocalError: as many as there may be are under way.
+        """
+        return self._calls.begin(now_s, timeout_s, _Call(answered, failed))
+
+    def answer(self, number: int, answer: A) -> bool:
+        """Answer a call; return whether it was still under way."""
+        call = self._calls.end(number)
+        if call is not None:
+            call.answered(answer)
+        return call is not None
+
+    def refuse(self, number: int, server: Name, reason: str, asked: Set[Name]) -> None:
+        """Take a replica's word that it has no answer; fail the call when all that are asked say so."""
+        call = self._calls.get(number)
+        if call is not None:
+            call.refused.add(server)
+            if call.refused >= asked:
+                self._calls.end(number)
+                call.failed(Failure.REFUSED, reason)
+
+    def expire(self, now_s: float) -> None:
+        """Fail the calls whose time has run out."""
+        for _, call in self._calls.expired(now_s):
+            call.failed(Failure.TIMED_OUT, "")
+
+    def next_timeout(self) -> float | None:
+        """Return the monotonic second at which a call's time runs out, or None."""
+        return self._calls.next_timeout()
+
+    def fail_all(self, failure: Failure, reason: str) -> None:
+        """Fail every call."""
+        for _, call in self._calls.fail_all():
+            call.failed(failure, reason)

@@ -1,0 +1,170 @@
+"""The cluster of ``healing.py``: two machines of the provider ``local``, a robot and its node that calls.
+
+Place: shell; what it makes is a run's, and what ``fog`` makes for it ends with ``fog down``, also after a crash.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Final, TypeVar
+
+from peers.process import FailedError, Started
+from report import progress
+
+from fog.demo.stage import ENVIRONMENT, STATE, end_all_of, fog_command, standing_runs, sweep
+from fog.providers.local import trouble
+from fog.site import open_site
+from fog.supervisor.background import pid_of
+from fog.supervisor.ground import local_provider
+from fog.supervisor.journal import Journal
+from fog.supervisor.record import Record
+from gdp.testbed.namespaces import Namespaces
+from gdp.testbed.topology import DomainPlan, Topology
+
+__all__ = ["Cluster"]
+
+_LAUNCH_FILE: Final = Path(__file__).resolve().parents[2] / "examples" / "echo.launch.py"
+_ROBOT: Final = "robot"
+_SIZE: Final = 2
+_PATIENCE_S: Final = 90.0
+_LAUNCH_S: Final = 200.0
+_REPORT_S: Final = 5.0
+_STEP_S: Final = 0.02
+
+T = TypeVar("T")
+
+
+class Cluster:
+    """Two replicas that serve, and a robot that calls; a context manager that takes everything down.
+
+    Args:
+        rate_hz: requests a second.
+
+    Raises:
+        LocalError: the kernel refuses.
+        FailedError: a process did not come up.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        runs = standing_runs("bench")
+        sweep(runs)
+        self._run = runs.start()
+        self._undo = ExitStack()
+        with ExitStack() as undo:
+            undo.callback(end_all_of, self._run)
+            self._spaces = Namespaces(Topology((), (DomainPlan("home", (_ROBOT,)),), ()), self._run)
+            progress("two machines boot")
+            self._launch()
+            self._site = open_site(None, self._run.directory / STATE)
+            self._journal = undo.enter_context(closing(Journal(self._site.journal)))
+            self._runs = local_provider(self._site).runs
+            told = ["-m", "fog.demo.caller", "--ros-args", "-p", f"rate_hz:={rate_hz}", "-p", f"report_s:={_REPORT_S}"]
+            self._caller = undo.enter_context(self._start("caller", told))
+            if not self._caller.read(_PATIENCE_S)["answered"]:
+                raise FailedError("the robot's node is not answered")
+            self._supervisors = undo.enter_context(ExitStack())
+            self._undo = undo.pop_all()
+
+    def __enter__(self) -> Cluster:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._undo.close()
+
+    def oldest(self) -> Record:
+        """Return the machine that has served for longest."""
+        serving = [each for each in self._machines() if each.is_serving]
+        return min(serving, key=lambda each: each.served_unix_s or 0.0)
+
+    def notice(self, machine: Record, seconds: float) -> None:
+        """Give a machine notice."""
+        trouble.notice(self._runs, machine.id, seconds)
+
+    def kill(self, machine: Record) -> None:
+        """Kill all of a machine, and unplug it."""
+        trouble.kill(self._runs, machine.id)
+
+    def kill_supervisor(self) -> None:
+        """Kill the supervisor; return when it is gone."""
+        pid = pid_of(self._site)
+        if pid is None:
+            raise FailedError("no supervisor lives")
+        os.kill(pid, signal.SIGKILL)
+        self._until(lambda: pid_of(self._site) is None or None, "the supervisor's end")
+
+    def start_supervisor(self) -> float:
+        """Start one; return when that was, in seconds since 1970."""
+        self._supervisors.close()
+        at_s = time.time()
+        self._supervisors.enter_context(self._start("supervisor", fog_command(self._run, ["supervise"])))
+        return at_s
+
+    def await_replacement(self, after_s: float) -> Record:
+        """Return the first machine that was asked for after this moment, when it serves."""
+
+        def served() -> Record | None:
+            later = (each for each in self._machines() if each.asked_unix_s >= after_s and each.is_serving)
+            return next(later, None)
+
+        return self._until(served, "a replacement that serves")
+
+    def await_event(self, machine: str, what: set[str], after_s: float) -> float:
+        """Return when one of these events was written of a machine, in seconds since 1970."""
+
+        def written() -> float | None:
+            found = (e for e in self._journal.events() if e.machine == machine and e.what in what)
+            return next((each.unix_s for each in found if each.unix_s >= after_s), None)
+
+        return self._until(written, f"{machine}: {' or '.join(sorted(what))}")
+
+    def await_whole(self, victim: Record) -> None:
+        """Return when this machine is gone and all others are as many as are wanted, and serve."""
+
+        def is_whole() -> bool | None:
+            there = [each for each in self._machines() if not each.is_gone]
+            is_rid = all(each.name != victim.name for each in there)
+            return (is_rid and len(there) == _SIZE and all(each.is_serving for each in there)) or None
+
+        self._until(is_whole, "two machines that serve, and no other")
+
+    def end_caller(self) -> dict[str, float]:
+        """End the robot's node; return how many requests it made, and how many failed."""
+        os.kill(self._caller.pid, signal.SIGUSR1)
+        while not (said := self._caller.read(_PATIENCE_S))["done"]:
+            pass  # an older line
+        for line in (self._run.directory / "caller.log").read_text(encoding="utf-8").splitlines():
+            progress(f"caller: {line}")
+        calls, answered, wrong, unserved = (int(str(said[key])) for key in ("calls", "answered", "wrong", "unserved"))
+        return {"requests": calls + unserved, "failed": calls - answered + wrong + unserved}
+
+    def _machines(self) -> list[Record]:
+        return [each for cluster in self._journal.clusters() for each in self._journal.machines(cluster.plan.name)]
+
+    def _launch(self) -> None:
+        argv = [sys.executable, *fog_command(self._run, ["launch", str(_LAUNCH_FILE), "--detach"])]
+        ended = subprocess.run(self._command(argv), capture_output=True, text=True, timeout=_LAUNCH_S, check=False)
+        if ended.returncode:
+            raise FailedError(f"fog launch: {(ended.stderr or ended.stdout).strip()}")
+
+    def _start(self, what: str, arguments: Sequence[str]) -> Started:
+        return Started(self._run, what, self._command, arguments)
+
+    def _command(self, argv: Sequence[str]) -> list[str]:
+        told = [f"{name}={value}" for name, value in ENVIRONMENT.items()]
+        return self._spaces.command(_ROBOT, ["env", *told, *argv])
+
+    def _until(self, found: Callable[[], T | None], what: str) -> T:
+        """Look until something is there that tells nobody when it comes."""
+        end_s = time.monotonic() + _PATIENCE_S
+        while (value := found()) is None:
+            if time.monotonic() > end_s:
+                raise FailedError(f"waited {_PATIENCE_S:g} s for {what}")
+            time.sleep(_STEP_S)
+        return value

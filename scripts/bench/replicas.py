@@ -1,0 +1,328 @@
+"""What replicas give a service, and what they cost: real ROS nodes, a proxy at the robot, one at each machine.
+
+    killed    10^5 requests while any two of three replicas are killed (SIGKILL) at random moments and come back; one
+              that serves stays, another one each time. Asked: none fails, each is answered once
+    added     calls of 100 bytes, one at a time, to one server and to two replicas in turn: what replication adds.
+              Asked: at most 0.2 ms at the median
+    hedged    a server that is slow (+200 ms) once in 100 requests: one such server, two of which both are asked, and
+              two of which the second is asked only when the first is late. Asked of the last: at most 2 % more
+              requests, and a p99.9 five times better
+
+The fourth figure, two replicas against the least of two of the same samples, is ``scripts/experiments/fig5.py``'s.
+
+    sudo .venv/bin/python scripts/bench/replicas.py                     # the whole; writes docs/benchmarks/replicas.*
+    sudo .venv/bin/python scripts/bench/replicas.py --quick --no-save   # a few seconds each: does it work?
+    sudo .venv/bin/python scripts/bench/replicas.py --only killed --requests 20000 --rate 250 --no-save
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+_HERE: Final = Path(__file__).resolve().parent
+sys.path.append(str(_HERE.parent / "experiments"))
+
+from field import READY_S, ROBOT, Field, Served, Server, Work  # noqa: E402 - it lies with the experiments
+from machine import machine_state  # noqa: E402
+from peers.process import FailedError  # noqa: E402
+from plot import Panel, panel_of, require_plot, save_bars  # noqa: E402
+from report import Goal, Rounds, Settings, percentile, progress, show, write_json  # noqa: E402
+
+from gdp.errors import LocalError  # noqa: E402
+from gdp.testbed.runs import Runs  # noqa: E402
+
+KILLED, ADDED, HEDGED = "killed", "added", "hedged"
+CASES: Final = {
+    KILLED: "any two of three replicas killed again and again",
+    ADDED: "100 bytes, one call at a time",
+    HEDGED: "slow (+200 ms) once in 100 requests",
+}
+ONE, TWO, BOTH, LATE = "one server", "two replicas", "two replicas, both asked", "two replicas, the second if late"
+THREE: Final = "three replicas"
+REQUESTS: Final = {KILLED: 100_000, ADDED: 1_200, HEDGED: 9_000}  # of a round
+QUICK: Final = {KILLED: 1_000, ADDED: 60, HEDGED: 300}
+ROUNDS: Final = {KILLED: 1, ADDED: 7, HEDGED: 3}
+RATE: Final = 300  # what two cores carry with three replicas, and one of them starting
+MEDIAN, P99, P999 = "p50, ms", "p99, ms", "p99.9, ms"
+COUNT: Final = "requests"
+COUNTS: Final = {"failed": "failed", "answered wrongly": "wrong", "answers": "heard", "answers too many": "twice"}
+KILLS: Final = "replicas killed"
+EXTRA: Final = "requests too many, %"
+ADDED_MS: Final = 0.2
+GAIN: Final = 5.0
+OUTPUT: Final = _HERE.parents[1] / "docs" / "benchmarks"
+_END: Final = _HERE / "replicas_end.py"
+TYPE: Final = "rcl_interfaces/srv/ListParameters"
+_MACHINES: Final = ("m1", "m2", "m3")
+_LANES: Final = 200
+_CALL_S: Final = 20.0
+_APART_S: Final = 1.5  # at most, from one death of a turn to the next
+_AWAY_S: Final = 2.0  # at most, until the next one is started again
+_REST_S: Final = 1.0  # that all serve, between two turns
+_STEP_S: Final = 0.5
+_TELL_S: Final = 10.0
+_RESTFUL: Final = 80.0  # calls a second
+_BRISK: Final = 200.0
+_BUDGET: Final = 0.02
+_SLOW: Final = {"slow_in": 100, "slow_s": 0.2}
+
+Said = Mapping[str, object]
+
+
+class Kills:
+    """Kills all replicas but one at random moments, starts them again, and then another one stays. A context manager.
+
+    Attributes:
+        count: deaths.
+    """
+
+    def __init__(self, here: Field, draw: random.Random) -> None:
+        self.count = 0
+        self._servers = list(here.servers.values())
+        self._draw = draw
+        self._over = threading.Event()
+        self._error: FailedError | None = None
+        self._thread = threading.Thread(target=self._run, name="kills")
+
+    def __enter__(self) -> Kills:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+
+    def _run(self) -> None:
+        try:
+            self._all_serve(self._servers)
+            while not self._over.wait(_REST_S):
+                self._turn()
+        except FailedError as error:
+            self._error = error
+
+    def _turn(self) -> None:
+        stays = self._draw.choice(self._servers)
+        others = self._draw.sample([each for each in self._servers if each is not stays], len(self._servers) - 1)
+        for server in others:
+            self._over.wait(self._draw.uniform(0, _APART_S))
+            server.kill()
+            self.count += 1
+        for server in others:
+            self._over.wait(self._draw.uniform(0, _AWAY_S))
+            server.begin()
+        for server in others:
+            server.wait()
+        self._all_serve(others)
+
+    def _all_serve(self, servers: Sequence[Server]) -> None:
+        """Wait until a request has come to each, as its node says, or until no more are sent."""
+        for server in servers:
+            late_s = time.monotonic() + READY_S
+            while not self._over.is_set():
+                try:
+                    server.hear(_STEP_S)
+                    break
+                except FailedError:
+                    if time.monotonic() > late_s:
+                        raise
+
+
+class Bench:
+    """The rounds under way.
+
+    Attributes:
+        over: the figures.
+    """
+
+    def __init__(self, runs: Runs, rate: float, draw: random.Random) -> None:
+        self._runs = runs
+        self._rate = rate
+        self._draw = draw
+        self.over = Rounds()
+
+    def killed(self, count: int) -> None:
+        """Ask three replicas while two of them are killed again and again."""
+        served = [Served("/number", TYPE, _MACHINES, imports={"timeout_s": _CALL_S})]
+        with self._field(served) as here, Kills(here, self._draw) as kills:
+            told = {"lanes": _LANES, "rate": self._rate, "counts_answers": True}
+            said = _ask(here, ["/number"], count, told)
+        figures = {column: _number(said, key) for column, key in COUNTS.items()}
+        figures |= {COUNT: count, KILLS: kills.count, **_latencies(_times(said, "/number"))}
+        self._add(KILLED, THREE, figures)
+
+    def added(self, count: int) -> None:
+        """Ask one server and two replicas in turn; between two calls all have come to rest."""
+        names = {ONE: "/one", TWO: "/two"}
+        with self._field([Served("/one", TYPE, _MACHINES[:1]), Served("/two", TYPE, _MACHINES[:2])]) as here:
+            said = _ask(here, list(names.values()), count, {"lanes": 1, "rate": _RESTFUL})
+        for who, name in names.items():
+            self._add(ADDED, who, _latencies(_times(said, name)))
+
+    def hedged(self, count: int) -> None:
+        """Ask a server that is slow now and then, two of them, and the second one only if the first is late."""
+        names = {ONE: ("/one/m1", "/one/m2"), BOTH: ("/both",), LATE: ("/late",)}
+        served = [
+            Served("/one/m1", TYPE, _MACHINES[:1]),
+            Served("/one/m2", TYPE, _MACHINES[1:2]),
+            Served("/both", TYPE, _MACHINES[:2]),
+            Served("/late", TYPE, _MACHINES[:2], imports={"replication": {"mode": "hedged", "budget": _BUDGET}}),
+        ]
+        turns = ["/one/m1", "/both", "/late", "/one/m2", "/both", "/late"]
+        with self._field(served, _SLOW) as here:
+            said = _ask(here, turns, count, {"lanes": 1, "rate": _BRISK})
+        for who, its in names.items():
+            times_s = [each for name in its for each in _times(said, name)]
+            had, asked = (sum(_counted(said, key, name) for name in its) for key in ("had", "asked"))
+            self._add(HEDGED, who, {**_latencies(times_s), EXTRA: 100 * (had / asked - 1)})
+
+    @contextmanager
+    def _field(self, served: Sequence[Served], settings: Mapping[str, object] | None = None) -> Iterator[Field]:
+        names = {each: " ".join(one.name for one in served if each in one.machines) for each in _MACHINES}
+        role = "serve" if settings is None else "straggle"
+        work = {each: Work(role, {**(settings or {}), "services": its}, _END) for each, its in names.items() if its}
+        run = self._runs.start()
+        try:
+            with Field(run, served, work) as here:
+                yield here
+        finally:
+            run.end()
+
+    def _add(self, case: str, who: str, figures: Mapping[str, float | None]) -> None:
+        for column, value in figures.items():
+            self.over.add(who, CASES[case], column, value)
+
+
+def goals_of(over: Rounds) -> list[Goal]:
+    """Return what was asked for of what was measured."""
+    killed, added, hedged = CASES.values()
+    goals = []
+    if killed in over.cases():
+        for column in ("failed", "answered wrongly", "answers too many"):
+            goals.append(over.goal(f"{killed}: {column}", THREE, killed, column, 0.0, at_most=True))
+    if added in over.cases():
+        goals.append(over.difference(f"{added}: {TWO} - {ONE}, ms", TWO, ONE, added, MEDIAN, ADDED_MS))
+    if hedged in over.cases():
+        goals.append(over.goal(f"{hedged}: {LATE}, {EXTRA}", LATE, hedged, EXTRA, 100 * _BUDGET, at_most=True))
+        for who, asked in ((LATE, GAIN), (BOTH, None)):
+            goals.append(over.ratio(f"{hedged}: {ONE} / {who}, p99.9", ONE, who, hedged, P999, asked))
+    return goals
+
+
+def panels_of(over: Rounds) -> list[Panel]:
+    """Return a panel for each case: medians, whiskers to the p99."""
+    rows = {ADDED: (ONE, TWO), HEDGED: (ONE, BOTH, LATE), KILLED: (THREE,)}
+    return [
+        panel_of(over, CASES[case], MEDIAN, list(who), p99=P99, ours=list(who))
+        for case, who in rows.items()
+        if CASES[case] in over.cases()
+    ]
+
+
+def arguments() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", action="append", choices=list(CASES), help="this part; may be repeated")
+    parser.add_argument("--rounds", type=int, help=f"of each part (default: {_told(ROUNDS)})")
+    parser.add_argument("--requests", type=int, help=f"of a round (default: {_told(REQUESTS)})")
+    parser.add_argument("--rate", type=float, default=RATE, help="of 'killed', a second (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=7, help="of the deaths (default: %(default)s)")
+    parser.add_argument("--quick", action="store_true", help="one short round of each")
+    parser.add_argument("--json", type=Path, default=OUTPUT / "replicas.json", help="where the figures go")
+    parser.add_argument("--plot", type=Path, default=OUTPUT / "replicas.png", help="where the picture goes")
+    parser.add_argument("--no-plot", action="store_true", help="no picture")
+    parser.add_argument("--no-save", action="store_true", help="print only")
+    return parser
+
+
+def main() -> None:
+    """Run the bench, or a part of it."""
+    options = arguments().parse_args()
+    is_drawn = not (options.no_plot or options.no_save)
+    if is_drawn:
+        require_plot()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
+    state, begun_s = machine_state(), time.monotonic()
+    runs = Runs()
+    runs.sweep()
+    bench = Bench(runs, options.rate, random.Random(options.seed))
+    parts = {KILLED: bench.killed, ADDED: bench.added, HEDGED: bench.hedged}
+    only = options.only or list(parts)
+    counts = {each: options.requests or (QUICK if options.quick else REQUESTS)[each] for each in only}
+    rounds = {each: 1 if options.quick else options.rounds or ROUNDS[each] for each in only}
+    try:
+        for at in range(1, max(rounds.values()) + 1):  # parts take turns, as contenders do elsewhere
+            for each in only:
+                if at <= rounds[each]:
+                    progress(f"round {at}/{rounds[each]}, {each}: {counts[each]} requests")
+                    parts[each](counts[each])
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except (LocalError, FailedError) as error:
+        sys.exit(f"error: {error}")
+    settings: Settings = {
+        "rounds": _told(rounds),
+        "requests of a round": _told(counts),
+        "requests a second while killed": options.rate,
+        "seed": options.seed,
+        "took, s": round(time.monotonic() - begun_s),
+    }
+    goals = goals_of(bench.over)
+    title = "Calls of a service with replicas, over two switches"
+    show(title, state, settings, bench.over, goals)
+    if not options.no_save:
+        write_json(options.json, "replicas", state, settings, bench.over, goals)
+    if is_drawn:
+        save_bars(options.plot, title, str(state), panels_of(bench.over))
+
+
+def _ask(here: Field, services: Sequence[str], count: int, told: Mapping[str, object]) -> Said:
+    """Return what the robot's client has to say in the end."""
+    own = {"services": " ".join(services), "count": count, "patience_s": _CALL_S, **told}
+    with here.client(ROBOT, "ask", _END, **own) as client:
+        client.read(READY_S)
+        told_s = time.monotonic()
+        while (said := client.read(2 * _CALL_S))["event"] == "asked":
+            if time.monotonic() - told_s >= _TELL_S:
+                told_s = time.monotonic()
+                progress(f"    {said['ended']} of {count}, failed: {said['failed']}")
+    return said
+
+
+def _number(said: Said, key: str) -> float | None:
+    value = said[key]
+    return value if isinstance(value, int | float) else None
+
+
+def _times(said: Said, name: str) -> list[float]:
+    all_of = said["times_s"]
+    return all_of[name] if isinstance(all_of, dict) else []
+
+
+def _counted(said: Said, key: str, name: str) -> int:
+    """Return how often the client asked a service, or how often its machines were."""
+    by_name = said[key]
+    found = by_name[name] if isinstance(by_name, dict) else 0
+    return sum(found.values()) if isinstance(found, dict) else int(found)
+
+
+def _latencies(times_s: Sequence[float]) -> dict[str, float | None]:
+    return {column: 1e3 * percentile(times_s, share) for column, share in ((MEDIAN, 0.5), (P99, 0.99), (P999, 0.999))}
+
+
+def _told(numbers: Mapping[str, int]) -> str:
+    return ", ".join(f"{each} {number}" for each, number in numbers.items())
+
+
+if __name__ == "__main__":
+    main()
