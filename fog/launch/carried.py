@@ -22,13 +22,13 @@ SomeReplication: TypeAlias = Replication | str | Mapping[str, object]
 _BOTH_SIDES: Final = ("encoding", "max_bytes", "metadata", "priority")
 _ROBOT_SIDE: Final[dict[Kind, tuple[str, ...]]] = {
     "topic": (),
-    "service": ("replication", "timeout_s"),
+    "service": ("replication", "state", "timeout_s"),
     "action": ("replication", "timeout_s"),
 }
 _MACHINE_SIDE: Final[dict[Kind, tuple[str, ...]]] = {
     "topic": ("max_hz",),
-    "service": ("at_once", "stop"),
-    "action": ("at_once",),
+    "service": ("at_once", "state", "state_node", "stop"),
+    "action": (),
 }
 _EXAMPLES: Final[dict[Kind, str]] = {
     "topic": "sensor_msgs/msg/Image",
@@ -85,6 +85,7 @@ def _one(kind: Kind, name: str, said: str | Mapping[str, object], defaults: Mapp
         raise LocalError(f"{kind} {name}: {', '.join(unknown)}: expected type, {', '.join(sorted({*robot, *machine}))}")
     if isinstance(replication := keys.get("replication"), str | Mapping | Replication):
         keys["replication"] = replication_rule(replication)
-    keys = {**{key: value for key, value in defaults.items() if key in robot}, **keys}
+    own = {"replication"} if keys.get("state") == "ordered" else set()  # all have every request then
+    keys = {**{key: value for key, value in defaults.items() if key in robot and key not in own}, **keys}
     options = {key: keys[key] for key in robot if key in keys}
     return Carried(kind, name, type_name, options, {key: keys[key] for key in machine if key in keys})

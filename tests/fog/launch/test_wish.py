@@ -45,6 +45,13 @@ def test_keys_for_all_go_where_they_mean_something() -> None:
     )
 
 
+def test_a_service_that_keeps_state_says_so_on_both_sides_and_is_asked_in_one_way() -> None:
+    counter = {"type": "std_srvs/srv/SetBool", "state": "ordered", "state_node": "/counter"}
+    (carried,) = cluster(services={"/count": counter}, replication="hedged").wish.carried or ()
+    assert carried.options == {"state": "ordered"}
+    assert carried.served == {"state": "ordered", "state_node": "/counter"}
+
+
 def test_what_is_found_out_gets_the_keys_for_all() -> None:
     wish = cluster(replication=Replication(Mode.SOME, copies=2)).wish
     assert wish.carried is None

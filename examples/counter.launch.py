@@ -1,0 +1,14 @@
+"""A counter that two spot machines keep in step: whichever dies, the other has counted the same (docs/state.md)."""
+
+from fog import FogCluster, LaunchDescription, Node, SpotMachine
+
+
+def generate_launch_description() -> LaunchDescription:
+    counter = Node(package="fog.demo", executable="counter")
+    cluster = FogCluster(
+        name="counter",
+        cloud_nodes=[counter],
+        deployments=[SpotMachine(hardware="cpu:1"), SpotMachine(hardware="cpu:1")],
+        services={"/count": {"type": "std_srvs/srv/SetBool", "state": "ordered", "state_node": "/counter"}},
+    )
+    return LaunchDescription([cluster])
