@@ -23,9 +23,9 @@ from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from fog.agent.bundle import install
 from fog.enrolment.boots import RobotDevices, robot_boot
 from fog.enrolment.members import Authority
+from fog.host.bundle import install
 from fog.providers.aws.config import AwsConfig
 from fog.providers.skypilot.config import SkyPilotConfig
 from fog.topology import AUTOMATIC, Gateway

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from fog.agent.status import Status
 from fog.hardware import Hardware
+from fog.host.status import Status
 from fog.machine import MachineState
 from fog.providers.local import trouble
 from fog.providers.local.provider import LocalProvider

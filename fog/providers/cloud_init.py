@@ -26,7 +26,7 @@ from typing import Final
 import yaml
 from pydantic import Field
 
-from fog.agent.bundle import BOOT_FILE, read_programs
+from fog.host.bundle import BOOT_FILE, read_programs
 from gdp.errors import LocalError
 from gdp.nodes.schema import Section
 

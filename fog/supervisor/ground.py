@@ -15,9 +15,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from fog.agent.status import STATUS_FILE, Status
 from fog.cluster import CloudNode
 from fog.enrolment.boots import gateway_boot
+from fog.host.status import STATUS_FILE, Status
 from fog.launch.resolve import command_line, deferred
 from fog.machine import MachineState
 from fog.providers.local.begin import begin
@@ -127,7 +127,7 @@ def _start_robot(site: Site, home: Path) -> None:
     (home / STATUS_FILE).unlink(missing_ok=True)
     (home / "logs").mkdir(mode=0o700, exist_ok=True)
     run = runs.start()
-    argv = ["fog.agent.cli", "--home", str(home), "--await-go"]
+    argv = ["fog.host.cli", "--home", str(home), "--await-go"]
     try:
         begin(run, _OWN_SPACE, argv, home / "logs" / "machine.log", lambda _: None)
         _await_up(home)

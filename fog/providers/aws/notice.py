@@ -25,7 +25,7 @@ from urllib.request import ProxyHandler, Request, build_opener
 
 import typer
 
-from fog.agent.notice import write_notice
+from fog.host.notice import write_notice
 from fog.providers.aws.reading import DRAIN
 
 __all__ = ["Metadata", "Watch", "main"]

@@ -16,8 +16,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from fog.agent.bundle import pack
 from fog.hardware import Hardware
+from fog.host.bundle import pack
 from fog.machine import Boot, Machine, MachineSpec, Program
 from fog.offer import Offer
 from fog.providers.aws.clients import Clients, filters

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from fog.agent.bundle import install
+from fog.host.bundle import install
 from fog.machine import Boot
 from fog.providers.local.begin import begin
 from fog.providers.local.wire import MACHINES, UP, delete, exists, join, make_segment, make_space, space_path
@@ -153,5 +153,5 @@ class Network:
             process = Process.of(pid)
             (home / "process.json").write_text(json.dumps([process.pid, process.started]), encoding="ascii")
 
-        argv = ["fog.agent.cli", "--home", str(home), "--await-go"]
+        argv = ["fog.host.cli", "--home", str(home), "--await-go"]
         begin(run, standing.space(gateway.gateway), argv, home / "logs" / "machine.log", note)

@@ -19,10 +19,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from fog.agent.bounded_log import last_lines
-from fog.agent.bundle import install
 from fog.catalog.local import LOCAL_REGIONS, local_offers
 from fog.hardware import Hardware
+from fog.host.bounded_log import last_lines
+from fog.host.bundle import install
 from fog.machine import Boot, Machine, MachineSpec, MachineState
 from fog.offer import Offer
 from fog.providers.local.begin import begin
@@ -193,7 +193,7 @@ class LocalProvider:
             group.add(pid)
             replace(file, is_bounded=is_bounded).write(run.directory)
 
-        argv = ["fog.agent.cli", "--home", str(machine.home), "--await-go"]
+        argv = ["fog.host.cli", "--home", str(machine.home), "--await-go"]
         begin(run, machine.space, argv, machine.home / "logs" / "machine.log", confine)
 
     def _is_forgotten(self, machine: Standing, now_unix_s: float) -> bool:

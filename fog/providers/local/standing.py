@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from fog.agent.notice import given_unix_s, read_notice
-from fog.agent.status import Status
+from fog.host.notice import given_unix_s, read_notice
+from fog.host.status import Status
 from fog.machine import Machine, MachineState
 from fog.providers.local.machine_file import MachineFile
 from fog.providers.local.wire import space_path

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 
-from fog.agent.notice import write_notice
-from fog.agent.status import Status
+from fog.host.notice import write_notice
+from fog.host.status import Status
 from fog.providers.local.begin import begin
 from fog.providers.local.standing import Standing, find
 from fog.providers.local.wire import delete, exists, join_within, plug

@@ -15,8 +15,8 @@ from importlib import import_module
 from types import ModuleType
 from typing import Final
 
-from fog.agent.bundle import pack
 from fog.hardware import Hardware
+from fog.host.bundle import pack
 from fog.machine import Boot, Machine, MachineSpec
 from fog.offer import Offer
 from fog.providers.cloud_init import lines_of, shell_script

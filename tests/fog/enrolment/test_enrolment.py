@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from fog.agent.bundle import install
 from fog.cluster import Carried, CloudNode, ClusterPlan, Wanted
 from fog.enrolment.boots import gateway_boot, machine_boot
 from fog.enrolment.members import Authority, metadata_of
 from fog.enrolment.revoking import take_back
 from fog.enrolment.robot_side import forget_rules, introduce, processes_of
 from fog.hardware import Hardware
+from fog.host.bundle import install
 from fog.site import open_site
 from gdp.crypto.statements import parse
 from gdp.errors import LocalError

@@ -16,7 +16,7 @@ import pytest
 import yaml
 from pydantic import ValidationError
 
-from fog.agent.bundle import pack
+from fog.host.bundle import pack
 from fog.machine import Boot, Program
 from fog.providers.cloud_init import (
     USER_DATA_MAX_BYTES,

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from fog.agent.notice import write_notice
-from fog.agent.status import Status
 from fog.hardware import Hardware
+from fog.host.notice import write_notice
+from fog.host.status import Status
 from fog.machine import Boot, MachineSpec, MachineState
 from fog.offer import Offer
 from fog.providers.local import trouble

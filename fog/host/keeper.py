@@ -12,9 +12,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from fog.agent.bounded_log import BoundedLog
-from fog.agent.life import Life
-from fog.agent.status import ProgramStatus
+from fog.host.bounded_log import BoundedLog
+from fog.host.life import Life
+from fog.host.status import ProgramStatus
 from fog.machine import Program
 
 __all__ = ["Keeper"]

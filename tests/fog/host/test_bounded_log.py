@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fog.agent.bounded_log import BoundedLog, last_lines
+from fog.host.bounded_log import BoundedLog, last_lines
 
 
 def test_a_log_never_takes_more_than_its_two_halves(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from fog.agent.host import Host
+from fog.host.host import Host
 from gdp.cli.node import Verbose, emit, failing_clearly, set_up_logging
 
 __all__ = ["main"]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fog.agent.bundle import install, pack, unpack
+from fog.host.bundle import install, pack, unpack
 from fog.machine import Boot, Program
 from gdp.errors import LocalError
 

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from fog.agent.bundle import install
-from fog.agent.notice import write_notice
-from fog.agent.status import Status
+from fog.host.bundle import install
+from fog.host.notice import write_notice
+from fog.host.status import Status
 from fog.machine import Boot, MachineState, Program
 
 _PATIENCE_S = 20.0
@@ -68,7 +68,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
     def begin(*programs: Program, options: tuple[str, ...] = ()) -> subprocess.Popen[str]:
         install(tmp_path, Boot({}, programs))
-        argv = [sys.executable, "-m", "fog.agent.cli", "--home", str(tmp_path), *options]
+        argv = [sys.executable, "-m", "fog.host.cli", "--home", str(tmp_path), *options]
         process = subprocess.Popen(
             argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
@@ -166,7 +166,7 @@ def test_a_machine_that_nobody_has_a_record_of_does_not_begin(start: Start, tmp_
 
 
 def test_a_folder_without_a_boot_is_refused(tmp_path: Path) -> None:
-    argv = [sys.executable, "-m", "fog.agent.cli", "--home", str(tmp_path)]
+    argv = [sys.executable, "-m", "fog.host.cli", "--home", str(tmp_path)]
     ended = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=_PATIENCE_S)
     assert ended.returncode == 2
     assert "boot.json" in ended.stderr

@@ -16,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from fog.agent.bounded_log import BoundedLog
+from fog.host.bounded_log import BoundedLog
 from fog.machine import Program
 
 __all__ = ["Life"]

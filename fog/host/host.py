@@ -17,10 +17,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from fog.agent.bundle import BOOT_FILE, read_programs
-from fog.agent.keeper import Keeper
-from fog.agent.notice import read_notice
-from fog.agent.status import Status
+from fog.host.bundle import BOOT_FILE, read_programs
+from fog.host.keeper import Keeper
+from fog.host.notice import read_notice
+from fog.host.status import Status
 from fog.machine import MachineState
 from gdp.errors import LocalError
 
