@@ -123,6 +123,9 @@ class ProxyConfig(Section):
                     yield (side, index, key), f"this stands in rules under {only[key]}"
                 if rule.state_node is not None and not rule.is_ordered:
                     yield (side, index, "state_node"), "this needs 'state: ordered'"
+                if side == "expose" and rule.stop is not None and rule.at_once != 1:
+                    ordered, needs = "with 'state: ordered' nothing is broken off", "this needs 'at_once: 1'"
+                    yield (side, index, "stop"), ordered if rule.is_ordered else needs
                 if rule.is_ordered and rule.at_once is not None:
                     yield (side, index, "at_once"), "with 'state: ordered' it is always 1"
 

@@ -19,6 +19,7 @@ from typing import Final, NamedTuple
 from gdp.crypto.cbor import decode, encode
 from gdp.errors import DropReason, RemoteError
 from gdp.limits import MESSAGE_MAX_BYTES
+from gdp.service.dispatch import STOP_MAX
 from proxy.serial.channel import CHANNEL_MAX_BYTES, Channel
 from proxy.serial.serializer import Encoding
 from proxy.serial.service import Service
@@ -95,6 +96,8 @@ class Stop(NamedTuple):
         calls = wire[_STOP.size :]
         if not part & _STOPS or not calls or len(calls) % _CALL.size:
             raise RemoteError(DropReason.MALFORMED, "a word about ended calls that names none")
+        if len(calls) > STOP_MAX * _CALL.size:
+            raise RemoteError(DropReason.MALFORMED, f"a word about more than {STOP_MAX} ended calls")
         return cls(part & ~_STOPS, tuple(call for (call,) in _CALL.iter_unpack(calls)))
 
 

@@ -7,12 +7,13 @@ with the cluster's, and taken out again when the cluster is gone; nothing else o
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import re
 import signal
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
@@ -31,6 +32,8 @@ _MARK: Final = "  # fog: "
 _IMPORT: Final = re.compile(r"^import:[ \t]*(#.*)?$", re.MULTILINE)
 _EMPTY: Final = re.compile(r"^import:[ \t]*\n(?=[^\s#-]|\Z)", re.MULTILINE)  # a list whose last line we took
 _NEXT: Final = re.compile(r"^[^\s#-]", re.MULTILINE)
+_PROGRAMS: Final = ("gdp-proxy", "proxy.cli")
+_CAUGHT: Final = re.compile(r"^SigCgt:\s*([0-9a-f]+)$", re.MULTILINE)
 _ITEM: Final = re.compile(r"^(?P<indent>[ \t]*)-[ \t]", re.MULTILINE)
 
 
@@ -41,47 +44,53 @@ def introduce(path: Path, authority: Authority, cluster: str, carried: Sequence[
         ConfigError: the file is not a proxy's, or a rule cannot be added by a line.
         LocalError: keys are missing.
     """
-    config = ProxyConfig.load(path)
     key = load_public_key(authority.owner_key).compressed
-    lacking = [
-        each
-        for each in carried
-        if choice.imported(config.imports, metadata_of(each).name(key), metadata_of(each)) is None
-    ]
-    if lacking:
-        owner = os.path.relpath(authority.owner_key, path.parent)
-        lines = [json.dumps({**robot_rule(each), "owner": owner}) + _MARK + cluster for each in lacking]
-        before = path.read_text(encoding="utf-8")
-        _write(path, _with_lines(before, lines))
-        try:
-            ProxyConfig.load(path)
-        except Exception:
-            _write(path, before)
-            raise
-    authority.let(config.identity, config.delegations, carried, days=days)
+    with _alone(path):
+        config = ProxyConfig.load(path)
+        lacking = [
+            each
+            for each in carried
+            if choice.imported(config.imports, metadata_of(each).name(key), metadata_of(each)) is None
+        ]
+        if lacking:
+            owner = os.path.relpath(authority.owner_key, path.parent)
+            lines = [json.dumps({**robot_rule(each), "owner": owner}) + _MARK + cluster for each in lacking]
+            before = path.read_text(encoding="utf-8")
+            _write(path, _with_lines(before, lines))
+            try:
+                ProxyConfig.load(path)
+            except Exception:
+                _write(path, before)
+                raise
+        authority.let(config.identity, config.delegations, carried, days=days)
 
 
 def forget_rules(path: Path, cluster: str) -> bool:
     """Take out the lines that were added for a cluster; return whether there were any."""
-    before = path.read_text(encoding="utf-8")
     mark = f"{_MARK}{cluster}"
-    after = "".join(line for line in before.splitlines(keepends=True) if not line.rstrip("\n").endswith(mark))
-    if after != before:
-        _write(path, _EMPTY.sub("", after))
+    with _alone(path):
+        before = path.read_text(encoding="utf-8")
+        after = "".join(line for line in before.splitlines(keepends=True) if not line.rstrip("\n").endswith(mark))
+        if after != before:
+            _write(path, _EMPTY.sub("", after))
     return after != before
 
 
 def processes_of(path: Path) -> Iterator[int]:
-    """Yield the ids of processes that were started with ``--config`` and this file."""
+    """Yield the ids of proxies that run with this file, and that a SIGHUP does not end.
+
+    Not one that only checks the file, nor one that is still starting: that has no handler yet.
+    """
     for folder in Path("/proc").iterdir():
         if not folder.name.isdigit():
             continue
         with suppress(OSError):  # it has ended, or is somebody else's
             words = (folder / "cmdline").read_bytes().decode("utf-8", "replace").split("\0")
-            if "--config" in words[:-1]:
-                file = (folder / "cwd").resolve() / words[words.index("--config") + 1]
-                if file.exists() and file.samefile(path):
-                    yield int(folder.name)
+            if not any(Path(word).name in _PROGRAMS for word in words) or "--config" not in words[:-1]:
+                continue
+            file = (folder / "cwd").resolve() / words[words.index("--config") + 1]
+            if file.exists() and file.samefile(path) and _catches_hang_up(folder):
+                yield int(folder.name)
 
 
 def reload(path: Path) -> int:
@@ -92,6 +101,25 @@ def reload(path: Path) -> int:
             os.kill(pid, signal.SIGHUP)
             told += 1
     return told
+
+
+def _catches_hang_up(process: Path) -> bool:
+    caught = _CAUGHT.search((process / "status").read_text(encoding="utf-8"))
+    return caught is not None and bool(int(caught[1], 16) >> (signal.SIGHUP - 1) & 1)
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Hold off other launches that change this file; its folder is locked, for the file itself is replaced."""
+    try:
+        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise LocalError(f"{path.parent}: {error.strerror}") from error
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(folder)
 
 
 def _with_lines(text: str, rules: Sequence[str]) -> str:

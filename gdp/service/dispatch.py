@@ -27,7 +27,7 @@ from gdp.service.calls import Calls
 from gdp.service.latency import Latencies
 from gdp.service.replication import ALL, Mode, Replication
 
-__all__ = ["Ask", "Dispatch", "Effect", "Failure", "Stop"]
+__all__ = ["STOP_MAX", "Ask", "Dispatch", "Effect", "Failure", "Stop"]
 
 A = TypeVar("A")
 
@@ -74,6 +74,7 @@ class _Call(Generic[A]):
     begun_s: float
     request: bytes = b""
     owing: dict[Name, float] = field(default_factory=dict)  # and since when
+    tried: set[Name] = field(default_factory=set)  # whoever was asked, there still or not
     refused: set[Name] = field(default_factory=set)
     declined: list[A] = field(default_factory=list)  # an answer that says no, should nobody say yes
 
@@ -170,6 +171,7 @@ class Dispatch(Generic[A]):
         mode = self._replication.mode
         if mode is Mode.ALL and not chosen:
             call.owing = dict.fromkeys(self._servers, now_s)
+            call.tried.update(self._servers)
             self._effects.append(Ask(number, call.request, None))
         else:
             copies = self._replication.copies if mode is Mode.SOME else 1
@@ -180,14 +182,15 @@ class Dispatch(Generic[A]):
         return number
 
     def came(self, server: Name, now_s: float) -> None:
-        """Learn of a server; where all are asked, it is asked what is under way, too."""
+        """Learn of a server; where all are asked, it is asked what is under way, too, but for what it was asked."""
         if server in self._servers:
             self._servers[server] = False
             return
         self._servers[server] = False
         if self._replication.mode is Mode.ALL:
             for number, call in self._calls:
-                self._ask(number, call, [server], now_s)
+                if server not in call.tried:
+                    self._ask(number, call, [server], now_s)
 
     def leaves(self, server: Name) -> None:
         """Learn that a server goes soon: it is asked only where no other is left, and its answers are good."""
@@ -301,6 +304,7 @@ class Dispatch(Generic[A]):
     def _ask(self, number: int, call: _Call[A], servers: Sequence[Name], now_s: float) -> None:
         for server in servers:
             call.owing[server] = now_s
+            call.tried.add(server)
             self._latencies.asked(server, now_s)
         if servers:
             self._effects.append(Ask(number, call.request, tuple(servers)))

@@ -47,7 +47,7 @@ class Turn(NamedTuple, Generic[R]):
 
 
 class Expired(NamedTuple):
-    """A call that took too long.
+    """A call that took too long, or whose client is gone.
 
     ``asked``: None where nobody waited any more. ``is_given``: whether the local server has it.
     """
@@ -187,6 +187,29 @@ class Serving(Generic[R]):
             return number
         self.end(number)
         return None
+
+    @property
+    def clients(self) -> list[Name]:
+        """Return those who have calls under way here, wanted still or not."""
+        return list(self._shares)
+
+    def gone(self, client: Name) -> list[Expired]:
+        """Learn that a client is no more; return its calls that were wanted, ended. Asked again, they are served anew.
+
+        What the local server has keeps its place as after ``stop``.
+        """
+        ended = []
+        for asked in [each for each in self._numbers if each.client == client]:
+            number = self._numbers.pop(asked)
+            served = self._calls.get(number)
+            if served is None:
+                continue
+            is_given = served.request is None
+            served.is_wanted = False
+            if not is_given or self._at_once is None:
+                self.end(number)
+            ended.append(Expired(number, asked.part, asked, is_given))
+        return ended
 
     def expired(self, now_s: float) -> list[Expired]:
         """End what took too long."""

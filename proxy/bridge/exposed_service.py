@@ -6,7 +6,6 @@ their parts; and what nobody waits for any more is broken off by cancelling its 
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
@@ -17,8 +16,10 @@ from gdp.names import Name
 from gdp.service.follower import Refuse
 from gdp.service.ordered import FollowerWord
 from gdp.service.serving import Asked, Serving
+from proxy.bridge.callers import Callers
+from proxy.bridge.early import Early
+from proxy.bridge.goal_calls import GoalCalls
 from proxy.bridge.goals import cancel_of, goal_of
-from proxy.bridge.incoming import Incoming
 from proxy.bridge.kept_server import KeptServer
 from proxy.bridge.parts import CANCEL, GOAL, PROFILES, RESULT, Parts
 from proxy.bridge.rivals import mark_of, sign
@@ -26,18 +27,18 @@ from proxy.bridge.seat import Seat
 from proxy.bridge.site import Site
 from proxy.bridge.wishes import Wish
 from proxy.endpoints.endpoint import Answered, Described, End, Event, Failed, Faulted, Heard
-from proxy.exchange import Answer, Exchange, News, Outcome, Request, Stop, too_large
+from proxy.exchange import Answer, News, Outcome, Request, Stop, too_large
 from proxy.faults import Fault
 from proxy.ordering import is_word, keeper_word, to_wire
+from proxy.rules.rule import CALL_MAX_S
 from proxy.serial.schema import DefinitionError
 from proxy.serial.serializer import Serializer
 
 __all__ = ["ExposedService"]
 
-_EARLY_MAX: Final = 256  # requests of clients that are not described yet
 _GRACE_S: Final = 0.5  # it is the client's side that ends a call; here it is only forgotten
-_CLIENTS_MAX: Final = 1_024  # descriptions of clients kept ready; the oldest go
 _CANCEL_S: Final = 5.0
+_AWAY_S: Final = 30.0  # a client that is not heard for so long does not wait any more
 _NOTICE_S: Final = 1.0  # a server that leaves still takes requests for so long: of clients that have not heard it yet
 _TRIGGER: Final = "std_srvs/srv/Trigger"
 _NO_FIELDS: Final = {1: b"", 2: b"\0\1\0\0\0"}  # a request of it; ROS 2 fills a message without fields with one byte
@@ -59,14 +60,15 @@ class ExposedService:
         self._wish = wish
         self._topic = topic
         self._serving: Serving[bytes] = Serving(random_start, wish.rule.at_once)
-        self._goals: dict[Asked, bytes] = {}  # of an action's calls under way
+        self._goals = GoalCalls()
         self._words = 0  # of ours to the local server; their numbers
         self._refuses_from_s: float | None = None
-        self._clients: dict[tuple[bytes, bytes], tuple[Incoming, ...]] = {}
-        self._early = deque[Message](maxlen=_EARLY_MAX)
+        self._heard_s: dict[Name, float] = {}  # when clients were there last whose calls are under way
+        self._early = Early()
         endpoint, rule = seat.endpoint, wish.rule
         parts = Parts.of(rule.kind, wish.local, wish.type_name)
         self._exchange = replace(parts.known(endpoint, rule.encoding), is_ordered=rule.is_ordered)
+        self._callers = Callers(self._exchange, endpoint.ros)
         self._answers = [Serializer(each.response, rule.encoding) for each in self._exchange.services]
         self._news = [Serializer(each, rule.encoding) for each in self._exchange.topics]
         self._mark = seat.advertise(self, sign(mark_of(wish.local), endpoint.ros))
@@ -83,7 +85,8 @@ class ExposedService:
     def receive(self, message: Message, now_s: float) -> None:
         """Take a far client's request, or its word that some have ended; before its description both wait."""
         if not message.description:
-            self._early.append(message)
+            if not self._early.add(message):
+                self._drop_early("too many requests came before their client's description")
             return
         try:
             if self._kept is not None and is_word(message.delivered.message):
@@ -106,6 +109,8 @@ class ExposedService:
                 self._site.faults.tell(f"{self._wish.rule.stop}", Fault.REFUSED, event.reason)
         elif isinstance(event, Answered | Failed):
             asked = self._serving.end(event.call)
+            if asked is not None:
+                self._goals.end(asked)
             if asked is not None and isinstance(event, Answered):
                 self._answer(asked, event.raw)
             elif asked is not None and isinstance(event, Failed):
@@ -119,9 +124,8 @@ class ExposedService:
             assert isinstance(event, Described)  # what an action's topics are was known before
 
     def tick(self, now_s: float) -> None:
-        """Take what came before its description."""
-        if self._early:
-            self._take_early(now_s)
+        """Take what came before its description; look whose clients are still there."""
+        self._look_at_clients(now_s)
         if self._kept is not None:
             self._kept.look(self._site.member.peers(self._topic.name), now_s)
         self.timeout(now_s)
@@ -138,6 +142,7 @@ class ExposedService:
                 self._seat.endpoint.drop(self._servers[part], number)
                 self._break_off()
             if asked is not None:
+                self._goals.end(asked)
                 self._fail(asked, Fault.TIMED_OUT, "the server did not answer in time")
         self._give()
 
@@ -156,12 +161,15 @@ class ExposedService:
         is_closed = self._refuses_from_s is not None and now_s >= self._refuses_from_s
         if is_closed and self._kept is not None:
             self._kept.close()
-        return is_closed and not self._serving and not self._early and (self._kept is None or self._kept.is_idle)
+        return is_closed and not self._serving and (self._kept is None or self._kept.is_idle)
 
     def close(self, now_s: float) -> None:
         """Serve nobody any more; calls under way fail."""
         for asked in self._serving.fail_all():
+            self._goals.end(asked)
             self._fail(asked, Fault.NO_SERVER, "the server is gone")
+        for _ in range(self._early.forget_all_but(())):
+            self._drop_early("the server is gone before their client's description came")
         stopper = [] if self._stopper is None else [self._stopper]
         kept = [] if self._kept is None else self._kept.handles
         for handle in [self._mark, *self._servers, *stopper, *kept, *self._topics]:
@@ -174,13 +182,41 @@ class ExposedService:
         self._topic = topic
         self._site.member.renew(topic)
 
-    def _take_early(self, now_s: float) -> None:
+    def _look_at_clients(self, now_s: float) -> None:
+        """Take what came before its description; let the calls of clients that left go."""
         feeds = self._site.member.feeds_of(self._topic.name)
         known = {bytes(feed.publisher): feed.description for feed in feeds}
-        for _ in range(len(self._early)):
-            message = self._early.popleft()
-            if message.delivered.publisher in known:  # else the client is gone
-                self.receive(message._replace(description=known[message.delivered.publisher]), now_s)
+        for _ in range(self._early.forget_all_but(known.keys())):
+            self._drop_early("a client left before its description came")
+        for client, description in known.items():
+            for message in self._early.take(client):
+                self.receive(message._replace(description=description), now_s)
+        here = {self._site.member.name, *self._site.member.heard(self._topic.name)}
+        clients = self._serving.clients
+        self._heard_s = {each: now_s if each in here else self._heard_s.get(each, now_s) for each in clients}
+        for client, heard_s in self._heard_s.items():
+            if client not in here and (bytes(client) not in known or now_s - heard_s >= _AWAY_S):
+                self._let_go(client)
+
+    def _drop_early(self, reason: str) -> None:
+        self._site.faults.tell(self._wish.local, Fault.TOO_FAST, reason)
+
+    def _let_go(self, client: Name) -> None:
+        """Forget the calls of a client that left. Its goals go on: it may come back, and ask for their results."""
+        is_working = False
+        for number, part, asked, is_given in self._serving.gone(client):
+            if asked is not None:
+                self._goals.end(asked)
+            if is_given:
+                is_working = True
+                self._give_up(part, number)
+        if is_working:
+            self._break_off()
+
+    def _give_up(self, part: int, number: int) -> None:
+        """Await no more what the local server works on, unless the next one waits for that."""
+        if self._wish.rule.at_once is None:
+            self._seat.endpoint.drop(self._servers[part], number)
 
     def _ask(self, message: Message, now_s: float) -> None:
         delivered = message.delivered
@@ -196,19 +232,24 @@ class ExposedService:
             self._send(asked, Answer.failed(asked.part, asked.call, "the server is leaving"))
             return
         try:
-            incoming = self._incoming(message)
-            if request.part >= len(incoming):
-                raise DefinitionError("the client asks for a part that this service has not")
-            raw = incoming[request.part].decode(request.body)
+            raw = self._callers.incoming(delivered.publisher, message.description, asked.part).decode(request.body)
             if self._kept is not None:
                 self._kept.entry(asked.client, asked.call, raw, now_s)
-                return
-            patience_s = request.patience_ms / 1e3 + _GRACE_S if request.patience_ms else None
-            self._begin(now_s, patience_s, asked, raw)
-        except LocalError as error:
+            else:
+                self._begin(now_s, self._patience_s(request), asked, raw)
+        except DefinitionError as error:
             self._fail(asked, Fault.OTHER_TYPE, str(error))
+        except LocalError as error:
+            self._fail(asked, Fault.TOO_FAST, str(error))
         except RemoteError as error:
             self._fail(asked, Fault.MALFORMED, str(error))
+
+    def _patience_s(self, request: Request) -> float | None:
+        """Return how long a call may take; None: as long as a goal does."""
+        if self._wish.rule.kind == "action" and request.part == RESULT and not request.patience_ms:
+            return None
+        asked_s = request.patience_ms / 1e3 + _GRACE_S if request.patience_ms else CALL_MAX_S
+        return min(asked_s, CALL_MAX_S)
 
     def _keep(self, number: int) -> KeptServer:
         rule, what = self._wish.rule, self._wish.local
@@ -236,30 +277,27 @@ class ExposedService:
     def _begin(self, now_s: float, patience_s: float | None, asked: Asked, raw: bytes) -> None:
         """Take a request; what is about a goal waits until the local server knows whether it accepts that one."""
         goal = goal_of(raw) if self._wish.rule.kind == "action" else b""
-        accepting = (other for other, its in self._goals.items() if other.part == GOAL and its == goal)
-        self._serving.begin(now_s, patience_s, asked, raw, None if asked.part == GOAL else next(accepting, None))
+        after = None if asked.part == GOAL else self._goals.accepting(goal)
+        self._serving.begin(now_s, patience_s, asked, raw, after)
         if goal and asked.part != CANCEL:
-            self._goals[asked] = goal
+            self._goals.begin(asked, goal)
 
     def _give(self) -> None:
-        """Give the local server what it is the turn of; forget what has ended."""
+        """Give the local server what it is the turn of."""
         for number, asked, raw in self._serving.take():
             self._seat.endpoint.call(self._servers[asked.part], number, raw)
-        if len(self._goals) > 0:
-            self._goals = {asked: goal for asked, goal in self._goals.items() if asked in self._serving}
 
     def _stop(self, client: Name, stop: Stop, now_s: float) -> None:
         """Learn that a client's calls have ended: what waits is left undone, what is worked on is broken off."""
         is_working = False
         for call in stop.calls:
             asked = Asked(client, stop.part, call)
-            goal = self._goals.pop(asked, None)
+            goal = self._goals.end(asked)
             number = self._serving.stop(asked)
             if number is not None and stop.part < len(self._servers):
                 is_working = True
-                if self._wish.rule.at_once is None:
-                    self._seat.endpoint.drop(self._servers[stop.part], number)
-            if goal is not None and stop.part == RESULT and goal not in self._results():
+                self._give_up(stop.part, number)
+            if goal is not None and stop.part == RESULT and not self._goals.is_awaited(goal):
                 self._cancel(goal, now_s)
         if is_working:
             self._break_off()
@@ -278,27 +316,6 @@ class ExposedService:
             self._seat.endpoint.drop(self._stopper, self._words)  # what the last word came to is nobody's
             self._words += 1
             self._seat.endpoint.call(self._stopper, self._words, _NO_FIELDS[self._seat.endpoint.ros])
-
-    def _results(self) -> set[bytes]:
-        """Return the goals whose results somebody waits for."""
-        return {goal for asked, goal in self._goals.items() if asked.part == RESULT}
-
-    def _incoming(self, message: Message) -> tuple[Incoming, ...]:
-        """Return what a client's requests are, by part.
-
-        Raises:
-            DefinitionError: they are not what our server takes.
-        """
-        key = (message.delivered.publisher, message.description)
-        if key not in self._clients:
-            theirs, ros = Exchange.from_wire(message.description), self._seat.endpoint.ros
-            pairs = zip(theirs.services, self._exchange.services, strict=False)
-            self._clients[key] = tuple(
-                Incoming.ready(their.request, theirs.encoding, our.request, ros) for their, our in pairs
-            )
-            while len(self._clients) > _CLIENTS_MAX:
-                del self._clients[next(iter(self._clients))]
-        return self._clients[key]
 
     def _answer(self, asked: Asked, raw: bytes) -> None:
         body = self._answers[asked.part].encode(raw)

@@ -6,6 +6,9 @@ bytes of its request, of its feedback, and of a request for its result; answers 
 
 Every server works on the goal. Its client hears of one at a time, its leader: the one whose acceptance it got, until
 that one goes; and at last the one whose result it got, even if others say later that they were cancelled.
+
+Goals that only servers name, of other machines' clients or invented, have a room of their own and push out nobody
+else's: when it is full, the oldest of the server that named the most goes.
 """
 
 from __future__ import annotations
@@ -21,7 +24,8 @@ from proxy.bridge.parts import CANCEL
 
 __all__ = ["Goals", "cancel_of", "goal_of", "says_yes"]
 
-GOALS_MAX: Final = 1_024
+GOALS_MAX: Final = 1_024  # that clients here asked for, and as many that only servers named
+STATUSES_MAX: Final = 16_384  # goals in one status message
 GOAL_KEPT_MAX_BYTES: Final = 64 << 10  # larger goals are not sent again to a server that arrives later
 _HEAD: Final = 4  # of CDR
 _ID: Final = 16
@@ -63,13 +67,17 @@ class _Goal:
     result: int | None = None  # the status that its client got
     status: tuple[int, int, int] | None = None  # stamp and status, as the client knows it
     led_by: Name | None = None  # who said that
+    named_by: Name | None = None  # the server that named it first; None: a client here did
 
 
 class Goals:
     """What the clients here know of an action's goals."""
 
     def __init__(self) -> None:
-        self._goals: OrderedDict[bytes, _Goal] = OrderedDict()
+        self._goals: dict[bytes, _Goal] = {}
+        self._ours: OrderedDict[bytes, None] = OrderedDict()
+        self._named: dict[Name, OrderedDict[bytes, None]] = {}  # by server
+        self._named_count = 0
         self._told = _write({})
 
     def sent(self, goal: bytes, request: bytes) -> None:
@@ -122,7 +130,7 @@ class Goals:
         Raises:
             RemoteError: MALFORMED.
         """
-        return self._leads(goal_of(raw), server)
+        return self._led(goal_of(raw), server) is not None
 
     def statuses(self, server: Name, raw: bytes) -> bytes | None:
         """Return the status message that clients get now that a server has sent this one; None: nothing new.
@@ -136,25 +144,51 @@ class Goals:
             if is_its and goal not in said:
                 known.status = known.led_by = None  # its server has forgotten it, or is gone
         for goal, status in said.items():
-            if self._leads(goal, server):
-                known = self._of(goal)
-                known.led_by = server
-                known.status = status if known.result is None else (*status[:2], known.result)
+            led = self._led(goal, server)
+            if led is not None:
+                led.led_by = server
+                led.status = status if led.result is None else (*status[:2], led.result)
         return self._news()
 
-    def _leads(self, goal: bytes, server: Name) -> bool:
-        known = self._of(goal)
+    def _led(self, goal: bytes, server: Name) -> _Goal | None:
+        """Return a goal if this server speaks for it; it does if nobody did."""
+        known = self._goals.get(goal) or self._name(goal, server)
         if known.leader is None:
             known.leader = server
-        return known.leader == server
+        return known if known.leader == server else None
 
     def _of(self, goal: bytes) -> _Goal:
-        known = self._goals.get(goal)
-        if known is None:
-            known = self._goals[goal] = _Goal()
-            if len(self._goals) > GOALS_MAX:
-                self._goals.popitem(last=False)
+        """Return a goal that a client here asked for."""
+        known = self._goals.setdefault(goal, _Goal())
+        if goal not in self._ours:
+            self._unname(goal, known)
+            self._ours[goal] = None
+            if len(self._ours) > GOALS_MAX:
+                over = (each for each in self._ours if self._goals[each].result is not None)
+                oldest = next(over, None) or next(iter(self._ours))
+                del self._ours[oldest], self._goals[oldest]
         return known
+
+    def _name(self, goal: bytes, server: Name) -> _Goal:
+        """Return a goal that nobody here asked for, new."""
+        known = self._goals[goal] = _Goal(named_by=server)
+        self._named.setdefault(server, OrderedDict())[goal] = None
+        self._named_count += 1
+        if self._named_count > GOALS_MAX:
+            _, most = max(self._named.items(), key=lambda each: len(each[1]))
+            oldest = next(iter(most))
+            self._unname(oldest, self._goals.pop(oldest))
+        return known
+
+    def _unname(self, goal: bytes, known: _Goal) -> None:
+        if known.named_by is None:
+            return
+        named = self._named[known.named_by]
+        del named[goal]
+        if not named:
+            del self._named[known.named_by]
+        known.named_by = None
+        self._named_count -= 1
 
     def _news(self) -> bytes | None:
         raw = _write({goal: known.status for goal, known in self._goals.items() if known.status is not None})
@@ -170,6 +204,8 @@ def _read(raw: bytes) -> dict[bytes, tuple[int, int, int]]:
     body, said = raw[_HEAD:], dict[bytes, tuple[int, int, int]]()
     try:
         (count,) = _COUNT[order].unpack_from(body)
+        if count > STATUSES_MAX:
+            raise RemoteError(DropReason.MALFORMED, f"a status message of {count} goals; at most {STATUSES_MAX} can be")
         at = _COUNT[order].size
         for _ in range(min(count, len(body) // _ENTRY_MIN)):
             stamp_at = -(-(at + _ID) // 4) * 4

@@ -8,34 +8,31 @@ its time is up; a later answer finds nobody, and servers that still work on it a
 from __future__ import annotations
 
 import secrets
-from collections import deque
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple
 
 from gdp.client.member import Message, Topic
 from gdp.errors import GdpError, LocalError, RemoteError
 from gdp.names import Name
 from gdp.service.dispatch import Ask, Dispatch, Failure
-from gdp.service.dispatch import Effect as DispatchEffect
 from gdp.service.keeper import Keeper
 from gdp.service.ordered import LIFE_BITS, Word
 from gdp.service.replication import ALL, Mode
 from proxy.bridge.far_server import FarServer
 from proxy.bridge.goals import Goals, goal_of, says_yes
+from proxy.bridge.outgoing import Effect, ForAll, wire_of
 from proxy.bridge.parts import CANCEL, GOAL, PROFILES, RESULT, Parts
 from proxy.bridge.seat import Seat
 from proxy.bridge.site import Site
 from proxy.bridge.wishes import Wish
 from proxy.endpoints.endpoint import Asked, Event, Faulted
-from proxy.exchange import PATIENCE_MAX_MS, Answer, Exchange, News, Outcome, Request, Stop, too_large
+from proxy.exchange import PATIENCE_MAX_MS, Answer, Exchange, News, Outcome, Request, too_large
 from proxy.faults import Fault
-from proxy.ordering import follower_word, is_word, to_wire
+from proxy.ordering import follower_word, is_word
 from proxy.serial.serializer import Serializer
 
 __all__ = ["ImportedService"]
-
-Effect: TypeAlias = "DispatchEffect | Word"
 
 _GONE: Final = "the far server is gone"
 _FAULTS: Final = {
@@ -91,7 +88,7 @@ class ImportedService:
             for part in range(len(self._parts.services))
         )
         self._about: dict[tuple[int, int], bytes] = {}  # part and call -> goal, while under way
-        self._for_all = deque[tuple[int, Effect]]()  # waits until the stream to all servers has room
+        self._for_all = ForAll()
         self._counted: tuple[int, ...] = (0, 0, 0)  # late, strange and hedged, as told
         self._servers: dict[Name, FarServer] = {}
         self._requests: tuple[Serializer, ...] = ()
@@ -264,8 +261,7 @@ class ImportedService:
             self._refuse(waiting, Fault.MALFORMED, str(error))
         except LocalError as error:
             fault = Fault.REFUSED if self._keeper is not None else Fault.TOO_FAST
-            fault = fault if self._calls[part].servers else Fault.NO_SERVER
-            self._refuse(waiting, fault, str(error))
+            self._refuse(waiting, fault if self._calls[part].servers else Fault.NO_SERVER, str(error))
 
     def _write(self, waiting: _Waiting, body: bytes, timeout_s: float | None, call: int) -> bytes:
         patience_ms = 0 if timeout_s is None else min(max(int(timeout_s * 1e3), 1), PATIENCE_MAX_MS)
@@ -293,37 +289,42 @@ class ImportedService:
             while effects := dispatch.take():
                 for effect in effects:
                     whom = effect.servers if isinstance(effect, Ask) else effect.server and (effect.server,)
-                    if whom is None:
-                        self._for_all.append((part, effect))
+                    if whom is None and not isinstance(effect, Word):
+                        self._for_all.add(part, effect)
                     for server in whom or ():
                         self._send_to(server, part, effect, now_s)
         while self._for_all and self._publisher.has_room():
-            part, effect = self._for_all.popleft()
+            part, effect = self._for_all.take()
             if isinstance(effect, Ask):
                 if effect.call not in self._calls[part]:
-                    continue  # it ended while it waited
+                    continue  # of a log that is over
                 self._note_holders(part, effect.call, set(self._calls[part].servers))
-            wire = _wire(part, effect)
-            self._publisher.publish(wire)
-            self._site.traffic.sent(len(wire))
+            try:
+                wire = wire_of(part, effect)
+                self._publisher.publish(wire)
+                self._site.traffic.sent(len(wire))
+            except LocalError as error:
+                self._not_sent(part, effect, self._calls[part].servers, str(error), now_s)
 
     def _send_to(self, server: Name, part: int, effect: Effect, now_s: float) -> None:
-        wires = [_wire(part, effect)]
+        again = None
         if isinstance(effect, Ask) and self._goals is not None:
             goal = self._about.get((part, effect.call), b"")
             if part == RESULT and server not in self._goals.holders(goal):
                 again = self._goals.again(goal)  # a server that came later works on the goal as well
-                wires = wires if again is None else [again, *wires]
             self._note_holders(part, effect.call, {server})
-        for wire in wires:
-            try:
+        try:
+            for wire in (*([] if again is None else [again]), wire_of(part, effect)):
                 self._site.member.ask(self._topic.name, server, wire)
-            except LocalError as error:
-                self._site.traffic.unread += 1
-                if isinstance(effect, Ask):
-                    self._calls[part].refused(effect.call, server, str(error), now_s)
-                return
-            self._site.traffic.sent(len(wire))
+                self._site.traffic.sent(len(wire))
+        except LocalError as error:
+            self._not_sent(part, effect, [server], str(error), now_s)
+
+    def _not_sent(self, part: int, effect: Effect, servers: list[Name], reason: str, now_s: float) -> None:
+        self._site.traffic.unread += 1
+        if isinstance(effect, Ask):
+            for server in servers:
+                self._calls[part].refused(effect.call, server, reason, now_s)
 
     def _note_holders(self, part: int, call: int, servers: set[Name]) -> None:
         if self._goals is not None and part != CANCEL:
@@ -357,7 +358,7 @@ class ImportedService:
             dispatch.declined(answer.call, name, _Won(name, raw), now_s)
 
     def _answered(self, waiting: _Waiting, won: _Won) -> None:
-        self._about.pop((waiting.part, waiting.call), None)
+        self._forget(waiting)
         self._seat.endpoint.answer(self._handles[waiting.part], waiting.ticket, won.raw)
         if self._goals is None or not says_yes(waiting.part, won.raw):
             return
@@ -367,10 +368,15 @@ class ImportedService:
             self._tell_status(self._goals.ended(waiting.goal, won.server, won.raw))
 
     def _failed(self, waiting: _Waiting, failure: Failure, reason: str) -> None:
-        self._about.pop((waiting.part, waiting.call), None)
+        self._forget(waiting)
         if failure is Failure.TIMED_OUT:
             reason = f"no answer within {self._wish.rule.timeout_s:g} s"
         self._refuse(waiting, _FAULTS[failure], reason)
+
+    def _forget(self, waiting: _Waiting) -> None:
+        self._about.pop((waiting.part, waiting.call), None)
+        if self._keeper is None:  # a log's entries go to all servers, whoever waits
+            self._for_all.end(waiting.part, waiting.call)
 
     def _take_news(self, message: Message) -> None:
         news, name = News.from_wire(message.delivered.message), Name(message.delivered.publisher)
@@ -392,9 +398,3 @@ class ImportedService:
         self._site.faults.tell(self._wish.local, fault, reason)
         if self._handles:
             self._seat.endpoint.refuse(self._handles[waiting.part], waiting.ticket, reason)
-
-
-def _wire(part: int, effect: Effect) -> bytes:
-    if isinstance(effect, Ask):
-        return effect.request
-    return to_wire(effect.word) if isinstance(effect, Word) else Stop(part, effect.calls).to_wire()

@@ -176,7 +176,7 @@ class Rule(Section):
     stop: str | None = Field(
         default=None,
         description="Services, under `expose`: a local `std_srvs/srv/Trigger` that is called when nobody waits any more"
-        " for what the server works on. `null`: it works on.",
+        " for what the server works on; needs `at_once: 1`. `null`: it works on.",
         json_schema_extra={"pattern": f"^{NAME_FORM}$", "maxLength": NAME_MAX_CHARS},
     )
     at_once: int | None = Field(
@@ -184,7 +184,7 @@ class Rule(Section):
         ge=1,
         le=AT_ONCE_MAX,
         description="Services, under `expose`: how many requests the local server gets at one time; the others wait"
-        " in the proxy, in order. `null`: all.",
+        " in the proxy, where clients take turns. `null`: all.",
     )
     state: Literal["none", "ordered"] = Field(
         default="none",

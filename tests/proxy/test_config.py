@@ -198,6 +198,9 @@ def test_every_error_of_a_file_is_told_in_its_order(place: Path) -> None:
         ("import", "stop: /halt", "stop: this stands in rules under expose"),
         ("import", "state: ordered, state_node: /node", "state_node: this stands in rules under expose"),
         ("expose", "state_node: /node", "state_node: this needs 'state: ordered'"),
+        ("expose", "stop: /halt", "stop: this needs 'at_once: 1'"),
+        ("expose", "stop: /halt, at_once: 2", "stop: this needs 'at_once: 1'"),
+        ("expose", "stop: /halt, state: ordered", "stop: with 'state: ordered' nothing is broken off"),
         ("expose", "state: ordered, at_once: 2", "at_once: with 'state: ordered' it is always 1"),
     ],
 )

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from gdp.errors import RemoteError
 from gdp.limits import MESSAGE_MAX_BYTES
+from gdp.service.dispatch import STOP_MAX
 from proxy.exchange import PATIENCE_MAX_MS, Answer, Exchange, News, Outcome, Request, Stop, too_large
 from tests.proxy.bridge import known
 
@@ -49,6 +50,13 @@ def test_a_word_to_stop_there_and_back_is_the_same_and_is_no_request(part: int, 
 def test_a_word_to_stop_that_names_no_calls_is_refused(wire: bytes) -> None:
     with pytest.raises(RemoteError):
         Stop.from_wire(wire)
+
+
+def test_a_word_to_stop_names_at_most_so_many_as_our_side_ever_sends() -> None:
+    longest = Stop(0, tuple(range(STOP_MAX)))
+    assert Stop.from_wire(longest.to_wire()) == longest
+    with pytest.raises(RemoteError, match="more than 1024 ended calls"):
+        Stop.from_wire(Stop(0, tuple(range(STOP_MAX + 1))).to_wire())
 
 
 @pytest.mark.parametrize(

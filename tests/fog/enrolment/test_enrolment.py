@@ -1,6 +1,10 @@
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -152,5 +156,37 @@ def test_what_is_gone_is_revoked_once_and_forgotten_when_it_would_have_run_out(
     assert [path.name for path in folder.iterdir()] == [f"{second[:32]}.revoke"]
 
 
-def test_only_processes_that_were_started_with_the_file_are_told(tmp_path: Path) -> None:
-    assert list(processes_of(tmp_path / "proxy.yaml")) == []
+def test_only_proxies_that_run_with_the_file_and_take_the_signal_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "proxy.yaml"
+    path.touch()
+    takes, says = "import signal; signal.signal(signal.SIGHUP, print); ", "print(1, flush=True); signal.pause()"
+    programs = [
+        (f"{takes}{says}", "gdp-proxy", path),
+        (f"{takes}{says}", "gdp-proxy", tmp_path / "other.yaml"),
+        (f"{takes}{says}", "editor", path),
+        (f"import signal; {says}", "gdp-proxy", path),  # it only checks, or is still starting
+    ]
+    with ExitStack() as stack:
+        running = []
+        for code, name, file in programs:
+            argv = [sys.executable, "-c", code, name, "--config", str(file)]
+            program = stack.enter_context(subprocess.Popen(argv, stdout=subprocess.PIPE))
+            stack.callback(program.kill)
+            assert program.stdout is not None
+            assert program.stdout.readline()
+            running.append(program.pid)
+        assert list(processes_of(path)) == running[:1]
+
+
+def test_two_launches_change_the_robots_file_one_after_the_other(tmp_path: Path) -> None:
+    site = open_site(None, tmp_path / "state")
+    path = site.robots[0]
+    names = [f"c{number}" for number in range(4)]
+    with ThreadPoolExecutor() as pool:
+        for number, name in enumerate(names):
+            service = Carried("service", f"/plan{number}", "nav_msgs/srv/GetPlan")
+            pool.submit(introduce, path, site.authority, name, [service], days=1.0)
+    assert {rule.name for rule in ProxyConfig.load(path).imports} == {f"/plan{number}" for number in range(4)}
+    with ThreadPoolExecutor() as pool:
+        assert all(pool.map(lambda name: forget_rules(path, name), names))
+    assert not ProxyConfig.load(path).imports

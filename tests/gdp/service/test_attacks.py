@@ -10,7 +10,7 @@ from gdp.service.dispatch import GATHER_S, HEDGE_FIRST_S, Ask, Dispatch
 from gdp.service.keeper import Keeper
 from gdp.service.latency import LATELY_S
 from gdp.service.ordered import Log, Position, State, call_of
-from gdp.service.replication import Mode, Replication
+from gdp.service.replication import ALL, Mode, Replication
 from gdp.service.serving import ENDED_MAX, Asked, Serving
 
 FAST, SLOW, BAD = (Name(bytes([number]) * 32) for number in (1, 2, 3))
@@ -91,6 +91,20 @@ def test_the_call_that_is_late_for_longest_gets_the_first_second_copy_that_reque
     newest = begin(dispatch, 1.0)
     copies = [each.call for each in dispatch.take() if isinstance(each, Ask)]
     assert copies == [newest, oldest]
+
+
+def test_one_that_goes_and_comes_back_is_asked_each_call_once() -> None:
+    dispatch = dispatch_to(ALL, FAST, BAD)
+    call = begin(dispatch, 0.0)
+    dispatch.take()
+    for now_s in (1.0, 2.0):
+        dispatch.gone(BAD, now_s, "it describes itself anew")
+        dispatch.came(BAD, now_s)
+    dispatch.came(SLOW, 3.0)
+    assert dispatch.take() == [Ask(call, b"request", (SLOW,))]
+    for server in (FAST, SLOW):
+        dispatch.gone(server, 4.0, "gone")
+    assert dispatch.take() == [Ask(call, b"request", (BAD,))]  # when no other is left
 
 
 def test_a_client_with_many_requests_waits_its_turn() -> None:

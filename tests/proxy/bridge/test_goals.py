@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from gdp.errors import RemoteError
 from gdp.names import Name
-from proxy.bridge.goals import GOAL_KEPT_MAX_BYTES, Goals, cancel_of, goal_of, says_yes
+from proxy.bridge.goals import GOAL_KEPT_MAX_BYTES, STATUSES_MAX, Goals, cancel_of, goal_of, says_yes
 from proxy.bridge.parts import CANCEL, GOAL, RESULT
 
 CDR = b"\0\1\0\0"
@@ -101,6 +101,43 @@ def test_goals_are_forgotten_the_oldest_first() -> None:
     for number in range(2_000):
         goals.sent(number.to_bytes(16, "big"), b"goal")
     assert (goals.again(bytes(16)), goals.again((1_999).to_bytes(16, "big"))) == (None, b"goal")
+
+
+def test_goals_that_one_server_names_push_out_no_goal_of_a_client_here_nor_another_servers() -> None:
+    goals = Goals()
+    goals.sent(ONE, b"goal")
+    goals.may_feed(B, feedback(TWO))
+    for first in range(0, 3_000, 1_000):
+        many = [(number.to_bytes(16, "big"), EXECUTING) for number in range(1 << 40, (1 << 40) + 1_000)]
+        goals.statuses(A, statuses(*((bytes([first // 1_000]) + goal[1:], status) for goal, status in many)))
+    assert goals.again(ONE) == b"goal"
+    assert [goals.may_feed(server, feedback(TWO)) for server in (A, B)] == [False, True]
+    assert len(goals.statuses(B, statuses((TWO, EXECUTING))) or b"") < 40 * 1_100
+
+
+def test_a_goal_that_a_server_named_first_is_kept_like_any_other_when_a_client_here_sends_it() -> None:
+    goals = Goals()
+    goals.may_feed(A, feedback(ONE))
+    goals.sent(ONE, b"goal")
+    goals.statuses(A, statuses(*((number.to_bytes(16, "big"), EXECUTING) for number in range(1_100))))
+    assert goals.again(ONE) == b"goal"
+
+
+def test_of_too_many_goals_of_clients_here_one_that_has_ended_goes_first() -> None:
+    goals = Goals()
+    for number in range(1_024):
+        goals.sent(number.to_bytes(16, "big"), b"goal")
+    ended = (7).to_bytes(16, "big")
+    goals.holds(ended, {A})
+    goals.ended(ended, A, CDR + bytes([SUCCEEDED]))
+    goals.sent(ONE, b"goal")
+    assert (goals.again(bytes(16)), goals.again(ONE), goals.holders(ended)) == (b"goal", b"goal", set())
+
+
+def test_a_status_message_of_too_many_goals_is_refused() -> None:
+    raw = statuses(*((number.to_bytes(16, "big"), EXECUTING) for number in range(STATUSES_MAX + 1)))
+    with pytest.raises(RemoteError, match="at most"):
+        Goals().statuses(A, raw)
 
 
 @pytest.mark.parametrize(
