@@ -39,6 +39,7 @@ __all__ = ["Attachment", "Claimed"]
 
 CLAIM_LEASE_S: Final = 24.0
 _CLAIM_AGAIN_S: Final = 0.5  # until it is judged
+_OWN_FIRST_S: Final = 2.0  # that other claims wait for the node's own; without a RIB they are good on this switch only
 _ECHO_S: Final = 0.02  # the greeter answers a new session within this time
 _RTCERT_S: Final = 600
 
@@ -204,7 +205,9 @@ class Attachment:
             echo_at_s = self.greeter.ports[best.port].hello_at_s
             claim_at_s = echo_at_s if echo_at_s <= now_s + _ECHO_S else now_s  # what comes before our echo is dropped
             for each in self._claims.values():
-                each.claim_at_s, each.is_taken, each.refused, each.join_sequence = claim_at_s, False, None, -1
+                # Who hears of a name asks for its node at once: that one is claimed first.
+                at_s = claim_at_s if each.right is Right.ATTACH else claim_at_s + _OWN_FIRST_S
+                each.claim_at_s, each.is_taken, each.refused, each.join_sequence = at_s, False, None, -1
 
     def _claim_wire(self, each: Claimed, now: Instant) -> bytes:
         assert self._switch is not None
@@ -258,6 +261,10 @@ class Attachment:
             if not each.is_taken:
                 each.claim_at_s = now_s + CLAIM_LEASE_S / 3
             each.is_taken, each.refused = True, None
+            if each.right is Right.ATTACH:
+                for other in self._claims.values():
+                    if not other.is_judged:
+                        other.claim_at_s = min(other.claim_at_s, now_s)
             return
         self.refusals[verdict.refused] += 1
         each.is_taken = False

@@ -299,3 +299,28 @@ def test_the_clients_link_carries_one_copy_of_a_request_whatever_the_number_of_s
     assert [len(server.bodies()) for server in servers] == [200] * replicas
     parts = 8  # of 10,000 bytes over 1,500
     assert [tap.count(Kind.DATA) for tap in (uplink, *branches)] == [200 * parts] * (1 + replicas)
+
+
+@pytest.mark.parametrize("seed", [22, 28, 29, 34])
+def test_a_new_server_is_a_peer_at_once_though_its_claims_and_questions_about_it_overtake_each_other(seed: int) -> None:
+    star = Topology(
+        links=(Link("r", "g"), Link("g", "m1"), Link("g", "m2")),
+        domains=(DomainPlan("d", ("r", "g", "m1", "m2")),),
+        attachments=(Attachment("r", "rib", "rib"),),
+    )
+    world = World(star, seed=seed)
+    for cable in world.cables.values():
+        cable.jitter_s = 0.003
+    for label in ("r/proxy", "r/watch", "m1/old"):
+        world.add_member(label, label.partition("/")[0])
+    spare = world.cables[frozenset(("g", "m2"))]
+    world.network.set_link(spare, up=False)
+    assert world.settle()
+    clients = [Party(world, label, Right.CALL) for label in ("r/proxy", "r/watch")]
+    old = Party(world, "m1/old", Right.SERVE).member.name
+    assert world.network.run(10.0, lambda: all(old in each.member.peers(each.service) for each in clients))
+    world.network.set_link(spare, up=True)
+    world.network.run(0.6)
+    world.add_member("m2/new", "m2")
+    name = Party(world, "m2/new", Right.SERVE).member.name
+    assert world.network.run(1.0, lambda: all(name in each.member.peers(each.service) for each in clients))
