@@ -140,7 +140,7 @@ class Inquirer:
         if attachment is not None and attachment.claim.sequence < body.sequence and switch != self._identity.name:
             self._attached.remove(place.name, place.advertiser)  # it has moved to another switch
             self._unicast.forget(place.name)
-        before = self._places.put(place, now_s)
+        before = self._places.put(place, now_s, is_ours=switch == self._identity.name)
         if before is None or (before.switch, before.domain) != (place.switch, place.domain):
             self._unicast.forget(place.name)
         self._planter.publisher_found(place, now_s)

@@ -125,12 +125,18 @@ class Places:
         """Return a monotonic second that is no later than the next question, or None."""
         return self._ask_at_s if self._questions else None
 
-    def put(self, place: Place, now_s: float) -> Place | None:
-        """Note a place; return what was known of this advertiser before."""
-        self._answered(place.name, now_s)
+    def put(self, place: Place, now_s: float, *, is_ours: bool = False) -> Place | None:
+        """Note a place; return what was known of this advertiser before.
+
+        Args:
+            is_ours: it is attached here. The RIB echoes a claim to who brought it, which answers no question: only
+                what is told a second time does.
+        """
         self._nobody.pop(place.name, None)
         known = self._places.setdefault(place.name, {})
         before = known.get(place.advertiser)
+        if not is_ours or (before is not None and before.claim == place.claim):
+            self._answered(place.name, now_s)
         known[place.advertiser] = place
         self._expire_at_s = min(self._expire_at_s, place.expires_s)
         return before

@@ -115,3 +115,14 @@ def test_open_questions_are_bounded_and_watches_stand_apart() -> None:
     places.want(TOPIC, 0.0, watch=True)
     assert len(asked(places, 0.0)) == QUESTIONS_MAX + 1
     assert not places.is_asked(name(str(QUESTIONS_MAX + 9)))
+
+
+def test_the_echo_of_a_claim_that_was_brought_from_here_answers_no_question_until_it_is_told_again() -> None:
+    places = Places()
+    places.want(TOPIC, 0.0, watch=True)
+    assert asked(places, 0.0) == [(TOPIC, True)]
+    places.put(place(), 0.01, is_ours=True)
+    assert asked(places, RETRY_S) == [(TOPIC, True)]
+    places.put(place(), RETRY_S + 0.01, is_ours=True)
+    assert asked(places, 2 * RETRY_S + 0.1) == []
+    assert asked(places, WATCH_AGAIN_S + 1) == [(TOPIC, True)]
