@@ -18,8 +18,8 @@ import yaml
 
 from fog.cluster import Carried, CloudNode, ClusterPlan
 from fog.enrolment.members import Authority
+from fog.enrolment.papers import Papers
 from fog.machine import Boot, Program
-from fog.supervisor.record import Papers
 from gdp.crypto.certificates import Membership, Role
 
 __all__ = ["PROXY", "RobotDevices", "gateway_boot", "machine_boot", "node_names", "robot_boot", "robot_rule"]

@@ -83,6 +83,8 @@ def _one(kind: Kind, name: str, said: str | Mapping[str, object], defaults: Mapp
     robot, machine = (*_ROBOT_SIDE[kind], *_BOTH_SIDES), (*_MACHINE_SIDE[kind], *_BOTH_SIDES)
     if unknown := sorted(keys.keys() - {*robot, *machine}):
         raise LocalError(f"{kind} {name}: {', '.join(unknown)}: expected type, {', '.join(sorted({*robot, *machine}))}")
+    if "stop" in keys and keys.get("at_once") != 1:
+        raise LocalError(f'{kind} {name}: stop goes with "at_once": 1, or it breaks off what another client asked for')
     if isinstance(replication := keys.get("replication"), str | Mapping | Replication):
         keys["replication"] = replication_rule(replication)
     own = {"replication"} if keys.get("state") == "ordered" else set()  # all have every request then

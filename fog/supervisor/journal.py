@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import Final
 
 from fog.cluster import ClusterPlan, Wanted
+from fog.enrolment.papers import Papers
 from fog.hardware import Hardware
 from fog.machine import MachineSpec, MachineState
 from fog.offer import Offer
-from fog.supervisor.record import Ending, Papers, Record
+from fog.supervisor.record import Ending, Record
 from gdp.errors import LocalError, StoreError
 
 __all__ = ["LAST_WORDS", "Cluster", "Entry", "Journal"]

@@ -9,9 +9,10 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 from fog.cluster import Wanted
+from fog.enrolment.papers import Papers
 from fog.machine import Machine, MachineSpec, MachineState
 
-__all__ = ["Ending", "Papers", "Record", "cost_usd", "learn"]
+__all__ = ["Ending", "Record", "cost_usd", "learn"]
 
 
 class Ending(Enum):
@@ -20,21 +21,6 @@ class Ending(Enum):
     RELEASED = "released"  # we gave it back
     TAKEN = "taken"  # the provider took it, or it died
     FAILED = "failed"  # it was not to be had, or never served
-
-
-@dataclass(frozen=True, slots=True)
-class Papers:
-    """What a machine was enrolled with.
-
-    Args:
-        proxy: the name of its proxy in the overlay, 64 hex digits: who serves, if it does.
-        until_unix_s: when its certificates and delegations run out.
-        fingerprints: of its memberships, in hex, to take them back by.
-    """
-
-    proxy: str
-    until_unix_s: float
-    fingerprints: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from fog.cluster import Wanted
+from fog.enrolment.papers import Papers
 from fog.hardware import Hardware
 from fog.machine import Machine, MachineSpec, MachineState
 from fog.offer import Offer
 from fog.supervisor.decide import Drain, Launch, Patience, Release, decide
 from fog.supervisor.place import place
-from fog.supervisor.record import Papers, Record, learn
+from fog.supervisor.record import Record, learn
 
 NOW_S = 1_000_000.0
 SPOT = Wanted(Hardware(cpus=2), is_spot=True)
