@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 import subprocess
 import sys
 import threading
@@ -23,6 +22,16 @@ from fog.providers.aws.provider import WATCHER
 ACTION = "/latest/meta-data/spot/instance-action"
 DRAIN = "/latest/meta-data/tags/instance/fog-drain"
 LEAVES_AT = 1_505_722_920.0  # 2017-09-18T08:22:00Z
+MACHINE = """
+import json, signal, subprocess, sys
+told = {signal.SIGUSR1, signal.SIGUSR2}
+signal.pthread_sigmask(signal.SIG_BLOCK, told)  # before there is any other thread, which might take one
+program = subprocess.Popen(sys.argv[1:], stdout=subprocess.PIPE, text=True)
+signals = sorted(signal.Signals(signal.sigwait(told)).name for _ in told)
+program.terminate()
+words, _ = program.communicate()
+print(json.dumps({"signals": signals, "exit": program.returncode, "told": words.splitlines()}))
+"""
 
 
 class Service(ThreadingHTTPServer):
@@ -137,21 +146,15 @@ def test_nonsense_is_an_error_that_may_pass(service: Service, text: str) -> None
 
 def test_the_program_tells_the_machine_and_waits_to_be_ended(service: Service, tmp_path: Path) -> None:
     interrupt(service)
-    command = [sys.executable, "-m", "fog.providers.aws.notice", "--home", str(tmp_path), "--url", service.url]
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1, signal.SIGUSR2})
-    program = subprocess.Popen([*command, "--poll-s", "0.01"], stdout=subprocess.PIPE)
-    try:
-        assert signal.sigtimedwait({signal.SIGUSR2}, 20)
-        assert read_notice(tmp_path) == LEAVES_AT
-        assert signal.sigtimedwait({signal.SIGUSR1}, 20)  # the moment is long past
-    finally:
-        program.terminate()
-        told, _ = program.communicate(timeout=20)
-        while signal.sigtimedwait({signal.SIGUSR1, signal.SIGUSR2}, 0):
-            continue
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGUSR1, signal.SIGUSR2})
-    assert program.returncode == 0
-    assert told.decode().splitlines() == ["EC2 takes this machine at 1505722920", "the machine drains"]
+    program = [sys.executable, "-m", "fog.providers.aws.notice", "--home", str(tmp_path), "--url", service.url]
+    machine = [sys.executable, "-c", MACHINE, *program, "--poll-s", "0.01"]
+    done = subprocess.run(machine, capture_output=True, text=True, timeout=60, check=True)
+    assert json.loads(done.stdout) == {
+        "signals": ["SIGUSR1", "SIGUSR2"],  # the moment is long past
+        "exit": 0,
+        "told": ["EC2 takes this machine at 1505722920", "the machine drains"],
+    }
+    assert read_notice(tmp_path) == LEAVES_AT
 
 
 def test_a_machine_ends_well_when_its_owner_drains_it(service: Service, tmp_path: Path) -> None:
