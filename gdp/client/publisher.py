@@ -286,10 +286,7 @@ class Publisher:
     def _seal_next(self) -> None:
         """Seal of what was gathered as much as goes together."""
         together = self._gathered.take(self._bundle_room())
-        if len(together) == 1:
-            self._queue(together[0])
-        else:
-            self._queue(pack(together), len(together))
+        self._queue(together[0] if len(together) == 1 else pack(together), len(together))
 
     def _seal_gathered(self) -> None:
         while self._gathered:
@@ -353,8 +350,7 @@ class Publisher:
         return report
 
     def _sealer(self, kind: Kind) -> Sealer:
-        source = self._source
-        secret = self._secrets[self._epoch]
+        source, secret = self._source, self._secrets[self._epoch]
         return Sealer(secret, self._epoch, kind, source.name, source.incarnation, self.topic, source.signer)
 
     def _forget(self, name: bytes) -> None:
