@@ -42,11 +42,16 @@ lane clusters >"$beside" 2>&1 &
 others=$!
 trap 'kill "$others" 2>/dev/null || true; exit 130' INT TERM
 failed=()
-lane spaces || failed+=(spaces)
-wait "$others" || failed+=(clusters)
+declare -A ended=()
+lane spaces || { ended[spaces]=$?; failed+=(spaces); }
+wait "$others" || { ended[clusters]=$?; failed+=(clusters); }
 cat "$beside"
 for which in "${failed[@]}"; do
     printf 'failed beside other tests, so once more alone: %s\n' "$which"
-    lane "$which" --last-failed --last-failed-no-failures none
+    if [[ ${ended[$which]} -eq 1 ]]; then
+        lane "$which" --last-failed --last-failed-no-failures none
+    else
+        lane "$which"  # pytest itself did not come to its end
+    fi
     printf 'passed alone: unsteady, look at the failures above\n'
 done
