@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import signal
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -21,6 +20,7 @@ from fog.demo.play import Outcome, Pace, play
 from fog.demo.stage import Stage, end_all_of, standing_runs, sweep
 from fog.demo.view import View
 from gdp.errors import GdpError
+from gdp.testbed.interruption import Interrupted, interruptible, let_nothing_interrupt
 from gdp.testbed.runs import Run
 from proxy.ring.child import ChildError
 
@@ -29,7 +29,6 @@ __all__ = ["main"]
 _PASSED: Final = 0
 _FAILED: Final = 1
 _WRONG_INPUT: Final = 2
-_ENDING_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _PACE: Final = Pace()
 _WIDE: Final = 160  # columns where no terminal says how many there are
 
@@ -84,35 +83,16 @@ def main() -> None:
 def _run(run: Run, launch_file: Path, pace: Pace, console: Console, *, as_json: bool) -> int:
     """Play, and take down everything."""
     try:
-        outcome = asyncio.run(_interruptible(run, launch_file, pace, console))
+        outcome = asyncio.run(interruptible(_play(run, launch_file, pace, console)))
+    except Interrupted as interrupted:
+        console.print("interrupted")
+        return interrupted.exit_code
     finally:
-        for number in _ENDING_SIGNALS:
-            signal.signal(number, signal.SIG_IGN)  # this takes seconds, and must be done to the end
+        let_nothing_interrupt()
         console.print("[dim]giving machines back, taking the ring down[/dim]")
         end_all_of(run)
-    if isinstance(outcome, int):
-        return outcome
     _tell(outcome, console, as_json=as_json)
     return _FAILED if outcome.counts.failed or not outcome.counts.requests else _PASSED
-
-
-async def _interruptible(run: Run, launch_file: Path, pace: Pace, console: Console) -> Outcome | int:
-    """Play; a signal cancels it, wherever it is, and is what is returned then, as an exit code."""
-    loop = asyncio.get_running_loop()
-    work = asyncio.ensure_future(_play(run, launch_file, pace, console))
-    caught: list[int] = []
-
-    def stop(number: int) -> None:
-        caught.append(number)
-        work.cancel()
-
-    for number in _ENDING_SIGNALS:
-        loop.add_signal_handler(number, stop, number)
-    try:
-        return await work
-    except asyncio.CancelledError:
-        console.print("interrupted")
-        return 128 + caught[0]
 
 
 async def _play(run: Run, launch_file: Path, pace: Pace, console: Console) -> Outcome:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import signal
 import sys
 from collections.abc import Iterator, Sequence
 from itertools import zip_longest
@@ -20,6 +19,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from gdp.errors import GdpError, LocalError
+from gdp.testbed.interruption import Interrupted, interruptible, let_nothing_interrupt
 from gdp.testbed.runs import Run, Runs
 from gdp.testbed.topology import MTU_BYTES
 from proxy.config import Encoding
@@ -40,7 +40,6 @@ LIVES: Final[tuple[Live, ...]] = get_args(Live)
 _PASSED: Final = 0
 _FAILED: Final = 1
 _WRONG_INPUT: Final = 2
-_ENDING_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _WIDE: Final = 200  # columns where no terminal says how many there are
 
 _EXAMPLES: Final = """\b
@@ -134,35 +133,18 @@ def _run(options: Options, run: Run, errors: Console) -> int:
     """Do one run, and take down what it made unless it is to be kept."""
     kept = False
     try:
-        code = asyncio.run(_interruptible(options, run, errors))
+        code = asyncio.run(interruptible(_go(options, run, errors)))
         kept = options.keep and code in (_PASSED, _FAILED)
+    except Interrupted as interrupted:
+        errors.print("interrupted; taking everything down")
+        code = interrupted.exit_code
     finally:
         if kept:
             run.keep()
         else:
-            for number in _ENDING_SIGNALS:
-                signal.signal(number, signal.SIG_IGN)  # this takes seconds at most, and must be done to the end
+            let_nothing_interrupt()
             run.end()
     return code
-
-
-async def _interruptible(options: Options, run: Run, errors: Console) -> int:
-    """Do the run; a signal cancels it, wherever it is."""
-    loop = asyncio.get_running_loop()
-    work = asyncio.ensure_future(_go(options, run, errors))
-    caught: list[int] = []
-
-    def stop(number: int) -> None:
-        caught.append(number)
-        work.cancel()
-
-    for number in _ENDING_SIGNALS:
-        loop.add_signal_handler(number, stop, number)
-    try:
-        return await work
-    except asyncio.CancelledError:
-        errors.print("interrupted; taking everything down")
-        return 128 + caught[0]
 
 
 async def _go(options: Options, run: Run, errors: Console) -> int:
