@@ -27,6 +27,7 @@ class Arrival(NamedTuple):
     port: int
     mac: bytes  # the sender's, 6 bytes
     frame: bytes  # from the header on, without the Ethernet header; may end in padding
+    waited_s: float = 0.0  # between its arrival and the moment at which it is handed up, where that is known
 
     @property
     def via(self) -> bytes:

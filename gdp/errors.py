@@ -68,6 +68,8 @@ class DropReason(IntEnum):
     UNKNOWN_SENDER = 32  # not a neighbour (yet)
     NOT_FOR_US = 33
     REVOKED = 34
+    UNAVAILABLE = 35  # a RIB's store did not answer; the sender may try again
+    IN_USE = 36  # another node with this identity is alive elsewhere
 
     @property
     def label(self) -> str:

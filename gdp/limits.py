@@ -14,6 +14,7 @@ MTU_MIN_BYTES: Final = 576  # a link below this is refused: a signed hello would
 
 # Messages
 MESSAGE_MAX_BYTES: Final = 24 << 20  # serialised message, before sealing; it must fit, in parts, into JOIN_SOURCE_BYTES
+SEQUENCE_BYTES: Final = 8  # before each message, under its seal: which message of its publisher it is
 NUMBER_MAX: Final = (1 << 64) - 2  # message numbers have 64 bits, and each must have a next
 PARTS_MAX: Final = 1 << 17  # 64 MiB over the smallest link
 JOIN_SOURCE_BYTES: Final = 48 << 20  # reassembly memory of one source, so that one cannot starve all others
@@ -37,6 +38,7 @@ PROBE_MIN_S: Final = 0.03
 PROBE_MAX_S: Final = 0.25
 REPORT_IDLE_S: Final = 1.0  # a live reader reports at least this often
 READER_LEASE_S: Final = 6.0  # a reader that does not report for this long no longer holds its publisher
+READER_GRACE_S: Final = 60.0  # ... but what it lacks is kept for it for this long, as far as the window has room
 CALL_LAG_S: Final = 1.0  # ... or of requests, that has not confirmed in this time what another server has
 CALL_IDLE_S: Final = 0.5  # a live server reports at least this often to its clients
 CALL_QUIET_S: Final = 2.0  # a server that does not report for this long is no peer meanwhile
@@ -55,15 +57,21 @@ CLOCK_SKEW_S: Final = 120.0
 # Leases
 LEASE_MIN_S: Final = 1.0
 LEASE_MAX_S: Final = 3_600.0
+CLAIM_LEASE_S: Final = 24.0  # what a node asks for unless its configuration says otherwise; renewed after a third
 NEGATIVE_LEASE_S: Final = 0.5  # short: a question may just miss the claim that answers it
 
 # Neighbours and link state
-HELLO_S: Final = 0.25
-DEAD_S: Final = 0.9
+HELLO_S: Final = 0.25  # between hellos on a port, until its neighbours are heard by keepalives
+HELLO_IDLE: Final = 16  # hello intervals between two hellos, from then on
+DEAD_S: Final = 0.9  # a neighbour that sends no keepalives is gone when silent for so long
+KEEPALIVE_MS: Final = 70  # between keepalives to a neighbour that is up
+DETECT_MULTIPLIER: Final = 3  # of which it is gone
 LINK_STATE_REFRESH_S: Final = 30.0
 LINK_STATE_LEASE_S: Final = 100.0
 JOIN_REFRESH_S: Final = 2.0
 JOIN_LEASE_S: Final = 7.0
+
+WAIT_REPORT_S: Final = 5.0  # a node that makes no progress for so long says why
 
 # Tables
 TABLE_MAX: Final = 1 << 20

@@ -17,8 +17,20 @@ import typer
 
 from gdp.errors import ConfigError, GdpError
 
-__all__ = ["WRONG", "AwaitIface", "Check", "Config", "Json", "Verbose", "emit", "failing_clearly", "set_up_logging"]
+__all__ = [
+    "WRONG",
+    "AwaitIface",
+    "Check",
+    "Config",
+    "Json",
+    "Verbose",
+    "emit",
+    "emit_wait",
+    "failing_clearly",
+    "set_up_logging",
+]
 
+_OURS: Final = ("gdp", "proxy", "fog")
 WRONG: Final = 2  # exit code of a wrong configuration
 
 Config = Annotated[Path, typer.Option("--config", help="The YAML file; see docs/configuration.md.")]
@@ -35,12 +47,24 @@ def set_up_logging(*, verbose: bool) -> None:
     """Log to standard error: life-cycle steps, or decisions as well."""
     level = logging.DEBUG if verbose else logging.INFO
     logging.basicConfig(level=level, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s %(message)s")
+    for handler in logging.getLogger().handlers:
+        handler.addFilter(_is_ours_or_serious)
+
+
+def _is_ours_or_serious(record: logging.LogRecord) -> bool:
+    """Leave out the debug messages of libraries: pyroute2 would print every netlink message, and sets its own level."""
+    return record.levelno >= logging.WARNING or record.name.partition(".")[0] in _OURS
 
 
 def emit(event: str, **fields: object) -> None:
     """Write one line of JSON and flush it: somebody waits for it."""
     sys.stdout.buffer.write(orjson.dumps({"event": event, **fields}) + b"\n")
     sys.stdout.buffer.flush()
+
+
+def emit_wait(reason: str, text: str) -> None:
+    """Write what a node waits for as one line of JSON."""
+    emit("waiting", reason=reason, text=text)
 
 
 @contextlib.contextmanager

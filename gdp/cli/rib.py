@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import typer
 
-from gdp.cli.node import AwaitIface, Check, Config, Json, Verbose, emit, failing_clearly, set_up_logging
+from gdp.cli.node import AwaitIface, Check, Config, Json, Verbose, emit, emit_wait, failing_clearly, set_up_logging
 from gdp.crypto.certificates import Role
 from gdp.names import Name
 from gdp.nodes.awaiting import await_device
@@ -37,7 +37,11 @@ def rib(
             _report("checked", f"configuration good: RIB {identity.name.short}", identity.name, json=json)
             return
         await_device(settings.iface, await_iface)
-        run_rib(settings, lambda name: _report("ready", f"RIB {name.short} is up; Ctrl-C ends it", name, json=json))
+        run_rib(
+            settings,
+            lambda name: _report("ready", f"RIB {name.short} is up; Ctrl-C ends it", name, json=json),
+            emit_wait if json else None,
+        )
 
 
 def _report(event: str, text: str, name: Name, *, json: bool) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from gdp.cli.node import Check, Config, Json, Verbose, emit, failing_clearly, set_up_logging
+from gdp.cli.node import Check, Config, Json, Verbose, emit, emit_wait, failing_clearly, set_up_logging
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError
 from gdp.names import Name
@@ -43,7 +43,11 @@ def switch(
             identity, _ = load_member(settings.identity, settings.domain, Role.SWITCH)
             _report_check(identity.name, len(settings.ports), json=json)
             return
-        run_switch(settings, lambda name, plane, reason: _report_ready(name, plane, reason, json=json))
+        run_switch(
+            settings,
+            lambda name, plane, reason: _report_ready(name, plane, reason, json=json),
+            emit_wait if json else None,
+        )
 
 
 def _data_plane(text: str) -> DataPlane:

@@ -11,6 +11,7 @@ Place: pure. Whoever publishes, reads or serves builds on this; so does a RIB.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,6 +19,7 @@ from gdp.control.frames import ControlJoiner, ControlSplitter
 from gdp.control.greeter import Greeter
 from gdp.control.join import Join
 from gdp.control.neighbour import Neighbour
+from gdp.control.presence import Presence
 from gdp.control.settings import NodeSettings
 from gdp.control.verdict import Verdict
 from gdp.crypto.certificates import Role
@@ -29,7 +31,7 @@ from gdp.effects import Arrival, Instant, Transmit
 from gdp.errors import DropReason, FrameError, StatementError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Kind
-from gdp.names import Name
+from gdp.names import ZERO, Name
 from gdp.trust.claim import make_claim
 from gdp.trust.domain import Policy
 from gdp.trust.right import HEARS, Right
@@ -37,11 +39,14 @@ from gdp.trust.rtcert import RtCert
 
 __all__ = ["Attachment", "Claimed"]
 
-CLAIM_LEASE_S: Final = 24.0
 _CLAIM_AGAIN_S: Final = 0.5  # until it is judged
-_OWN_FIRST_S: Final = 2.0  # that other claims wait for the node's own; without a RIB they are good on this switch only
+_OWN_FIRST_S: Final = 0.5  # that other claims wait for the node's own; without a RIB they are good on this switch only
+_MOVED_S: Final = 5.0  # claims name the former switch for so long after a move
 _ECHO_S: Final = 0.02  # the greeter answers a new session within this time
-_RTCERT_S: Final = 600
+_IN_USE_SOON_S: Final = 0.1  # a refused node asks again: its earlier life may be known to be dead any moment
+_IN_USE_S: Final = 2.0  # ... and after so long this seldom
+_RTCERT_S: Final = 3_600
+_RTCERT_BEFORE_S: Final = 900  # it is dated back by so much, for clocks that lag
 
 
 @dataclass(slots=True)
@@ -70,18 +75,32 @@ class Attachment:
         self._identity = identity
         self._policy = policy
         self._incarnation = settings.incarnation
+        self._lease_s = settings.lease_s
         self._sequence = settings.first_sequence
         self.splitter = ControlSplitter(identity.name, settings.incarnation)
         self.joiner = ControlJoiner()
         self.greeter = Greeter(
-            identity, policy, self.splitter, settings.random_bytes, hello_s=settings.hello_s, dead_s=settings.dead_s
+            identity,
+            policy,
+            self.splitter,
+            settings.random_bytes,
+            hello_s=settings.hello_s,
+            dead_s=settings.dead_s,
+            timing=settings.timing,
+            incarnation=settings.incarnation,
         )
         self._claims: dict[tuple[Name, Right], Claimed] = {}
         self._switch: Neighbour | None = None
         self._switch_nonce = b""  # of the session with it
+        self._last = ZERO  # the switch of the newest attachment, the present one too
+        self._former = ZERO  # the one before
+        self._moved_s = float("-inf")
         self._rtcert = b""
         self._rtcert_until_s = 0.0
         self._out: list[Transmit] = []
+        self._in_use_s = 0.0  # since when another node with this identity keeps its place
+        self.clashes = 0  # signs of another node with this identity
+        self.rival_at: Name | None = None  # switch of a newer node with this identity, once it was reported
         self.refusals: Counter[DropReason] = Counter()
 
     @property
@@ -91,8 +110,19 @@ class Attachment:
 
     @property
     def is_attached(self) -> bool:
-        """Return whether a switch is there and has judged every claim."""
-        return self._switch is not None and all(each.is_judged for each in self._claims.values())
+        """Return whether a switch is there and has judged every claim, and no other node has this identity."""
+        is_judged = all(each.is_judged for each in self._claims.values())
+        return self._switch is not None and is_judged and not self.is_in_use
+
+    @property
+    def is_in_use(self) -> bool:
+        """Return whether this node is refused because an older one with its identity is there."""
+        own = self._own_claim
+        return own is not None and own.refused is DropReason.IN_USE
+
+    @property
+    def _own_claim(self) -> Claimed | None:
+        return next((each for each in self._claims.values() if each.right is Right.ATTACH), None)
 
     @property
     def claims(self) -> list[Claimed]:
@@ -140,6 +170,9 @@ class Attachment:
         Raises:
             RemoteError: it does not hold.
         """
+        if header.kind == Kind.KEEPALIVE:
+            self.greeter.receive_keepalive(arrival, header, now)
+            return None
         wire = self.joiner.add(header, arrival.frame, now.mono_s, arrival.via)
         if wire is None:
             return None
@@ -176,17 +209,22 @@ class Attachment:
         self._out += self.greeter.take(now.mono_s)
         if self._switch is None:
             return
-        for each in self._claims.values():
+        for each in self._due_claims():
             if each.claim_at_s <= now.mono_s:
-                each.claim_at_s = now.mono_s + (CLAIM_LEASE_S / 3 if each.is_judged else _CLAIM_AGAIN_S)
+                each.claim_at_s = now.mono_s + (self._lease_s / 3 if each.is_judged else _CLAIM_AGAIN_S)
                 self._say(Kind.ADVERTISE, self._claim_wire(each, now))
 
     def next_timeout(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         times = [self.greeter.next_timeout()]
         if self._switch is not None:
-            times += [each.claim_at_s for each in self._claims.values()]
+            times += [each.claim_at_s for each in self._due_claims()]
         return min((time for time in times if time is not None), default=None)
+
+    def _due_claims(self) -> Iterable[Claimed]:
+        """Return what may be claimed: while another node has this identity, the node's own name alone."""
+        own = self._own_claim
+        return (own,) if own is not None and self.is_in_use else self._claims.values()
 
     def take(self) -> list[Transmit]:
         """Return, once, what is to be sent."""
@@ -202,6 +240,8 @@ class Attachment:
         self._switch_nonce = b"" if best is None else best.nonce
         if best is not None and not is_same:
             self._rtcert = b""
+            if best.name != self._last:
+                self._former, self._last, self._moved_s = self._last, best.name, now_s
             echo_at_s = self.greeter.ports[best.port].hello_at_s
             claim_at_s = echo_at_s if echo_at_s <= now_s + _ECHO_S else now_s  # what comes before our echo is dropped
             for each in self._claims.values():
@@ -212,7 +252,7 @@ class Attachment:
     def _claim_wire(self, each: Claimed, now: Instant) -> bytes:
         assert self._switch is not None
         if not self._rtcert or now.mono_s >= self._rtcert_until_s:
-            validity = Validity(int(now.unix_s), int(now.unix_s) + _RTCERT_S)
+            validity = Validity(int(now.unix_s) - _RTCERT_BEFORE_S, int(now.unix_s) + _RTCERT_S)
             self._rtcert = RtCert.make(self._identity, self._switch.name, validity)
             self._rtcert_until_s = now.mono_s + _RTCERT_S / 2
         return make_claim(
@@ -222,9 +262,10 @@ class Attachment:
             rtcert=self._rtcert,
             sequence=self._next_sequence(),
             incarnation=self._incarnation,
-            lease_s=CLAIM_LEASE_S,
+            lease_s=self._lease_s,
             is_global=each.is_global,
             chain=each.chain,
+            previous=self._former if now.mono_s - self._moved_s < _MOVED_S else ZERO,
         )
 
     def _note_newest(self, join: Join) -> None:
@@ -250,6 +291,12 @@ class Attachment:
         statement.verify(member.key)
         if statement.type is StatementType.ANSWER:
             return statement
+        if statement.type is StatementType.PRESENCE:
+            presence = Presence.from_fields(statement.fields)
+            if (presence.node, presence.incarnation) == (self._identity.name, self._incarnation):
+                self.clashes += 1
+                self.rival_at = presence.other
+            return None
         verdict = Verdict.from_fields(statement.expect(StatementType.VERDICT))
         for (name, _), each in self._claims.items():
             if name == verdict.name and verdict.advertiser == self._identity.name:
@@ -259,7 +306,7 @@ class Attachment:
     def _judge(self, each: Claimed, verdict: Verdict, now_s: float) -> None:
         if verdict.refused is None:
             if not each.is_taken:
-                each.claim_at_s = now_s + CLAIM_LEASE_S / 3
+                each.claim_at_s = now_s + self._lease_s / 3
             each.is_taken, each.refused = True, None
             if each.right is Right.ATTACH:
                 for other in self._claims.values():
@@ -271,9 +318,15 @@ class Attachment:
         if verdict.refused is DropReason.STALE:
             self._sequence = max(self._sequence, verdict.sequence)
             each.claim_at_s = now_s  # an earlier life of ours was ahead: try again above it
+        elif verdict.refused is DropReason.IN_USE and each.right is Right.ATTACH:
+            if each.refused is not verdict.refused:
+                self._in_use_s = now_s
+            each.refused = verdict.refused
+            each.claim_at_s = now_s + (_IN_USE_SOON_S if now_s < self._in_use_s + _IN_USE_S else _IN_USE_S)
+            self.clashes += 1
         else:
             each.refused = verdict.refused
-            each.claim_at_s = now_s + CLAIM_LEASE_S / 3  # it may be taken later, but not for asking often
+            each.claim_at_s = now_s + self._lease_s / 3  # it may be taken later, but not for asking often
 
     def _say(self, kind: Kind, wire: bytes) -> None:
         assert self._switch is not None

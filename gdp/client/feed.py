@@ -3,7 +3,8 @@
 Place: pure; time comes in as ``now_s`` (monotonic seconds).
 
 A feed begins ``NEW``: it announces itself until a status tells it where to begin and what the messages are. ``LIVE`` it
-delivers: a reliable topic in order and complete, a best-effort one in order and never waiting.
+delivers: a reliable topic in order and complete, a best-effort one in order and never waiting. Sequence numbers under
+the seal show what is lost between two messages, statuses what is lost behind the last, and why.
 """
 
 from __future__ import annotations
@@ -31,9 +32,11 @@ from gdp.limits import (
     REPORT_GAP_S,
     REPORT_IDLE_S,
     REPORT_PAUSE_S,
+    SEQUENCE_BYTES,
 )
 from gdp.message.bundle import unpack
 from gdp.message.join import Joined, Joiner, VerifiesDigest
+from gdp.message.loss import Losses, LossReason, LostRange, explain
 from gdp.message.memory import Budget
 from gdp.message.move import Move
 from gdp.message.report import Missing, Report, ReportFlag
@@ -56,7 +59,8 @@ class Feed:
 
     Args:
         ended: where an earlier feed of the same ended. A latched topic's last messages come again all the same, as its
-            publisher says in a new status.
+            publisher says in a new status, unless this feed resumes that one.
+        restarted: this reader read another life of the publisher before: what was published in this one is lost.
     """
 
     def __init__(
@@ -70,6 +74,8 @@ class Feed:
         budget: Budget,
         now_s: float,
         ended: Ended = _NOWHERE,
+        *,
+        restarted: bool = False,
     ) -> None:
         self.publisher = publisher
         self.incarnation = incarnation
@@ -82,12 +88,19 @@ class Feed:
         self._openers: dict[tuple[int, int], Opener] = {}
         self._announced = 0
         self._note = self._note_sealer(max(secrets))
-        self._data = Joiner(publisher, lambda epoch: self._opener(Kind.DATA, epoch), writer, budget)
+        self._data = Joiner(
+            publisher, lambda epoch: self._opener(Kind.DATA, epoch), writer, budget, head_bytes=SEQUENCE_BYTES
+        )
         self._status = Joiner(publisher, lambda epoch: self._opener(Kind.STATUS, epoch), writer, budget)
         self.state = FeedState.NEW
         self.description = b""
         self._is_reliable: bool | None = None
         self._expected = 0  # next number to deliver, once LIVE
+        self._sequence = 0  # of the next message, once LIVE
+        self._known = 0  # the first sequence number of which nothing is known
+        self._gone: tuple[LostRange, ...] = ()  # what the publisher says that nobody can get
+        self._skipped: LossReason | None = None  # why it went on without what lacks
+        self._is_restarted = restarted
         self._sent = (0, 0)  # the publisher has sent everything before this (number, part)
         self._ready: dict[int, Joined] = {}  # whole, behind a gap
         self._out = deque[Delivered]()
@@ -97,7 +110,7 @@ class Feed:
         self.idle_s = REPORT_IDLE_S  # it reports at least so often
         self.claim = b""  # of the publisher, the newest
         self.claim_sequence = 0
-        self.lost = 0  # at least: of a bundle that did not come nobody knows how many were in it
+        self.losses = Losses()
         self.delivered = 0
 
     @property
@@ -106,10 +119,26 @@ class Feed:
         return self._data.drops + self._status.drops
 
     @property
+    def lost(self) -> int:
+        """Return how many messages are known to be lost."""
+        return self.losses.total
+
+    @property
     def ended(self) -> Ended:
         """Return where it is, for one that goes on after it."""
         before = self._before
-        return Ended(max(self._expected, before.number), max(self._status.window.top, before.status))
+        if self.state is FeedState.NEW:
+            return before._replace(status=max(self._status.window.top, before.status))
+        number, status = max(self._expected, before.number), max(self._status.window.top, before.status)
+        return Ended(number, status, self._sequence, max(self._known, self._sequence))
+
+    def finish(self) -> None:
+        """Hand out what is whole, and count what is known to lack: no more of this life of its publisher will come."""
+        if self.state is FeedState.LIVE:
+            self._skipped = LossReason.PUBLISHER_RESTARTED
+            for number in sorted(self._ready):
+                self._hand_out(self._take_ready(number))
+            self._lose_until(self._known, LossReason.PUBLISHER_RESTARTED)
 
     def receive(self, header: Header, frame: bytes, now_s: float) -> None:
         """Take one DATA or STATUS frame of this publisher."""
@@ -153,13 +182,15 @@ class Feed:
         if self.state is FeedState.NEW:
             self._report_at_s = now_s + ANNOUNCE_S
             self._note = self._note_sealer(self._epoch_to_try())
-            return self._note.seal(Report(ReportFlag.NEW, 0, 0, ()).to_wire())
+            number, sequence = (self._before.number, self._before.sequence) if self._before.resumes else (0, 0)
+            return self._note.seal(Report(ReportFlag.NEW, number, 0, (), sequence).to_wire())
         missing = self._missing() if self._is_reliable else ()
         if missing:
             self._clean_bytes = 0
         self._report_at_s = now_s + (REPORT_DELAY_S if missing else self.idle_s)
         part = self._data.progress(self._expected)
-        return self._note.seal(Report(ReportFlag.NONE, self._expected, part, missing).to_wire())
+        report = Report(ReportFlag.NONE, self._expected, part, missing, self._sequence, self.lost)
+        return self._note.seal(report.to_wire())
 
     def take_delivered(self) -> list[Delivered]:
         """Return, once, the messages that are ready, in order."""
@@ -174,7 +205,7 @@ class Feed:
         for number in list(self._ready):
             self._take_ready(number)
         self._report_at_s = float("inf")
-        return self._note.seal(Report(ReportFlag.BYE, self._expected, 0, ()).to_wire())
+        return self._note.seal(Report(ReportFlag.BYE, self._expected, 0, (), self._sequence, self.lost).to_wire())
 
     def renew(self, secrets: Secrets) -> None:
         """Take the topic's secrets anew; what is sealed under an epoch that is still among them opens as before."""
@@ -230,6 +261,7 @@ class Feed:
         if joined is not None:
             self._arrange(joined)
         elif joiner.drops[DropReason.MEMORY_FULL] > refused and self.state is FeedState.LIVE and self._ready:
+            self._skipped = LossReason.READER_MEMORY
             self._skip_to(min(self._ready))  # what waits behind the gap leaves no room to fill it: go on without
             self._deliver()
 
@@ -243,9 +275,11 @@ class Feed:
             self._deliver()
         elif self._budget.reserve(self.publisher, len(joined.message) + _READY_OVERHEAD_BYTES):
             self._ready[joined.number] = joined
+            self._known = max(self._known, min(int.from_bytes(joined.head, "big"), NUMBER_MAX) + 1)
         elif self.state is FeedState.NEW:
             self._data.drops[DropReason.MEMORY_FULL] += 1
         else:
+            self._skipped = LossReason.READER_MEMORY
             self._skip_to(joined.number)
             self._hand_out(joined)
             self._expected += 1
@@ -309,22 +343,44 @@ class Feed:
                 return
             self.state = FeedState.LIVE
             self._note = self._note_sealer(epoch)
-            self._expected = status.starts[self._reader.name]
-            if not joined.flags & _LATCHED:
-                self._expected = max(self._expected, self._before.number)
+            self._begin(status, is_latched=bool(joined.flags & _LATCHED))
             for number in [n for n in self._ready if not 0 <= n - self._expected < REPLAY_WINDOW_MESSAGES]:
                 self._take_ready(number)
             self._data.begin(self._expected, self._ready)
         if status.description and joined.number > self._described:
             self.description, self._described = status.description, joined.number
+        if joined.number == self._status.window.top:
+            self._gone = status.gone
         self._sent = max(self._sent, (status.sent_number, status.sent_part))
         for move in status.moves:
             if move.is_before(self._expected):
                 self._follow(move)
+        otherwise = LossReason.GIVEN_UP if self._is_reliable else LossReason.GAP
         if status.oldest > self._expected:
             self._skip_to(status.oldest)
-        self._report_at_s = now_s
+            self._lose_until(status.oldest_sequence, otherwise)
         self._deliver()
+        if self._expected == status.sent_number:
+            self._lose_until(status.sent_sequence, otherwise)
+        self._known = max(self._known, status.sent_sequence)
+        self._report_at_s = now_s
+
+    def _begin(self, status: Status, *, is_latched: bool) -> None:
+        """Begin where the publisher says, and count what came between this and what was read before."""
+        start, before = status.starts[self._reader.name], self._before
+        self._expected = start.number
+        if before.resumes or not is_latched:
+            self._expected = max(start.number, before.number)
+        begun, why = start.confirmed, LossReason.READER_RESTARTED
+        if before.resumes and before.sequence:
+            begun, why = before.sequence, LossReason.DETACHED
+        elif self._is_restarted:
+            begun, why = 1, LossReason.PUBLISHER_RESTARTED
+        self._gone = status.gone if why is LossReason.DETACHED else ()
+        self._sequence = begun or start.sequence
+        self._lose_until(start.sequence, why)
+        self._gone = status.gone
+        self._sequence = max(start.sequence, before.sequence) if self._expected > start.number else start.sequence
 
     def _follow(self, move: Move) -> None:
         """Go on under new numbers: what is here of the old ones waits, under theirs, for what lacks."""
@@ -343,9 +399,7 @@ class Feed:
 
     def _skip_to(self, number: int) -> None:
         """Accept that what lies before ``number`` and is not here will not come."""
-        here = sorted(each for each in self._ready if each < number)
-        self.lost += number - self._expected - len(here)
-        for each in here:
+        for each in sorted(each for each in self._ready if each < number):
             self._hand_out(self._take_ready(each))
         self._expected = number
         self._data.forget(number)
@@ -364,18 +418,32 @@ class Feed:
         self._budget.release(self.publisher, len(joined.message) + _READY_OVERHEAD_BYTES)
         return joined
 
+    def _lose_until(self, sequence: int, otherwise: LossReason) -> None:
+        """Count what lies before a message as lost."""
+        if self._sequence < sequence:
+            for lost in explain(self._sequence, sequence - 1, self._gone, otherwise):
+                self.losses.add(lost)
+            self._sequence = sequence
+
     def _hand_out(self, joined: Joined) -> None:
-        messages = [joined.message]
+        sequence, messages = int.from_bytes(joined.head, "big"), [joined.message]
+        if len(joined.head) < SEQUENCE_BYTES or sequence > NUMBER_MAX:
+            self._data.drops[DropReason.MALFORMED] += 1
+            return
         if joined.flags & _BUNDLE:
             try:
                 messages = unpack(joined.message)
             except RemoteError as error:
                 self._data.drops[error.reason] += 1
                 return
+        otherwise, self._skipped = self._skipped or (LossReason.GIVEN_UP if self._is_reliable else LossReason.GAP), None
+        self._lose_until(sequence, otherwise)
+        self._sequence = max(self._sequence, sequence + len(messages))
         self.delivered += len(messages)
         number, way = joined.number, (joined.parts, joined.hops)
         for place, message in enumerate(messages):
-            self._out.append(Delivered(self.publisher, self.incarnation, number, message, *way, place))
+            at = place, sequence + place
+            self._out.append(Delivered(self.publisher, self.incarnation, number, message, *way, *at))
 
 
 def _below(ranges: list[tuple[int, int]], end: int) -> list[tuple[int, int]]:

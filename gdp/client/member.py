@@ -32,6 +32,7 @@ from gdp.errors import DropReason, LocalError, RemoteError, StatementError
 from gdp.frame.codec import Header, decode
 from gdp.frame.kinds import CONTROL_FROM, Kind
 from gdp.limits import HELLO_S
+from gdp.message.loss import Losses, LossReason
 from gdp.names import Name
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
@@ -218,6 +219,19 @@ class Member:
         subscription = self._subscriptions.get(topic)
         return [] if subscription is None else list(subscription.feeds.values())
 
+    def losses_of(self, name: Name) -> Losses:
+        """Return what was lost of all that was heard on a name since it is heard."""
+        subscription = self._subscriptions.get(name)
+        return Losses() if subscription is None else subscription.losses()
+
+    def lost(self) -> Mapping[LossReason, int]:
+        """Return how many messages were lost on their way to this member, by reason."""
+        return self._subscriptions.lost()
+
+    def unconfirmed(self) -> Mapping[LossReason, int]:
+        """Return how many messages of this member some reader did not get, as far as it is known here, by reason."""
+        return self._publications.unconfirmed()
+
     def receive(self, arrivals: Sequence[Arrival], now: Instant) -> None:
         """Take frames in."""
         self._look_at_clock(now.mono_s)
@@ -375,7 +389,8 @@ class Member:
             self._revoke(statement, now)
         elif statement.type is StatementType.ANSWER:
             change = self._subscriptions.take(Answer.from_fields(statement.fields), now)
-            self._close(change.ended)
+            self._messages += change.rest
+            self._close(change.ended, goodbye=False)  # they may come back to what waits for them
             self._reporting.update(dict.fromkeys(change.opened))
 
     def _life_of(self, service: Name, party: bytes) -> Life | None:
@@ -389,11 +404,13 @@ class Member:
         if self._verifier.revoke(statement.wire, now.unix_s) is not None:
             self._close(self._subscriptions.recheck(now.unix_s))
 
-    def _close(self, feeds: list[Feed]) -> None:
-        """Say goodbye to whom these feeds are of; a party that goes is told nothing more."""
+    def _close(self, feeds: list[Feed], *, goodbye: bool = True) -> None:
+        """Say goodbye to whom these feeds are of, unless told otherwise; a party that goes is told nothing more."""
         self._under_way = None
         for feed in feeds:
-            self.attachment.send([feed.close()])
+            note = feed.close()
+            if goodbye:
+                self.attachment.send([note])
             self._reporting.pop(feed, None)
             self._feeds_due.touch(feed)
             self._publications.forget(feed.topic, Life(feed.publisher, feed.incarnation))

@@ -17,10 +17,11 @@ PASTS_MAX: Final = 4_096
 
 
 class Past(NamedTuple):
-    """The next number of a message, and the last of a status."""
+    """The next number of a message, the last of a status, and the last sequence number of a message."""
 
     next_number: int = 1
     status_number: int = 0
+    sequence: int = 0
 
 
 FIRST: Final = Past()

@@ -92,8 +92,14 @@ class PrivateStream(Publisher):
         """Note that there is something to say, or to hear; who was silent is a reader again, from now on."""
         self._touched_s = now_s
         name, incarnation = self.reader
-        if name not in self._readers:
-            self._readers.admit(name, incarnation, now_s)
+        if name in self._readers:
+            return
+        if not self._readers.resume(name, now_s):
+            self._readers.admit(name, incarnation, now_s).sequence = self._first_waiting()
+        self._readers[name].behind_s = None
+        if self._window.is_suspended(name):
+            self._window.resume(name, now_s)
+        else:
             self._window.add_reader(name, self._next_number, now_s)
 
     def is_idle(self, now_s: float) -> bool:
@@ -136,6 +142,7 @@ class PrivateFeed(Feed):
         self._early_bytes = 0
         self._is_reliable = True
         self._expected = max(ended.number, 1)
+        self._sequence = max(ended.sequence, 1)
         self._data.begin(self._expected, ())
         self._report_at_s = now_s + REPORT_IDLE_S
 

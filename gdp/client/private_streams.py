@@ -14,6 +14,7 @@ from gdp.client.private import IDLE_S, Life, PrivateStream, private_name
 from gdp.client.publisher import Publisher
 from gdp.client.source import Secrets, Source
 from gdp.errors import DropReason, LocalError
+from gdp.message.loss import LossReason
 from gdp.names import Name
 
 __all__ = ["STREAMS_MAX", "PrivateStreams"]
@@ -49,6 +50,7 @@ class PrivateStreams:
         self._streams: dict[Name, PrivateStream] = {}  # by reader
         self._look_at_s = 0.0  # no stream is idle for long enough before
         self._drops: Counter[DropReason] = Counter()  # of streams that are gone
+        self._losses: Counter[LossReason] = Counter()
 
     def __iter__(self) -> Iterator[PrivateStream]:
         return iter(self._streams.values())
@@ -60,6 +62,11 @@ class PrivateStreams:
     def drops(self) -> Counter[DropReason]:
         """Return what was dropped, by reason."""
         return sum((stream.drops for stream in self), self._drops)
+
+    @property
+    def losses(self) -> Counter[LossReason]:
+        """Return how many messages a reader did not get, as far as it is known here, by reason."""
+        return sum((stream.losses.counts for stream in self), self._losses)
 
     def is_about(self, stream: bytes, reader: Life) -> bool:
         """Return whether this is the name of the stream to a reader, whether there is one or not."""
@@ -96,6 +103,7 @@ class PrivateStreams:
             self._pasts.put(stream.topic, stream.past)
             stream.close()
             self._drops += stream.drops
+            self._losses += stream.losses.counts
 
     def forget_idle(self, now_s: float) -> None:
         """Let go of streams that nobody has read or written for long."""

@@ -20,6 +20,7 @@ from gdp.control.join import Join
 from gdp.crypto.note import topic_of
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.frame.codec import Header
+from gdp.message.loss import LossReason
 from gdp.names import Name
 
 __all__ = ["Publications"]
@@ -42,6 +43,7 @@ class Publications:
         self._agenda = Agenda[Publisher]()
         self.turns = Turns(self._agenda.touch)
         self._drops: Counter[DropReason] = Counter()  # of what is gone
+        self._losses: Counter[LossReason] = Counter()
 
     def __iter__(self) -> Iterator[Publisher]:
         return iter(self._publishers.values())
@@ -54,6 +56,11 @@ class Publications:
         """Return what was dropped, by reason."""
         publishers = sum((publisher.drops for publisher in self), self._drops)
         return sum((streams.drops for streams in self._private.values()), publishers)
+
+    def unconfirmed(self) -> Counter[LossReason]:
+        """Return how many messages some reader did not get, as far as it is known here, by reason."""
+        counts = sum((publisher.losses.counts for publisher in list(self)), self._losses)
+        return sum((streams.losses for streams in list(self._private.values())), counts)
 
     def get(self, name: Name) -> Publisher | None:
         """Return the publisher of a name, or None."""
@@ -91,9 +98,11 @@ class Publications:
         self._pasts.put(name, publisher.past)
         publisher.close()
         self._drops += publisher.drops
+        self._losses += publisher.losses.counts
         if streams is not None:
             streams.close()
             self._drops += streams.drops
+            self._losses += streams.losses
         return True
 
     def renew(self, name: Name, secrets: Secrets) -> None:

@@ -1,6 +1,9 @@
 """Who reads a topic, as its publisher knows them by their notes: in which life, and since when they are silent.
 
 Place: pure; time comes in as ``now_s`` (monotonic seconds).
+
+A reader that is silent for ``READER_LEASE_S`` is suspended: it may have moved. It is no reader until it reports again,
+and is forgotten ``READER_GRACE_S`` later.
 """
 
 from __future__ import annotations
@@ -15,8 +18,9 @@ from gdp.crypto.note import NoteOpener
 from gdp.errors import DropReason, EnvelopeError, FrameError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Kind
-from gdp.limits import CALL_LAG_S, CALL_QUIET_S, READER_LEASE_S
+from gdp.limits import CALL_IDLE_S, CALL_LAG_S, CALL_QUIET_S, READER_GRACE_S, READER_LEASE_S, REPORT_IDLE_S
 from gdp.message.report import Report, ReportFlag
+from gdp.message.status import Start
 from gdp.names import Name
 
 __all__ = ["CALLS", "TOPICS", "Patience", "Readers", "Reading"]
@@ -31,24 +35,35 @@ class Patience(NamedTuple):
     """How long a publisher bears with a reader.
 
     ``lag_s``: one that has not confirmed in this time what another has holds the window no longer; ``quiet_s``: one
-    from whom nothing is heard for this long does not follow.
+    from whom nothing is heard for this long does not follow; ``idle_s``: a live one reports at least so often.
     """
 
     lag_s: float
     quiet_s: float
+    idle_s: float
 
 
-TOPICS: Final = Patience(READER_LEASE_S, READER_LEASE_S)
-CALLS: Final = Patience(CALL_LAG_S, CALL_QUIET_S)  # other replicas must not wait for a dead one
+TOPICS: Final = Patience(READER_LEASE_S, READER_LEASE_S, REPORT_IDLE_S)
+CALLS: Final = Patience(CALL_LAG_S, CALL_QUIET_S, CALL_IDLE_S)  # other replicas must not wait for a dead one
 
 
 @dataclass(slots=True)
 class Reading:
-    """One reader, in one life of its process."""
+    """One reader, in one life of its process.
+
+    Attributes:
+        sequence: it has confirmed every message before this one, but for ``lost`` of them that it counted as lost.
+        behind_s: since when its window has been suspended; None: it is not.
+        confirmed: what ``sequence`` was at the end of a former life; 0: not known.
+    """
 
     incarnation: int
     heard_s: float
-    start: int | None = None  # its first message; None once it has begun to confirm
+    sequence: int = 0
+    lost: int = 0
+    behind_s: float | None = None
+    confirmed: int = 0
+    start: Start | None = None  # None once it has begun to confirm
     out_until_s: float = 0.0  # it may not hold the window before
     penances: int = 0
 
@@ -61,6 +76,7 @@ class Readers:
         self._source = source
         self._patience = patience
         self._readers: dict[bytes, Reading] = {}
+        self._suspended: dict[bytes, Reading] = {}
         self._lives: OrderedDict[tuple[bytes, int, int], NoteOpener] = OrderedDict()
 
     def __len__(self) -> int:
@@ -79,14 +95,51 @@ class Readers:
         """Return all of them."""
         return iter(self._readers.values())
 
+    def names(self) -> list[bytes]:
+        """Return the names of all, suspended ones included."""
+        return [*self._readers, *self._suspended]
+
+    def all(self) -> list[Reading]:
+        """Return all, suspended ones included."""
+        return [*self._readers.values(), *self._suspended.values()]
+
     def silent(self, now_s: float) -> list[bytes]:
         """Return those that have not been heard for ``READER_LEASE_S``."""
         return [name for name, reading in self._readers.items() if now_s - reading.heard_s > READER_LEASE_S]
 
     def next_silent(self) -> float | None:
-        """Return the monotonic second at which ``silent`` has somebody to return, or None."""
-        heard_s = min((reading.heard_s for reading in self._readers.values()), default=None)
-        return None if heard_s is None else heard_s + READER_LEASE_S + 0.001
+        """Return the monotonic second at which ``silent`` or ``overdue`` has somebody to return, or None."""
+        due_s = [reading.heard_s + READER_LEASE_S + 0.001 for reading in self._readers.values()]
+        due_s += [each.behind_s + READER_GRACE_S + 0.001 for each in self.all() if each.behind_s is not None]
+        return min(due_s, default=None)
+
+    def suspend(self, name: bytes, now_s: float) -> None:
+        """Take a silent reader for none, until it reports again or is forgotten."""
+        reading = self._suspended[name] = self._readers.pop(name)
+        reading.behind_s = now_s if reading.behind_s is None else reading.behind_s
+
+    def is_suspended(self, name: bytes) -> bool:
+        """Return whether somebody is a suspended reader."""
+        return name in self._suspended
+
+    def resume(self, name: bytes, now_s: float) -> bool:
+        """Take a suspended reader for one again; return whether it was suspended."""
+        reading = self._suspended.pop(name, None)
+        if reading is None:
+            return False
+        reading.heard_s = now_s
+        self._readers[name] = reading
+        return True
+
+    def overdue(self, now_s: float) -> list[tuple[bytes, Reading]]:
+        """Return those whose window has been suspended for ``READER_GRACE_S``, and the first of too many."""
+        everyone = [*self._readers.items(), *self._suspended.items()]
+        late = [each for each in everyone if each[1].behind_s is not None and now_s - each[1].behind_s > READER_GRACE_S]
+        return late or list(self._suspended.items())[: max(len(self._suspended) - READERS_MAX, 0)]
+
+    def is_quiet(self, name: bytes, now_s: float) -> bool:
+        """Return whether a reader has missed two of its reports: it is not slow, it is not there."""
+        return now_s - self._readers[name].heard_s > 2 * self._patience.idle_s
 
     def is_heard(self, name: bytes, now_s: float, awake_s: float) -> bool:
         """Return whether somebody is a reader, and was not silent for too long since ``awake_s``."""
@@ -102,12 +155,13 @@ class Readers:
 
     def admit(self, name: bytes, incarnation: int, now_s: float) -> Reading:
         """Take somebody for a reader, in place of a former life of his."""
-        reading = self._readers[name] = Reading(incarnation, now_s)
+        former = self._readers.get(name) or self._suspended.pop(name, None)
+        reading = self._readers[name] = Reading(incarnation, now_s, confirmed=former.sequence if former else 0)
         return reading
 
     def forget(self, name: bytes) -> bool:
-        """Let a reader go; return whether it was one."""
-        return self._readers.pop(name, None) is not None
+        """Let a reader go, suspended or not; return whether it was one."""
+        return (self._readers.pop(name, None) or self._suspended.pop(name, None)) is not None
 
     def open(self, header: Header, frame: bytes, secrets: Secrets, now_s: float) -> tuple[Report, bool]:
         """Return what a reader's sealed report says, and whether that reader, or this life of his, is new.
@@ -125,8 +179,8 @@ class Readers:
             source, topic = self._source, self._topic
             opener = NoteOpener(secret, Kind.REPORT, name, header.incarnation, source.name, topic, source.incarnation)
         report = Report.from_wire(opener.open(header, frame))
-        reading = self._readers.get(name)
-        if reading is None and len(self._readers) >= READERS_MAX:
+        reading = self._readers.get(name) or self._suspended.get(name)
+        if name not in self._readers and len(self._readers) >= READERS_MAX:
             raise EnvelopeError(DropReason.QUOTA, "readers")
         is_current = is_known if reading is None else reading.incarnation == header.incarnation
         if not is_current and ReportFlag.NEW not in report.flags:
@@ -137,6 +191,7 @@ class Readers:
             self._lives.popitem(last=False)
         if reading is not None and reading.incarnation == header.incarnation:
             reading.heard_s = now_s
+            self.resume(name, now_s)
             return report, False
         self.admit(name, header.incarnation, now_s)
         return report, True

@@ -42,10 +42,22 @@ class Delivered(NamedTuple):
     parts: int
     hops: int
     place: int = 0  # among the messages of one number: several come in one bundle
+    sequence: int = 0  # which message of its publisher's life this is, from 1; one that is skipped is lost
 
 
 class Ended(NamedTuple):
-    """Where a feed ended, for another one of the same: what came before is not opened again."""
+    """Where a feed ended, for another one of the same: what came before is not opened again.
 
-    number: int = 0  # of the next message
-    status: int = 0  # the highest seen
+    Args:
+        number: of the next message.
+        status: the highest seen.
+        sequence: of the next message.
+        known: the first sequence number of which nothing is known: what lies between was published, and did not come.
+        resumes: the feed ended without its reader's will: what it misses meanwhile is lost, and asked for again.
+    """
+
+    number: int = 0
+    status: int = 0
+    sequence: int = 0
+    known: int = 0
+    resumes: bool = False

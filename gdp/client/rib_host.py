@@ -32,6 +32,7 @@ class RibHost:
         self._identity = identity
         self._joiner = ControlJoiner()
         self._drops: Counter[DropReason] = Counter()
+        self._is_connected = False
         self.attachment = Attachment(identity, policy, settings)
         self.rib = rib
 
@@ -50,11 +51,14 @@ class RibHost:
 
     def receive(self, arrivals: Sequence[Arrival], now: Instant) -> None:
         """Take frames in."""
+        statements: list[tuple[bytes, Name]] = []
         for arrival in arrivals:
             try:
-                self._take(arrival, now)
+                statements += self._take(arrival, now)
             except RemoteError as error:
                 self._drops[error.reason] += 1
+        self.rib.receive_all(statements, now)
+        self._note_connection(now)
         self._post()
 
     def port_changed(self, port: int, up: bool, now: Instant) -> None:
@@ -64,6 +68,7 @@ class RibHost:
     def timeout(self, now: Instant) -> None:
         """Do what is due."""
         self.attachment.timeout(now)
+        self._note_connection(now)
         self._joiner.expire(now.mono_s)
         self.rib.timeout(now)
         self._post()
@@ -77,20 +82,26 @@ class RibHost:
         """Return, once, what is to be sent."""
         return self.attachment.take()
 
-    def _take(self, arrival: Arrival, now: Instant) -> None:
+    def _take(self, arrival: Arrival, now: Instant) -> list[tuple[bytes, Name]]:
+        """Return the statement for the RIB that a frame completes, with its sender."""
         header = decode(arrival.frame)
         if header.kind >= CONTROL_FROM:
             statement = self.attachment.receive_control(arrival, header, now)
             if statement is not None and statement.type is StatementType.REVOKE:
                 self.rib.revoke(statement.wire, now)
-            return
+            return []
         if header.destination != self.name:
             raise FrameError(DropReason.NOT_FOR_US)
         if header.kind not in (Kind.RIB_REQUEST, Kind.RIB_ANSWER):
             raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
         wire = self._joiner.add(header, arrival.frame, now.mono_s, arrival.via)
-        if wire is not None:
-            self.rib.receive(wire, Name(header.source), now)
+        return [] if wire is None else [(wire, Name(header.source))]
+
+    def _note_connection(self, now: Instant) -> None:
+        is_connected = self.attachment.switch is not None
+        if is_connected and not self._is_connected:
+            self.rib.connected(now)
+        self._is_connected = is_connected
 
     def _post(self) -> None:
         letters = self.rib.take()

@@ -9,11 +9,9 @@ growing distances.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Final
 
-from gdp.message.move import Move
-from gdp.message.status import STARTS_MAX, Status
+from gdp.message.status import STARTS_MAX, Start, Status
 
 __all__ = ["Statuses"]
 
@@ -31,13 +29,13 @@ class Statuses:
 
     Attributes:
         wanted: there is something to tell.
-        starts: new readers, and the first message that is theirs.
+        starts: new readers, and where they begin.
     """
 
     def __init__(self, description: bytes, number: int) -> None:
         self.number = number
         self.wanted = False
-        self.starts: dict[bytes, int] = {}
+        self.starts: dict[bytes, Start] = {}
         self._description = description
         self._said = len(_PAUSES_S) + 1  # times; it is no news
         self._again_s = _NEVER  # when the news is to be said again
@@ -69,14 +67,18 @@ class Statuses:
         """Return whether one is wanted and may go."""
         return self.wanted and now_s >= self._at_s
 
-    def take(self, oldest: int, sent: tuple[int, int], moves: Iterable[Move], now_s: float) -> bytes:
-        """Return the wire form of the next one, whose number is then ``number``."""
+    def take(self, place: Status, now_s: float) -> bytes:
+        """Return the wire form of the next one, whose number is then ``number``.
+
+        Args:
+            place: what is kept, sent, moved and gone; starts and description are added.
+        """
         is_news = self._said <= len(_PAUSES_S)
         about = self._description if self.starts or is_news else b""
         if is_news:
             self._again_s = now_s + _PAUSES_S[self._said] if self._said < len(_PAUSES_S) else _NEVER
             self._said += 1
-        wire = Status(oldest, *sent, dict(self.starts), about, tuple(moves)).to_wire()
+        wire = place._replace(starts=dict(self.starts), description=about).to_wire()
         self.starts.clear()
         self.wanted = False
         self.number += 1

@@ -23,6 +23,7 @@ from gdp.errors import DropReason, StatementError
 from gdp.frame.codec import Header
 from gdp.limits import CALL_IDLE_S
 from gdp.message.join import VerifiesDigest
+from gdp.message.loss import Losses, LossReason, LostRange
 from gdp.message.memory import Budget
 from gdp.names import Name
 from gdp.trust.claim import Claim
@@ -34,6 +35,7 @@ from gdp.trust.verifier import ClaimVerifier
 __all__ = ["Change", "Message", "Subscription", "Subscriptions", "Topic"]
 
 ENDED_MAX: Final = 4_096  # closed feeds whose end is remembered
+ABSENT_MAX: Final = 1_024  # publishers of one topic that went, and may come back
 _NOWHERE: Final = Ended()
 
 
@@ -64,12 +66,34 @@ class Topic:
 
 @dataclass(slots=True)
 class Subscription:
-    """One name that is heard, by which right, and the feeds of it."""
+    """One name that is heard, by which right, and the feeds of it.
+
+    Attributes:
+        private: by writer.
+        absent: publishers whose route has ended, in which life, and where their feeds were.
+        past_losses: of feeds that are gone.
+    """
 
     topic: Topic
     right: Right
     feeds: dict[Name, Feed] = field(default_factory=dict)
-    private: dict[Name, PrivateFeed] = field(default_factory=dict)  # by writer
+    private: dict[Name, PrivateFeed] = field(default_factory=dict)
+    absent: dict[Name, tuple[int, Ended]] = field(default_factory=dict)
+    past_losses: Losses = field(default_factory=Losses)
+
+    def losses(self) -> Losses:
+        """Return what was lost of everything that is heard on this name."""
+        losses = Losses()
+        losses.update(self.past_losses)
+        for feed in self.all():
+            losses.update(feed.losses)
+        return losses
+
+    def forget_absent(self, party: Name, why: LossReason) -> None:
+        """Expect nothing any more of a life of a publisher that went; what is known to lack of it is lost."""
+        _, ended = self.absent.pop(party)
+        if ended.sequence < ended.known:
+            self.past_losses.add(LostRange(ended.sequence, ended.known - 1, why))
 
     def all(self) -> list[Feed]:
         """Return every feed."""
@@ -96,10 +120,11 @@ class _Way(NamedTuple):
 
 
 class Change(NamedTuple):
-    """Feeds that began, and that are to be closed: no frame finds them any more."""
+    """Feeds that began, and that are to be closed: no frame finds them any more; and the last messages of these."""
 
     opened: list[Feed]
     ended: list[Feed]
+    rest: list[Message]
 
 
 class Subscriptions:
@@ -117,6 +142,7 @@ class Subscriptions:
         self._ways: dict[tuple[bytes, int], _Way] = {}  # by writer and incarnation, as headers have them
         self._ended: Lru[Ended] = Lru(ENDED_MAX)
         self.drops: Counter[DropReason] = Counter()  # of feeds that are gone, and of claims
+        self._past_losses: Counter[LossReason] = Counter()  # on names that are heard no more
 
     def __iter__(self) -> Iterator[Subscription]:
         return iter(self._by_name.values())
@@ -125,6 +151,10 @@ class Subscriptions:
     def held_bytes(self) -> int:
         """Return how much memory unfinished messages hold."""
         return self._budget.held_bytes
+
+    def lost(self) -> Counter[LossReason]:
+        """Return how many messages were lost, by reason."""
+        return sum((each.losses().counts for each in list(self._by_name.values())), self._past_losses)
 
     def get(self, name: Name) -> Subscription | None:
         """Return what is heard on a name, or None."""
@@ -137,7 +167,11 @@ class Subscriptions:
     def remove(self, name: Name) -> list[Feed]:
         """Hear nobody on a name any more; return the feeds that are to be closed."""
         subscription = self._by_name.pop(name, None)
-        return [] if subscription is None else self._end_all(subscription)
+        if subscription is None:
+            return []
+        ended = self._end_all(subscription)
+        self._past_losses += subscription.losses().counts
+        return ended
 
     def find(self, header: Header, now_s: float) -> tuple[Subscription, Feed] | None:
         """Return whose frame this is, if it is anybody's."""
@@ -156,12 +190,12 @@ class Subscriptions:
         Raises:
             StatementError: the claim does not hold, or is about something else.
         """
-        subscription, change = self._by_name.get(answer.name), Change([], [])
+        subscription, change = self._by_name.get(answer.name), Change([], [], [])
         if subscription is None or answer.advertiser == self._reader.name:
             return change
         feed = subscription.feeds.get(answer.advertiser)
         if not answer.claim:
-            return change if feed is None else Change([], self._end(subscription, answer.advertiser))
+            return change if feed is None else Change([], self._detach(subscription, answer.advertiser), [])
         claim = self._verifier.verify(answer.claim, now.unix_s)
         is_heard = HEARS[subscription.right] is claim.right
         if not is_heard or claim.name != answer.name or claim.node != answer.advertiser:
@@ -172,8 +206,10 @@ class Subscriptions:
             if feed.incarnation == claim.incarnation:
                 feed.claim_sequence, feed.claim = claim.sequence, claim.wire
                 return change
-            change = Change([], self._end(subscription, claim.node))
-        return Change(self._open(subscription, claim, now.mono_s), change.ended)
+            feed.finish()
+            rest = [Message(answer.name, each, feed.description) for each in feed.take_delivered()]
+            change = Change([], self._detach(subscription, claim.node), rest)
+        return change._replace(opened=self._open(subscription, claim, now.mono_s))
 
     def recheck(self, unix_s: float) -> list[Feed]:
         """Return the feeds that are to be closed, for their party's claim holds no more."""
@@ -184,7 +220,7 @@ class Subscriptions:
                     self._verifier.verify(feed.claim, unix_s)
                 except StatementError as error:
                     self.drops[error.reason] += 1
-                    ended += self._end(subscription, feed.publisher)
+                    ended += self._detach(subscription, feed.publisher)
         return ended
 
     def leave(self) -> list[Feed]:
@@ -194,9 +230,16 @@ class Subscriptions:
     def _open(self, subscription: Subscription, claim: Claim, now_s: float) -> list[Feed]:
         topic, reader, party = subscription.topic, self._reader, claim.node
         ended = self._ended.get(topic.name + _key(party, claim.incarnation)) or _NOWHERE
+        life, before = subscription.absent.get(party, (claim.incarnation, ended))
+        if life == claim.incarnation:
+            ended = before
+            subscription.absent.pop(party, None)
+        else:
+            subscription.forget_absent(party, LossReason.PUBLISHER_RESTARTED)
         feed = Feed(
-            topic.name, reader, party, claim.incarnation, claim.member.key, topic.secrets, self._budget, now_s, ended
-        )
+            topic.name, reader, party, claim.incarnation, claim.member.key, topic.secrets, self._budget, now_s, ended,
+            restarted=life != claim.incarnation,
+        )  # fmt: skip
         feed.claim_sequence, feed.claim = claim.sequence, claim.wire
         subscription.feeds[party] = feed
         if subscription.right is Right.SERVE:
@@ -223,15 +266,28 @@ class Subscriptions:
         return private_name(topic, Life(feed.publisher, feed.incarnation), reader)
 
     def _end_all(self, subscription: Subscription) -> list[Feed]:
+        for party in list(subscription.absent):
+            subscription.forget_absent(party, LossReason.DETACHED)
         return [feed for party in list(subscription.feeds) for feed in self._end(subscription, party)]
+
+    def _detach(self, subscription: Subscription, party: Name) -> list[Feed]:
+        """End the feeds of a party that may come back, in this life or another."""
+        feed = subscription.feeds[party]
+        if feed.ended.sequence:
+            subscription.absent[party] = feed.incarnation, feed.ended._replace(resumes=True)
+        if len(subscription.absent) > ABSENT_MAX:
+            subscription.forget_absent(next(iter(subscription.absent)), LossReason.DETACHED)
+        return self._end(subscription, party)
 
     def _end(self, subscription: Subscription, party: Name) -> list[Feed]:
         feed = subscription.feeds.pop(party)
+        subscription.past_losses.update(feed.losses)
         self._remember(subscription.topic.name + _key(party, feed.incarnation), feed)
         self._ways.pop((party, private_incarnation(self._stream_from(subscription.topic.name, feed))), None)
         private = subscription.private.pop(party, None)
         if private is None:
             return [feed]
+        subscription.past_losses.update(private.losses)
         self._remember(private.topic, private)
         return [feed, private]
 

@@ -7,6 +7,9 @@ nonce of our port's present session, and is newer than all that came of its own,
 of sessions that ended, too, the last sequence number is remembered.
 
 Hellos also say what each end takes: a link is as wide as its narrowest end. Where an end changes, both know at once.
+
+Between neighbours that are up, keepalives (``keepalive.py``) take over from most hellos: a silent cut is noticed after
+the negotiated detection time. Time in which this node itself was not called counts for nobody's silence.
 """
 
 from __future__ import annotations
@@ -16,15 +19,19 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gdp.control.frames import ControlSplitter
-from gdp.control.hello import DIGEST_BYTES, NONCE_BYTES, Hello
+from gdp.control.hello import DIGEST_BYTES, NO_KEEPALIVES, NONCE_BYTES, Hello, Timing
 from gdp.control.join import Join
+from gdp.control.keepalive import KeepaliveSession, Slowness
 from gdp.control.neighbour import TRANSITIONS, Neighbour, NeighbourEvent, NeighbourState
+from gdp.control.strangers import Strangers
+from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType
 from gdp.effects import BROADCAST, Arrival, Instant, Transmit
-from gdp.errors import DropReason, StatementError
+from gdp.errors import DropReason, FrameError, StatementError
+from gdp.frame.codec import Header
 from gdp.frame.kinds import Kind
-from gdp.limits import DEAD_S, HELLO_S, MTU_MIN_BYTES
+from gdp.limits import DEAD_S, HELLO_IDLE, HELLO_S, MTU_MIN_BYTES
 from gdp.message.replay import ReplayWindow
 from gdp.names import Name
 from gdp.trust.domain import Policy
@@ -32,9 +39,15 @@ from gdp.trust.domain import Policy
 __all__ = ["Change", "Greeter", "LinkPort"]
 
 NEIGHBOURS_PER_PORT: Final = 32
+_UNHEARD: Final = (-1, -1)
 _ENDED_MAX: Final = 1_024  # sessions of the far ends, remembered for one session of a port
 _JOINS_WINDOW: Final = 1_024  # how far joins may overtake each other
 _ANSWER_S: Final = 0.02  # a stranger's hello is answered at once, but not more often than this
+_EAGER_HELLOS: Final = 4  # after a change, so that a lost one delays nobody
+_HELLOS_MISSED: Final = 5  # idle hello intervals after which keepalives alone keep nobody up
+_RECHECK_S: Final = 1.0  # a membership may be revoked or run out while keepalives come
+_LATE_S: Final = 0.02  # called later than this, a node had no time of its own
+_TOGETHER: Final = 0.125  # of an interval: keepalives due within it leave at once
 
 # A neighbour after the change, and its state before; the same state where only the link to it changed, MTU or cost.
 Change = tuple[Neighbour, NeighbourState]
@@ -49,14 +62,18 @@ class LinkPort:
     own_mtu: int  # what our end takes, in bytes after the Ethernet header
     cost: int
     nonce: bytes
+    exchange_key: ExchangeKey
     is_up: bool = True
     sequence: int = 0
+    keepalive_sequence: int = 0
+    eager: int = _EAGER_HELLOS  # hellos until they become rare
     hello_at_s: float = 0.0
     said_s: float = float("-inf")
     neighbours: dict[Name, Neighbour] = field(default_factory=dict)
-    ended: dict[bytes, int] = field(default_factory=dict)  # nonce of a session to its last sequence number
+    ended: dict[bytes, tuple[int, int]] = field(default_factory=dict)  # nonce to last hello and keepalive
     joins: dict[Name, ReplayWindow] = field(default_factory=dict)  # which joins were taken in this session
     said_mtus: dict[Name, int] = field(default_factory=dict)  # what each neighbour's end takes
+    strangers: Strangers = field(default_factory=Strangers)  # whose hellos were refused
 
     @property
     def mtu(self) -> int:
@@ -72,13 +89,25 @@ class LinkPort:
     def last_of(self, name: Name, nonce: bytes) -> int:
         """Return the last sequence number that came of a neighbour's session, or -1."""
         known = self.neighbours.get(name)
-        return known.sequence if known is not None and known.nonce == nonce else self.ended.get(nonce, -1)
+        return known.sequence if known is not None and known.nonce == nonce else self.ended.get(nonce, _UNHEARD)[0]
+
+    @property
+    def is_idle(self) -> bool:
+        """Return whether all neighbours are up and hear us, and we them, by keepalives."""
+        sessions = [each.keepalives for each in self.neighbours.values()]
+        return bool(sessions) and all(each is not None and each.is_heard and each.hears_us for each in sessions)
+
+    def hurry(self, at_s: float) -> None:
+        """Say hello at ``at_s`` or before, and then often for a while: what it says has changed."""
+        self.hello_at_s, self.eager = min(self.hello_at_s, at_s), _EAGER_HELLOS
 
     def end(self, neighbour: Neighbour) -> None:
         """Remember how far a session came."""
         if neighbour.nonce:
-            self.ended.pop(neighbour.nonce, None)
-            self.ended[neighbour.nonce] = neighbour.sequence
+            _, received = self.ended.pop(neighbour.nonce, _UNHEARD)
+            if neighbour.keepalives is not None:
+                received = neighbour.keepalives.received
+            self.ended[neighbour.nonce] = neighbour.sequence, received
             if len(self.ended) > _ENDED_MAX:
                 del self.ended[next(iter(self.ended))]
 
@@ -104,7 +133,8 @@ class Greeter:
     """Greets on every port.
 
     Args:
-        random_bytes: source of nonces.
+        random_bytes: source of nonces and of session keys.
+        timing: what this node wants of keepalives, where ``set_timing`` says nothing else of a port.
         digest_for: what to say of our link state to the far end of a port.
     """
 
@@ -117,6 +147,8 @@ class Greeter:
         *,
         hello_s: float = HELLO_S,
         dead_s: float = DEAD_S,
+        timing: Timing = NO_KEEPALIVES,
+        incarnation: int = 0,
         digest_for: Callable[[LinkPort], bytes] = lambda _: bytes(DIGEST_BYTES),
     ) -> None:
         self._identity = identity
@@ -125,8 +157,18 @@ class Greeter:
         self._random_bytes = random_bytes
         self._hello_s = hello_s
         self._dead_s = dead_s
+        self._timing = timing
+        self._timings: dict[int, Timing] = {}
+        self._incarnation = incarnation
+        self._due_s = float("inf")  # when the next call was asked for
+        self._lateness_s = 0.0  # how long, in all, this node was called later than it had asked to be
+        self._slowness = Slowness()
         self._digest_for = digest_for
         self.ports: dict[int, LinkPort] = {}
+
+    def set_timing(self, index: int, timing: Timing) -> None:
+        """Want other keepalives on one port, from its next session on."""
+        self._timings[index] = timing
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now_s: float) -> list[Change]:
         """Begin to greet on a port, or learn that the MTU or cost of one that is up has changed.
@@ -136,13 +178,13 @@ class Greeter:
         port, own_mtu = self.ports.get(index), max(mtu, MTU_MIN_BYTES)
         if port is None or not port.is_up or port.mac != mac:
             lost = [] if port is None else self._lose(port, list(port.neighbours.values()), NeighbourEvent.LINK_LOST)
-            nonce = self._random_bytes(NONCE_BYTES)
-            self.ports[index] = LinkPort(index, mac, own_mtu, cost, nonce, hello_at_s=now_s)
+            nonce, key = self._session()
+            self.ports[index] = LinkPort(index, mac, own_mtu, cost, nonce, key, hello_at_s=now_s)
             return lost
         if (port.own_mtu, port.cost) == (own_mtu, cost):
             return []
         port.own_mtu, port.cost = own_mtu, cost
-        port.hello_at_s = now_s  # the other ends must know
+        port.hurry(now_s)  # the other ends must know
         for neighbour in port.neighbours.values():
             neighbour.mtu = min(port.said_mtus[neighbour.name], own_mtu)
         return [(each, each.state) for each in port.neighbours.values() if each.state is NeighbourState.UP]
@@ -169,7 +211,11 @@ class Greeter:
             return None
         if statement.signer == self._identity.name:
             raise StatementError(DropReason.NOT_FOR_US, "our own hello came back")
-        member = self._policy.verify_membership(hello.membership, now.unix_s)
+        try:
+            member = self._policy.verify_membership(hello.membership, now.unix_s)
+        except StatementError as error:
+            port.strangers.note(hello.membership, error.reason, now.mono_s)
+            raise
         if member.name != statement.signer:
             raise StatementError(DropReason.BAD_CERTIFICATE, "a hello under another's certificate")
         known = port.neighbours.get(member.name)
@@ -185,23 +231,46 @@ class Greeter:
         is_two_way = port.nonce in hello.heard
         is_new_session = known.nonce != hello.nonce
         if not is_two_way or is_new_session:
-            port.hello_at_s = min(port.hello_at_s, max(now.mono_s, port.said_s + _ANSWER_S))
+            port.hurry(max(now.mono_s, port.said_s + _ANSWER_S))
         if is_new_session and not is_two_way and known.state is NeighbourState.UP:
             known.candidate = hello.nonce  # a restart, or an old hello played back: only an echo of our nonce will tell
             return None
-        if is_new_session:
+        if is_new_session or not is_two_way:
             port.end(known)
+            known.keepalives = None
         said_mtu = port.said_mtus[known.name] = max(hello.mtu, MTU_MIN_BYTES)
         mtu = min(said_mtu, port.own_mtu)
         is_resized = known.mtu != mtu
         known.mac, known.mtu, known.nonce, known.candidate = arrival.mac, mtu, hello.nonce, b""
-        known.sequence, known.digest, known.heard_s = hello.sequence, hello.digest, now.mono_s
+        known.sequence, known.digest, known.greeted_s = hello.sequence, hello.digest, now.mono_s
+        known.member, known.checked_s = member, now.mono_s
+        self._alive(known, now.mono_s)
+        if is_two_way and known.keepalives is None:
+            self._begin_keepalives(port, known, hello, now.mono_s)
         change = self._step(known, NeighbourEvent.TWO_WAY if is_two_way else NeighbourEvent.ONE_WAY)
         if change is None and is_new_session and is_two_way:
             return known, NeighbourState.GONE  # it restarted, and has forgotten what we told it
         if change is None and is_resized and known.state is NeighbourState.UP:
             return known, known.state
         return change
+
+    def receive_keepalive(self, arrival: Arrival, header: Header, now: Instant) -> Neighbour:
+        """Take a keepalive; return the neighbour that it is of.
+
+        Raises:
+            FrameError: UNKNOWN_SENDER, REPLAYED, BAD_TAG or TRUNCATED; nothing has changed.
+            StatementError: the neighbour's membership holds no longer.
+        """
+        port = self.ports.get(arrival.port)
+        known = port.neighbours.get(Name(header.source)) if port is not None else None
+        if known is None or known.keepalives is None:
+            raise FrameError(DropReason.UNKNOWN_SENDER, "a keepalive")
+        if known.member is not None and now.mono_s >= known.checked_s + _RECHECK_S:
+            self._policy.check_member(known.member, now.unix_s)
+            known.checked_s = now.mono_s
+        known.digest = known.keepalives.open(header, arrival.frame, now.mono_s)
+        self._alive(known, now.mono_s - arrival.waited_s)
+        return known
 
     def port_changed(self, index: int, up: bool, now_s: float) -> list[Change]:
         """Learn that a link came or went; return the neighbours that this took away."""
@@ -210,40 +279,101 @@ class Greeter:
             return []
         port.is_up = up
         if up:
-            port.nonce = self._random_bytes(NONCE_BYTES)
+            port.nonce, port.exchange_key = self._session()
             port.ended.clear()
             port.joins.clear()
-            port.hello_at_s = now_s
+            port.hurry(now_s)
             return []
         return self._lose(port, list(port.neighbours.values()), NeighbourEvent.LINK_LOST)
 
     def expire(self, now_s: float) -> list[Change]:
-        """Let silent neighbours go; return them."""
+        """Let silent neighbours go; return them. What waits at the sockets must have been taken before."""
+        if now_s > self._due_s + _LATE_S:
+            self._lateness_s += now_s - self._due_s
+            self._slowness.late(now_s - self._due_s, now_s)
+        self._due_s = float("inf")
         changes: list[Change] = []
         for port in self.ports.values():
-            silent = [n for n in port.neighbours.values() if now_s >= n.heard_s + self._dead_s]
+            silent = [n for n in port.neighbours.values() if now_s >= self._gone_at_s(n)]
             if silent:
+                port.hurry(now_s)  # who still hears us hears at once that we do not hear it
                 changes += self._lose(port, silent, NeighbourEvent.SILENCE)
         return changes
 
     def take(self, now_s: float) -> list[Transmit]:
-        """Return the hellos that are due."""
-        due = [port for port in self.ports.values() if port.is_up and port.hello_at_s <= now_s]
-        return [Transmit(port.index, BROADCAST, self._hello(port, now_s)) for port in due]
+        """Return the hellos and keepalives that are due."""
+        out: list[Transmit] = []
+        for port in self.ports.values():
+            if not port.is_up:
+                continue
+            if port.hello_at_s <= now_s:
+                out.append(Transmit(port.index, BROADCAST, self._hello(port, now_s)))
+            for neighbour in port.neighbours.values():
+                session = neighbour.keepalives
+                if session is None:
+                    continue
+                is_suspect = session.suspect_at_s(neighbour.heard_s) <= now_s
+                if is_suspect or session.send_at_s <= now_s + session.out_interval_s * _TOGETHER:
+                    port.keepalive_sequence += 1
+                    timing = self._timings.get(port.index, self._timing)
+                    frame = session.seal(
+                        (self._identity.name, self._incarnation),
+                        port.keepalive_sequence,
+                        self._slowness.multiplier(timing, self._dead_s, now_s),
+                        self._digest_for(port),
+                        now_s,
+                        poll=is_suspect,
+                    )
+                    out.append(Transmit(port.index, neighbour.mac, [frame]))
+        return out
 
     def next_timeout(self) -> float | None:
-        """Return the monotonic second of the next hello or of the next neighbour's silence."""
+        """Return the monotonic second of the next hello or keepalive, or of the next neighbour's silence."""
         times = [port.hello_at_s for port in self.ports.values() if port.is_up]
-        times += [n.heard_s + self._dead_s for port in self.ports.values() for n in port.neighbours.values()]
-        return min(times, default=None)
+        for port in self.ports.values():
+            for neighbour in port.neighbours.values():
+                times.append(self._gone_at_s(neighbour))
+                session = neighbour.keepalives
+                if session is not None and port.is_up:
+                    times += [session.send_at_s, session.suspect_at_s(neighbour.heard_s)]
+        self._due_s = min(times, default=float("inf"))
+        return self._due_s if times else None
+
+    def _gone_at_s(self, neighbour: Neighbour) -> float:
+        """Return when a neighbour is gone if nothing comes of it; the node's own lateness is no silence of theirs."""
+        late_s = self._lateness_s - neighbour.lateness_s
+        session = neighbour.keepalives
+        if session is None or not session.is_heard:
+            return neighbour.heard_s + self._dead_s + late_s
+        hellos_end_s = neighbour.greeted_s + _HELLOS_MISSED * HELLO_IDLE * self._hello_s
+        return min(neighbour.heard_s + session.detect_s, hellos_end_s) + late_s
+
+    def _alive(self, neighbour: Neighbour, heard_s: float) -> None:
+        neighbour.heard_s, neighbour.lateness_s = heard_s, self._lateness_s
+
+    def _session(self) -> tuple[bytes, ExchangeKey]:
+        """Return nonce and key of a new session of a port."""
+        return self._random_bytes(NONCE_BYTES), ExchangeKey.from_random(self._random_bytes(EXCHANGE_KEY_BYTES))
+
+    def _begin_keepalives(self, port: LinkPort, neighbour: Neighbour, hello: Hello, now_s: float) -> None:
+        timing = self._timings.get(port.index, self._timing)
+        ends = port.nonce + self._identity.name, neighbour.nonce + neighbour.name
+        _, received = port.ended.get(neighbour.nonce, _UNHEARD)
+        neighbour.keepalives = KeepaliveSession.begin(
+            port.exchange_key, hello.exchange_key, ends, (timing, hello.timing), received, now_s
+        )
 
     def _hello(self, port: LinkPort, now_s: float) -> list[bytes]:
         port.sequence += 1
         port.said_s = now_s
-        port.hello_at_s = now_s + self._hello_s
+        port.eager = max(port.eager - 1, 0)
+        port.hello_at_s = now_s + self._hello_s * (HELLO_IDLE if port.is_idle and not port.eager else 1)
         heard = tuple(n for each in port.neighbours.values() for n in (each.nonce, each.candidate) if n)
-        identity = self._identity
-        hello = Hello(port.nonce, port.sequence, heard, port.own_mtu, self._digest_for(port), identity.membership)
+        identity, timing = self._identity, self._timings.get(port.index, self._timing)
+        hello = Hello(
+            port.nonce, port.sequence, heard, port.own_mtu, self._digest_for(port), identity.membership,
+            timing, port.exchange_key.public,
+        )  # fmt: skip
         return self._splitter.split(Kind.HELLO, hello.to_wire(identity.name, identity.key), port.hello_mtu)
 
     def _lose(self, port: LinkPort, lost: list[Neighbour], event: NeighbourEvent) -> list[Change]:

@@ -6,19 +6,44 @@ Place: pure.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
+from gdp.crypto.exchange import EXCHANGE_KEY_BYTES
 from gdp.crypto.fields import Fields
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import StatementType, sign
+from gdp.errors import DropReason, StatementError
 from gdp.limits import FRAME_MAX_BYTES
 from gdp.names import Name
 
-__all__ = ["DIGEST_BYTES", "NONCE_BYTES", "Hello"]
+__all__ = ["DIGEST_BYTES", "INTERVAL_MAX_MS", "MULTIPLIER_MAX", "NONCE_BYTES", "NO_KEEPALIVES", "Hello", "Timing"]
 
 NONCE_BYTES: Final = 8
 DIGEST_BYTES: Final = 8
 HEARD_MAX: Final = 32
+INTERVAL_MAX_MS: Final = 60_000
+MULTIPLIER_MAX: Final = 255
+
+
+class Timing(NamedTuple):
+    """What one end wants; the slower end decides. RFC 5880, section 6.8.1.
+
+    Attributes:
+        transmit_ms: desired minimum between keepalives that it sends; 0: it sends none.
+        receive_ms: required minimum between those that it takes; 0: it wants none.
+        multiplier: after how many of its intervals without a frame the other end may call it gone.
+    """
+
+    transmit_ms: int
+    receive_ms: int
+    multiplier: int
+
+    def interval_s(self, receiver: Timing) -> float:
+        """Return the seconds between keepalives from here to ``receiver``; 0: there are none."""
+        return max(self.transmit_ms, receiver.receive_ms) / 1_000 if self.transmit_ms and receiver.receive_ms else 0.0
+
+
+NO_KEEPALIVES: Final = Timing(0, 0, 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +57,8 @@ class Hello:
         mtu: bytes after the Ethernet header that the sender's port takes.
         digest: of the link state that both ends should share; where it differs, they send each other all of it.
         membership: the sender's certificate, DER.
+        timing: what the sender wants of keepalives.
+        exchange_key: X25519, for the key of keepalives; empty where the sender wants none.
     """
 
     nonce: bytes
@@ -40,6 +67,8 @@ class Hello:
     mtu: int
     digest: bytes
     membership: bytes
+    timing: Timing = NO_KEEPALIVES
+    exchange_key: bytes = b""
 
     def to_wire(self, signer: Name, key: SigningKey) -> bytes:
         """Return the signed statement."""
@@ -50,6 +79,8 @@ class Hello:
             "m": self.mtu,
             "d": self.digest,
             "c": self.membership,
+            "k": list(self.timing),
+            "x": self.exchange_key,
         }
         return sign(StatementType.HELLO, body, signer, key)
 
@@ -67,4 +98,17 @@ class Hello:
             fields.uint("m", FRAME_MAX_BYTES),
             fields.bytes_("d", DIGEST_BYTES),
             fields.bytes_("c"),
+            _timing(fields),
+            fields.bytes_("x", EXCHANGE_KEY_BYTES) if fields.get("x") != b"" else b"",
         )
+
+
+def _timing(fields: Fields) -> Timing:
+    match fields.list_("k", 3):
+        case [int(transmit_ms), int(receive_ms), int(multiplier)] if (
+            0 <= transmit_ms <= INTERVAL_MAX_MS
+            and 0 <= receive_ms <= INTERVAL_MAX_MS
+            and 1 <= multiplier <= MULTIPLIER_MAX
+        ):
+            return Timing(transmit_ms, receive_ms, multiplier)
+    raise StatementError(DropReason.MALFORMED, "timing of keepalives")

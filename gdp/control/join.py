@@ -31,6 +31,7 @@ class Join:
         evidence: the signed claim of a reader further down; whoever passes a join on checks it.
         session: nonce of the receiver's port, as its hellos say it.
         sequence: rises with every join and leave of the sender, over its restarts too.
+        version: sequence number of the publisher's claim that ``switch`` was read from; the newest decides.
     """
 
     topic: Name
@@ -43,6 +44,7 @@ class Join:
     evidence: bytes
     session: bytes
     sequence: int
+    version: int = 0
 
     def to_wire(self, signer: Name, key: SigningKey) -> bytes:
         """Return the signed statement."""
@@ -57,6 +59,7 @@ class Join:
             "e": self.evidence,
             "i": self.session,
             "s": self.sequence,
+            "v": self.version,
         }
         return sign(StatementType.JOIN, body, signer, key)
 
@@ -78,4 +81,5 @@ class Join:
             fields.bytes_("e"),
             fields.bytes_("i", NONCE_BYTES),
             fields.uint("s"),
+            fields.uint("v"),
         )

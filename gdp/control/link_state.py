@@ -2,8 +2,9 @@
 
 Place: pure.
 Source: after OSPF (RFC 2328): newest sequence wins, a link counts when both ends name it. Two scopes: ``DOMAIN`` stays
-within the trust domain and names every link; ``BORDER`` goes to all domains that accept its signer's and names only the
-links that leave the domain and how far the domain's other borders are.
+within the trust domain and names every link; ``BORDER`` goes to all domains that accept its signer's. It names the
+links that leave the domain, how far the other borders are, and which switches and RIBs are reachable behind it. When a
+failure parts a domain, each part is reached through the borders that list it.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final, NamedTuple
 
+from gdp.control.hello import NONCE_BYTES
 from gdp.crypto.fields import Fields
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import StatementType, sign
@@ -19,10 +21,11 @@ from gdp.errors import DropReason, StatementError
 from gdp.limits import FRAME_MAX_BYTES
 from gdp.names import Name
 
-__all__ = ["Adjacency", "LinkState", "Scope"]
+__all__ = ["Adjacency", "AttachedRib", "LinkState", "Scope"]
 
 LINKS_MAX: Final = 128
 RIBS_MAX: Final = 16
+MEMBERS_MAX: Final = 128  # 4.4 kB; of a larger domain the rest is reached through the nearest border
 COST_MAX: Final = 1 << 24
 
 
@@ -42,6 +45,19 @@ class Adjacency(NamedTuple):
     mtu: int
 
 
+class AttachedRib(NamedTuple):
+    """A RIB that is attached to a switch.
+
+    Args:
+        domain: the RIB's own, which may differ from the switch's.
+        session: nonce of its present session with its switch; a restarted or moved RIB has another one.
+    """
+
+    name: Name
+    domain: Name
+    session: bytes
+
+
 @dataclass(frozen=True, slots=True)
 class LinkState:
     """All that one switch says in one scope."""
@@ -52,7 +68,8 @@ class LinkState:
     sequence: int
     links: tuple[Adjacency, ...]
     inside: tuple[Adjacency, ...]  # BORDER only
-    ribs: tuple[Name, ...]  # RIBs attached here (DOMAIN), or reachable in this domain (BORDER)
+    ribs: tuple[AttachedRib, ...]  # attached here (DOMAIN), or reachable within this domain (BORDER)
+    members: tuple[Name, ...] = ()  # BORDER only: switches of the domain that are reachable within it from here
 
     def to_wire(self, key: SigningKey, membership: bytes) -> bytes:
         """Return the signed statement."""
@@ -61,7 +78,8 @@ class LinkState:
             "s": self.sequence,
             "l": [list(each) for each in self.links[:LINKS_MAX]],
             "i": [list(each) for each in self.inside[:LINKS_MAX]],
-            "r": list(self.ribs[:RIBS_MAX]),
+            "r": [list(each) for each in self.ribs[:RIBS_MAX]],
+            "m": list(self.members[:MEMBERS_MAX]),
             "c": membership,
         }
         return sign(StatementType.LINK_STATE, body, self.origin, key)
@@ -83,8 +101,22 @@ class LinkState:
             fields.uint("s"),
             _adjacencies(fields, "l"),
             _adjacencies(fields, "i"),
-            tuple(fields.names("r", RIBS_MAX)),
+            _ribs(fields),
+            tuple(fields.names("m", MEMBERS_MAX)),
         )
+
+
+def _ribs(fields: Fields) -> tuple[AttachedRib, ...]:
+    found = []
+    for each in fields.list_("r", RIBS_MAX):
+        match each:
+            case [bytes(name), bytes(domain), bytes(session)] if (
+                len(name) == len(domain) == 32 and len(session) == NONCE_BYTES
+            ):
+                found.append(AttachedRib(Name(name), Name(domain), session))
+            case _:
+                raise StatementError(DropReason.MALFORMED, "RIB")
+    return tuple(found)
 
 
 def _adjacencies(fields: Fields, key: str) -> tuple[Adjacency, ...]:

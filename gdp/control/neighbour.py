@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-from gdp.crypto.certificates import Role
+from gdp.control.keepalive import KeepaliveSession
+from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.keys import PublicKey
 from gdp.names import Name
 
@@ -69,6 +70,11 @@ class Neighbour:
     nonce: bytes
     sequence: int
     digest: bytes
-    heard_s: float
+    heard_s: float  # when it last gave a sign of life
     state: NeighbourState = NeighbourState.GONE
     candidate: bytes = b""  # nonce of a session that has not proved itself yet
+    member: Membership | None = None
+    checked_s: float = 0.0  # when its membership was last seen to hold
+    greeted_s: float = 0.0  # when its last hello came
+    keepalives: KeepaliveSession | None = None  # while it is up and both ends want them
+    lateness_s: float = 0.0  # of this node, in all, when the neighbour was last heard

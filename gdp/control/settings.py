@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from gdp.limits import DEAD_S, HELLO_S
+from gdp.control.hello import Timing
+from gdp.limits import CLAIM_LEASE_S, DEAD_S, DETECT_MULTIPLIER, HELLO_S, KEEPALIVE_MS
 
 __all__ = ["NodeSettings"]
 
@@ -22,7 +23,10 @@ class NodeSettings:
         first_sequence: above every sequence number of an earlier life; wall-clock milliseconds do.
         random_bytes: source of nonces.
         hello_s: between two hellos on a port.
-        dead_s: a neighbour silent for so long is gone.
+        dead_s: a neighbour silent for so long is gone, while it sends no keepalives.
+        lease_s: lease of what the node keeps at RIBs: claims of a member or a RIB, watches of a switch.
+        keepalive_ms: between keepalives, which neighbours negotiate; 0: none; None: in proportion to ``dead_s``.
+        detect_multiplier: a neighbour silent for so many keepalives is gone.
     """
 
     incarnation: int
@@ -30,3 +34,12 @@ class NodeSettings:
     random_bytes: Callable[[int], bytes]
     hello_s: float = HELLO_S
     dead_s: float = DEAD_S
+    lease_s: float = CLAIM_LEASE_S
+    keepalive_ms: int | None = None
+    detect_multiplier: int = DETECT_MULTIPLIER
+
+    @property
+    def timing(self) -> Timing:
+        """Return what this node wants of keepalives."""
+        every_ms = round(KEEPALIVE_MS * self.dead_s / DEAD_S) if self.keepalive_ms is None else self.keepalive_ms
+        return Timing(every_ms, every_ms, self.detect_multiplier)

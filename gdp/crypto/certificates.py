@@ -13,11 +13,11 @@ from enum import Enum
 from gdp.crypto.keys import PublicKey
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
-from gdp.crypto.x509_form import DOMAIN_UNIT, Certificate, bad, read
+from gdp.crypto.x509_form import DOMAIN_UNIT, Certificate, bad, issuer_common_name, read
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
 
-__all__ = ["Membership", "Role", "Root", "Unverified"]
+__all__ = ["Membership", "Role", "Root", "Unverified", "issuer_label"]
 
 
 class Role(str, Enum):
@@ -115,6 +115,15 @@ class Membership:
             StatementError: BAD_CERTIFICATE, WRONG_NAME, WRONG_DOMAIN or EXPIRED.
         """
         return Unverified.from_wire(wire).verify(root, unix_s)
+
+
+def issuer_label(wire: bytes) -> str:
+    """Return the label of the domain that a certificate, DER, says it is of: unproven, printable, maybe empty."""
+    try:
+        label = issuer_common_name(wire)
+    except StatementError:
+        return ""
+    return label if label.isprintable() else ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,7 @@ from gdp.effects import Arrival
 from gdp.errors import DropReason, EnvelopeError, LocalError
 from gdp.frame.codec import HEADER_BYTES, Header, authenticated, encode
 from gdp.frame.kinds import VERSION, Flag
-from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, PARTS_MAX
+from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, PARTS_MAX, SEQUENCE_BYTES
 
 __all__ = ["SIGNATURE_BYTES", "TAG_BYTES", "Opener", "Sealed", "Sealer", "Signer", "digest_of", "part_room", "seal_key"]
 
@@ -119,7 +119,7 @@ class Sealer:
         size = len(message)
         room = part_room(mtu)
         parts = -(-(size + SIGNATURE_BYTES) // room)
-        if size > MESSAGE_MAX_BYTES or parts > PARTS_MAX:
+        if size > MESSAGE_MAX_BYTES + SEQUENCE_BYTES or parts > PARTS_MAX:
             raise LocalError(f"a message of {size} bytes in {parts} parts is above the limit")
         self._last_number = number
         epoch, kind, incarnation, destination, source = self._fixed

@@ -45,6 +45,11 @@ class StatementType(str, Enum):
     RELAY = "relay"  # a claim passed on by a switch or a RIB
     REVOKE = "revoke"
     VERDICT = "verdict"
+    PRESENCE = "presence"  # RIB to switch and back: is the older of two nodes with one identity still there?
+    DIGEST = "digest"  # between RIBs of one domain
+    FETCH = "fetch"
+    INVENTORY = "inventory"
+    REPLICAS = "replicas"
 
 
 _TYPES: Final[dict[Value, StatementType]] = {member.value: member for member in StatementType}

@@ -39,6 +39,7 @@ __all__ = [
     "alternative_names",
     "bad",
     "distinguished_name",
+    "issuer_common_name",
     "read",
     "read_request",
     "to_pem",
@@ -116,6 +117,20 @@ def read_request(wire: bytes) -> Holder:
         StatementError: BAD_CERTIFICATE or WRONG_NAME; never another exception, whatever the bytes.
     """
     return _strictly(wire, _request)
+
+
+def issuer_common_name(wire: bytes) -> str:
+    """Return the issuer's CN of a certificate in DER, at most ``LABEL_MAX_CHARS`` of it; nothing is verified.
+
+    Raises:
+        StatementError: BAD_CERTIFICATE; never another exception, whatever the bytes.
+    """
+    return _strictly(wire, _issuer_common_name)
+
+
+def _issuer_common_name(wire: bytes) -> str:
+    names = x509.load_der_x509_certificate(wire).issuer.get_attributes_for_oid(NameOID.COMMON_NAME)
+    return str(names[0].value)[:LABEL_MAX_CHARS] if names else ""
 
 
 def to_pem(wire: bytes) -> bytes:

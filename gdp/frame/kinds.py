@@ -24,6 +24,7 @@ class Kind(IntEnum):
     REPORT = 0x03  # sealed: what a reader has and lacks, to the publisher
     RIB_REQUEST = 0x10  # a statement to a RIB
     RIB_ANSWER = 0x11  # a statement from a RIB
+    RELOCATE = 0x12  # a statement of a node's new switch to its former one
     ECHO_REQUEST = 0x20
     ECHO_REPLY = 0x21
     HELLO = 0x80  # to the neighbour: who I am
@@ -34,6 +35,9 @@ class Kind(IntEnum):
     WITHDRAW = 0x85
     VERDICT = 0x86  # the switch's answer to an attached node: taken, or refused and why
     REVOKE = 0x87  # to the neighbour, who passes it on: this certificate no longer counts
+    KEEPALIVE = 0x88  # to a neighbour that is up: I am still here; no statement, but a tag by a key of both sessions
+    REDIRECT = 0x89  # to the neighbour whose frames came here: where the node is now
+    WHERE = 0x8A  # to the neighbour whose frame came here, while no RIB answers: where is that node?
 
 
 class Flag(IntFlag):

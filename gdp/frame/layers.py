@@ -37,14 +37,18 @@ from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION, Flag, Kind
 from gdp.limits import HOPS_MAX
 from gdp.names import NAME_BYTES, ZERO, Name
 
-__all__ = ["GDP", "Statement", "layout"]
+__all__ = ["GDP", "Keepalive", "Statement", "layout"]
 
 KIND_NAMES: Final = {int(kind): kind.name.lower().replace("_", "-") for kind in Kind}
 FLAG_NAMES: Final = [next((f.name.lower() for f in Flag if f.name and f == 1 << bit), f"bit{bit}") for bit in range(8)]
-_STATEMENTS: Final = frozenset({Kind.RIB_REQUEST, Kind.RIB_ANSWER, *(kind for kind in Kind if kind >= CONTROL_FROM)})
+_NO_STATEMENTS: Final = frozenset({Kind.KEEPALIVE})  # of those for the neighbour itself
+_STATEMENTS: Final = frozenset(
+    {Kind.RIB_REQUEST, Kind.RIB_ANSWER, *(kind for kind in Kind if kind >= CONTROL_FROM and kind not in _NO_STATEMENTS)}
+)
 _ANSWER_TO: Final = {Kind.RIB_ANSWER: Kind.RIB_REQUEST, Kind.ECHO_REPLY: Kind.ECHO_REQUEST}
 _COSE_SIGN1: Final = 0xD284  # tag 18, an array of four
 _LENGTH_AT: Final = 6
+_KEEPALIVE_BYTES: Final = 26
 
 
 class NameField(XStrFixedLenField):
@@ -116,6 +120,8 @@ class GDP(Packet):
     def guess_payload_class(self, payload: bytes) -> type[Packet]:
         if self.version == VERSION and self.kind in _STATEMENTS and self.parts == 1 and _is_statement(payload):
             return Statement
+        if self.version == VERSION and self.kind == Kind.KEEPALIVE and len(payload) >= _KEEPALIVE_BYTES:
+            return Keepalive
         return conf.raw_layer
 
     def hashret(self) -> bytes:
@@ -141,6 +147,18 @@ class GDP(Packet):
         source, destination = Name(self.source).short, Name(self.destination).short
         which = f"#{self.number} {self.part + 1}/{self.parts}"
         return f"GDP {self.sprintf('%kind%')} {source} > {destination} {which} hops {self.hops_left}"
+
+
+class Keepalive(Packet):
+    """The payload of a keepalive: what it says, and the tag of the two sessions' key (``control/keepalive.py``)."""
+
+    name = "GDP keepalive"
+    fields_desc = [  # noqa: RUF012  (the form that Scapy prescribes)
+        FlagsField("flags", 0, 8, ["poll", "final", "heard", "bit3", "bit4", "bit5", "bit6", "bit7"]),
+        ByteField("multiplier", 3),
+        XStrFixedLenField("digest", bytes(8), length=8),
+        XStrFixedLenField("tag", bytes(16), length=16),
+    ]
 
 
 class Statement(Packet):

@@ -14,15 +14,14 @@ from collections.abc import Iterable
 from typing import Final
 
 from gdp.errors import DropReason, FrameError
-from gdp.message.move import Move
 
-__all__ = ["BUNDLE_BYTES", "BUNDLE_MAX_BYTES", "Counts", "Gathered", "pack", "unpack"]
+__all__ = ["BUNDLE_BYTES", "BUNDLE_MAX_BYTES", "Gathered", "pack", "unpack"]
 
 BUNDLE_BYTES: Final = 48 << 10  # what a publisher makes; larger ones save hardly more, and the first in it waits longer
 BUNDLE_MAX_BYTES: Final = 64 << 10  # what a reader takes: it bounds how many messages one frame may turn into
 _LENGTH: Final = struct.Struct("!I")
 _SMALL: Final = 4  # so many of them, or more, go into one bundle
-_ALONE_BYTES: Final = 176  # what sealing it alone would add: what waits is not to weigh less than what is sealed
+_ALONE_BYTES: Final = 184  # what sealing it alone would add: what waits is not to weigh less than what is sealed
 
 
 def pack(messages: Iterable[bytes]) -> bytes:
@@ -50,43 +49,12 @@ def unpack(wire: bytes) -> list[bytes]:
     return messages
 
 
-class Counts:
-    """How many messages went under each number, for what a publisher still keeps."""
-
-    def __init__(self) -> None:
-        self._of: dict[int, int] = {}  # bundles alone; numbers rise
-        self._forgotten = 0
-
-    def __contains__(self, number: int) -> bool:
-        return number in self._of
-
-    def note(self, number: int, messages: int) -> None:
-        """Note how many messages are in the newest number."""
-        if messages > 1:
-            self._of[number] = messages
-
-    def beyond_one(self, number: int) -> int:
-        """Return by how much messages outnumber numbers, up to this one; which is not before what was forgotten."""
-        return self._forgotten + sum(messages - 1 for each, messages in self._of.items() if each <= number)
-
-    def forget(self, below: int) -> int:
-        """Keep nothing of numbers under ``below``; return by how much their messages outnumber them."""
-        more = 0
-        while self._of and (first := next(iter(self._of))) < below:
-            more += self._of.pop(first) - 1
-        self._forgotten += more
-        return more
-
-    def move(self, move: Move) -> None:
-        """Go on under new numbers."""
-        self._of = {move.of(number): messages for number, messages in self._of.items()}
-
-
 class Gathered:
-    """Small messages that wait for their seal, oldest first."""
+    """Small messages that wait for their seal, oldest first; their sequence numbers follow each other."""
 
     def __init__(self) -> None:
         self._messages = deque[bytes]()
+        self.first = 0  # sequence number of the oldest
         self.held_bytes = 0
 
     def __len__(self) -> int:
@@ -97,8 +65,10 @@ class Gathered:
         """Return whether several messages of this size go into a bundle of ``room`` bytes."""
         return _SMALL * (len(message) + _LENGTH.size) <= room
 
-    def add(self, message: bytes) -> None:
+    def add(self, sequence: int, message: bytes) -> None:
         """Let a message wait."""
+        if not self._messages:
+            self.first = sequence
         self._messages.append(message)
         self.held_bytes += len(message) + _ALONE_BYTES
 
@@ -111,4 +81,5 @@ class Gathered:
                 break
             together.append(self._messages.popleft())
             self.held_bytes -= len(together[-1]) + _ALONE_BYTES
+        self.first += len(together)
         return together

@@ -68,6 +68,7 @@ class Joined:
     message: bytes
     parts: int
     hops: int  # switches passed by the part that took the longest way
+    head: bytes = b""  # what came before the message, as many bytes as its joiner was told
 
 
 class _Hash(Protocol):
@@ -103,6 +104,7 @@ class Joiner:
         writer: the key that must have signed.
         budget: shared by all joiners of the node.
         patience_s: an unfinished message is given back this long after its last new part.
+        head_bytes: how many bytes come before each message; fewer than any first part has.
     """
 
     def __init__(
@@ -113,7 +115,9 @@ class Joiner:
         budget: Budget,
         *,
         patience_s: float = JOIN_PATIENCE_S,
+        head_bytes: int = 0,
     ) -> None:
+        self._head_bytes = head_bytes
         self._source = source
         self._opener_of = opener_of
         self._writer = writer
@@ -210,7 +214,8 @@ class Joiner:
         self.highest = max(self.highest, number)
         self.new_parts += 1
         self.window.finish(number)
-        return Joined(number, header.flags & _SHARED_FLAGS, plain, 1, max(HOPS_MAX - header.hops_left, 0))
+        head, message = plain[: self._head_bytes], plain[self._head_bytes :]
+        return Joined(number, header.flags & _SHARED_FLAGS, message, 1, max(HOPS_MAX - header.hops_left, 0), head)
 
     def _start(self, header: Header, opener: OpensParts, now_s: float) -> _Unfinished:
         """Return a message of which nothing is kept yet; one with another number of parts gives way."""
@@ -261,8 +266,9 @@ class Joiner:
         if not self._is_signed(message.signature, message.running):
             return None  # not finished: the writer's own parts may still come
         self.window.finish(number)
-        whole = b"".join([message.plain[part] for part in range(message.parts)])
-        return Joined(number, header.flags & _SHARED_FLAGS, whole, message.parts, message.hops)
+        first, size = message.plain[0], self._head_bytes
+        whole = b"".join([first[size:], *(message.plain[part] for part in range(1, message.parts))])
+        return Joined(number, header.flags & _SHARED_FLAGS, whole, message.parts, message.hops, first[:size])
 
     def _is_signed(self, signature: bytes, running: _Hash) -> bool:
         try:

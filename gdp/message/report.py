@@ -1,7 +1,7 @@
 """What a reader tells its publisher: how far it is, and what it lacks.
 
-Place: pure. Wire form, big-endian: ``flags (1) | next number (8) | next part (4) | ranges (2)`` and for each range
-``number (8) | first part (4) | last part (4)``.
+Place: pure. Wire form, big-endian: ``flags (1) | next number (8) | next part (4) | next sequence number (8) | lost (8)
+| ranges (2)`` and for each range ``number (8) | first part (4) | last part (4)``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from gdp.limits import NACKS_PER_REPORT
 
 __all__ = ["Missing", "Report", "ReportFlag"]
 
-_HEAD: Final = struct.Struct("!BQIH")
+_HEAD: Final = struct.Struct("!BQIQQH")
+_U64_MAX: Final = (1 << 64) - 1
 _RANGE: Final = struct.Struct("!QII")
 
 
@@ -36,17 +37,24 @@ class Missing(NamedTuple):
 
 
 class Report(NamedTuple):
-    """Everything before (next_number, next_part) is held; of what follows, ``missing`` is known to lack."""
+    """Everything before (next_number, next_part) is held; of what follows, ``missing`` is known to lack.
+
+    Messages with sequence numbers before ``sequence`` were delivered, but for ``lost`` of them. A report flagged NEW
+    names what its reader had of this publisher's life before, and zeros if nothing.
+    """
 
     flags: ReportFlag
     next_number: int
     next_part: int
     missing: tuple[Missing, ...]
+    sequence: int = 0
+    lost: int = 0
 
     def to_wire(self) -> bytes:
         """Return the wire form; ranges beyond ``NACKS_PER_REPORT`` wait for the next report."""
         ranges = self.missing[:NACKS_PER_REPORT]
-        head = _HEAD.pack(self.flags, self.next_number, self.next_part, len(ranges))
+        counts = min(self.sequence, _U64_MAX), min(self.lost, _U64_MAX)
+        head = _HEAD.pack(self.flags, self.next_number, self.next_part, *counts, len(ranges))
         return head + b"".join(_RANGE.pack(*each) for each in ranges)
 
     @classmethod
@@ -58,8 +66,8 @@ class Report(NamedTuple):
         """
         if len(wire) < _HEAD.size:
             raise FrameError(DropReason.TRUNCATED, "report")
-        flags, number, part, count = _HEAD.unpack_from(wire)
+        flags, number, part, sequence, lost, count = _HEAD.unpack_from(wire)
         if count > NACKS_PER_REPORT or len(wire) != _HEAD.size + count * _RANGE.size or flags > ReportFlag.BYE:
             raise FrameError(DropReason.MALFORMED, "report")
         ranges = tuple(Missing(*each) for each in _RANGE.iter_unpack(wire[_HEAD.size :]))
-        return cls(ReportFlag(flags), number, part, ranges)
+        return cls(ReportFlag(flags), number, part, ranges, sequence, lost)

@@ -11,6 +11,9 @@ with Karn's rule. Positions count bytes of frames from the first message on.
 
 A reader can make work for its publisher, but only so much: all readers together get at most a flight of repairs in a
 round trip, and one that stands still, or that lags while others are through, no longer holds the window.
+
+A suspended reader is silent, and may have moved. It holds neither the flight nor ``has_room``, but what it lacks stays
+as long as the budget has room. When it reports again it gets repairs, and is a reader again once it has caught up.
 """
 
 from __future__ import annotations
@@ -82,6 +85,7 @@ class SendWindow:
         self._budget_bytes = budget_bytes
         self._kept: OrderedDict[int, _Kept] = OrderedDict()
         self._readers: dict[bytes, _Reader] = {}
+        self._suspended: dict[bytes, _Reader] = {}
         self._next = deque[tuple[int, int]]()  # (number, first part not sent), oldest first
         self._repairs: OrderedDict[tuple[int, int], None] = OrderedDict()
         self._repaired = 0  # parts of kept messages that were sent again
@@ -126,13 +130,24 @@ class SendWindow:
         """Return whether a reader holds the window."""
         return reader in self._readers
 
+    def is_suspended(self, reader: bytes) -> bool:
+        """Return whether a reader is suspended."""
+        return reader in self._suspended
+
+    @property
+    def suspended(self) -> int:
+        """Return how many readers are suspended."""
+        return len(self._suspended)
+
     def has_room(self) -> bool:
-        """Return whether another message may be added without letting an older one go."""
-        return self._end_at - self._acked_at() < self._budget_bytes
+        """Return whether another message may be added without letting one go that a reader waits for."""
+        is_idle = bool(self._suspended) and not self._readers
+        return is_idle or self._end_at - self._acked_at() < self._budget_bytes
 
     def is_acknowledged(self) -> bool:
-        """Return whether every reader has everything."""
-        return self._acked_at() == self._end_at
+        """Return whether every reader has everything, suspended ones included."""
+        has_all = all(reader.next_number > self._newest for reader in self._suspended.values())
+        return has_all and self._acked_at() == self._end_at
 
     @property
     def sent(self) -> tuple[int, int]:
@@ -141,19 +156,30 @@ class SendWindow:
 
     @property
     def acknowledged(self) -> int:
-        """Return the highest message number that every reader has confirmed, with all before it."""
+        """Return the highest message number that every reader, suspended or not, has confirmed, with all before it."""
         return min(self._least_number(), self._newest + 1) - 1
 
-    def add(self, number: int, frames: Sequence[bytes], size: int) -> None:
-        """Queue a message of ``size`` bytes of frames, which may be sealed as they are asked for; numbers rise."""
-        while self._kept and self._kept_bytes + size > 2 * self._budget_bytes:
-            self._release(next(iter(self._kept)))
-            self.let_go += 1
+    def add(self, number: int, frames: Sequence[bytes], size: int) -> list[int]:
+        """Queue a message of ``size`` bytes of frames, which may be sealed as they are asked for; numbers rise.
+
+        Returns:
+            the numbers of messages that were let go for it before every reader had them.
+        """
+        gone = []
+        while self._kept and self._kept_bytes + size > self._budget_bytes:
+            if self._kept_bytes + size <= self._budget_now():
+                break
+            oldest = next(iter(self._kept))
+            if oldest >= self._least_number():
+                gone.append(oldest)
+            self._release(oldest)
+        self.let_go += len(gone)
         self._newest = number
         self._kept[number] = _Kept(frames, self._end_at, size)
         self._kept_bytes += size
         self._end_at += size
         self._next.append((number, 0))
+        return gone
 
     def kept(self) -> list[tuple[int, Sequence[bytes]]]:
         """Return what is kept, oldest first."""
@@ -171,25 +197,39 @@ class SendWindow:
         self._sample = None
         for number, each, size in frames:
             self.add(number, each, size)
-        for reader in self._readers.values():
+        everyone = [*self._readers.values(), *self._suspended.values()]
+        for reader in everyone:
             reader.next_number = move.of(reader.next_number)
-        least = self._least_number() if self._readers else 0
+        least = self._least_waiting() if self._readers else 0
         while self._next and self._next[0][0] < least:
             self._sent_at = self._kept[self._next.popleft()[0]].end_at
-        for reader in self._readers.values():
+        for reader in everyone:
             reader.acked_at = reader.mark_at = self._sent_at
         self._release_acknowledged()
 
     def add_reader(self, reader: bytes, first_number: int, now_s: float) -> None:
         """Let a reader hold the window from a message on."""
+        self._suspended.pop(reader, None)
         kept = self._kept.get(first_number)
         acked_at = min(kept.begin_at, self._sent_at) if kept else self._sent_at
         self._readers[reader] = _Reader(acked_at, first_number, now_s, acked_at, now_s)
 
     def drop_reader(self, reader: bytes) -> None:
-        """Let a reader hold nothing any more."""
-        if self._readers.pop(reader, None) is not None:
+        """Let a reader hold nothing any more, and keep nothing for it."""
+        if self._readers.pop(reader, None) or self._suspended.pop(reader, None):
             self._release_acknowledged()
+
+    def suspend(self, reader: bytes) -> None:
+        """Let a silent reader hold nothing, but keep what it lacks while there is room."""
+        state = self._readers.pop(reader, None)
+        if state is not None:
+            self._suspended[reader] = state
+
+    def resume(self, reader: bytes, now_s: float) -> None:
+        """Let a suspended reader hold the window again, from where it is."""
+        state = self._readers[reader] = self._suspended.pop(reader)
+        state.moved_s = state.mark_s = now_s
+        state.mark_at = state.acked_at
 
     def laggards(self, now_s: float) -> list[bytes]:
         """Return the readers that hold the window for nothing, whose time it is to let go.
@@ -217,10 +257,18 @@ class SendWindow:
 
     def report(self, reader: bytes, report: Report, now_s: float) -> None:
         """Take a known reader's report: release, grow or shrink, and queue repairs."""
-        state = self._readers[reader]
-        state.next_number = max(state.next_number, report.next_number)
         kept = self._kept.get(report.next_number)
         position = kept.position(report.next_part) if kept else self._position_of(report.next_number)
+        if reader in self._suspended:
+            if self._readers and position < self._acked_at():  # the others are not to wait for it
+                self._suspended[reader].next_number = max(self._suspended[reader].next_number, report.next_number)
+                self._queue_repairs(report, now_s)
+                self._release_acknowledged()
+                return
+            self._suspended[reader].acked_at = min(position, self._sent_at)
+            self.resume(reader, now_s)
+        state = self._readers[reader]
+        state.next_number = max(state.next_number, report.next_number)
         before = self._acked_at()
         self._confirm(state, min(position, self._sent_at), now_s)
         self._grow(self._acked_at() - before, now_s)
@@ -248,7 +296,7 @@ class SendWindow:
         below = 0
         if self._next:
             self._start_clocks(now_s)
-            below = self._least_number() + FLIGHT_MESSAGES_MAX
+            below = self._least_waiting() + FLIGHT_MESSAGES_MAX
         while self._next and self._sent_at < may_reach and len(frames) < limit and self._next[0][0] < below:
             number, part = self._next[0]
             kept = self._kept[number]
@@ -288,8 +336,20 @@ class SendWindow:
         """Return how far the first reader is."""
         return max((reader.acked_at for reader in self._readers.values()), default=0)
 
-    def _least_number(self) -> int:
+    def _least_waiting(self) -> int:
+        """Return the lowest number that a reader which holds the window lacks."""
         return min((reader.next_number for reader in self._readers.values()), default=1 << 64)
+
+    def _least_number(self) -> int:
+        """Return the lowest number that any reader lacks, suspended or not."""
+        least = self._least_waiting()
+        return min([least, *(each.next_number for each in self._suspended.values())]) if self._suspended else least
+
+    def _budget_now(self) -> int:
+        """Return how many bytes may be kept: less where what is oldest is kept for suspended readers alone."""
+        oldest = self.oldest
+        is_spare = len(self._kept) > self._keep_last and oldest is not None and oldest < self._least_waiting()
+        return self._budget_bytes if self._suspended and is_spare else 2 * self._budget_bytes
 
     def _position_of(self, number: int) -> int:
         """Return where a message that is not kept begins or would begin."""

@@ -9,17 +9,50 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
 
-from gdp.limits import DEAD_S, HELLO_S, LEASE_MAX_S, LEASE_MIN_S, RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX, TABLE_MAX
-from gdp.nodes.schema import Directory, Domain, Ifname, Metrics, NameText, Section, Unique, load
+from gdp.control.hello import INTERVAL_MAX_MS, Timing
+from gdp.limits import (
+    CLAIM_LEASE_S,
+    DEAD_S,
+    DETECT_MULTIPLIER,
+    HELLO_S,
+    KEEPALIVE_MS,
+    LEASE_MAX_S,
+    LEASE_MIN_S,
+    RIB_NAMES_PER_SENDER,
+    RIB_WATCHES_MAX,
+    TABLE_MAX,
+)
+from gdp.nodes.schema import (
+    Directory,
+    Domain,
+    ExistingFile,
+    Ifname,
+    Metrics,
+    NewFile,
+    RequiredName,
+    Section,
+    Unique,
+    load,
+)
 from gdp.ports.kernel.shapes import ENTRIES_DEFAULT
+from gdp.stores.cluster_address import ClusterAddress
 
-__all__ = ["DataPlane", "PortConfig", "Quotas", "RibConfig", "SwitchConfig"]
+__all__ = ["DataPlane", "LeaseSeconds", "PortConfig", "Quotas", "RibConfig", "SwitchConfig"]
 
+def _server(text: str) -> str:
+    host, colon, port = text.rpartition(":")
+    if not (host and colon and port.isdecimal() and 0 < int(port) < 65_536):
+        raise ValueError(f"expected host:port, not {text!r}")
+    return text
+
+
+ServerText = Annotated[str, AfterValidator(_server)]
 DataPlane = Literal["auto", "kernel", "raw", "scapy"]
 
 COST_DEFAULT: Final = 10
+_KEEPALIVE_MIN_MS: Final = 10
 _ATTACH_MAX: Final = 13  # leaves room for the "-s" of the switch's end
 
 
@@ -29,15 +62,31 @@ def _attach_name(text: str) -> str:
     return text
 
 
+LeaseSeconds = Annotated[float, Field(ge=LEASE_MIN_S, le=LEASE_MAX_S)]
 AttachName = Annotated[Ifname, AfterValidator(_attach_name)]
 
 
+def _interval(milliseconds: int) -> int:
+    if 0 < milliseconds < _KEEPALIVE_MIN_MS:
+        raise ValueError(f"0 for none, or at least {_KEEPALIVE_MIN_MS}")
+    return milliseconds
+
+
+KeepaliveMs = Annotated[int, Field(ge=0, le=INTERVAL_MAX_MS), AfterValidator(_interval)]
+DetectMultiplier = Annotated[int, Field(ge=2, le=50)]
+
+
 class PortConfig(Section):
-    """A layer-2 device towards neighbours; one that is ``optional`` may appear later."""
+    """A layer-2 device towards neighbours; one that is ``optional`` may appear later.
+
+    What is not given of keepalives is the switch's.
+    """
 
     iface: Ifname
     optional: bool = False
     cost: int = Field(default=COST_DEFAULT, ge=1, le=1_000_000)
+    keepalive_ms: KeepaliveMs | None = None
+    detect_multiplier: DetectMultiplier | None = None
 
 
 class SwitchConfig(Section):
@@ -56,6 +105,14 @@ class SwitchConfig(Section):
     metrics: Metrics | None = None
     hello_s: float = Field(default=HELLO_S, ge=0.01, le=60.0)
     dead_s: float = Field(default=DEAD_S, ge=0.02, le=600.0)
+    lease_s: LeaseSeconds = CLAIM_LEASE_S
+    keepalive_ms: KeepaliveMs = KEEPALIVE_MS
+    detect_multiplier: DetectMultiplier = DETECT_MULTIPLIER
+
+    def timing_of(self, port: PortConfig) -> Timing:
+        """Return what is wanted of keepalives on a port."""
+        every_ms = self.keepalive_ms if port.keepalive_ms is None else port.keepalive_ms
+        return Timing(every_ms, every_ms, port.detect_multiplier or self.detect_multiplier)
 
     @classmethod
     def load(cls, path: Path) -> SwitchConfig:
@@ -107,16 +164,59 @@ class Quotas(Section):
     lease_max_s: float = Field(default=LEASE_MAX_S, ge=LEASE_MIN_S, le=LEASE_MAX_S)
 
 
+class ClusterConfig(Section):
+    """A Valkey or Redis Cluster; ``nodes`` are some of its servers, each ``host:port``."""
+
+    nodes: Annotated[tuple[ServerText, ...], Unique] = Field(min_length=1)
+    username: str = ""
+    password_file: ExistingFile | None = None
+    ca: ExistingFile | None = None
+    cert: ExistingFile | None = None
+    key: ExistingFile | None = None
+
+    def address(self) -> ClusterAddress:
+        """Return what the store connects to; the password's file is read now."""
+        password = "" if self.password_file is None else self.password_file.read_text().strip()
+        split = (node.rpartition(":") for node in self.nodes)
+        nodes = tuple((host.strip("[]"), int(port)) for host, _, port in split)
+        return ClusterAddress(nodes, self.username, password, self.ca, self.cert, self.key)
+
+
+class SharedStore(Section):
+    """A store outside the process, shared by the RIBs of a domain."""
+
+    cluster: ClusterConfig
+
+
+def _as_names(value: object) -> object:
+    """Read one name, or ``null`` for none, as a tuple."""
+    if value is None or isinstance(value, str):
+        return () if value is None else (value,)
+    return tuple(value) if isinstance(value, list) else value
+
+
 class RibConfig(Section):
-    """``rib.yaml``. ``upper`` is the name of the RIB of the tier above; ``null`` at the top."""
+    """``rib.yaml``. ``upper`` names the RIB of the tier above, or several of which any may be used; ``null``: none.
+    ``peers`` names other RIBs of this domain: they hold the same routes.
+    """
 
     identity: Directory
     domain: Domain
     iface: Ifname
-    upper: NameText = None
+    upper: Annotated[tuple[RequiredName, ...], Unique, BeforeValidator(_as_names)] = ()
+    peers: Annotated[tuple[RequiredName, ...], Unique] = ()
     allow_unowned: bool = False
+    lease_s: LeaseSeconds = CLAIM_LEASE_S
+    store: Literal["memory"] | SharedStore = "memory"
+    snapshot: NewFile | None = None
     quotas: Quotas = Quotas()
     metrics: Metrics | None = None
+
+    @model_validator(mode="after")
+    def _a_shared_store_needs_no_copies(self) -> RibConfig:
+        if self.store != "memory" and (self.peers or self.snapshot is not None):
+            raise ValueError("store: a cluster replicates and keeps by itself: leave out peers and snapshot")
+        return self
 
     @classmethod
     def load(cls, path: Path) -> RibConfig:

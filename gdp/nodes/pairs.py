@@ -3,22 +3,28 @@
 Place: shell; netlink through pyroute2, imported only here because it is large.
 
 Each pair carries its switch's name as an alias. What a killed run of the same switch left behind is known by it and is
-replaced; a device of that name without the alias is somebody else's and is refused.
+replaced; a device of that name without the alias is somebody else's and is refused. The switch's ends are locked while
+the pairs stand (``single_instance.py``), so the pair of a switch that still runs is never touched.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gdp.errors import LocalError
 from gdp.names import Name
+from gdp.nodes.single_instance import own_devices
+from gdp.ports.sockets import AS_ROOT
 
 if TYPE_CHECKING:
     from pyroute2 import IPRoute
+    from pyroute2.netlink.exceptions import NetlinkError
 
 __all__ = ["attach_pairs", "switch_end"]
 
@@ -32,13 +38,14 @@ def switch_end(name: str) -> str:
 
 @contextlib.contextmanager
 def attach_pairs(names: Sequence[str], switch: Name, mtu: int) -> Iterator[None]:
-    """Make the pairs ``NAME``/``NAME-s`` while within.
+    """Make the pairs ``NAME``/``NAME-s`` while within, and hold the locks of the switch's ends.
 
     Args:
         mtu: bytes after the Ethernet header.
 
     Raises:
-        LocalError: a device of that name belongs to somebody else, or devices cannot be made here.
+        LocalError: a device of that name belongs to somebody else or to a switch that runs, or devices cannot be made
+            here.
     """
     if not names:
         yield
@@ -48,7 +55,7 @@ def attach_pairs(names: Sequence[str], switch: Name, mtu: int) -> Iterator[None]
 
     alias = f"gdp-switch {switch.to_text()}"
     made: list[str] = []
-    with IPRoute() as links:
+    with own_devices(map(switch_end, names)), IPRoute() as links:
         try:
             try:
                 for name in names:
@@ -56,12 +63,21 @@ def attach_pairs(names: Sequence[str], switch: Name, mtu: int) -> Iterator[None]
                     _make(links, name, alias, mtu)
                     made.append(name)
             except NetlinkError as error:
-                raise LocalError(f"attach {name}: the veth pair cannot be made: {error}") from error
+                raise LocalError(f"attach {name}: the veth pair cannot be made: {_reason(error, mtu)}") from error
             yield
         finally:
             for name in made:
                 for index in links.link_lookup(ifname=switch_end(name)):
                     links.link("del", index=index)
+
+
+def _reason(error: NetlinkError, mtu: int) -> str:
+    """Return what the kernel refused and what to do about it."""
+    if error.code in (errno.EPERM, errno.EACCES):
+        return f"not permitted; {AS_ROOT}"
+    if error.code == errno.EINVAL:
+        return f"invalid argument (MTU {mtu}, which it takes from the widest port)"
+    return os.strerror(error.code) if error.code else str(error)
 
 
 def _clear(links: IPRoute, ifname: str, alias: str) -> None:

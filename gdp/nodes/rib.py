@@ -1,4 +1,4 @@
-"""``gdp-rib``: a RIB's machine on a real device, with the embedded store.
+"""``gdp-rib``: a RIB's machine on a real device, with its routes in memory or in a cluster.
 
 Place: shell.
 """
@@ -11,50 +11,69 @@ import secrets
 from collections.abc import Callable
 
 from gdp.client.rib_host import RibHost
+from gdp.client.waiting import attachment_waits
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.names import Name
 from gdp.nodes.config import RibConfig
 from gdp.nodes.counts import count_list
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
-from gdp.nodes.runtime import Runtime
+from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
+from gdp.nodes.rib_upkeep import MemoryUpkeep, Upkeep
+from gdp.nodes.runtime import Runtime, now
+from gdp.nodes.single_instance import run_alone
+from gdp.nodes.uplink import open_uplink
 from gdp.ports.plane import Plane
-from gdp.ports.raw import RawPlane
 from gdp.rib.machine import Rib, RibSettings
-from gdp.rib.store import MemoryStore
 from gdp.telemetry.sources import Sources
+from gdp.trust.domain import Policy
 
 __all__ = ["run_rib"]
 
 log = logging.getLogger(__name__)
 
 
-def run_rib(config: RibConfig, ready: Callable[[Name], None]) -> None:
+def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | None = None) -> None:
     """Run a RIB until it is told to stop.
 
     Args:
         ready: called once with the RIB's name, when its switch has been found.
+        on_wait: called with reason and text when the RIB reports what it waits for.
 
     Raises:
-        LocalError: keys or the device are not as the configuration says.
+        LocalError: keys or the device are not as the configuration says, or this RIB already runs.
     """
     identity, policy = load_member(config.identity, config.domain, Role.RIB)
     quotas = config.quotas
     settings = RibSettings(
-        config.upper, config.allow_unowned, quotas.names_per_sender, quotas.watches, quotas.lease_max_s
+        config.upper, config.peers, config.allow_unowned, quotas.names_per_sender, quotas.watches, quotas.lease_max_s
     )
-    rib = Rib(identity, policy, MemoryStore(), settings)
-    attachment = NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes)
-    host = RibHost(identity, policy, rib, attachment)
+    attachment = NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes, lease_s=config.lease_s)
     with contextlib.ExitStack() as stack:
-        plane = RawPlane([config.iface])
-        stack.callback(plane.close)
+        stack.enter_context(run_alone("RIB", identity.name))
+        upkeep = _upkeep(config, policy)
+        stack.callback(upkeep.close)
+        rib = Rib(identity, policy, upkeep.store, settings)
+        host = RibHost(identity, policy, rib, attachment)
+        upkeep.begin(rib, now())
+        plane = stack.enter_context(open_uplink(config.iface))
         runtime = Runtime(host, plane)
+        runtime.every(upkeep.every_s, upkeep.work)
+        node_log = NodeLog(
+            host.attachment.greeter,
+            policy,
+            plane,
+            lambda now_s: attachment_waits(host.attachment, now_s),
+            on_wait=on_wait,
+        )
+        runtime.every(LOOK_S, node_log.look)
         stack.enter_context(runtime.signals())
+        for source in upkeep.sources():
+            runtime.watch(source, lambda: upkeep.work(now()))
         if config.metrics is not None:
             from gdp.telemetry.metrics import Metrics
 
-            metrics = Metrics(_sources(host, plane))
+            metrics = Metrics(_sources(host, plane, node_log))
             metrics.serve(config.metrics.port)
             stack.callback(metrics.close)
         log.info("rib up name=%s iface=%s", identity.name.short, config.iface)
@@ -63,7 +82,15 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None]) -> None:
         runtime.run()
 
 
-def _sources(host: RibHost, plane: Plane) -> Sources:
+def _upkeep(config: RibConfig, policy: Policy) -> Upkeep:
+    if config.store == "memory":
+        return MemoryUpkeep(config.snapshot)
+    from gdp.nodes.rib_cluster import ClusterUpkeep  # the client library is an optional extra
+
+    return ClusterUpkeep(config.store.cluster.address(), policy, allow_unowned=config.allow_unowned)
+
+
+def _sources(host: RibHost, plane: Plane, node_log: NodeLog) -> Sources:
     counters, rib = plane.counters, host.rib
     return Sources(
         frames=lambda: {"in": counters.frames_in, "out": counters.frames_out, "handed-up": counters.handed_up},
@@ -75,4 +102,6 @@ def _sources(host: RibHost, plane: Plane) -> Sources:
             "accepted": rib.accepted,
         },
         rib_refusals=lambda: {reason.label: count for reason, count in list(rib.refusals.items())},
+        waiting=node_log.metrics,
+        clashes=lambda: rib.identities.clashes,
     )

@@ -13,6 +13,7 @@ import signal
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from types import FrameType
 
 from gdp.effects import Arrival, Instant, Machine
@@ -31,6 +32,13 @@ _STREAK_MAX = 8
 def now() -> Instant:
     """Return the present moment."""
     return Instant(time.monotonic(), time.time())
+
+
+@dataclass(slots=True)
+class _Look:
+    period_s: float
+    call: Callable[[Instant], None]
+    due_s: float = float("-inf")
 
 
 class Runtime:
@@ -52,6 +60,7 @@ class Runtime:
         self._is_woken = False  # by a watched source: whoever drives us has work
         self._streak = 0  # steps in a row that brought frames, without a look at the timers
         self._deadline_s: float | None = None
+        self._looks: list[_Look] = []
         moment = now()
         for port in list(plane.ports.values()):
             self._add(port.index, moment)
@@ -89,6 +98,10 @@ class Runtime:
 
         self._plane.watch(source, wake)
 
+    def every(self, period_s: float, look: Callable[[Instant], None]) -> None:
+        """Call ``look`` from within the loop each ``period_s``, the first time at once."""
+        self._looks.append(_Look(period_s, look))
+
     def unwatch(self, source: HasFileno) -> None:
         """Undo ``watch``, before the source is closed."""
         self._plane.unwatch(source)
@@ -106,6 +119,7 @@ class Runtime:
         if not is_sending and not arrivals and not self._is_woken:
             self._deadline_s = self._machine.next_timeout()
             times = [each for each in (self._deadline_s, latest_s) if each is not None]
+            times += [look.due_s for look in self._looks]
             arrivals = self._wait(max(min(times) - time.monotonic(), 0.0) if times else None)
         self._streak = self._streak + 1 if arrivals and self._streak < _STREAK_MAX else 0
         moment = now()
@@ -114,6 +128,10 @@ class Runtime:
         if self._deadline_s is not None and moment.mono_s >= self._deadline_s:
             self._machine.timeout(moment)
             self._deadline_s = self._machine.next_timeout()
+        for look in self._looks:
+            if moment.mono_s >= look.due_s:
+                look.due_s = moment.mono_s + look.period_s
+                look.call(moment)
 
     def _wait(self, timeout_s: float | None) -> list[Arrival]:
         """Wait for frames; where they follow each other closely, look again for a moment before going to sleep."""
@@ -191,7 +209,7 @@ class Runtime:
     def _link_changed(self, index: int, up: bool) -> None:
         moment = now()
         port = self._plane.ports.get(index)
-        log.info("link port=%d up=%s mtu=%d", index, up, 0 if port is None else port.mtu)
+        log.info("link port=%s up=%s mtu=%d", "?" if port is None else port.ifname, up, 0 if port is None else port.mtu)
         if up and port is not None:
             self._add(index, moment)  # it may have come back with another address, or only its MTU has changed
         else:

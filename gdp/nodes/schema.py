@@ -25,6 +25,7 @@ __all__ = [
     "Metrics",
     "NameText",
     "NewFile",
+    "RequiredName",
     "Section",
     "Unique",
     "load",
@@ -107,6 +108,7 @@ NewFile = Annotated[Relative, AfterValidator(_writable_place)]
 Unique = AfterValidator(_unique)
 Ifname = Annotated[str, AfterValidator(_ifname)]
 NameText = Annotated[Name | None, BeforeValidator(read_name)]
+RequiredName = Annotated[Name, BeforeValidator(read_name)]
 
 
 class Domain(Section):

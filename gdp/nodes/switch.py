@@ -19,11 +19,15 @@ from gdp.nodes.config import SwitchConfig
 from gdp.nodes.counts import count_list
 from gdp.nodes.data_plane import Chosen, choose_plane
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
+from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.pairs import attach_pairs, switch_end
 from gdp.nodes.runtime import Runtime, now
+from gdp.nodes.single_instance import own_devices, run_alone
+from gdp.nodes.uplink import refuse_loopback
 from gdp.ports.link import LinkWatch
 from gdp.switch.machine import Switch
 from gdp.switch.table import Table
+from gdp.switch.waiting import switch_waits
 from gdp.telemetry.sources import Sources
 
 __all__ = ["run_switch"]
@@ -33,25 +37,39 @@ log = logging.getLogger(__name__)
 _MTU_FALLBACK = 1_500
 
 
-def run_switch(config: SwitchConfig, ready: Callable[[Name, str, str], None]) -> None:
+def run_switch(
+    config: SwitchConfig, ready: Callable[[Name, str, str], None], on_wait: OnWait | None = None
+) -> None:
     """Run a switch until it is told to stop.
 
     Args:
         ready: called once when it has begun, with the switch's name, its data plane, and why it is not a better one.
+        on_wait: called with reason and text when the switch reports what it waits for.
 
     Raises:
-        LocalError: keys, devices or ports are not as the configuration says.
+        LocalError: keys, devices or ports are not as the configuration says, or this switch already runs. Nothing has
+            been touched then.
     """
     identity, policy = load_member(config.identity, config.domain, Role.SWITCH)
     if not config.ports and not config.attach:
         raise LocalError("a switch needs at least one port: --iface, or ports in the configuration")
+    ifaces = [port.iface for port in config.ports]
+    refuse_loopback(ifaces)
     table = Table()
     settings = NodeSettings(
-        incarnation(), wall_clock_ms(), secrets.token_bytes, config.hello_s, config.dead_s
+        incarnation(),
+        wall_clock_ms(),
+        secrets.token_bytes,
+        config.hello_s,
+        config.dead_s,
+        config.lease_s,
+        config.keepalive_ms,
+        config.detect_multiplier,
     )
     switch = Switch(identity, policy, table, settings)
-    ifaces = [port.iface for port in config.ports]
     with contextlib.ExitStack() as stack:
+        stack.enter_context(run_alone("switch", identity.name))
+        stack.enter_context(own_devices(ifaces))
         stack.enter_context(attach_pairs(config.attach, identity.name, _widest(ifaces)))
         wanted = [port.iface for port in config.ports if not port.optional]
         devices = [*wanted, *map(switch_end, config.attach)]
@@ -61,13 +79,26 @@ def run_switch(config: SwitchConfig, ready: Callable[[Name, str, str], None]) ->
         for iface in ifaces:
             if iface not in wanted:
                 plane.add_port(iface, may_be_absent=True)
+        for port in config.ports:
+            index = next(each.index for each in plane.ports.values() if each.ifname == port.iface)
+            switch.greeter.set_timing(index, config.timing_of(port))
         runtime = Runtime(switch, plane, {port.iface: port.cost for port in config.ports})
+        attachments = {port.index for port in plane.ports.values() if port.ifname not in ifaces}
+        node_log = NodeLog(
+            switch.greeter,
+            policy,
+            plane,
+            lambda now_s: switch_waits(switch, attachments, now_s),
+            rib=lambda: switch.rib,
+            on_wait=on_wait,
+        )
+        runtime.every(LOOK_S, node_log.look)
         stack.enter_context(runtime.signals(lambda: _revoke(switch, config.revocations)))
         _revoke(switch, config.revocations)
         if config.metrics is not None:
             from gdp.telemetry.metrics import Metrics
 
-            metrics = Metrics(_sources(switch, chosen))
+            metrics = Metrics(_sources(switch, chosen, node_log))
             metrics.serve(config.metrics.port)
             stack.callback(metrics.close)
         log.info("switch up name=%s plane=%s ports=%d", identity.name.short, chosen.name, len(plane.ports))
@@ -93,7 +124,7 @@ def _widest(ifaces: Sequence[str]) -> int:
     return max(mtus, default=_MTU_FALLBACK)
 
 
-def _sources(switch: Switch, chosen: Chosen) -> Sources:
+def _sources(switch: Switch, chosen: Chosen, node_log: NodeLog) -> Sources:
     plane = chosen.plane
 
     def frames() -> dict[str, int]:
@@ -106,4 +137,5 @@ def _sources(switch: Switch, chosen: Chosen) -> Sources:
         table_entries=lambda: len(switch.table),
         entries=chosen.entry_counts,
         parked_frames=lambda: len(switch.parked),
+        waiting=node_log.metrics,
     )

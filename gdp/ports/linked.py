@@ -25,10 +25,14 @@ from gdp.ports.link import Link, LinkWatch
 from gdp.ports.plane import MAC_BYTES, Arrival, Counters, HasFileno, LinkCallback, Port
 from gdp.switch.table import Hops, Table
 
-__all__ = ["LinkedPlane"]
+__all__ = ["LinkedPlane", "NoDeviceError"]
 
 _MTU_MAX_BYTES: Final = FRAME_MAX_BYTES - ETHER_BYTES
 _AUDIT_POLLS: Final = 256  # a busy plane asks the kernel for its drops this often, an idle one each time
+
+
+class NoDeviceError(LocalError):
+    """There is no device of that name."""
 
 
 class LinkedPlane(ABC):
@@ -143,7 +147,7 @@ class LinkedPlane(ABC):
             self._next_index += 1
             return self._next_index - 1
         if link is None:
-            raise LocalError(f"port {ifname}: no such device")
+            raise NoDeviceError(f"port {ifname}: no such device")
         if link.mtu < MTU_MIN_BYTES:
             raise LocalError(f"port {ifname}: MTU {link.mtu} is below {MTU_MIN_BYTES}")
         if len(link.mac) != MAC_BYTES:

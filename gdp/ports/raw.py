@@ -178,7 +178,7 @@ class RawPlane(LinkedPlane):
 
     def _narrowest(self, hops: Hops) -> int:
         """Return the size that every hop's link takes; 0 where one is down or there is none."""
-        return min((self._mtus.get(port, 0) for port, _ in hops), default=0)
+        return min((self._mtus.get(hop[0], 0) for hop in hops), default=0)
 
     def _consider(
         self, entries: Mapping[bytes, Hops], port: int, sinks: Mapping[int, socket.socket], slot: int, size: int
@@ -202,7 +202,7 @@ class RawPlane(LinkedPlane):
         if not count:
             return
         counters = self._counters
-        for port, macs in hops:
-            left = self._batch.put(sinks[port], first, count, macs, counters.drops)
+        for hop in hops:
+            left = self._batch.put(sinks[hop[0]], first, count, hop[1], counters.drops)
             counters.forwarded += left
             counters.frames_out += left

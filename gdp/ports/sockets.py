@@ -29,9 +29,19 @@ from gdp.errors import LocalError
 from gdp.frame.codec import ETHER_BYTES, FLAGS_AT, KIND_AT
 from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, Flag
 
-__all__ = ["NO_RAW_SOCKETS", "Lane", "hear_nothing", "kernel_drops", "large_buffers", "only_ours", "open_port"]
+__all__ = [
+    "AS_ROOT",
+    "NO_RAW_SOCKETS",
+    "Lane",
+    "hear_nothing",
+    "kernel_drops",
+    "large_buffers",
+    "only_ours",
+    "open_port",
+]
 
-NO_RAW_SOCKETS: Final = "raw sockets need root or CAP_NET_RAW (or a user namespace with its own network)"
+AS_ROOT: Final = "run this as root, or with scripts/privileged.sh"
+NO_RAW_SOCKETS: Final = f"raw sockets need root or CAP_NET_RAW; {AS_ROOT}"
 
 _SOL_PACKET: Final = 263
 _PACKET_STATISTICS: Final = 6

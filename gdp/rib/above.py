@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gdp.names import Name
+from gdp.rib.watches import Asker
 
 __all__ = ["Above"]
 
@@ -23,7 +24,7 @@ OPEN_MAX: Final = 65_536
 class _Open:
     asked_s: float
     again_s: float
-    askers: list[Name] = field(default_factory=list)
+    askers: list[Asker] = field(default_factory=list)
     watch_until_s: float = 0.0
     is_answered: bool = False
 
@@ -32,20 +33,20 @@ class Above:
     """Questions to the tier above.
 
     Args:
-        upper: its RIB; None at the top: then nothing is ever asked.
+        is_top: there is no tier above: nothing is ever asked.
     """
 
-    def __init__(self, upper: Name | None) -> None:
-        self._upper = upper
+    def __init__(self, *, is_top: bool) -> None:
+        self._is_top = is_top
         self._open: dict[Name, _Open] = {}
         self._due_s = float("inf")  # no question is due before
 
-    def want(self, name: Name, asker: Name, watch_s: float, now_s: float, *, is_known: bool) -> bool:
+    def want(self, name: Name, asker: Asker, watch_s: float, now_s: float, *, is_known: bool) -> bool:
         """Note that somebody asks; return whether the tier above must be asked now.
 
         A known name is asked for only when it is watched: others may advertise it elsewhere.
         """
-        if self._upper in (None, asker) or (is_known and watch_s == 0):
+        if self._is_top or (is_known and watch_s == 0):
             return False
         question = self._open.get(name)
         is_new = question is None
@@ -64,6 +65,12 @@ class Above:
             question.askers.append(asker)
         return is_new
 
+    def ask_again(self, now_s: float) -> None:
+        """Have every open question and every watch asked at once: there is another RIB above."""
+        for question in self._open.values():
+            question.again_s = now_s
+        self._due_s = min(self._due_s, now_s)
+
     def watch_s(self, name: Name) -> float:
         """Return for how long to watch a name above: longer than until it is asked again."""
         question = self._open.get(name)
@@ -74,19 +81,20 @@ class Above:
         question = self._open.get(name)
         return question is not None and not question.is_answered
 
-    def answered(self, name: Name, now_s: float) -> list[Name]:
+    def answered(self, name: Name, now_s: float) -> list[Asker]:
         """Note an answer; return who waited for it. There may be more answers to come, for the same askers."""
         question = self._open.get(name)
         if question is None:
             return []
-        question.is_answered = True
-        question.again_s = now_s + WATCH_AGAIN_S
+        if not question.is_answered:  # what is pushed later renews no watch
+            question.is_answered = True
+            question.again_s = now_s + WATCH_AGAIN_S
         return list(question.askers)
 
-    def due(self, now_s: float) -> tuple[list[tuple[Name, float]], list[tuple[Name, list[Name]]]]:
+    def due(self, now_s: float) -> tuple[list[tuple[Name, float]], list[tuple[Name, list[Asker]]]]:
         """Return what to ask now, as (name, watch seconds), and what was given up, as (name, askers)."""
         ask: list[tuple[Name, float]] = []
-        given_up: list[tuple[Name, list[Name]]] = []
+        given_up: list[tuple[Name, list[Asker]]] = []
         if now_s < self._due_s:
             return ask, given_up
         for name, question in list(self._open.items()):

@@ -11,31 +11,46 @@ the quota not spent. Global names climb to the tier above; what this tier does n
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
+from gdp.control.presence import IdentityChecks, Presence
 from gdp.control.query import Answer, Query
 from gdp.control.relay import Relay
+from gdp.control.replica import Digest, Entry, Fetch, Inventory, Key, Replicas
 from gdp.control.verdict import Verdict
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.effects import Instant
-from gdp.errors import DropReason, RemoteError, StatementError
+from gdp.errors import DropReason, RemoteError, StatementError, StoreError
 from gdp.frame.kinds import Kind
 from gdp.limits import LEASE_MAX_S, NEGATIVE_LEASE_S, RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX
 from gdp.names import Name
 from gdp.rib.above import Above
+from gdp.rib.digest_tree import DigestTree
+from gdp.rib.replication import Message, Replication
 from gdp.rib.route import Route, Withdrawn
 from gdp.rib.store import Store
-from gdp.rib.watches import Watches
+from gdp.rib.upstream import PROBE_S, Passed, Upstream
+from gdp.rib.watches import Asker, Watches
 from gdp.trust.claim import Claim, ClaimBody
 from gdp.trust.domain import Policy
+from gdp.trust.right import Right
 from gdp.trust.verifier import ClaimVerifier
 
 __all__ = ["Letter", "Rib", "RibSettings"]
 
-_ADVISED_S: Final = 30.0
+_ADVISED_S: Final = 30.0  # who was answered is told of a move for so long
+_UNTOLD_S: Final = 1.0  # ... where there are too many for that
+_DOUBT_S: Final = 0.1  # a RIB above that said nothing for so long is asked for a sign of life beside a question
+_PEER_MESSAGES: Final[dict[StatementType, type[Message]]] = {
+    StatementType.DIGEST: Digest,
+    StatementType.FETCH: Fetch,
+    StatementType.INVENTORY: Inventory,
+    StatementType.REPLICAS: Replicas,
+}
 
 
 class Letter(NamedTuple):
@@ -44,13 +59,20 @@ class Letter(NamedTuple):
     to: Name
     kind: Kind
     statement: bytes
+    about: Key | None = None  # what it says was kept: not sent if the store did not take that
 
 
 @dataclass(frozen=True, slots=True)
 class RibSettings:
-    """What an operator may choose."""
+    """What an operator may choose.
 
-    upper: Name | None = None
+    Args:
+        upper: RIBs of the tier above, any of which may be used; empty at the top.
+        peers: other RIBs of this domain, with which this one replicates.
+    """
+
+    upper: tuple[Name, ...] = ()
+    peers: tuple[Name, ...] = ()
     allow_unowned: bool = False
     names_per_sender: int = RIB_NAMES_PER_SENDER
     watches: int = RIB_WATCHES_MAX
@@ -67,8 +89,13 @@ class Rib:
         self._settings = settings
         self._verifier = ClaimVerifier(policy, allow_unowned=settings.allow_unowned)
         self._watches = Watches(settings.watches)
-        self._above = Above(settings.upper)
+        self._holders = Watches(settings.watches)  # who was answered, for the lease of the answer
+        self._above = Above(is_top=not settings.upper)
+        self._upstream = Upstream(settings.upper)
+        self._replication = self._replication_over(store.digests)
+        self._now_s = 0.0  # of the last call
         self._letters: list[Letter] = []
+        self.identities = IdentityChecks()
         self.refusals: Counter[DropReason] = Counter()
         self.accepted = 0
         self.answers = 0
@@ -86,6 +113,7 @@ class Rib:
 
     def receive(self, wire: bytes, sender: Name, now: Instant) -> None:
         """Take a statement that came from ``sender`` (as the frame says; unproven). What does not hold is counted."""
+        self._now_s = now.mono_s
         try:
             statement = parse(wire)
             if statement.signer != sender:
@@ -96,10 +124,56 @@ class Rib:
                 self._take_query(statement, now)
             elif statement.type is StatementType.ANSWER:
                 self._take_answer_from_above(statement, now)
-            elif statement.type is not StatementType.VERDICT:
+            elif statement.type is StatementType.VERDICT:
+                self._take_verdict_from_above(statement, now)
+            elif statement.type is StatementType.PRESENCE:
+                self._take_presence(statement, now)
+            elif statement.type in _PEER_MESSAGES:
+                self._take_peer_message(statement, now)
+            else:
                 raise StatementError(DropReason.MALFORMED, f"a RIB takes no {statement.type.value}")
         except RemoteError as error:
             self.refusals[error.reason] += 1
+        except StoreError:
+            self.refusals[DropReason.UNAVAILABLE] += 1  # no answer: who sent it will try again
+
+    def receive_all(self, wires: Sequence[tuple[bytes, Name]], now: Instant) -> None:
+        """Take statements, each with its sender; what they are about is read from the store in one go."""
+        if self._store.digests is None:
+            self._store.prefetch([name for wire, _ in wires if (name := _name_in(wire)) is not None], now)
+        for wire, sender in wires:
+            self.receive(wire, sender, now)
+
+    def changed(self, names: Iterable[tuple[Name, list[Route]]], now: Instant) -> None:
+        """Tell who watches what another RIB changed in a shared store, given the routes that were known before."""
+        self._now_s = now.mono_s
+        concerned = [(name, before) for name, before in names if self._concerns(name, now.mono_s)]
+        self._store.prefetch([name for name, _ in concerned], now)
+        for name, before in concerned:
+            try:
+                routes = {route.advertiser: route for route in self._store.routes(name)}
+            except StoreError:
+                self.refusals[DropReason.UNAVAILABLE] += 1
+                continue
+            known = {route.advertiser: route for route in before}
+            for advertiser, route in routes.items():
+                self._tell(route, known.get(advertiser), now.mono_s, self._above.answered(name, now.mono_s))
+            for advertiser in known.keys() - routes.keys():
+                self._tell_gone(known[advertiser], now.mono_s)
+
+    def load(self, entries: Iterable[Entry], now: Instant) -> int:
+        """Take entries of a snapshot, each verified; return how many are live. What does not hold is counted."""
+        before = self.names
+        for entry in entries:
+            try:
+                self._take_entry(entry, now)
+            except StatementError as error:
+                self.refusals[error.reason] += 1
+        return self.names - before
+
+    def entry_of(self, key: Key, now_s: float) -> Entry | None:
+        """Return what is kept of an advertiser of a name, for a peer or a snapshot, or None."""
+        return self._entry_of(key, now_s)
 
     def revoke(self, wire: bytes, now: Instant) -> None:
         """Take a certificate back: what rests on it is gone, and whoever watched is told.
@@ -124,22 +198,35 @@ class Rib:
         """Let expired routes go and tell who watched them; ask above again what is open."""
         for route in self._store.expire(now.mono_s, now.unix_s):
             self._tell_gone(route, now.mono_s)
+        self._now_s = now.mono_s
         self._watches.expire(now.mono_s)
-        ask, given_up = self._above.due(now.mono_s)
-        for name, watch_s in ask:
-            self._ask_above(name, watch_s)
-        for name, askers in given_up:
-            for asker in askers:
-                self._answer_nobody(name, asker)
+        self._holders.expire(now.mono_s)
+        if self._replication is not None:
+            self._replication.timeout(now.mono_s)
+        self._ask_what_is_due(now.mono_s)
+        for passed in self._upstream.due(now.mono_s):
+            self._send_up(passed)
+
+    def connected(self, now: Instant) -> None:
+        """Note that what is sent arrives from now on: there is a switch."""
+        self._now_s = now.mono_s
+        if self._replication is not None:
+            self._replication.connected(now.mono_s)
 
     def next_timeout(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._store.next_expiry(), self._above.next_due()]
+        times = [self._store.next_expiry(), self._above.next_due(), self._upstream.next_due()]
+        if self._replication is not None:
+            times.append(self._replication.next_due())
         return min((time for time in times if time is not None), default=None)
 
     def take(self) -> list[Letter]:
         """Return, once, what is to be sent."""
+        if refused := set(self._store.commit()):
+            self._letters = [letter for letter in self._letters if letter.about not in refused]
         letters, self._letters = self._letters, []
+        if self._replication is not None:
+            letters += [Letter(to, Kind.RIB_REQUEST, wire) for to, wire in self._replication.take(self._now_s)]
         return letters
 
     # -- advertisements
@@ -147,9 +234,8 @@ class Rib:
     def _take_relay(self, statement: Statement, now: Instant) -> None:
         relay = Relay.from_fields(statement.fields)
         member = self._sender(relay.membership, statement, now)
-        is_own_switch = member.role is Role.SWITCH and member.domain == self._policy.own
-        if not is_own_switch and member.role is not Role.RIB:
-            raise StatementError(DropReason.WRONG_DOMAIN, "relays are switches of this domain, or RIBs")
+        if member.role not in (Role.SWITCH, Role.RIB):
+            raise StatementError(DropReason.WRONG_DOMAIN, "relays are switches or RIBs")
         statement.verify(member.key)
         passed_on = parse(relay.statement)
         if passed_on.type is StatementType.WITHDRAW:
@@ -157,21 +243,48 @@ class Rib:
             return
         try:
             claim = self._verifier.verify_statement(passed_on, now.unix_s)
-            if is_own_switch and claim.switch != member.name:
+            if member.role is Role.SWITCH and claim.switch != member.name:
                 raise StatementError(DropReason.NOT_DELEGATED, "the RtCert names another switch than the relay")
+            if member.domain != self._policy.own and not claim.is_global:
+                raise StatementError(DropReason.WRONG_DOMAIN, "a local name of another domain")
+            self._check_identity(claim, now.mono_s)
             known = self._check_news(claim, member)
         except StatementError as error:
-            self._refuse(passed_on, member, error)
+            self._refuse(passed_on, member, error, now.mono_s)
             raise
         route = self._route(claim, relay.transit, member, now)
         self._store.put(route)
         self.accepted += 1
         self._judge(route.name, route.advertiser, None, route.sequence, member.name)
-        self._tell(route, now.mono_s)
-        if isinstance(known, Route) and known.sender != route.sender:
-            self._answer(route, known.sender, now.mono_s)  # it has moved: whoever brought it before must know
-        if claim.is_global and self._settings.upper not in (None, member.name):
-            self._pass_up(relay.statement, relay.transit, member)
+        self._tell(route, known, now.mono_s)
+        self._replicate(route.name, route.advertiser)
+        if claim.is_global and not self._upstream.has(member.name):
+            self._pass_up(route, relay.statement, route.sequence, now.mono_s)
+
+    def _check_identity(self, claim: Claim, now_s: float) -> None:
+        """Refuse a node's own name in another incarnation while the older node lives at another switch.
+
+        Raises:
+            StatementError: IN_USE; the older one's switch has been asked whether it is there.
+        """
+        held = self._store.get(claim.name, claim.node) if claim.right is Right.ATTACH else None
+        if not isinstance(held, Route) or held.switch == claim.switch:
+            return
+        older = ClaimBody.from_statement(parse(held.claim)).incarnation
+        if older == claim.incarnation or self.identities.is_free(claim.node, older, held.switch, now_s):
+            return
+        if self.identities.must_ask(claim.node, older, held.switch, now_s):
+            question = Presence(claim.node, older, claim.switch)
+            wire = question.to_wire(self._identity.name, self._identity.key, self._identity.membership)
+            self._letters.append(Letter(held.switch, Kind.RIB_ANSWER, wire))
+        raise StatementError(DropReason.IN_USE, "another node with this identity")
+
+    def _take_presence(self, statement: Statement, now: Instant) -> None:
+        member = self._sender(statement.fields.bytes_("c"), statement, now)
+        statement.verify(member.key)
+        presence = Presence.from_fields(statement.fields)
+        if presence.is_answer:
+            self.identities.answered(presence, member.name, now.mono_s)
 
     def _check_news(self, claim: Claim, member: Membership) -> Route | Withdrawn | None:
         """Return what was known before of a claim that may be taken.
@@ -197,8 +310,9 @@ class Rib:
             name=claim.name,
             advertiser=claim.node,
             sender=member.name,
+            switch=claim.switch,
             domain=member.domain,
-            transit=transit if member.role is Role.RIB else tuple(sorted(self._policy.transit)),
+            transit=tuple(sorted(self._policy.transit)) if self._is_own_switch(member) else transit,
             sequence=claim.sequence,
             is_global=claim.is_global,
             claim=claim.wire,
@@ -216,115 +330,200 @@ class Rib:
             raise StatementError(DropReason.STALE, "nothing to withdraw")
         claimed = ClaimBody.from_statement(parse(known.claim))
         withdrawal.verify(self._policy.verify_membership(claimed.membership, now.unix_s).key)
-        self._store.withdraw(name, advertiser)
+        self._withdraw(known, sequence, withdrawal.wire, claimed.membership)
         self._judge(name, advertiser, None, sequence, member.name)
-        self._tell_gone(known, now.mono_s)
-        if known.is_global and self._settings.upper not in (None, member.name):
-            self._pass_up(withdrawal.wire, (), member)
+        self._tell_gone(known, now.mono_s, by=member.name)
+        self._replicate(name, advertiser)
+        if known.is_global and not self._upstream.has(member.name):
+            self._pass_up(known, withdrawal.wire, sequence, now.mono_s)
 
-    def _pass_up(self, statement: bytes, transit: tuple[Name, ...], member: Membership) -> None:
-        upper = self._settings.upper
+    def _withdraw(self, route: Route, sequence: int, proof: bytes, membership: bytes) -> None:
+        gone = Withdrawn(route.sender, max(sequence, route.sequence), route.valid_until_unix_s, proof, membership)
+        self._store.withdraw(route.name, route.advertiser, gone)
+
+    def _pass_up(self, route: Route, statement: bytes, sequence: int, now_s: float) -> None:
+        if self._upstream.rib is not None:
+            key = (route.name, route.advertiser)
+            self._upstream.put(Passed(key, sequence, statement, route.transit, route.expires_s), now_s)
+            for passed in self._upstream.due(now_s):
+                self._send_up(passed)
+
+    def _send_up(self, passed: Passed) -> None:
+        upper = self._upstream.rib
         assert upper is not None
-        passed = transit if member.role is Role.RIB else tuple(sorted(self._policy.transit))
-        relay = Relay(statement, passed, self._identity.membership)
+        relay = Relay(passed.statement, passed.transit, self._identity.membership)
         self._letters.append(Letter(upper, Kind.RIB_REQUEST, relay.to_wire(self._identity.name, self._identity.key)))
 
-    def _refuse(self, passed_on: Statement, member: Membership, error: StatementError) -> None:
-        """Tell a proven relay why a claim was not taken."""
+    def _refuse(self, passed_on: Statement, member: Membership, error: StatementError, now_s: float) -> None:
+        """Tell a proven relay why a claim was not taken, and where its maker is now if it has moved."""
         try:
             name = ClaimBody.from_statement(passed_on).subject.name
         except StatementError:
             return  # not even a claim: nothing to name in an answer; the caller counts it
         known = self._store.get(name, passed_on.signer)
         self._judge(name, passed_on.signer, error.reason, 0 if known is None else known.sequence, member.name)
+        has_moved = error.reason is DropReason.STALE and isinstance(known, Route) and known.sender != member.name
+        if has_moved and isinstance(known, Route) and self._may_tell(known, _asker(member)):
+            self._answer(known, _asker(member), now_s)
 
-    def _judge(
-        self, name: Name, advertiser: Name, refused: DropReason | None, sequence: int, to: Name
-    ) -> None:
+    def _judge(self, name: Name, advertiser: Name, refused: DropReason | None, sequence: int, to: Name) -> None:
         verdict = Verdict(name, advertiser, refused, sequence)
         wire = verdict.to_wire(self._identity.name, self._identity.key, self._identity.membership)
-        self._letters.append(Letter(to, Kind.RIB_ANSWER, wire))
+        about = (name, advertiser) if refused is None else None
+        self._letters.append(Letter(to, Kind.RIB_ANSWER, wire, about))
 
     # -- questions
 
     def _take_query(self, statement: Statement, now: Instant) -> None:
         fields = statement.fields
         member = self._sender(fields.bytes_("c"), statement, now)
-        if member.role is Role.SWITCH and member.domain != self._policy.own:
-            raise StatementError(DropReason.WRONG_DOMAIN, "switches ask the RIB of their own domain")
         statement.verify(member.key)
         query = Query.from_fields(fields)
+        if query.name == self._identity.name:
+            self._deny(query.name, member.name)  # a probe for a sign of life
+            return
+        asker = _asker(member)
         if query.watch_s > 0:
-            self._watch(query, member.name, now.mono_s)
-        routes = [route for route in self._store.routes(query.name) if self._may_tell(route, member)]
+            self._watch(query, asker, now.mono_s)
+        routes = [route for route in self._store.routes(query.name) if self._may_tell(route, asker)]
         for route in routes:
-            self._answer(route, member.name, now.mono_s)
-        is_asked = self._above.want(query.name, member.name, query.watch_s, now.mono_s, is_known=bool(routes))
-        if is_asked:
+            self._answer(route, asker, now.mono_s)
+        is_below = not self._upstream.has(member.name)
+        if is_below and self._above.want(query.name, asker, query.watch_s, now.mono_s, is_known=bool(routes)):
             self._ask_above(query.name, self._above.watch_s(query.name))
         elif not routes and not self._above.is_waiting(query.name):
             self._answer_nobody(query.name, member.name)
 
-    def _watch(self, query: Query, watcher: Name, now_s: float) -> None:
+    def _watch(self, query: Query, asker: Asker, now_s: float) -> None:
         """Watch for an asker; where there are too many watches it is answered all the same, and will ask again."""
         try:
-            self._watches.add(query.name, watcher, now_s + query.watch_s)
+            self._watches.add(query.name, asker, now_s + query.watch_s)
         except StatementError as error:
             self.refusals[error.reason] += 1
 
-    def _may_tell(self, route: Route, asker: Membership) -> bool:
-        """Return whether an asker may learn of a route: what is not global stays in its domain."""
-        is_allowed = route.is_global or asker.domain == self._policy.own
-        return is_allowed and not self._is_its_own(route, asker.name)
+    def _may_tell(self, route: Route, asker: Asker) -> bool:
+        """Return whether an asker may learn of a route.
 
-    def _is_its_own(self, route: Route, asker: Name) -> bool:
-        """Return whether a RIB below told us of this route itself."""
-        return route.sender == asker and route.domain != self._policy.own
+        A local name stays in its domain. A RIB below is not told what its own domain brought.
+        """
+        if asker.domain == self._policy.own:
+            return True
+        return route.is_global and not (asker.is_rib and asker.domain == route.domain)
 
-    def _answer(self, route: Route, to: Name, now_s: float) -> None:
+    def _answer(self, route: Route, to: Asker, now_s: float) -> None:
         lease_s = min(max(route.expires_s - now_s, 0.0), _ADVISED_S)
+        try:
+            self._holders.add(route.name, to, now_s + lease_s)
+        except StatementError:
+            lease_s = min(lease_s, _UNTOLD_S)
         answer = Answer(route.name, route.advertiser, route.claim, route.domain, route.transit, lease_s)
         self.answers += 1
-        self._send(answer, to)
+        self._send(answer, to.name, (route.name, route.advertiser))
 
     def _answer_nobody(self, name: Name, to: Name) -> None:
+        if self._replication is not None and self._replication.is_cold(self._now_s):
+            return  # a peer may know; who asks will ask again, or ask that peer
+        self._deny(name, to)
+
+    def _deny(self, name: Name, to: Name) -> None:
         self.negative_answers += 1
         self._send(Answer(name, name, b"", self._policy.own, (), NEGATIVE_LEASE_S), to)
 
-    def _send(self, answer: Answer, to: Name) -> None:
+    def _send(self, answer: Answer, to: Name, about: Key | None = None) -> None:
         wire = answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)
-        self._letters.append(Letter(to, Kind.RIB_ANSWER, wire))
+        self._letters.append(Letter(to, Kind.RIB_ANSWER, wire, about))
 
-    def _tell(self, route: Route, now_s: float) -> None:
-        for watcher in self._watches.watchers(route.name, now_s):
-            if not self._is_its_own(route, watcher):
-                self._answer(route, watcher, now_s)
+    def _concerns(self, name: Name, now_s: float) -> bool:
+        """Return whether anybody is to be told of a name."""
+        is_held = self._watches.watchers(name, now_s) or self._holders.watchers(name, now_s)
+        return bool(is_held) or self._above.is_waiting(name)
 
-    def _tell_gone(self, route: Route, now_s: float) -> None:
-        for watcher in self._watches.watchers(route.name, now_s):
-            self._send(Answer(route.name, route.advertiser, b"", route.domain, (), 0.0), watcher)
+    def _tell(self, route: Route, known: Route | Withdrawn | None, now_s: float, askers: Sequence[Asker] = ()) -> None:
+        """Tell of a route: ``askers``, who watches its name, and after a move who holds or brought the old place."""
+        told = dict.fromkeys((*askers, *self._watches.watchers(route.name, now_s)))
+        if isinstance(known, Route) and known.place != route.place:
+            told |= dict.fromkeys(self._holders.watchers(route.name, now_s))
+            if known.sender != route.sender:
+                told |= self._bringer(known)
+        for asker in told:
+            if self._may_tell(route, asker):
+                self._answer(route, asker, now_s)
+
+    def _bringer(self, route: Route) -> dict[Asker, None]:
+        """Return who relayed a route, unless that was the tier above."""
+        is_rib = route.sender != route.switch
+        return {} if route.is_from_above else {Asker(route.sender, route.domain, is_rib): None}
+
+    def _tell_gone(self, route: Route, now_s: float, by: Name | None = None) -> None:
+        """Tell those who watch a name, hold a route of it or brought it that one is gone; ``by`` knows."""
+        told = dict.fromkeys((*self._watches.watchers(route.name, now_s), *self._holders.watchers(route.name, now_s)))
+        if by not in (None, route.sender):
+            told |= self._bringer(route)
+        for asker in told:
+            if self._may_tell(route, asker):
+                self._send(Answer(route.name, route.advertiser, b"", route.domain, (), 0.0), asker.name)
 
     # -- the tier above
 
+    def _ask_what_is_due(self, now_s: float) -> None:
+        """Repeat questions to the tier above; of several RIBs there, leave one that is silent."""
+        if self._upstream.turn_over(now_s):
+            self._above.ask_again(now_s)
+        ask, given_up = self._above.due(now_s)
+        for name, watch_s in ask:
+            self._ask_above(name, watch_s)
+        for name, askers in given_up:
+            for asker in askers:
+                self._answer_nobody(name, asker.name)
+        self._probe(now_s, PROBE_S)
+
+    def _probe(self, now_s: float, quiet_s: float) -> None:
+        """Ask one of several RIBs above for a sign of life if it gave none for ``quiet_s``."""
+        if self._upstream.probe(now_s, quiet_s):
+            self._query_above(self._upstream.rib, 0.0)
+
     def _ask_above(self, name: Name, watch_s: float) -> None:
-        upper = self._settings.upper
+        self._query_above(name, watch_s)
+        self._probe(self._now_s, _DOUBT_S)
+
+    def _query_above(self, name: Name | None, watch_s: float) -> None:
+        upper = self._upstream.rib
         assert upper is not None
+        assert name is not None
         query = Query(name, watch_s)
         wire = query.to_wire(self._identity.name, self._identity.key, self._identity.membership)
         self._letters.append(Letter(upper, Kind.RIB_REQUEST, wire))
 
+    def _upper_member(self, statement: Statement, now: Instant) -> Membership:
+        """Return who signed what came from the tier above.
+
+        Raises:
+            StatementError: it is not from there.
+        """
+        member = self._sender(statement.fields.bytes_("c"), statement, now)
+        if not self._upstream.has(member.name) or member.role is not Role.RIB:
+            raise StatementError(DropReason.WRONG_DOMAIN, "not from the tier above")
+        statement.verify(member.key)
+        self._upstream.heard(member.name, now.mono_s)
+        return member
+
+    def _take_verdict_from_above(self, statement: Statement, now: Instant) -> None:
+        self._upper_member(statement, now)
+        verdict = Verdict.from_fields(statement.fields)
+        if verdict.refused in (None, DropReason.STALE):
+            self._upstream.settle((verdict.name, verdict.advertiser), verdict.sequence)
+        else:
+            self._upstream.refused((verdict.name, verdict.advertiser))
+
     def _take_answer_from_above(self, statement: Statement, now: Instant) -> None:
         fields = statement.fields
-        member = self._sender(fields.bytes_("c"), statement, now)
-        if member.name != self._settings.upper or member.role is not Role.RIB:
-            raise StatementError(DropReason.WRONG_DOMAIN, "an answer from no tier above")
-        statement.verify(member.key)
+        member = self._upper_member(statement, now)
         answer = Answer.from_fields(fields)
         if answer.is_nobody:
             askers = self._above.answered(answer.name, now.mono_s)
             if not self._store.routes(answer.name):
                 for asker in askers:
-                    self._answer_nobody(answer.name, asker)
+                    self._answer_nobody(answer.name, asker.name)
             return
         known = self._store.get(answer.name, answer.advertiser)
         if not answer.claim:
@@ -334,7 +533,9 @@ class Rib:
             return
         self._learn_from_above(answer, member, known, now)
 
-    def _learn_from_above(self, answer: Answer, member: Membership, known: object, now: Instant) -> None:
+    def _learn_from_above(
+        self, answer: Answer, member: Membership, known: Route | Withdrawn | None, now: Instant
+    ) -> None:
         claim = self._verifier.verify(answer.claim, now.unix_s)
         if claim.name != answer.name or claim.node != answer.advertiser:
             raise StatementError(DropReason.WRONG_NAME, "an answer about something else than its claim")
@@ -349,12 +550,134 @@ class Rib:
             expires_s=now.mono_s + answer.lease_s,
         )
         self._store.put(route)
-        askers = self._above.answered(answer.name, now.mono_s)
-        for asker in dict.fromkeys([*askers, *self._watches.watchers(route.name, now.mono_s)]):
-            self._answer(route, asker, now.mono_s)
+        if isinstance(known, Route) and not known.is_from_above:
+            self._replicate(route.name, route.advertiser)  # a peer holds the old place
+        self._tell(route, known, now.mono_s, self._above.answered(answer.name, now.mono_s))
+
+    # -- other RIBs of the domain
+
+    def _replication_over(self, digests: DigestTree | None) -> Replication | None:
+        if digests is None:
+            return None
+        return Replication(self._identity, digests, self._settings.peers, self._entry_of, self._rank_of)
+
+    def _replicate(self, name: Name, advertiser: Name) -> None:
+        if self._replication is not None:
+            self._replication.news((name, advertiser))
+
+    def _rank_of(self, key: Key) -> int | None:
+        known = self._store.get(*key)
+        return None if known is None else _rank(known)
+
+    def _entry_of(self, key: Key, now_s: float) -> Entry | None:
+        known = self._store.get(*key)
+        if isinstance(known, Route) and known.expires_s > now_s:
+            lease_s = min(known.expires_s - now_s, LEASE_MAX_S)
+            return Entry(known.claim, b"", known.sender, known.domain, known.transit, lease_s, known.is_from_above)
+        if isinstance(known, Withdrawn) and known.proof:
+            return Entry(known.proof, known.membership, known.sender, self._policy.own, (), 0.0, is_from_above=False)
+        return None
+
+    def _take_peer_message(self, statement: Statement, now: Instant) -> None:
+        member = self._sender(statement.fields.bytes_("c"), statement, now)
+        if member.role is not Role.RIB or member.domain != self._policy.own or self._replication is None:
+            raise StatementError(DropReason.WRONG_DOMAIN, "replicates with RIBs of this domain only")
+        statement.verify(member.key)
+        if not self._replication.add_peer(member.name):
+            raise StatementError(DropReason.QUOTA, "peers")
+        message = _PEER_MESSAGES[statement.type].from_fields(statement.fields)
+        for entry in self._replication.receive(message, member.name, now.mono_s):
+            try:
+                self._take_entry(entry, now)
+            except StatementError as error:
+                self.refusals[error.reason] += 1
+
+    def _take_entry(self, entry: Entry, now: Instant) -> None:
+        """Take what a peer holds, as if it had come here.
+
+        Raises:
+            StatementError: it does not hold; what is merely no news raises nothing.
+        """
+        statement = parse(entry.statement)
+        if statement.type is StatementType.WITHDRAW:
+            self._take_withdrawn_entry(entry, statement, now)
+            return
+        claim = self._verifier.verify_statement(statement, now.unix_s)
+        known = self._store.get(claim.name, claim.node)
+        lease_s = min(entry.lease_s, claim.lease_s, claim.valid_until_unix_s - now.unix_s)
+        if lease_s <= 0 or claim.lease_s > self._settings.lease_max_s:
+            raise StatementError(DropReason.LEASE_BOUNDS)
+        if known is not None and not self._is_newer(claim, known, now.mono_s + lease_s):
+            return
+        if entry.is_from_above and (not isinstance(known, Route) or known.is_from_above):
+            return  # nothing here that it corrects
+        if known is None and self._store.count_of(entry.sender) >= self._settings.names_per_sender:
+            raise StatementError(DropReason.QUOTA, "names of one sender")
+        route = Route(
+            name=claim.name,
+            advertiser=claim.node,
+            sender=entry.sender,
+            switch=claim.switch,
+            domain=entry.domain,
+            transit=entry.transit,
+            sequence=claim.sequence,
+            is_global=claim.is_global,
+            claim=claim.wire,
+            is_from_above=entry.is_from_above,
+            expires_s=now.mono_s + lease_s,
+            valid_until_unix_s=claim.valid_until_unix_s,
+            fingerprints=claim.fingerprints,
+        )
+        self._store.put(route)
+        self._tell(route, known, now.mono_s, self._above.answered(route.name, now.mono_s))
+
+    def _is_newer(self, claim: Claim, known: Route | Withdrawn, expires_s: float) -> bool:
+        """Return whether a peer's claim replaces what is known: a higher sequence, or the same for longer."""
+        if claim.sequence != known.sequence:
+            return claim.sequence > known.sequence
+        is_same = isinstance(known, Route) and known.claim == claim.wire
+        return is_same and isinstance(known, Route) and (known.is_from_above or expires_s > known.expires_s)
+
+    def _take_withdrawn_entry(self, entry: Entry, withdrawal: Statement, now: Instant) -> None:
+        fields = withdrawal.expect(StatementType.WITHDRAW)
+        name, sequence = fields.name("n"), fields.uint("s")
+        known = self._store.get(name, withdrawal.signer)
+        if known is not None and _rank(known) >= 2 * sequence + 1:
+            return
+        member = self._sender(entry.membership, withdrawal, now)
+        withdrawal.verify(member.key)
+        if known is None and self._store.count_of(entry.sender) >= self._settings.names_per_sender:
+            raise StatementError(DropReason.QUOTA, "names of one sender")
+        gone = Withdrawn(entry.sender, sequence, member.not_after_unix_s, withdrawal.wire, entry.membership)
+        route = self._store.withdraw(name, withdrawal.signer, gone)
+        if route is not None:
+            self._tell_gone(route, now.mono_s, by=entry.sender)
+
+    def _is_own_switch(self, member: Membership) -> bool:
+        return member.role is Role.SWITCH and member.domain == self._policy.own
 
     def _sender(self, membership: bytes, statement: Statement, now: Instant) -> Membership:
         member = self._policy.verify_membership(membership, now.unix_s)
         if member.name != statement.signer:
             raise StatementError(DropReason.BAD_CERTIFICATE, "the membership is of another node")
         return member
+
+
+def _name_in(wire: bytes) -> Name | None:
+    """Return the name that a query or a relay is about, unverified; None for anything else."""
+    try:
+        statement = parse(wire)
+        if statement.type is StatementType.RELAY:
+            statement = parse(statement.fields.bytes_("q"))
+        return statement.fields.name("name" if statement.type is StatementType.ADVERTISE else "n")
+    except StatementError:
+        return None
+
+
+def _rank(known: Route | Withdrawn) -> int:
+    """Return ``Item.rank`` of what is kept; a lease that ended ranks like the claim."""
+    return 2 * known.sequence + (isinstance(known, Withdrawn) and bool(known.proof))
+
+
+def _asker(member: Membership) -> Asker:
+    return Asker(member.name, member.domain, member.role is Role.RIB)

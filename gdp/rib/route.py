@@ -18,7 +18,8 @@ class Route:
 
     Args:
         sender: the switch or RIB that relayed the claim, whose quota it counts against.
-        domain: where the claim's switch stands.
+        switch: where the advertiser is attached, as its RtCert says.
+        domain: where that switch stands.
         transit: domains through which that domain lets its traffic pass.
         claim: the signed bytes.
         is_from_above: learnt from the tier above, to be passed down only.
@@ -30,6 +31,7 @@ class Route:
     name: Name
     advertiser: Name
     sender: Name
+    switch: Name
     domain: Name
     transit: tuple[Name, ...]
     sequence: int
@@ -40,14 +42,25 @@ class Route:
     valid_until_unix_s: int
     fingerprints: frozenset[bytes]
 
+    @property
+    def place(self) -> tuple[Name, Name]:
+        """Return what a move changes: switch and domain."""
+        return self.switch, self.domain
+
 
 @dataclass(frozen=True, slots=True)
 class Withdrawn:
     """What stays of a withdrawn or expired advertisement: the sequence number that a new one must pass.
 
     It counts against its sender's quota like a route: else claiming and withdrawing in turn would fill the store.
+
+    Args:
+        proof: the signed withdrawal; empty for a lease that ended, which every RIB notices by itself.
+        membership: of its maker, whose key signed it.
     """
 
     sender: Name
     sequence: int
     valid_until_unix_s: int
+    proof: bytes = b""
+    membership: bytes = b""

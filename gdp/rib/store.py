@@ -1,14 +1,19 @@
 """Where a RIB keeps its routes.
 
-Place: pure; the interface, and the embedded store, which is memory: leases refill it after a restart.
+Place: pure; the interface, and the embedded store, which is memory. Leases, other RIBs of the domain
+(``replication.py``) or a snapshot refill it after a restart.
 """
 
 from __future__ import annotations
 
 import heapq
+from collections.abc import Collection
 from typing import Protocol
 
+from gdp.control.replica import Key
+from gdp.effects import Instant
 from gdp.names import Name
+from gdp.rib.digest_tree import DigestTree
 from gdp.rib.route import Route, Withdrawn
 
 __all__ = ["MemoryStore", "Store"]
@@ -20,8 +25,18 @@ class Store(Protocol):
     Every method may raise ``StoreError``: try again.
     """
 
+    @property
+    def digests(self) -> DigestTree | None:
+        """Return hashes over what is kept, for replication; None where several RIBs share the store itself."""
+
     def __len__(self) -> int:
         """Return how many routes are kept."""
+
+    def prefetch(self, names: Collection[Name], now: Instant) -> None:
+        """Make ready what the next calls are about, all in one go."""
+
+    def commit(self) -> list[Key]:
+        """End a turn of changes; return the keys whose change was not taken: the cause has told, or may try again."""
 
     def routes(self, name: Name) -> list[Route]:
         """Return a name's routes."""
@@ -32,8 +47,8 @@ class Store(Protocol):
     def put(self, route: Route) -> None:
         """Add or replace a route."""
 
-    def withdraw(self, name: Name, advertiser: Name) -> Route | None:
-        """Take a route away, keep its sequence number; return it."""
+    def withdraw(self, name: Name, advertiser: Name, withdrawn: Withdrawn | None = None) -> Route | None:
+        """Take a route away and return it; keep ``withdrawn``, by default the sequence number that it had."""
 
     def expire(self, now_s: float, unix_s: float) -> list[Route]:
         """Take away, keeping sequence numbers, and return the routes whose lease ended."""
@@ -58,9 +73,18 @@ class MemoryStore:
         self._ends: list[tuple[float, Name, Name]] = []
         self._forget: list[tuple[int, Name, Name]] = []
         self._size = 0
+        self.changes: set[Key] | None = None  # what changed since a snapshot was told; None: there is none
+        self.digests = DigestTree()  # over what replicates: all but what the tier above told, and leases that ended
 
     def __len__(self) -> int:
         return self._size
+
+    def prefetch(self, names: Collection[Name], now: Instant) -> None:
+        """Do nothing: all of it is in memory."""
+
+    def commit(self) -> list[Key]:
+        """Return nothing: memory takes everything."""
+        return []
 
     def routes(self, name: Name) -> list[Route]:
         """Return a name's routes."""
@@ -74,21 +98,31 @@ class MemoryStore:
     def put(self, route: Route) -> None:
         """Add or replace a route."""
         self._take(route.name, route.advertiser)
-        withdrawn = self._withdrawn.pop((route.name, route.advertiser), None)
-        if withdrawn is not None:
-            self._uncount(withdrawn.sender)
+        self._forget_withdrawn(route.name, route.advertiser)
+        if self.changes is not None:
+            self.changes.add((route.name, route.advertiser))
+        if not route.is_from_above:
+            self.digests.put(route.name, route.advertiser, route.sequence, is_withdrawn=False)
         self._routes.setdefault(route.name, {})[route.advertiser] = route
         self._counts[route.sender] = self._counts.get(route.sender, 0) + 1
         self._size += 1
         heapq.heappush(self._ends, (route.expires_s, route.name, route.advertiser))
 
-    def withdraw(self, name: Name, advertiser: Name) -> Route | None:
-        """Take a route away, keep its sequence number; return it."""
+    def withdraw(self, name: Name, advertiser: Name, withdrawn: Withdrawn | None = None) -> Route | None:
+        """Take a route away and return it; keep ``withdrawn``, by default the sequence number that it had."""
         route = self._take(name, advertiser)
-        if route is not None:
-            self._withdrawn[name, advertiser] = Withdrawn(route.sender, route.sequence, route.valid_until_unix_s)
-            self._counts[route.sender] = self._counts.get(route.sender, 0) + 1
-            heapq.heappush(self._forget, (route.valid_until_unix_s, name, advertiser))
+        if withdrawn is None:
+            if route is None:
+                return None
+            withdrawn = Withdrawn(route.sender, route.sequence, route.valid_until_unix_s)
+        if self.changes is not None:
+            self.changes.add((name, advertiser))
+        self._forget_withdrawn(name, advertiser)
+        self._withdrawn[name, advertiser] = withdrawn
+        self._counts[withdrawn.sender] = self._counts.get(withdrawn.sender, 0) + 1
+        heapq.heappush(self._forget, (withdrawn.valid_until_unix_s, name, advertiser))
+        if withdrawn.proof:
+            self.digests.put(name, advertiser, withdrawn.sequence, is_withdrawn=True)
         return route
 
     def expire(self, now_s: float, unix_s: float) -> list[Route]:
@@ -104,8 +138,7 @@ class MemoryStore:
             _, name, advertiser = heapq.heappop(self._forget)
             withdrawn = self._withdrawn.get((name, advertiser))
             if withdrawn is not None and withdrawn.valid_until_unix_s <= unix_s:
-                del self._withdrawn[name, advertiser]
-                self._uncount(withdrawn.sender)
+                self._forget_withdrawn(name, advertiser)
         return gone
 
     def next_expiry(self) -> float | None:
@@ -130,7 +163,14 @@ class MemoryStore:
             del self._routes[name]
         self._size -= 1
         self._uncount(route.sender)
+        self.digests.remove(name, advertiser)
         return route
+
+    def _forget_withdrawn(self, name: Name, advertiser: Name) -> None:
+        withdrawn = self._withdrawn.pop((name, advertiser), None)
+        if withdrawn is not None:
+            self._uncount(withdrawn.sender)
+            self.digests.remove(name, advertiser)
 
     def _uncount(self, sender: Name) -> None:
         left = self._counts[sender] - 1

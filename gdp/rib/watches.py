@@ -5,15 +5,26 @@ Place: pure; time comes in as ``now_s`` (monotonic seconds).
 
 from __future__ import annotations
 
+import heapq
+from typing import NamedTuple
+
 from gdp.errors import DropReason, StatementError
 from gdp.limits import RIB_WATCHES_MAX
 from gdp.names import Name
 
-__all__ = ["Watches"]
+__all__ = ["Asker", "Watches"]
+
+
+class Asker(NamedTuple):
+    """A proven member that asks or watches."""
+
+    name: Name
+    domain: Name
+    is_rib: bool
 
 
 class Watches:
-    """Watches by name and asker.
+    """Watches by name and asker; their ends in a heap, whose entries are renewed when they come up.
 
     Args:
         maximum: how many there may be at once.
@@ -21,47 +32,48 @@ class Watches:
 
     def __init__(self, maximum: int = RIB_WATCHES_MAX) -> None:
         self._maximum = maximum
-        self._by_name: dict[Name, dict[Name, float]] = {}
+        self._by_name: dict[Name, dict[Asker, float]] = {}
+        self._ends: list[tuple[float, Name, Asker]] = []
         self._size = 0
-        self._expire_at_s = float("inf")  # no watch ends before
 
     def __len__(self) -> int:
         return self._size
 
-    def add(self, name: Name, asker: Name, until_s: float) -> None:
+    def add(self, name: Name, asker: Asker, until_s: float) -> None:
         """Watch, or watch on.
 
         Raises:
             StatementError: QUOTA.
         """
-        watchers = self._by_name.setdefault(name, {})
-        if asker not in watchers:
-            if self._size >= self._maximum:
-                if not watchers:
-                    del self._by_name[name]
-                raise StatementError(DropReason.QUOTA, "watches")
-            self._size += 1
-        watchers[asker] = max(until_s, watchers.get(asker, until_s))
-        self._expire_at_s = min(self._expire_at_s, until_s)
+        watchers = self._by_name.get(name)
+        known_s = None if watchers is None else watchers.get(asker)
+        if known_s is not None and watchers is not None:
+            watchers[asker] = max(until_s, known_s)
+            return
+        if self._size >= self._maximum:
+            raise StatementError(DropReason.QUOTA, "watches")
+        self._size += 1
+        self._by_name.setdefault(name, {})[asker] = until_s
+        heapq.heappush(self._ends, (until_s, name, asker))
 
-    def watchers(self, name: Name, now_s: float) -> list[Name]:
+    def watchers(self, name: Name, now_s: float) -> list[Asker]:
         """Return who watches a name now."""
         return [asker for asker, until_s in self._by_name.get(name, {}).items() if until_s > now_s]
 
-    def until_s(self, name: Name) -> float | None:
-        """Return when the last watch of a name ends, or None."""
-        return max(self._by_name.get(name, {}).values(), default=None)
+    def names(self) -> list[Name]:
+        """Return every watched name."""
+        return list(self._by_name)
 
     def expire(self, now_s: float) -> None:
         """Forget watches that ended."""
-        if now_s < self._expire_at_s:
-            return
-        for name in list(self._by_name):
-            watchers = self._by_name[name]
-            for asker in [asker for asker, until_s in watchers.items() if until_s <= now_s]:
-                del watchers[asker]
-                self._size -= 1
-            if not watchers:
+        while self._ends and self._ends[0][0] <= now_s:
+            _, name, asker = self._ends[0]
+            until_s = self._by_name[name][asker]
+            if until_s > now_s:
+                heapq.heapreplace(self._ends, (until_s, name, asker))
+                continue
+            heapq.heappop(self._ends)
+            del self._by_name[name][asker]
+            if not self._by_name[name]:
                 del self._by_name[name]
-        ends = (until_s for watchers in self._by_name.values() for until_s in watchers.values())
-        self._expire_at_s = min(ends, default=float("inf"))
+            self._size -= 1

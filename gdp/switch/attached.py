@@ -121,6 +121,11 @@ class Attached:
         """Return a monotonic second that is no later than the next relay or lease end, or None."""
         return self._next_s if self._by_name else None
 
+    def next_expiry(self) -> float | None:
+        """Return the monotonic second of the next lease end, or None; looks at all."""
+        ends = (each.expires_s for claims in self._by_name.values() for each in claims.values())
+        return min(ends, default=None)
+
     def _look_ahead(self) -> None:
         times = [
             each.expires_s if each.is_settled or each.tries >= RELAY_TRIES else min(each.relay_at_s, each.expires_s)

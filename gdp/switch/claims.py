@@ -13,12 +13,13 @@ from gdp.crypto.statements import Statement, StatementType
 from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
-from gdp.names import Name
+from gdp.names import ZERO, Name
 from gdp.switch.attached import Attached
 from gdp.switch.inquirer import Inquirer
 from gdp.switch.outbox import Outbox
 from gdp.switch.places import Places
 from gdp.switch.planter import Planter
+from gdp.switch.relocation import Relocations
 from gdp.switch.unicast import Unicast
 from gdp.trust.claim import ClaimBody
 from gdp.trust.right import HEARS, Right
@@ -39,6 +40,7 @@ class Claims:
         planter: Planter,
         unicast: Unicast,
         inquirer: Inquirer,
+        relocations: Relocations,
         outbox: Outbox,
     ) -> None:
         self._identity = identity
@@ -48,6 +50,7 @@ class Claims:
         self._planter = planter
         self._unicast = unicast
         self._inquirer = inquirer
+        self._relocations = relocations
         self._outbox = outbox
 
     def take(self, neighbour: Neighbour, statement: Statement, now: Instant) -> None:
@@ -75,15 +78,17 @@ class Claims:
                 self._places.want(claim.name, now.mono_s, watch=True)
             for place in self._places.of(claim.name, now.mono_s):
                 self._inquirer.tell_reader(at, claim.right, place, now.mono_s)
-        if claim.right is Right.READ:
+        is_alone = self._inquirer.rib is None and claim.previous != ZERO  # no RIB will judge a node that has moved
+        if claim.right is Right.READ or is_alone:
             self._judge(neighbour, claim.name, None, claim.sequence)
-        else:
+        if claim.right is not Right.READ:
+            known = self._attached.get(claim.name, claim.node)
             self._attached.put(claim, *at, now.mono_s)
-            self._unicast.forget(claim.name)
+            if known is None or (known.port, known.mac) != at:
+                self._unicast.forget(claim.name)
             self._unicast.release(claim.name, now.mono_s)
-            for tree in self._planter.trees.of_topic(claim.name):
-                if tree.publisher == claim.node:
-                    tree.renew_at_s = now.mono_s
+            self._planter.publisher_attached(claim, now.mono_s)
+        self._relocations.arrived(claim, now.mono_s)
         self._inquirer.ask(now.mono_s)
 
     def _sequence_of(self, name: Name, neighbour: Neighbour) -> int:

@@ -2,7 +2,8 @@
 
 Place: pure; time comes in as ``now_s`` (monotonic seconds).
 Source: after RFC 2328, section 13. What differs: neighbours compare digests in every hello and send each other all they
-have where these differ, so that a lost flood heals without acknowledgements.
+have where these differ, so that a lost flood heals without acknowledgements. A switch that has restarted asks not to be
+passed through until it has learnt the network again (RFC 6987, stub router on start-up).
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Final
 
 from gdp.control.greeter import Greeter, LinkPort
 from gdp.control.hello import DIGEST_BYTES
-from gdp.control.link_state import Adjacency, LinkState, Scope
+from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
 from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
@@ -21,13 +22,18 @@ from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
 from gdp.limits import LINK_STATE_REFRESH_S
 from gdp.names import Name
+from gdp.switch.damping import Damping
 from gdp.switch.link_states import LinkStates
 from gdp.switch.paths import Paths
 from gdp.trust.domain import Policy
 
 __all__ = ["Flooding"]
 
+_STUB_S: Final = 2.0  # after a restart, until the trees and ways through here are set up
+_STUB_COST: Final = 1 << 20  # above every real way, so only what has no other way passes
+_EARLY_S: Final = 10.0  # when a link state of an earlier life comes this soon, we have restarted
 _SYNC_S: Final = 0.5  # a neighbour is not sent everything more often than this
+_OUT_OF_STEP_S: Final = 0.2  # a flood under way makes digests differ for less long
 
 SendStatement = Callable[[Neighbour, bytes], None]
 
@@ -47,13 +53,18 @@ class Flooding:
         self._policy = policy
         self._greeter = greeter
         self._send = send
-        self._sequence = first_sequence
+        self._sequence = self._first_sequence = first_sequence
+        self._begun_s: float | None = None
+        self._stub_until_s: float | None = None
+        self._was_stub = False
         self._domain = identity.member.domain
         self.link_states = LinkStates(self._domain)
         self.paths = Paths(identity.name, self._domain, self.link_states)
+        self.damping = Damping()
         self._said: dict[Scope, tuple[object, ...]] = {}
         self._refresh_at_s = 0.0
         self._synced_s: dict[tuple[int, Name], float] = {}
+        self._differs_s: dict[tuple[int, Name], float] = {}  # since when keepalives show other ones
 
     def digest_for(self, port: LinkPort) -> bytes:
         """Return what to say in a hello on a port: nothing where its switches are of several domains."""
@@ -103,23 +114,37 @@ class Flooding:
         """Return whether a neighbour's last hello showed the same link states as ours."""
         return neighbour.digest in (self.link_states.digest(neighbour.domain), bytes(DIGEST_BYTES))
 
+    def compare(self, neighbour: Neighbour, now_s: float) -> None:
+        """Look at what a neighbour's keepalive says of its link states; send it ours where they differ for long."""
+        key = (neighbour.port, neighbour.name)
+        if self.is_in_step(neighbour):
+            self._differs_s.pop(key, None)
+        elif now_s - self._differs_s.setdefault(key, now_s) >= _OUT_OF_STEP_S:
+            self.sync(neighbour, now_s)
+
     def timeout(self, now_s: float) -> None:
         """Renew our link states, forget what others did not renew, and follow what moved inside our domain."""
+        self._begun_s = now_s if self._begun_s is None else self._begun_s
+        if self._stub_until_s is not None and now_s >= self._stub_until_s:
+            self._stub_until_s = None
         self.link_states.expire(now_s)
+        self.damping.expire(now_s)
         if now_s >= self._refresh_at_s:
             self._said.clear()
         self._originate(now_s)
 
     def next_timeout(self) -> float:
         """Return the monotonic second of the next timer."""
-        expiry = self.link_states.next_expiry()
-        return self._refresh_at_s if expiry is None else min(expiry, self._refresh_at_s)
+        times = (self._refresh_at_s, self.link_states.next_expiry(), self._stub_until_s, self.damping.next_reuse())
+        return min(time for time in times if time is not None)
 
     def _originate(self, now_s: float) -> None:
-        up = [each for each in self._greeter.all_up() if each.role == Role.SWITCH]
+        switches = [each for each in self._greeter.all_up() if each.role == Role.SWITCH]
+        steady = [each for each in switches if not self.damping.suppresses((each.port, each.name))]
+        up = steady or switches  # better a link that flaps than none
         links = tuple(sorted(Adjacency(n.name, n.domain, self._cost(n), n.mtu) for n in up))
-        ribs = tuple(sorted(n.name for n in self._greeter.all_up() if n.role == Role.RIB and n.domain == self._domain))
-        self._say(Scope.DOMAIN, links, (), ribs, now_s)
+        ribs = {AttachedRib(n.name, n.domain, n.nonce) for n in self._greeter.all_up() if n.role == Role.RIB}
+        self._say(Scope.DOMAIN, links, (), tuple(sorted(ribs)), (), now_s)
         leaving = tuple(link for link in links if link.domain != self._domain)
         if leaving or Scope.BORDER in self._said or self.link_states.sequence_of(self._identity.name, Scope.BORDER):
             inside = tuple(
@@ -127,22 +152,24 @@ class Flooding:
                 for border, distance in self.paths.borders().items()
                 if border != self._identity.name
             )
-            self._say(Scope.BORDER, leaving, inside, tuple(sorted(self.paths.ribs())), now_s)
+            members = tuple(sorted(self.paths.members()))
+            self._say(Scope.BORDER, leaving, inside, tuple(sorted(self.paths.ribs_inside())), members, now_s)
 
     def _say(
         self,
         scope: Scope,
         links: tuple[Adjacency, ...],
         inside: tuple[Adjacency, ...],
-        ribs: tuple[Name, ...],
+        ribs: tuple[AttachedRib, ...],
+        members: tuple[Name, ...],
         now_s: float,
     ) -> None:
-        said = (links, inside, ribs)
+        said = (links, inside, ribs, members)
         if self._said.get(scope) == said:
             return
         self._said[scope] = said
         self._sequence += 1
-        state = LinkState(self._identity.name, self._domain, scope, self._sequence, links, inside, ribs)
+        state = LinkState(self._identity.name, self._domain, scope, self._sequence, links, inside, ribs, members)
         wire = state.to_wire(self._identity.key, self._identity.membership)
         self.link_states.put(state, wire, now_s)
         self._refresh_at_s = now_s + LINK_STATE_REFRESH_S
@@ -150,6 +177,10 @@ class Flooding:
 
     def _outdo(self, state: LinkState, now_s: float) -> None:
         """Answer a link state of an earlier life of ours that others still hold."""
+        is_early = self._begun_s is not None and now_s - self._begun_s < _EARLY_S
+        if is_early and not self._was_stub and state.sequence <= self._first_sequence:
+            self._was_stub, self._stub_until_s = True, now_s + _STUB_S
+            self._originate(now_s)
         if state.sequence > self._sequence:
             self._sequence = state.sequence
             self._said.clear()
@@ -163,4 +194,5 @@ class Flooding:
                 self._send(neighbour, wire)
 
     def _cost(self, neighbour: Neighbour) -> int:
-        return self._greeter.ports[neighbour.port].cost
+        cost = self._greeter.ports[neighbour.port].cost
+        return cost if self._stub_until_s is None else cost + _STUB_COST

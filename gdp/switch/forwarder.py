@@ -7,7 +7,8 @@ Source: DESIGN sections 3 and 7. In this order:
 2. a kind from 0x80 on is for the neighbour itself: hand up;
 3. hops left 0 or 1: drop, for it may not leave again; a payload longer than what came: drop, truncated;
 4. look up destination and source, then destination alone; a miss: hand up; an entry without hops: drop, no route;
-5. one copy to every hop, except to a port that is down or whose link is too narrow: that copy alone is dropped.
+5. one copy to every hop, or to its alternate while the hop's port is down, except to a port that is down or whose link
+   is too narrow: that copy alone is dropped.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class HandUp(NamedTuple):
 class Forward(NamedTuple):
     """Copies to send, and why some could not be."""
 
-    hops: Hops
+    hops: tuple[Hop, ...]
     lost: tuple[DropReason, ...] = ()
 
 
@@ -85,13 +86,17 @@ def _fit(hops: Hops, size: int, mtus: Mapping[int, int]) -> Forward:
     good: list[Hop] = []
     lost: list[DropReason] = []
     for hop in hops:
-        mtu = mtus.get(hop[0])
+        exit_: Hop = hop[:2]
+        mtu = mtus.get(exit_[0])
+        if mtu is None and len(hop) > 2:
+            exit_ = hop[2:]
+            mtu = mtus.get(exit_[0])
         if mtu is None:
             lost.append(DropReason.PORT_DOWN)
         elif size > mtu:
             lost.append(DropReason.TOO_BIG)
         else:
-            good.append(hop)
+            good.append(exit_)
     return Forward(tuple(good), tuple(lost))
 
 

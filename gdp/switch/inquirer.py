@@ -1,38 +1,52 @@
 """A switch's dealings with its RIB: relay what attached nodes claim, ask where names are, take the answers in.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds). Only a RIB of the switch's own domain is believed, and its
-answers carry the claims themselves, which readers verify again.
+Place: pure; time comes in as ``now_s`` (monotonic seconds).
+
+The nearest RIB of the switch's own domain is asked, over other domains where its own is parted. Where the own domain
+has none, it is the nearest RIB of a domain through which traffic may pass. One that owes an answer for ``SILENT_S`` is
+left for the next one. While none answers, what is known is served on (``places.py``).
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Final
+
+from gdp.control.presence import Presence
 from gdp.control.query import Answer, Query
 from gdp.control.relay import Relay
 from gdp.control.verdict import Verdict
-from gdp.crypto.certificates import Role
+from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.identity import Identity
-from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.crypto.statements import Statement, StatementType
 from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.switch.attached import Attached
+from gdp.switch.evidence import Evidence
 from gdp.switch.outbox import Outbox
 from gdp.switch.parked import Parked
 from gdp.switch.paths import Paths
-from gdp.switch.places import WATCH_S, Place, Places
+from gdp.switch.places import Place, Places
 from gdp.switch.planter import Planter
+from gdp.switch.presence import PresenceAnswers
+from gdp.switch.relocation import Relocations
 from gdp.switch.trees import At
 from gdp.switch.unicast import Unicast
-from gdp.trust.claim import ClaimBody
 from gdp.trust.domain import Policy
 from gdp.trust.right import HEARS, Right
 
-__all__ = ["Inquirer"]
+__all__ = ["SILENT_S", "Inquirer"]
+
+SILENT_S: Final = 1.6  # longer than a RIB waits for the tier above
+KNOWN_MAX: Final = 8
+_AVOID_S: Final = 10.0  # a RIB that owed an answer for too long is left for so long, if there is another
+_REFILL_S: Final = 10.0  # how long a RIB that is new here may say "nobody" of what is known
 
 
 class Inquirer:
-    """Speaks with the nearest RIB of the switch's domain.
+    """Speaks with the nearest RIB.
 
     Attributes:
         rib: whom it asks, or None while none is known.
@@ -48,7 +62,10 @@ class Inquirer:
         parked: Parked,
         planter: Planter,
         unicast: Unicast,
+        relocations: Relocations,
+        evidence: Evidence,
         outbox: Outbox,
+        presence: PresenceAnswers,
     ) -> None:
         self._identity = identity
         self._policy = policy
@@ -58,40 +75,70 @@ class Inquirer:
         self._parked = parked
         self._planter = planter
         self._unicast = unicast
+        self._relocations = relocations
+        self._evidence = evidence
         self._outbox = outbox
+        self._presence = presence
         self.rib: Name | None = None
+        self._session = b""  # of that RIB with its switch: another one means that it restarted or moved
+        self._chosen_s = float("-inf")
+        self._owed_s: float | None = None  # since when it owes an answer
+        self._avoided: dict[Name, float] = {}  # RIBs that did not answer, until when
+        self._review_s = float("inf")  # when one of them may be asked again
+        self._asked: dict[Name, None] = {}  # RIBs whose answers are taken, the newest last
 
     def links_changed(self, now_s: float) -> None:
         """Choose the RIB anew; a new one is told and asked everything."""
-        rib = self._nearest_rib()
-        if rib != self.rib:
-            self.rib = rib
+        rib = self._nearest_rib(now_s)
+        known = None if rib is None else self._paths.ribs().get(rib)
+        session = b"" if known is None else known.session
+        if (rib, session) != (self.rib, self._session):
+            self.rib, self._session, self._chosen_s, self._owed_s = rib, session, now_s, None
+            self._places.serve_stale(rib is None, now_s)
             self._attached.relay_all(now_s)
             self._places.ask_again(now_s)
         self.ask(now_s)
 
-    def _nearest_rib(self) -> Name | None:
-        ribs = self._paths.ribs()
-        ways = {rib: self._paths.to_rib(rib, frozenset({self._policy.own})) for rib in ribs}
-        reached = [
-            (0 if way is None else way.distance, rib)
-            for rib, (way, host) in ways.items()
-            if host is not None
-        ]
-        return min(reached, default=(0, None))[1]
+    def _nearest_rib(self, now_s: float) -> Name | None:
+        own, transit = self._policy.own, self._policy.transit
+        reached = []
+        for name, rib in self._paths.ribs().items():
+            if rib.domain not in transit:
+                continue
+            way, host = self._paths.to_rib(name, transit)
+            if host is not None:
+                is_avoided = self._avoided.get(name, 0.0) > now_s
+                reached.append((is_avoided, rib.domain != own, 0 if way is None else way.distance, name))
+        return min(reached)[3] if reached else None
 
     def ask(self, now_s: float) -> None:
         """Relay and ask what is due."""
         if self.rib is None:
             return
+        if now_s >= self._review_s:
+            self._review_s = float("inf")
+            self.links_changed(now_s)
+        if self._owed_s is not None and now_s - self._owed_s >= SILENT_S:
+            self._leave_silent_rib(now_s)
         for attachment in self._attached.due(now_s):
             self.relay(attachment.claim.wire, now_s)
         questions, given_up = self._places.due(now_s)
-        for name, is_watch in questions:
-            query = Query(name, WATCH_S if is_watch else 0.0)
+        for name, watch_s in questions:
+            query = Query(name, watch_s)
             self._to_rib(query.to_wire(self._identity.name, self._identity.key, self._identity.membership), now_s)
         for name in given_up:
             self._parked.refuse(name, DropReason.NO_ROUTE)
+
+    def _leave_silent_rib(self, now_s: float) -> None:
+        """Ask another RIB; where there is none, serve what is known."""
+        assert self.rib is not None
+        self._avoided = {rib: until_s for rib, until_s in self._avoided.items() if until_s > now_s}
+        self._avoided[self.rib] = self._review_s = now_s + _AVOID_S
+        self._owed_s = None
+        before = self.rib
+        self._places.serve_stale(True, now_s)
+        if self._nearest_rib(now_s) != before:
+            self.links_changed(now_s)
 
     def relay(self, statement: bytes, now_s: float) -> None:
         """Pass an attached node's claim or withdrawal on to the RIB."""
@@ -99,23 +146,37 @@ class Inquirer:
         self._to_rib(relay.to_wire(self._identity.name, self._identity.key), now_s)
 
     def _to_rib(self, statement: bytes, now_s: float) -> None:
-        if self.rib is not None:
-            frames = self._outbox.far(Kind.RIB_REQUEST, statement, self.rib)
-            self._unicast.send(frames, self.rib, self._identity.name, now_s)
+        if self.rib is None:
+            return
+        if self._owed_s is None:
+            self._owed_s = now_s
+        self._asked.pop(self.rib, None)
+        self._asked[self.rib] = None
+        if len(self._asked) > 8:
+            del self._asked[next(iter(self._asked))]
+        frames = self._outbox.far(Kind.RIB_REQUEST, statement, self.rib)
+        self._unicast.send(frames, self.rib, self._identity.name, now_s)
 
     def receive(self, statement: Statement, now: Instant) -> None:
-        """Take a RIB's answer or verdict.
+        """Take a RIB's answer or verdict, or what a node's former switch knows.
 
         Raises:
-            StatementError: it does not hold, or is not from a RIB of our domain.
+            StatementError: it does not hold, or is from nobody who was asked.
         """
         fields = statement.fields
         member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
-        if member.role is not Role.RIB or member.domain != self._policy.own or member.name != statement.signer:
-            raise StatementError(DropReason.WRONG_DOMAIN, "an answer that is not from a RIB of ours")
+        if member.name != statement.signer or not self._was_asked(member, now.mono_s):
+            raise StatementError(DropReason.WRONG_DOMAIN, "an answer from nobody who was asked")
         statement.verify(member.key)
+        if member.role is Role.SWITCH:
+            self._take_context(statement, now)
+            return
+        self._rib_answered(member.name, now.mono_s)
         if statement.type is StatementType.VERDICT:
             self._take_verdict(statement)
+            return
+        if statement.type is StatementType.PRESENCE:
+            self._presence.ask(Presence.from_fields(fields), member.name, statement.wire, now.mono_s)
             return
         statement.expect(StatementType.ANSWER)
         answer = Answer.from_fields(fields)
@@ -124,54 +185,137 @@ class Inquirer:
         elif not answer.claim:
             self._gone(answer, now.mono_s)
         else:
-            self._found(answer, now.mono_s)
+            self._found(answer, statement.wire, now)
 
-    def _found(self, answer: Answer, now_s: float) -> None:
-        claim = parse(answer.claim)
-        body = ClaimBody.from_statement(claim)
-        if body.subject.name != answer.name or claim.signer != answer.advertiser:
-            raise StatementError(DropReason.WRONG_NAME, "an answer about something else than its claim")
-        switch = parse(body.rtcert).fields.name("switch")
-        place = Place(
-            answer.name, answer.advertiser, body.right, switch, answer.domain, frozenset(answer.transit),
-            answer.claim, now_s + answer.lease_s,
-        )  # fmt: skip
+    def verify_answer(self, statement: Statement, now: Instant) -> Place:
+        """Return the place in an answer that was passed on; any RIB of a trusted domain may have given it.
+
+        Raises:
+            StatementError: it does not hold, or tells of no place.
+        """
+        fields = statement.expect(StatementType.ANSWER)
+        member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
+        if member.name != statement.signer or member.role not in (Role.RIB, Role.SWITCH):
+            raise StatementError(DropReason.BAD_CERTIFICATE, "an answer from nobody who may give one")
+        statement.verify(member.key)
+        answer = Answer.from_fields(fields)
+        if not answer.claim:
+            raise StatementError(DropReason.MALFORMED, "a redirect to nowhere")
+        return self._evidence.from_answer(answer, now)
+
+    def _was_asked(self, member: Membership, now_s: float) -> bool:
+        if member.role is Role.RIB:
+            return member.domain == self._policy.own or member.name in self._asked
+        return member.role is Role.SWITCH and self._relocations.is_former(member.name, now_s)
+
+    def _rib_answered(self, rib: Name, now_s: float) -> None:
+        self._avoided.pop(rib, None)
+        if rib == self.rib:
+            self._owed_s = None
+            self._places.serve_stale(False, now_s)
+
+    def _found(self, answer: Answer, wire: bytes, now: Instant) -> None:
+        try:
+            place = self._evidence.from_answer(answer, now)
+        except StatementError:
+            self._nobody(answer.name, now.mono_s)  # it is of no use here, and an answer all the same
+            raise
+        self.learn(place, wire, now.mono_s)
+
+    def _take_context(self, statement: Statement, now: Instant) -> None:
+        """Take from a node's former switch whom the node hears; a RIB's word counts more."""
+        if statement.type is StatementType.VERDICT:
+            verdict = Verdict.from_fields(statement.fields)
+            self._relocations.acknowledged(verdict.name, verdict.advertiser, verdict.sequence)
+            return
+        statement.expect(StatementType.ANSWER)
+        place = self._evidence.from_answer(Answer.from_fields(statement.fields), now)
+        known = self._places.get(place.name, place.advertiser)
+        if known is None or known.sequence < place.sequence:
+            self.learn(place, statement.wire, now.mono_s)
+
+    def learn(self, place: Place, statement: bytes, now_s: float) -> None:
+        """Take in where an advertiser is, and let everything that depends on it follow.
+
+        Args:
+            statement: what proved it.
+        """
+        is_ours = place.switch == self._identity.name
         attachment = self._attached.get(place.name, place.advertiser)
-        if attachment is not None and attachment.claim.sequence < body.sequence and switch != self._identity.name:
+        was_here = self._relocations.was_here(place.name, place.advertiser, now_s)
+        if attachment is not None and attachment.claim.sequence < place.sequence and not is_ours:
             self._attached.remove(place.name, place.advertiser)  # it has moved to another switch
+            self._relocations.departed(attachment.claim, now_s)
             self._unicast.forget(place.name)
-        before = self._places.put(place, now_s, is_ours=switch == self._identity.name)
+            was_here = True
+        known = self._places.get(place.name, place.advertiser)
+        if known is not None and known.sequence > place.sequence:
+            place = replace(known, expires_s=max(known.expires_s, place.expires_s))  # the teller lags behind
+        before = self._places.put(place, now_s, is_ours=is_ours)
         if before is None or (before.switch, before.domain) != (place.switch, place.domain):
             self._unicast.forget(place.name)
+            self._unicast.forget(place.advertiser)
+            self._planter.publisher_moved(place, now_s)
+            if was_here and not is_ours:
+                self._relocations.moved(place, statement, now_s)
         self._planter.publisher_found(place, now_s)
         if before is None or before.claim != place.claim:
             for at, right in self._planter.readers(place.name):
                 self.tell_reader(at, right, place, now_s)
-        self._unicast.release(place.name, now_s)
+        for name in (place.name, place.advertiser):
+            self._unicast.release(name, now_s)
+
+    def answer_relocation(self, moved: Place, now_s: float) -> None:
+        """Tell the new switch of a node that it was understood, and whom the node hears on the name."""
+        identity = self._identity
+        verdict = Verdict(moved.name, moved.advertiser, None, moved.sequence)
+        statements = [verdict.to_wire(identity.name, identity.key, identity.membership)]
+        for place in self._places.of(moved.name, now_s):
+            if HEARS.get(moved.right) is place.right:
+                statements.append(self._as_answer(place, now_s))
+        for statement in statements:
+            frames = self._outbox.far(Kind.RIB_ANSWER, statement, moved.switch)
+            self._unicast.send(frames, moved.switch, identity.name, now_s)
+
+    def known_of(self, name: Name, now_s: float) -> list[bytes]:
+        """Return statements that prove where a node, or who advertises a name, is; at most ``KNOWN_MAX``."""
+        attachment = self._attached.at(name)
+        if attachment is not None:
+            relay = Relay(attachment.claim.wire, tuple(sorted(self._policy.transit)), self._identity.membership)
+            return [relay.to_wire(self._identity.name, self._identity.key)]
+        node = self._places.of_node(name, now_s)
+        places = self._places.of(name, now_s) + ([] if node is None else [node])
+        return [self._as_answer(place, now_s) for place in places[:KNOWN_MAX]]
 
     def tell_reader(self, at: At, right: Right, place: Place, now_s: float) -> None:
         """Hand the claim of whoever an attached node hears, by its right, on to it; it verifies that itself."""
         if HEARS[right] is place.right:
-            lease_s = max(place.expires_s - now_s, 0.0)
-            answer = Answer(
-                place.name, place.advertiser, place.claim, place.domain, tuple(sorted(place.transit)), lease_s
-            )
-            self._answer_reader(at, answer)
+            self._outbox.say_at(*at, Kind.VERDICT, self._as_answer(place, now_s))
+
+    def _as_answer(self, place: Place, now_s: float) -> bytes:
+        lease_s = max(place.expires_s - now_s, 0.0)
+        answer = Answer(place.name, place.advertiser, place.claim, place.domain, tuple(sorted(place.transit)), lease_s)
+        return answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)
 
     def _gone(self, answer: Answer, now_s: float) -> None:
         self._places.remove(answer.name, answer.advertiser, now_s)
         self._planter.publisher_gone(answer.name, answer.advertiser)
         self._unicast.forget(answer.name)
-        for at, _ in self._planter.readers(answer.name):
-            self._answer_reader(at, answer)
-
-    def _answer_reader(self, at: At, answer: Answer) -> None:
         wire = answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)
-        self._outbox.say_at(*at, Kind.VERDICT, wire)
+        for at, _ in self._planter.readers(answer.name):
+            self._outbox.say_at(*at, Kind.VERDICT, wire)
 
     def _nobody(self, name: Name, now_s: float) -> None:
+        if self._places.of(name, now_s) and now_s - self._chosen_s < _REFILL_S:
+            self._places.answered(name, now_s)  # a RIB that has just begun does not know yet: keep what is known
+            return
         self._places.nobody(name, now_s)
         self._parked.refuse(name, DropReason.NO_ROUTE)
+
+    def expire(self, now_s: float) -> None:
+        """Let go of what no RIB has confirmed for a lease."""
+        for place in self._places.expire(now_s):
+            self._planter.publisher_gone(place.name, place.advertiser)
 
     def _take_verdict(self, statement: Statement) -> None:
         verdict = Verdict.from_fields(statement.fields)
@@ -179,3 +323,12 @@ class Inquirer:
         attachment = self._attached.settle(verdict.name, verdict.advertiser, taken)
         if attachment is not None:
             self._outbox.say_at(attachment.port, attachment.mac, Kind.VERDICT, statement.wire)
+            if verdict.refused is DropReason.IN_USE:  # the older node with this identity is elsewhere
+                self._attached.remove(verdict.name, verdict.advertiser)
+                self._unicast.forget(verdict.name)
+
+    def next_timeout(self) -> float | None:
+        """Return the monotonic second of the next question, or of the moment to leave a silent RIB."""
+        owed_s = None if self._owed_s is None else self._owed_s + SILENT_S
+        times = [self._attached.next_event(), self._places.next_due(), owed_s, self._review_s]
+        return None if self.rib is None else min((time for time in times if time is not None), default=None)

@@ -110,4 +110,4 @@ class LinkStates:
 
 
 def _ways(state: LinkState) -> tuple[object, ...]:
-    return state.links, state.inside, state.ribs
+    return state.links, state.inside, state.ribs, state.members

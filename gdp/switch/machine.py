@@ -19,6 +19,7 @@ from gdp.control.frames import ControlJoiner, ControlSplitter
 from gdp.control.greeter import Change, Greeter, LinkPort
 from gdp.control.join import Join
 from gdp.control.neighbour import Neighbour, NeighbourState
+from gdp.control.query import Query
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
@@ -31,23 +32,26 @@ from gdp.limits import HOPS_MAX
 from gdp.names import Name
 from gdp.switch.attached import Attached
 from gdp.switch.claims import Claims
+from gdp.switch.evidence import Evidence
 from gdp.switch.flooding import Flooding
 from gdp.switch.inquirer import Inquirer
 from gdp.switch.outbox import Outbox
 from gdp.switch.parked import Parked
-from gdp.switch.places import Places
+from gdp.switch.places import Place, Places
 from gdp.switch.planter import Planter
+from gdp.switch.presence import PresenceAnswers
+from gdp.switch.relocation import Relocations
 from gdp.switch.revoker import Revoker
+from gdp.switch.spf_delay import SpfDelay
 from gdp.switch.table import Table
 from gdp.switch.unicast import Unicast
 from gdp.trust.domain import Policy
-from gdp.trust.right import HEARS
+from gdp.trust.right import HEARS, Right
 from gdp.trust.verifier import ClaimVerifier
 
 __all__ = ["Switch"]
 
-_FOLLOW_S: Final = 0.005  # from the first news of links to new paths
-_FOLLOW_AGAIN_S: Final = 0.1  # ... and where news keep coming
+_PROTECT_S: Final = 0.1  # from new paths to their alternates, which nobody waits for
 _CONTROL = frozenset(kind.value for kind in Kind if kind >= CONTROL_FROM)
 
 
@@ -72,6 +76,8 @@ class Switch:
             settings.random_bytes,
             hello_s=settings.hello_s,
             dead_s=settings.dead_s,
+            timing=settings.timing,
+            incarnation=settings.incarnation,
             digest_for=self._digest_for,
         )
         self._outbox = Outbox(self.greeter, self._splitter)
@@ -80,27 +86,33 @@ class Switch:
         self._verifier = ClaimVerifier(policy)
         self._incarnation = settings.incarnation
         self.attached = Attached()
-        self.places = Places()
+        self.places = Places(settings.lease_s)
         self.parked = Parked()
         self.planter = Planter(
             identity, policy, table, self._paths, self.attached, self._outbox, settings.first_sequence
         )
         self.unicast = Unicast(
-            policy.own, policy.transit, table, self._paths, self.places, self.attached, self.parked, self._outbox
-        )
+            identity.name, policy.own, policy.transit, table, self._paths, self.places, self.attached, self.parked,
+            self._outbox,
+        )  # fmt: skip
+        self._evidence = Evidence(policy, self._verifier)
         self._revoker = Revoker(
-            self._verifier, self.greeter, self.attached, self.planter, self.unicast, self._outbox
-        )
+            self._verifier, self.greeter, self.attached, self.planter, self.unicast, self.places, self._evidence,
+            self._outbox,
+        )  # fmt: skip
+        self.relocations = Relocations(identity, policy, self.planter, self.unicast, self._outbox)
         self._seen_version = -1
-        self._follow_at_s: float | None = None  # when paths are computed anew
+        self._spf_delay = SpfDelay()
+        self._protect_at_s: float | None = None  # when alternates are computed
         self._followed_s = float("-inf")
+        self._presence = PresenceAnswers(identity, self.greeter, self.attached, self.unicast, self._outbox)
         self.inquirer = Inquirer(
             identity, policy, self._paths, self.attached, self.places, self.parked, self.planter, self.unicast,
-            self._outbox,
+            self.relocations, self._evidence, self._outbox, self._presence,
         )  # fmt: skip
         self._claims = Claims(
             identity, self._verifier, self.attached, self.places, self.planter, self.unicast, self.inquirer,
-            self._outbox,
+            self.relocations, self._outbox,
         )  # fmt: skip
         self._drops: Counter[DropReason] = Counter()
 
@@ -145,6 +157,7 @@ class Switch:
                 self._take(arrival, decode(arrival.frame), now)
             except RemoteError as error:
                 self._drops[error.reason] += 1
+        self._presence.answer(now.mono_s)
         self._plan_follow(now.mono_s)
 
     def timeout(self, now: Instant) -> None:
@@ -156,38 +169,48 @@ class Switch:
         for hello in self.greeter.take(now_s):
             self._outbox.put(hello)
         self._flooding.timeout(now_s)
-        if lost or (self._follow_at_s is not None and self._follow_at_s <= now_s):
+        if lost or (self._spf_delay.due_s is not None and self._spf_delay.due_s <= now_s):
             self._follow_links(now_s)
         else:
             self._plan_follow(now_s)
+        if self._protect_at_s is not None and self._protect_at_s <= now_s:
+            self._protect_at_s = None
+            self._paths.has_alternates = True
+            self.unicast.refresh(now_s)
         if self.unicast.is_refreshing:
             self.unicast.refresh_more(now_s)
         self._joiner.expire(now_s)
         self._hellos.expire(now_s)
         self.parked.expire(now_s)
-        self.places.expire(now_s)
+        self.inquirer.expire(now_s)
         for key in self.table.expire(now_s):
             self.unicast.expired(key)
         for attachment in self.attached.expire(now_s):
             self.unicast.forget(attachment.claim.name)
         for topic in self.planter.timeout(now_s):
             self.places.unwatch(topic)
+        self.relocations.timeout(now_s)
         self.inquirer.ask(now_s)
+        self._presence.answer(now_s)
 
     def next_timeout(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         times = [
-            self._follow_at_s,
+            self._spf_delay.due_s,
+            self._protect_at_s,
             self.greeter.next_timeout(),
             self._flooding.next_timeout(),
             self.parked.next_expiry(),
             self.table.next_expiry(),
             self.planter.next_timeout(),
+            self.places.next_expiry(),
+            self.relocations.next_timeout(),
+            self.inquirer.next_timeout(),
         ]
         if self.unicast.is_refreshing:
             times.append(self._followed_s)  # past: at once
-        if self.inquirer.rib is not None:
-            times += [self.attached.next_event(), self.places.next_due()]
+        if self.inquirer.rib is None:
+            times.append(self.attached.next_expiry())
         return min((time for time in times if time is not None), default=None)
 
     def take(self) -> list[Transmit]:
@@ -215,6 +238,11 @@ class Switch:
         if header.kind >= CONTROL_FROM:
             if header.kind not in _CONTROL:
                 raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
+            if header.kind == Kind.KEEPALIVE:
+                neighbour = self.greeter.receive_keepalive(arrival, header, now)
+                if neighbour.role is Role.SWITCH:
+                    self._flooding.compare(neighbour, now.mono_s)
+                return
             joiner = self._joiner
             if header.kind == Kind.HELLO:
                 joiner = self._hellos
@@ -224,11 +252,14 @@ class Switch:
             if wire is not None:
                 self._take_control(arrival, header.kind, parse(wire), now)
             return
-        self._sender(arrival)  # nor is anything answered or looked for in their name
+        neighbour = self._sender(arrival)  # nor is anything answered or looked for in their name
         if header.destination == self.name:
             self._take_own(header, arrival, now)
         else:
-            self.unicast.miss(header, arrival.frame[: HEADER_BYTES + header.length], now.mono_s)
+            sought = self.unicast.miss(header, arrival.frame[: HEADER_BYTES + header.length], now.mono_s)
+            if sought is not None and self.places.serves_stale:
+                self.relocations.ask_neighbour(sought, neighbour, now.mono_s)
+            self.relocations.frame_came(Name(header.destination), neighbour, now.mono_s)
 
     def _take_control(self, arrival: Arrival, kind: int, statement: Statement, now: Instant) -> None:
         if kind == Kind.HELLO:
@@ -252,6 +283,10 @@ class Switch:
             self._take_join(neighbour, statement, now)
         elif kind == Kind.REVOKE:
             self._revoke(statement, neighbour, now)
+        elif kind == Kind.REDIRECT:
+            self._redirected(statement, now)
+        elif kind == Kind.WHERE:
+            self._where(neighbour, statement, now)
         else:
             raise FrameError(DropReason.UNKNOWN_KIND, str(kind))
 
@@ -268,10 +303,12 @@ class Switch:
         raise FrameError(DropReason.UNKNOWN_SENDER)
 
     def _take_own(self, header: Header, arrival: Arrival, now: Instant) -> None:
-        if header.kind == Kind.RIB_ANSWER:
+        if header.kind in (Kind.RIB_ANSWER, Kind.RELOCATE):
             wire = self._joiner.add(header, arrival.frame, now.mono_s, arrival.via)
-            if wire is not None:
+            if wire is not None and header.kind == Kind.RIB_ANSWER:
                 self.inquirer.receive(parse(wire), now)
+            elif wire is not None:
+                self._relocated(parse(wire), now)
         elif header.kind == Kind.ECHO_REQUEST:
             back = header._replace(
                 kind=Kind.ECHO_REPLY, hops_left=HOPS_MAX, destination=header.source, source=self.name,
@@ -302,36 +339,79 @@ class Switch:
             if neighbour.role is Role.SWITCH:
                 self._flooding.sync(neighbour, now_s)
         elif before is NeighbourState.UP:
+            if neighbour.role is Role.SWITCH:
+                self._flooding.damping.went((neighbour.port, neighbour.name), now_s)
             self.planter.neighbour_lost((neighbour.port, neighbour.mac))
             for attachment in self.attached.of(neighbour.name):
                 if attachment.port == neighbour.port:
+                    self.relocations.departed(attachment.claim, now_s)
                     self.attached.remove(attachment.claim.name, neighbour.name)
                     self.unicast.forget(attachment.claim.name)
 
     def _plan_follow(self, now_s: float) -> None:
         """See that a change of the links is followed soon, together with those that come right behind it.
 
-        Link states come in bursts; the longest wait is that of OSPF's usual timers, the shortest hardly one.
+        Link states come in bursts (``spf_delay.py``).
         """
-        if self._follow_at_s is None and self._flooding.link_states.version != self._seen_version:
-            is_quiet = now_s - self._followed_s >= _FOLLOW_AGAIN_S
-            self._follow_at_s = now_s + (_FOLLOW_S if is_quiet else _FOLLOW_AGAIN_S)
+        if self._spf_delay.due_s is None and self._flooding.link_states.version != self._seen_version:
+            self._spf_delay.news(now_s)
 
     def _follow_links(self, now_s: float) -> None:
         """Let everything that depends on paths follow a change of the links."""
-        self._follow_at_s = None
+        self._spf_delay.computed()
         version = self._flooding.link_states.version
         if version == self._seen_version:
             return
         self._flooding.neighbour_changed(now_s)  # what lies inside our domain may have moved
         self._seen_version = self._flooding.link_states.version
         self._followed_s = now_s
+        self._paths.has_alternates, self._protect_at_s = False, now_s + _PROTECT_S
         self.unicast.refresh(now_s)
         self.planter.reroute(now_s)
         self.inquirer.links_changed(now_s)
 
     def _send_link_state(self, neighbour: Neighbour, wire: bytes) -> None:
         self._outbox.say(neighbour, Kind.LINK_STATE, wire)
+
+    # -- moved nodes
+
+    def _relocated(self, statement: Statement, now: Instant) -> None:
+        """Take from the new switch of a node that was attached here where it is, and tell whom it hears."""
+        place = self._evidence.from_relay(statement, now)
+        if place.right in HEARS and self.planter.reader_moved(place):
+            self.places.unwatch(place.name)
+        self.inquirer.answer_relocation(place, now.mono_s)
+        if place.right is not Right.READ and self._is_news(place):
+            self.inquirer.learn(place, statement.wire, now.mono_s)
+
+    def _redirected(self, statement: Statement, now: Instant) -> None:
+        """Take from a neighbour, to whom our frames for a node went, where that node is now."""
+        if statement.type is StatementType.RELAY:
+            place = self._evidence.from_relay(statement, now)
+        else:
+            place = self.inquirer.verify_answer(statement, now)
+        if self._is_news(place):
+            is_known = self.places.get(place.name, place.advertiser) is not None
+            has_moved = is_known or self.planter.trees.get(place.name, place.advertiser) is not None
+            self.inquirer.learn(place, statement.wire, now.mono_s)
+            if has_moved:
+                self.relocations.moved(place, statement.wire, now.mono_s)
+
+    def _where(self, neighbour: Neighbour, statement: Statement, now: Instant) -> None:
+        """Tell a neighbour, to whom our frames for a node go, where that node is."""
+        query = Query.from_fields(statement.expect(StatementType.QUERY))
+        if neighbour.role is not Role.SWITCH or statement.signer != neighbour.name:
+            raise StatementError(DropReason.UNKNOWN_SENDER, "a question that a neighbouring switch did not ask")
+        statement.verify(neighbour.key)
+        for known in self.inquirer.known_of(query.name, now.mono_s):
+            self._outbox.say(neighbour, Kind.REDIRECT, known)
+
+    def _is_news(self, place: Place) -> bool:
+        """Return whether a place is newer than what is known of the advertiser, here or elsewhere."""
+        attachment = self.attached.get(place.name, place.advertiser)
+        known = self.places.get(place.name, place.advertiser)
+        newest = max(-1 if attachment is None else attachment.claim.sequence, -1 if known is None else known.sequence)
+        return place.sequence > newest
 
     # -- trees
 
@@ -345,4 +425,5 @@ class Switch:
             claim = self._verifier.verify(join.evidence, now.unix_s)
             if claim.right not in HEARS or claim.name != join.topic:
                 raise StatementError(DropReason.NOT_DELEGATED, "a join without a reader's claim")
-        self.planter.join(join, neighbour, now.mono_s)
+        if self.planter.join(join, neighbour, now.mono_s):
+            self.relocations.redirect_join(join.topic, join.publisher, neighbour, now.mono_s)

@@ -10,7 +10,7 @@ from gdp.control.greeter import Greeter
 from gdp.control.neighbour import Neighbour
 from gdp.effects import Transmit
 from gdp.names import ZERO, Name
-from gdp.switch.table import Hop
+from gdp.switch.table import Hop, ProtectedHop
 
 __all__ = ["Outbox"]
 
@@ -60,6 +60,16 @@ class Outbox:
     def hop(self, neighbour: Neighbour) -> Hop:
         """Return the table's hop to a neighbour."""
         return neighbour.port, neighbour.mac + self._greeter.ports[neighbour.port].mac
+
+    def protected_hop(self, neighbour: Neighbour, alternate: Name | None) -> Hop | ProtectedHop:
+        """Return the hop to a neighbour with another way out: over a second link to it, or else to ``alternate``."""
+        hop = self.hop(neighbour)
+        others = [port for port in self._greeter.ports if port != hop[0]]
+        for name in (neighbour.name, alternate or neighbour.name):
+            found = [n for port in others if (n := self._greeter.neighbour(port, name)) is not None]
+            if found:
+                return *hop, *self.hop(min(found, key=lambda n: (self._greeter.ports[n.port].cost, n.port)))
+        return hop
 
     def hop_at(self, port: int, mac: bytes) -> Hop:
         """Return the table's hop to an address on a port."""

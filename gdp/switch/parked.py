@@ -32,21 +32,26 @@ class Parked:
     def __len__(self) -> int:
         return self._frames
 
-    def park(self, name: bytes, frame: bytes, now_s: float) -> None:
-        """Keep a frame until ``release`` or until ``PARKED_S`` have gone."""
+    def park(self, name: bytes, frame: bytes, now_s: float, until_s: float | None = None) -> None:
+        """Keep a frame until ``release``, or until ``until_s``; if not given, until ``PARKED_S`` have gone."""
         if self._frames >= PARKED_FRAMES_MAX or self._bytes + len(frame) > PARKED_BYTES_MAX:
             self.drops[DropReason.PARKED_FULL] += 1
             return
-        self._by_name.setdefault(name, deque()).append(_Waiting(frame, now_s + PARKED_S))
+        waiting = _Waiting(frame, now_s + PARKED_S if until_s is None else until_s)
+        self._by_name.setdefault(name, deque()).append(waiting)
         self._frames += 1
         self._bytes += len(frame)
 
-    def release(self, name: bytes) -> list[bytes]:
-        """Return, in order, what waited for a name."""
+    def is_waiting(self, name: bytes) -> bool:
+        """Return whether frames wait for a name."""
+        return name in self._by_name
+
+    def release(self, name: bytes) -> list[tuple[bytes, float]]:
+        """Return, in order, what waited for a name, and until when each frame would have waited."""
         waiting = self._by_name.pop(name, deque())
         self._frames -= len(waiting)
         self._bytes -= sum(len(each.frame) for each in waiting)
-        return [each.frame for each in waiting]
+        return [(each.frame, each.until_s) for each in waiting]
 
     def refuse(self, name: bytes, reason: DropReason) -> None:
         """Drop what waited for a name, under a reason."""

@@ -2,7 +2,8 @@
 
 Place: pure.
 Source: Dijkstra, by networkx. Edges are directed; a link counts when both ends name it. Of another domain a switch sees
-the borders only, so the way to a switch behind them is the way to the nearest border.
+the borders only, so the way to a switch behind them is the way to the nearest border that lists it. A part of the own
+domain that a failure has cut off is seen in the same way: through its borders, over other domains.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
-from gdp.control.link_state import LinkState, Scope
+from gdp.control.link_state import MEMBERS_MAX, Adjacency, AttachedRib, LinkState, Scope
 from gdp.names import Name
 from gdp.switch.link_states import LinkStates
 
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 __all__ = ["Paths", "Way"]
 
 _CACHE_MAX = 64
+_ALTERNATES_CACHE_MAX = 4_096
+_ALTERNATES_SWITCHES_MAX = 256  # among more, paths from every neighbour would keep a switch busy for too long
 
 
 class Way(NamedTuple):
@@ -27,10 +30,16 @@ class Way(NamedTuple):
 
     first: Name  # the neighbour to go through
     distance: int
+    alternate: Name | None = None  # another neighbour, from which frames do not come back
 
 
 class Paths:
-    """Answers of shortest-path questions, computed when first asked after a change."""
+    """Answers of shortest-path questions, computed when first asked after a change.
+
+    Attributes:
+        has_alternates: whether ways are given with their loop-free alternates (RFC 5286), which cost a computation for
+            each neighbour: nobody should wait for them.
+    """
 
     def __init__(self, me: Name, domain: Name, link_states: LinkStates) -> None:
         self._me = me
@@ -38,17 +47,61 @@ class Paths:
         self._link_states = link_states
         self._version = -1
         self._graph: nx.DiGraph[Name] | None = None
-        self._domains: dict[Name, Name] = {}
-        self._ribs: dict[Name, set[Name]] = {}
-        self._ways: dict[frozenset[Name], dict[Name, Way]] = {}
+        self._members: frozenset[Name] = frozenset()  # switches of our domain that are reachable within it
+        self._domains: dict[Name, Name] = {}  # of every switch that is known by name
+        self._borders_of: dict[Name, list[Name]] = {}  # of a switch that is not in the graph: borders that list it
+        self._beyond: dict[Name, list[Name]] = {}  # by domain: borders that are reached over links between domains
+        self._open_borders: dict[Name, list[Name]] = {}  # by domain: borders that could not list all their switches
+        self._ribs: dict[Name, dict[Name, AttachedRib]] = {}  # RIB to the switches where it is attached or reached
+        self._ways: dict[tuple[Name, frozenset[Name]], dict[Name, Way]] = {}
+        self._alternates: dict[tuple[Name, frozenset[Name]], Name | None] = {}
+        self.has_alternates = False
 
     def to_switch(self, switch: Name, domain: Name, allowed: frozenset[Name]) -> Way | None:
         """Return the way to a switch of a domain; None when there is none through ``allowed`` domains."""
-        ways = self._to_all(allowed)
-        if domain == self._domain or switch in ways:
-            return ways.get(switch)
-        borders = (ways[each] for each, its in self._domains.items() if its == domain and each in ways)
-        return min(borders, key=lambda way: way.distance, default=None)
+        way = self._pick(self._to_all(allowed), switch, domain)
+        if way is None or not self.has_alternates:
+            return way
+        key = switch, allowed
+        if key not in self._alternates:
+            if len(self._alternates) >= _ALTERNATES_CACHE_MAX:
+                self._alternates.clear()
+            self._alternates[key] = self._alternate(way, switch, domain, allowed)
+        return way._replace(alternate=self._alternates[key])
+
+    def _alternate(self, way: Way, switch: Name, domain: Name, allowed: frozenset[Name]) -> Name | None:
+        """Return the best neighbour whose own shortest path does not lead back here: RFC 5286, inequality 1.
+
+        Only one of our domain: how others choose their paths is theirs to know.
+        """
+        if self._graph is None or len(self._graph) > _ALTERNATES_SWITCHES_MAX:
+            return None
+        found: list[tuple[int, Name]] = []
+        for neighbour, edge in self._graph.adj[self._me].items():
+            if neighbour == way.first or self._domains.get(neighbour) != self._domain:
+                continue
+            onwards = self.distance_from(neighbour, switch, domain, allowed)
+            back = self.distance_from(neighbour, self._me, self._domain, allowed)
+            if onwards is not None and back is not None and onwards < back + way.distance:
+                found.append((edge["weight"] + onwards, neighbour))
+        return min(found, default=(0, None))[1]
+
+    def distance_from(self, start: Name, switch: Name, domain: Name, allowed: frozenset[Name]) -> int | None:
+        """Return how far a switch is from another one than this; None where there is no way."""
+        way = self._pick(self._to_all(allowed, start), switch, domain)
+        return 0 if start == switch else None if way is None else way.distance
+
+    def _pick(self, ways: dict[Name, Way], switch: Name, domain: Name) -> Way | None:
+        if switch in ways:
+            return ways[switch]
+        borders = self._borders_of.get(switch) or self._fallback_borders(domain)
+        return min((ways[each] for each in borders if each in ways), key=lambda way: way.distance, default=None)
+
+    def _fallback_borders(self, domain: Name) -> list[Name]:
+        """Return where to try a switch that no border lists: it may be new, or beyond what a border can list."""
+        if domain == self._domain:
+            return self._open_borders.get(domain, [])
+        return self._beyond.get(domain, [])
 
     def to_rib(self, rib: Name, allowed: frozenset[Name]) -> tuple[Way | None, Name | None]:
         """Return the way to the nearest switch from which a RIB is reached, and that switch (self: no way needed).
@@ -57,7 +110,7 @@ class Paths:
             allowed: domains to pass through; the one that the RIB stands in may be another.
         """
         self._refresh()
-        hosts = self._ribs.get(rib, set())
+        hosts = self._ribs.get(rib, {})
         if self._me in hosts:
             return None, self._me
         found = ((self.to_switch(host, self._domains[host], allowed | {self._domains[host]}), host) for host in hosts)
@@ -79,28 +132,42 @@ class Paths:
         self._refresh()
         return self._domains.get(switch)
 
-    def ribs(self) -> frozenset[Name]:
-        """Return the RIBs of our own domain that are attached somewhere."""
-        return frozenset(rib for state in self._link_states.states(Scope.DOMAIN) for rib in state.ribs)
+    def ribs(self) -> dict[Name, AttachedRib]:
+        """Return every RIB that a link state names, our own domain's and others', by name."""
+        self._refresh()
+        return {rib: min(hosts.values()) for rib, hosts in self._ribs.items()}
+
+    def ribs_inside(self) -> frozenset[AttachedRib]:
+        """Return the RIBs that are attached to switches of our domain, as far as those are reachable within it."""
+        self._refresh()
+        hosts = (state for state in self._link_states.states(Scope.DOMAIN) if state.origin in self._members)
+        return frozenset(rib for state in hosts for rib in state.ribs)
+
+    def members(self) -> frozenset[Name]:
+        """Return the switches of our domain that are reachable within it, this one too."""
+        self._refresh()
+        return self._members
 
     def borders(self) -> dict[Name, int]:
         """Return the other switches of our domain that have links leaving it, with their distance within it."""
         ways = self._to_all(frozenset({self._domain}))
         states = self._link_states.states(Scope.DOMAIN)
         borders = {s.origin for s in states if any(link.domain != self._domain for link in s.links)}
-        return {border: ways[border].distance for border in sorted(borders) if border in ways}
+        return {each: ways[each].distance for each in sorted(borders & self._members) if each in ways}
 
-    def _to_all(self, allowed: frozenset[Name]) -> dict[Name, Way]:
+    def _to_all(self, allowed: frozenset[Name], start: Name | None = None) -> dict[Name, Way]:
+        """Return the ways from a switch, this one if not given, to all others."""
         self._refresh()
-        ways = self._ways.get(allowed)
+        key = start or self._me, allowed
+        ways = self._ways.get(key)
         if ways is None:
             if len(self._ways) >= _CACHE_MAX:
                 self._ways.clear()
-            ways = self._ways[allowed] = self._compute(allowed)
+            ways = self._ways[key] = self._compute(*key)
         return ways
 
-    def _compute(self, allowed: frozenset[Name]) -> dict[Name, Way]:
-        if self._graph is None or self._me not in self._graph:
+    def _compute(self, start: Name, allowed: frozenset[Name]) -> dict[Name, Way]:
+        if self._graph is None or start not in self._graph:
             return {}
         from networkx import dijkstra_predecessor_and_distance
 
@@ -109,12 +176,12 @@ class Paths:
         def cost(_from: Name, to: Name, edge: dict[str, int]) -> int | None:
             return edge["weight"] if to in open_ else None  # None hides an edge
 
-        before, distances = dijkstra_predecessor_and_distance(self._graph, self._me, weight=cost)
+        before, distances = dijkstra_predecessor_and_distance(self._graph, start, weight=cost)
         ways: dict[Name, Way] = {}
         for to, distance in distances.items():  # the nearest first: whoever comes before ``to`` is there already
-            if to != self._me:
+            if to != start:
                 last = before[to][0]
-                ways[to] = Way(to if last == self._me else ways[last].first, int(distance))
+                ways[to] = Way(to if last == start else ways[last].first, int(distance))
         return ways
 
     def _refresh(self) -> None:
@@ -122,22 +189,44 @@ class Paths:
             return
         self._version = self._link_states.version
         self._ways.clear()
+        self._alternates.clear()
         home = self._link_states.states(Scope.DOMAIN)
-        borders = self._link_states.states(Scope.BORDER)
-        self._domains = {state.origin: state.domain for state in [*home, *borders]}
-        self._ribs = {}
-        for state in [*home, *(each for each in borders if each.domain != self._domain)]:
+        self._members = _reachable(self._me, home, self._domain)
+        inside = [state for state in home if state.origin in self._members]
+        beyond = [state for state in self._link_states.states(Scope.BORDER) if state.origin not in self._members]
+        self._domains = {member: state.domain for state in beyond for member in state.members}
+        self._domains |= {state.origin: state.domain for state in [*home, *beyond]}
+        self._borders_of, self._open_borders, self._beyond, self._ribs = {}, {}, {}, {}
+        for state in beyond:
+            self._beyond.setdefault(state.domain, []).append(state.origin)
+            for member in state.members:
+                self._borders_of.setdefault(member, []).append(state.origin)
+            if len(state.members) >= MEMBERS_MAX:
+                self._open_borders.setdefault(state.domain, []).append(state.origin)
+        for state in [*inside, *beyond]:
             for rib in state.ribs:
-                self._ribs.setdefault(rib, set()).add(state.origin)
-        self._graph = _graph([*home, *borders], self._domain)
+                self._ribs.setdefault(rib.name, {})[state.origin] = rib
+        self._graph = _graph([(s.origin, s.links) for s in inside] + [(s.origin, s.links + s.inside) for s in beyond])
 
 
-def _graph(states: Iterable[LinkState], home: Name) -> nx.DiGraph[Name]:
-    """Return the links; of other domains also the ways between their borders, which hide what lies inside."""
+def _reachable(me: Name, states: Iterable[LinkState], domain: Name) -> frozenset[Name]:
+    """Return the switches that are joined to ``me`` by links within the domain."""
+    links = {state.origin: {link.name for link in state.links if link.domain == domain} for state in states}
+    found, todo = {me}, [me]
+    while todo:
+        here = todo.pop()
+        joined = {each for each in links.get(here, ()) if here in links.get(each, ())} - found
+        found |= joined
+        todo += joined
+    return frozenset(found)
+
+
+def _graph(edges: Iterable[tuple[Name, tuple[Adjacency, ...]]]) -> nx.DiGraph[Name]:
+    """Return the graph of all links that both ends name."""
     cost: dict[tuple[Name, Name], int] = {}
-    for state in states:
-        for link in state.links if state.domain == home else [*state.links, *state.inside]:
-            edge = (state.origin, link.name)
+    for origin, links in edges:
+        for link in links:
+            edge = (origin, link.name)
             cost[edge] = min(cost.get(edge, link.cost), link.cost)
     from networkx import DiGraph  # large; nothing is asked before there is a neighbour
 

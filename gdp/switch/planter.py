@@ -4,8 +4,13 @@ Place: pure; time comes in as ``now_s`` (monotonic seconds).
 
 A reader's claim and each known publisher of its topic make a tree; so do a server's with each client, and a client's
 with each server, which are called reader and publisher here. A switch asks the next switch towards the publisher,
-again and again while a branch stands, and asks another one at once when the way changes. A join says the smallest MTU
-below, so it is said anew at once when that changes: a reader came or left, or a link got narrower or wider.
+again and again while a branch stands, and asks another one at once when the way changes. A join is said several times
+at first, since one may be lost. A join says the smallest MTU below, so it is said anew at once when that changes: a
+reader came or left, or a link got narrower or wider.
+
+Make before break: where the one above changes because a better way has come up, the former one is left only after
+``_OVERLAP_S``; readers drop what comes twice. Where the publisher has moved it is left at once, for the former one may
+now have to take its messages from here.
 """
 
 from __future__ import annotations
@@ -13,6 +18,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final
 
 from gdp.control.join import Join
 from gdp.control.neighbour import Neighbour
@@ -32,6 +38,9 @@ from gdp.trust.domain import Policy
 from gdp.trust.right import HEARS, Right
 
 __all__ = ["Planter"]
+
+_JOIN_AGAIN_S: Final = (0.1, 0.3)  # a new join is said again after so long, then every JOIN_REFRESH_S
+_OVERLAP_S: Final = 0.3  # the former one above is left so long after the new one was asked
 
 
 @dataclass(slots=True)
@@ -106,12 +115,33 @@ class Planter:
                 continue  # one's own messages do not come back
             allowed = (self._policy.transit & place.transit) | {self._policy.own, place.domain}
             tree = self._tree(place.name, place.advertiser, allowed)
-            tree.switch, tree.domain, tree.allowed = place.switch, place.domain, allowed
-            lease_s = min(reader.expires_s, place.expires_s)
-            tree.branches[at] = Branch(lease_s, self._outbox.mtu_of(at[0]), reader.claim.wire)
+            if place.sequence >= tree.version:
+                self._place_at(tree, place.switch, place.domain, place.sequence)
+                tree.allowed = allowed
+            tree.branches[at] = Branch(reader.expires_s, self._outbox.mtu_of(at[0]), reader.claim.wire)
             self._plant(tree)
             self._follow(tree, now_s)
             self._ask_above(tree, now_s)
+
+    def publisher_attached(self, claim: Claim, now_s: float) -> None:
+        """Take in that a publisher claims its topic here: trees that pass here are asked of itself at once."""
+        tree = self.trees.get(claim.name, claim.node)
+        if tree is not None:
+            self._place_at(tree, self._identity.name, self._policy.own, max(claim.sequence, tree.version))
+            tree.renew_at_s = now_s
+
+    def publisher_moved(self, place: Place, now_s: float) -> None:
+        """Let the tree of a publisher follow it, if it passes here and its readers let it pass there."""
+        tree = self.trees.get(place.name, place.advertiser)
+        if tree is not None and place.sequence >= tree.version and place.domain in tree.allowed:
+            self._place_at(tree, place.switch, place.domain, place.sequence)
+            self._follow(tree, now_s)
+
+    def below(self, topic: Name, publisher: Name) -> list[At]:
+        """Return the neighbouring switches that take a tree from here."""
+        tree = self.trees.get(topic, publisher)
+        readers = self._readers.get(topic, {})
+        return [] if tree is None else [at for at in tree.branches if at not in readers]
 
     def publisher_gone(self, topic: Name, publisher: Name) -> None:
         """Take the readers attached here off a tree whose publisher is gone."""
@@ -120,8 +150,18 @@ class Planter:
             for at in self._readers.get(topic, {}):
                 self._cut(tree, at)
 
-    def join(self, join: Join, neighbour: Neighbour, now_s: float) -> None:
+    def reader_moved(self, place: Place) -> bool:
+        """Let a reader go that is attached elsewhere now; return whether the topic has none left here."""
+        for at, reader in list(self._readers.get(place.name, {}).items()):
+            if reader.claim.node == place.advertiser and reader.claim.sequence < place.sequence:
+                return self.remove_reader(place.name, at)
+        return False
+
+    def join(self, join: Join, neighbour: Neighbour, now_s: float) -> bool:
         """Take a verified join (or, with no lease, a leave) from the switch below.
+
+        Returns:
+            Whether it looks for the publisher where that is no longer.
 
         Raises:
             StatementError: the way is not allowed to lead through here.
@@ -131,25 +171,30 @@ class Planter:
             tree = self.trees.get(join.topic, join.publisher)
             if tree is not None and at in tree.branches and tree.branches[at].sequence < join.sequence:
                 self._cut(tree, at)
-            return
+            return False
         if self._policy.own not in join.allowed or neighbour.domain not in join.allowed:
             raise StatementError(DropReason.WRONG_DOMAIN, "a tree that must not pass here")
         tree = self._tree(join.topic, join.publisher, join.allowed)
         before = tree.branches.get(at)
         if before is not None and join.sequence < before.sequence:
-            return  # a newer one overtook it
-        is_same_place = (tree.switch, tree.domain) == (join.switch, join.domain)
-        tree.switch, tree.domain, tree.allowed = join.switch, join.domain, join.allowed
+            return False  # a newer one overtook it
+        if tree.former is not None and tree.former[0] == at:
+            self._leave_former(tree)  # it takes the messages from here now
+        is_behind = join.version < tree.version
+        is_same_place = (tree.switch, tree.domain) == (join.switch, join.domain) or is_behind
+        if join.version >= tree.version:
+            self._place_at(tree, join.switch, join.domain, join.version)
+            tree.allowed = join.allowed
         branch = Branch(now_s + min(join.lease_s, JOIN_LEASE_S), join.mtu, join.evidence, join.mtu, join.sequence)
         branch.fit(self._outbox.mtu_of(neighbour.port))
         tree.branches[at] = branch
         self._plant(tree)
-        if self._follow(tree, now_s):
-            return
-        if before is None or not is_same_place or tree.is_doubted:
-            self._ask_above(tree, now_s)
-        else:
-            self._resize(tree)
+        if not self._follow(tree, now_s):
+            if before is None or not is_same_place or tree.is_doubted:
+                self._ask_above(tree, now_s)
+            else:
+                self._resize(tree)
+        return is_behind and tree.switch != join.switch
 
     def neighbour_up(self, at: At, now_s: float) -> None:
         """Ask a neighbour again for what it was asked before its present session, of which it knows nothing."""
@@ -208,6 +253,8 @@ class Planter:
         for tree in self.trees.all():
             if tree.renew_at_s <= now_s:
                 self._ask_above(tree, now_s)
+            if tree.former is not None and tree.former_until_s <= now_s:
+                self._leave_former(tree)
         return orphaned
 
     def next_timeout(self) -> float | None:
@@ -237,6 +284,7 @@ class Planter:
             self._resize(tree)
             return
         self._table.remove(tree.key)
+        self._leave_former(tree)
         self._leave(tree)
         self.trees.remove(tree)
 
@@ -247,9 +295,7 @@ class Planter:
             return None if attachment is None else (attachment.port, attachment.mac, tree.publisher)
         way = self._paths.to_switch(tree.switch, tree.domain, tree.allowed)
         neighbour = None if way is None else self._outbox.neighbour(way.first)
-        if neighbour is None or (neighbour.port, neighbour.mac) in tree.branches:
-            return None  # no way, or it leads back to where the join came from: links are still settling
-        return neighbour.port, neighbour.mac, neighbour.name
+        return None if neighbour is None else (neighbour.port, neighbour.mac, neighbour.name)
 
     def _follow(self, tree: Tree, now_s: float) -> bool:
         """Leave the one above and ask another where the way to the publisher has changed; return whether it has."""
@@ -263,10 +309,15 @@ class Planter:
         above = self._above(tree)
         tree.renew_at_s = now_s + JOIN_REFRESH_S
         if (None if above is None else above[:2]) != tree.above:
-            self._leave(tree)
-        if above is None:
+            self._part_from_above(tree, now_s, keep=above is not None)
+            if above is not None:
+                tree.above, tree.above_name = above[:2], above[2]
+            self._plant(tree)
+        if above is None or not tree.is_wanted_below:
             return
-        tree.above, tree.above_name = above[:2], above[2]
+        if tree.joins < len(_JOIN_AGAIN_S):
+            tree.renew_at_s = now_s + _JOIN_AGAIN_S[tree.joins]
+            tree.joins += 1
         tree.asked_mtu = min(tree.mtu, self._outbox.mtu_of(above[0]))
         self._show(tree)
 
@@ -284,19 +335,51 @@ class Planter:
         evidence = tree.evidence
         tree.is_doubted = tree.is_doubted and evidence == tree.shown
         tree.shown = evidence
-        self._say(tree, tree.asked_mtu, JOIN_LEASE_S, evidence)
+        if tree.above is not None and tree.above_name is not None:
+            self._say(tree, tree.above, tree.above_name, tree.asked_mtu, JOIN_LEASE_S, evidence)
+
+    def _place_at(self, tree: Tree, switch: Name, domain: Name, version: int) -> None:
+        """Take in where a tree's publisher is; where that is news, the one above is left before another is asked."""
+        if (tree.switch, tree.domain) != (switch, domain):
+            self._leave_former(tree)
+            tree.has_moved = True
+        tree.switch, tree.domain, tree.version = switch, domain, version
+
+    def _part_from_above(self, tree: Tree, now_s: float, *, keep: bool) -> None:
+        """Leave the one above: at once, or where the way to the same place has changed, after a while."""
+        self._leave_former(tree)
+        if keep and tree.above is not None and tree.above_name is not None and self._is_loop_free(tree):
+            tree.former, tree.former_until_s = (tree.above, tree.above_name), now_s + _OVERLAP_S
+            tree.above = tree.above_name = None
+        else:
+            self._leave(tree)
+        tree.joins, tree.has_moved = 0, False
+
+    def _is_loop_free(self, tree: Tree) -> bool:
+        """Return whether the one above, which is not the best any more, cannot take the messages from here itself.
+
+        Source: RFC 5286, inequality 3 (a downstream neighbour is nearer to the destination than we are).
+        """
+        if tree.has_moved or tree.above_name is None:
+            return False
+        own = self._paths.to_switch(tree.switch, tree.domain, tree.allowed)
+        its = self._paths.distance_from(tree.above_name, tree.switch, tree.domain, tree.allowed)
+        return own is not None and its is not None and its < own.distance
+
+    def _leave_former(self, tree: Tree) -> None:
+        if tree.former is not None:
+            (at, name), tree.former = tree.former, None
+            if at != tree.above:
+                self._say(tree, at, name, 1, 0.0, b"")
 
     def _leave(self, tree: Tree) -> None:
-        if tree.above is not None:
-            self._say(tree, 1, 0.0, b"")
+        if tree.above is not None and tree.above_name is not None:
+            self._say(tree, tree.above, tree.above_name, 1, 0.0, b"")
         tree.above = tree.above_name = None
 
-    def _say(self, tree: Tree, mtu: int, lease_s: float, evidence: bytes) -> None:
-        """Send a join, or with no lease a leave, to the one above."""
-        above = tree.above
-        if above is None or tree.above_name is None:
-            return
-        session = self._outbox.session_of(above[0], tree.above_name)
+    def _say(self, tree: Tree, above: At, name: Name, mtu: int, lease_s: float, evidence: bytes) -> None:
+        """Send a join, or with no lease a leave, to one above."""
+        session = self._outbox.session_of(above[0], name)
         if session is None:
             return  # it is gone, and with it what it knew of us
         self._sequence += 1
@@ -311,6 +394,7 @@ class Planter:
             evidence,
             session,
             self._sequence,
+            tree.version,
         )
         kind = Kind.JOIN if lease_s else Kind.LEAVE
         self._outbox.say_at(*above, kind, join.to_wire(self._identity.name, self._identity.key))

@@ -21,7 +21,9 @@ from gdp.errors import StatementError
 from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.switch.attached import Attached
+from gdp.switch.evidence import Evidence
 from gdp.switch.outbox import Outbox
+from gdp.switch.places import Places
 from gdp.switch.planter import Planter
 from gdp.switch.unicast import Unicast
 from gdp.trust.claim import Claim
@@ -43,6 +45,8 @@ class Revoker:
         attached: Attached,
         planter: Planter,
         unicast: Unicast,
+        places: Places,
+        evidence: Evidence,
         outbox: Outbox,
     ) -> None:
         self._verifier = verifier
@@ -50,6 +54,8 @@ class Revoker:
         self._attached = attached
         self._planter = planter
         self._unicast = unicast
+        self._places = places
+        self._evidence = evidence
         self._outbox = outbox
         self._told: OrderedDict[bytes, bytes] = OrderedDict()  # fingerprint -> statement
 
@@ -83,6 +89,11 @@ class Revoker:
             if not self._holds(attachment.claim, now):
                 self._attached.remove(attachment.claim.name, attachment.claim.node)
                 self._unicast.forget(attachment.claim.name)
+        for place in self._places.all():
+            if not self._evidence.still_holds(place, now):
+                self._places.remove(place.name, place.advertiser, now.mono_s)
+                self._planter.publisher_gone(place.name, place.advertiser)
+                self._unicast.forget(place.name)
         orphaned = []
         for topic, at, claim in self._planter.claims():
             if not self._holds(claim, now) and self._planter.remove_reader(topic, at):

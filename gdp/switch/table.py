@@ -3,7 +3,8 @@
 Place: pure; a data plane reads ``entries`` directly for every frame, the switch's machine alone writes.
 Source: DESIGN sections 6 and 7. A key is a destination (32 bytes) or destination and source (64 bytes, the order in
 which they stand in a frame), the longer one looked up first. A value is the tuple of hops that each get a copy; the
-empty tuple is a negative entry: known to lead nowhere.
+empty tuple is a negative entry: known to lead nowhere. A hop may name an alternate, computed ahead (RFC 5286), which a
+data plane takes by itself while the first port is down.
 
 Leases stand beside the entries, so that the hot dictionary holds nothing that forwarding does not need. A heap holds
 for every entry at least one item that is no later than the end of its lease; renewing a lease leaves the item alone,
@@ -23,12 +24,13 @@ from gdp.errors import LocalError
 from gdp.limits import TABLE_MAX
 from gdp.names import NAME_BYTES
 
-__all__ = ["EXPIRE_MAX", "MACS_BYTES", "NOWHERE", "Hop", "Hops", "Observer", "Table"]
+__all__ = ["EXPIRE_MAX", "MACS_BYTES", "NOWHERE", "Hop", "Hops", "Observer", "ProtectedHop", "Table"]
 
 MACS_BYTES: Final = 12  # destination MAC, source MAC: the first bytes of the frame that goes out
 
 Hop = tuple[int, bytes]  # port index, the 12 bytes of addresses
-Hops = tuple[Hop, ...]
+ProtectedHop = tuple[int, bytes, int, bytes]  # a hop, and its alternate
+Hops = tuple[Hop | ProtectedHop, ...]
 
 NOWHERE: Final[Hops] = ()
 
@@ -217,5 +219,5 @@ class Table:
 def _check(key: bytes, hops: Hops) -> None:
     if len(key) not in _KEY_SIZES:
         raise LocalError(f"a table key has {NAME_BYTES} or {2 * NAME_BYTES} bytes, not {len(key)}")
-    if any(len(macs) != MACS_BYTES for _, macs in hops):
+    if any(len(hop[1]) != MACS_BYTES or (len(hop) > 2 and len(hop[3]) != MACS_BYTES) for hop in hops):
         raise LocalError(f"a hop has {MACS_BYTES} bytes of addresses: destination MAC, source MAC")

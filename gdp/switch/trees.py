@@ -47,6 +47,11 @@ class Tree:
     renew_at_s: float = 0.0
     asked_mtu: int = 0  # what the last join said
     shown: bytes = b""  # the evidence that it carried
+    version: int = 0  # sequence number of the publisher's claim that ``switch`` was read from
+    joins: int = 0  # that the one above was sent since it was chosen
+    has_moved: bool = False  # the publisher has, since the one above was chosen
+    former: tuple[At, Name] | None = None  # whom this tree took its messages from before, until ``former_until_s``
+    former_until_s: float = 0.0
     is_doubted: bool = False  # that proves nothing any more
 
     @property
@@ -68,9 +73,18 @@ class Tree:
         """Return when the last branch ends."""
         return max(branch.expires_s for branch in self.branches.values())
 
+    @property
+    def is_wanted_below(self) -> bool:
+        """Return whether anybody but the one above wants a copy."""
+        return any(at != self.above for at in self.branches)
+
     def hops(self, mac_of: dict[int, bytes]) -> Hops:
-        """Return where copies go: one per branch, in a stable order."""
-        return tuple((port, mac + mac_of[port]) for port, mac in sorted(self.branches) if port in mac_of)
+        """Return where copies go: one per branch, in a stable order.
+
+        None goes back to the one above (split horizon): while links settle, two neighbours may each ask the other.
+        """
+        below = (at for at in sorted(self.branches) if at != self.above)
+        return tuple((port, mac + mac_of[port]) for port, mac in below if port in mac_of)
 
 
 class Trees:
@@ -116,5 +130,6 @@ class Trees:
     def next_event(self) -> float | None:
         """Return the monotonic second of the next renewal or lease end, or None."""
         times = [tree.renew_at_s for tree in self._trees.values()]
+        times += [tree.former_until_s for tree in self._trees.values() if tree.former is not None]
         times += [branch.expires_s for tree in self._trees.values() for branch in tree.branches.values()]
         return min(times, default=None)

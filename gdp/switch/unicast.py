@@ -20,13 +20,14 @@ from gdp.switch.outbox import Outbox
 from gdp.switch.parked import Parked
 from gdp.switch.paths import Paths, Way
 from gdp.switch.places import Place, Places
-from gdp.switch.table import NOWHERE, Hop, Table
+from gdp.switch.table import NOWHERE, Hop, ProtectedHop, Table
 from gdp.trust.right import Right
 
 __all__ = ["Unicast"]
 
 NODE_LEASE_S: Final = 30.0  # an entry for a switch or a RIB, which the link states renew
-NEGATIVE_S: Final = 1.0
+STALE_S: Final = 5.0  # an entry for a place whose lease has ended, while no RIB answers
+NEGATIVE_S: Final = 0.5
 _REFRESH_AT_ONCE: Final = 4_096  # ways; about 50 ms
 _TAKES_FRAMES: Final = (Right.ATTACH, Right.SERVE)
 
@@ -50,6 +51,7 @@ class Unicast:
 
     def __init__(
         self,
+        me: Name,
         own_domain: Name,
         transit: frozenset[Name],
         table: Table,
@@ -59,6 +61,7 @@ class Unicast:
         parked: Parked,
         outbox: Outbox,
     ) -> None:
+        self._me = me
         self._own_domain = own_domain
         self._transit = transit
         self._table = table
@@ -72,10 +75,10 @@ class Unicast:
         self._keys_of: dict[Name, set[bytes]] = {}  # of what is installed, by destination
         self.drops: Counter[DropReason] = Counter()
 
-    def miss(self, header: Header, frame: bytes, now_s: float) -> None:
-        """Take a frame for which the table had no entry."""
+    def miss(self, header: Header, frame: bytes, now_s: float) -> Name | None:
+        """Take a frame for which the table had no entry; return the name whose place it waits for, if it does."""
         destination, source = Name(header.destination), Name(header.source)
-        self._find(destination, source, frame, now_s)
+        return self._find(destination, source, frame, now_s)
 
     def send(self, frames: list[bytes], destination: Name, source: Name, now_s: float) -> None:
         """Send frames of our own to a name, by the way that others' frames go."""
@@ -88,8 +91,9 @@ class Unicast:
 
     def release(self, name: Name, now_s: float) -> None:
         """Look again at what waited for a name."""
-        for frame in self._parked.release(name):
-            self._find(Name(frame[DESTINATION_AT:SOURCE_AT]), Name(frame[SOURCE_AT:HEADER_BYTES]), frame, now_s)
+        for frame, until_s in self._parked.release(name):
+            source = Name(frame[SOURCE_AT:HEADER_BYTES])
+            self._find(Name(frame[DESTINATION_AT:SOURCE_AT]), source, frame, now_s, until_s)
 
     def refresh(self, now_s: float) -> None:
         """Compute every installed way anew, for links have changed; ``refresh_more`` does the rest of very many."""
@@ -142,15 +146,18 @@ class Unicast:
         self._installed[key] = why
         self._keys_of.setdefault(why.destination, set()).add(key)
 
-    def _find(self, destination: Name, source: Name, frame: bytes, now_s: float) -> None:
+    def _find(
+        self, destination: Name, source: Name, frame: bytes, now_s: float, until_s: float | None = None
+    ) -> Name | None:
         """Send a frame on, or have it wait for what is asked."""
         waits_for = self._resolve(destination, source, now_s)
         if waits_for is None:
             self._forward(destination, source, frame)
         elif self._places.is_asked(waits_for):
-            self._parked.park(waits_for, frame, now_s)
+            self._parked.park(waits_for, frame, now_s, until_s)
         else:
             self.drops[DropReason.PARKED_FULL] += 1  # too many questions are open
+        return waits_for
 
     def _forward(self, destination: Name, source: Name, frame: bytes) -> None:
         hop = self._hop(destination, source)
@@ -165,7 +172,7 @@ class Unicast:
 
     def _hop(self, destination: Name, source: Name) -> Hop | None:
         hops = self._table.entries.get(destination + source) or self._table.entries.get(destination)
-        return hops[0] if hops else None
+        return hops[0][:2] if hops else None
 
     def _resolve(self, destination: Name, source: Name, now_s: float) -> Name | None:
         """Install an entry, perhaps a negative one; or return the name whose place must be asked for first."""
@@ -191,22 +198,31 @@ class Unicast:
     def _resolve_by_rib(self, destination: Name, source: Name, now_s: float) -> Name | None:
         places = self._places.of(destination, now_s)
         takers = [place for place in places if place.right in _TAKES_FRAMES]
-        if not takers:
+        if not places and (node := self._places.of_node(destination, now_s)) is not None:
+            takers = [node]
+        if takers:
+            takers = [place for place in takers if place.switch != self._me]
+            if not takers:  # it has left, and nobody has said where to
+                self._places.ask_now(destination, now_s)
+                return destination
+        else:
             if not places and not self._places.is_nowhere(destination, now_s):
-                self._places.want(destination, now_s, watch=False)
+                self._places.ask_now(destination, now_s)
                 return destination
             self._install_nowhere(destination, source, DropReason.NO_READER if places else DropReason.NO_ROUTE, now_s)
             return None
+        self._places.use(destination, now_s)
         if all(place.domain == self._own_domain for place in takers) and self._is_of_own_domain(source, now_s):
             best = self._nearest(takers, frozenset({self._own_domain}))
-            self._install_place(destination, b"", best, source, now_s)
-            return None
+            if best is not None:
+                self._install_place(destination, b"", best, source, now_s)
+                return None
         transit = self._source_transit(source, now_s)
         if transit is None:
             if self._places.is_nowhere(source, now_s):
                 self._install_nowhere(destination, source, DropReason.NO_ROUTE, now_s)
                 return None
-            self._places.want(source, now_s, watch=False)
+            self._places.ask_now(source, now_s)
             return source
         best = self._nearest(takers, transit & self._transit)
         self._install_place(destination, source, best, source, now_s)
@@ -223,6 +239,8 @@ class Unicast:
         if self._attached.at(source) is not None or self._paths.is_switch(source) or self._paths.is_rib(source):
             return self._transit
         places = self._places.of(source, now_s)
+        if places:
+            self._places.use(source, now_s)
         return places[0].transit | {places[0].domain} if places else None
 
     def _nearest(self, takers: list[Place], allowed: frozenset[Name]) -> tuple[Place, Way] | None:
@@ -239,7 +257,12 @@ class Unicast:
         if best is None:
             self._install_way(destination, source_key, None, source, now_s, now_s)
         else:
-            self._install_way(destination, source_key, best[1], source, best[0].expires_s, now_s)
+            self._install_way(destination, source_key, best[1], source, self._until_s(best[0], now_s), now_s)
+
+    @staticmethod
+    def _until_s(place: Place, now_s: float) -> float:
+        """Return how long an entry stands for a place; one that is served stale is looked at again soon."""
+        return max(place.expires_s, now_s + STALE_S)
 
     def _install_way(
         self, destination: Name, source_key: bytes, way: Way | None, source: Name, expires_s: float, now_s: float
@@ -248,9 +271,12 @@ class Unicast:
         if neighbour is None:
             self._install_nowhere(destination, source, DropReason.NO_ROUTE, now_s)
         else:
-            self._install(destination, source_key, self._outbox.hop(neighbour), source, expires_s)
+            hop = self._outbox.protected_hop(neighbour, None if way is None else way.alternate)
+            self._install(destination, source_key, hop, source, expires_s)
 
-    def _install(self, destination: Name, source_key: bytes, hop: Hop, source: Name, expires_s: float) -> None:
+    def _install(
+        self, destination: Name, source_key: bytes, hop: Hop | ProtectedHop, source: Name, expires_s: float
+    ) -> None:
         key = destination + source_key
         negative = self._installed.get(destination + source)
         if negative is not None and negative.is_negative:

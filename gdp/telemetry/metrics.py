@@ -54,8 +54,16 @@ class Metrics(Collector):
         yield from _counter("gdp_messages", "Whole messages by direction", "direction", of.messages)
         yield from _counter("gdp_message_bytes", "Their bytes before sealing", "direction", of.message_bytes)
         yield from _counter("gdp_repairs", "Lost parts by what happened to them", "step", of.repairs)
+        yield from _counter("gdp_lost_messages", "Messages lost on their way here, by reason", "reason", of.lost)
+        text = "Messages from here that some reader did not get, by reason"
+        yield from _counter("gdp_unconfirmed_messages", text, "reason", of.unconfirmed)
         yield from _counter("gdp_proxy_faults", "What was not carried as it should be, by fault", "fault", of.faults)
         yield from _counter("gdp_calls", "Calls of several servers by what came of it", "event", of.calls)
+        yield from _gauges("gdp_waiting", "1: the node makes no progress for this reason", "reason", of.waiting)
+        if of.clashes is not None:
+            yield CounterMetricFamily(
+                "gdp_identity_clashes", "Signs of another node with this identity", value=of.clashes()
+            )
         if of.latency is not None:
             yield _histogram("gdp_latency_seconds", "One-way latency of messages", of.latency())
 
@@ -122,6 +130,14 @@ def _entries(source: EntryCounts | None) -> Iterator[Metric]:
 def _gauge(name: str, text: str, source: Gauge | None) -> Iterator[Metric]:
     if source is not None:
         yield GaugeMetricFamily(name, text, value=source())
+
+
+def _gauges(name: str, text: str, label: str, source: Counts | None) -> Iterator[Metric]:
+    if source is not None:
+        family = GaugeMetricFamily(name, text, labels=[label])
+        for value, number in source().items():
+            family.add_metric([value], number)
+        yield family
 
 
 def _histogram(name: str, text: str, seen: Histogram) -> Metric:

@@ -56,8 +56,12 @@ class Sources:
         messages: whole messages by direction.
         message_bytes: their bytes by direction, before sealing.
         repairs: lost parts by what happened to them: asked, sent, given-up.
+        lost: messages that were lost on their way here, by reason.
+        unconfirmed: messages from here that some reader did not get, by reason.
         faults: what a proxy could not carry, or not as it should be, by what was wrong.
         calls: what several servers of one service bring with them: late and strange answers, hedged requests.
+        waiting: 1 for each reason for which the node makes no progress, 0 for the others.
+        clashes: signs of another node with this identity.
         latency: one-way, from the source's stamp to delivery.
     """
 
@@ -71,6 +75,10 @@ class Sources:
     messages: Counts | None = None
     message_bytes: Counts | None = None
     repairs: Counts | None = None
+    lost: Counts | None = None
+    unconfirmed: Counts | None = None
     faults: Counts | None = None
     calls: Counts | None = None
+    waiting: Counts | None = None
+    clashes: Gauge | None = None
     latency: Callable[[], Histogram] | None = None

@@ -24,6 +24,8 @@ __all__ = ["Cgroup"]
 _MOUNTS: Final = Path("/proc/self/mounts")
 _OLD_CONTROLLERS: Final = frozenset({"cpu", "memory"})
 _PERIOD_US: Final = 20_000  # a fifth of the kernel's own, so that a slow machine is slow rather than jerky
+_LEAST_US: Final = 1_000  # the kernel takes no quota below this
+_LONGEST_PERIOD_US: Final = 1_000_000
 _PATIENCE_S: Final = 3.0
 _LOOK_S: Final = 0.005
 _GONE: Final = (errno.ENOENT, errno.ENODEV)
@@ -67,14 +69,17 @@ class Cgroup:
         Raises:
             LocalError: there is no such bound here.
         """
-        quota_us = None if cpus is None else max(int(cpus * _PERIOD_US), 1_000)
+        period_us = _PERIOD_US
+        if cpus is not None and cpus * period_us < _LEAST_US:
+            period_us = min(int(_LEAST_US / cpus), _LONGEST_PERIOD_US)
+        quota_us = None if cpus is None else max(int(cpus * period_us), _LEAST_US)
         path = self._find(("cpu.max", "cpu.cfs_quota_us"))
         if path is None:
             raise LocalError(f"the group {self.name} has no bound on processor time here")
         if path.name == "cpu.max":
-            self._write(path, f"{'max' if quota_us is None else quota_us} {_PERIOD_US}")
+            self._write(path, f"{'max' if quota_us is None else quota_us} {period_us}")
         else:
-            self._write(path.with_name("cpu.cfs_period_us"), str(_PERIOD_US))
+            self._write(path.with_name("cpu.cfs_period_us"), str(period_us))
             self._write(path, str(-1 if quota_us is None else quota_us))
 
     def limit_memory(self, size_bytes: int | None) -> None:

@@ -25,6 +25,7 @@ __all__ = ["Namespaces", "silence"]
 _MAC_PREFIX: Final = "02:67:64:70"  # locally administered; "gdp" in ASCII
 _LOOPBACK: Final = 1  # the index of lo in every namespace
 _INDEX_FROM: Final = 100
+_PLUG_FROM: Final = 10_000
 _NO_IPV6: Final = ("all", "default")
 _IPV6_SETTINGS: Final = Path("/proc/sys/net/ipv6/conf")
 
@@ -38,6 +39,7 @@ class Namespaces:
 
     def __init__(self, topology: Topology, run: Run) -> None:
         self.topology = topology
+        self._plugged = 0
         if in_first_user_namespace():
             self._paths = {node: netns_files.IP_NETNS_DIRECTORY / f"gdp-{run.id}-{node}" for node in topology.nodes}
         else:
@@ -72,6 +74,22 @@ class Namespaces:
     def mend(self, a: str, b: str) -> None:
         """Bring a cut link back."""
         self._set_link(a, b, "up")
+
+    def plug(self, home: str, ifname: str, switch: str) -> None:
+        """Join device ``ifname`` in one switch's namespace to a new ``ifname-s`` in that of another, or the same."""
+        self._plugged += 1
+        mtu = max(link.mtu for link in self.topology.links)
+        far = os.open(self._paths[switch], os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            self._inside(home, partial(_plug, ifname, mtu, _PLUG_FROM + self._plugged, far))
+        finally:
+            os.close(far)
+        self._inside(switch, partial(_set_state, f"{ifname}-s", "up"))
+        self._inside(home, partial(_set_state, ifname, "up"))
+
+    def unplug(self, home: str, ifname: str) -> None:
+        """Take away what ``plug`` made: both ends are gone."""
+        self._inside(home, partial(_delete, ifname))
 
     def _set_link(self, a: str, b: str, state: str) -> None:
         link = self.topology.link(a, b)
@@ -117,6 +135,15 @@ def _add(links: Sequence[Link], number: dict[str, int], files: dict[str, int], i
         own = {"ifname": link.b, "mtu": link.mtu, "address": _mac(a, b), "net_ns_fd": files[link.a]}
         peer = {"ifname": link.a, "mtu": link.mtu, "address": _mac(b, a), "net_ns_fd": files[link.b]}
         ipr.link("add", kind="veth", index=index, peer=peer, **own)
+
+
+def _plug(ifname: str, mtu: int, index: int, far: int, ipr: IPRoute) -> None:
+    peer = {"ifname": f"{ifname}-s", "mtu": mtu, "net_ns_fd": far}
+    ipr.link("add", kind="veth", ifname=ifname, mtu=mtu, index=index, peer=peer)
+
+
+def _delete(ifname: str, ipr: IPRoute) -> None:
+    ipr.link("del", index=ipr.link_lookup(ifname=ifname)[0])
 
 
 def _mac(own: int, other: int) -> str:

@@ -16,8 +16,9 @@ from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.validity import Validity
-from gdp.limits import DEAD_S, HELLO_S
+from gdp.limits import CLAIM_LEASE_S, DEAD_S, HELLO_S
 from gdp.metadata import Metadata
+from gdp.names import Name
 from gdp.rib.machine import Rib, RibSettings
 from gdp.rib.store import MemoryStore
 from gdp.switch.machine import Switch
@@ -43,6 +44,7 @@ class World:
         trusts: for each domain label, the labels it trusts; None: everyone trusts everyone.
         transits: for a domain label, the labels through which its traffic may pass; all trusted ones if not given.
         delay_s: of every link between switches.
+        lease_s: of claims and watches.
         lead_mtu: of the links to members and RIBs, in bytes after the Ethernet header.
     """
 
@@ -52,21 +54,24 @@ class World:
     lead_mtu: int = 1_500
     hello_s: float = HELLO_S
     dead_s: float = DEAD_S
+    lease_s: float = CLAIM_LEASE_S
     trusts: dict[str, tuple[str, ...]] | None = None
     transits: Mapping[str, tuple[str, ...]] | None = None
     network: MemoryNetwork = field(init=False)
     authorities: dict[str, DomainAuthority] = field(default_factory=dict)
     identities: dict[str, Identity] = field(default_factory=dict)
     switches: dict[str, Switch] = field(default_factory=dict)
-    ribs: dict[str, RibHost] = field(default_factory=dict)
+    ribs: dict[str, RibHost] = field(default_factory=dict)  # by domain; further ones of a domain: ``domain#2``, ...
     members: dict[str, Member] = field(default_factory=dict)
     cables: dict[frozenset[str], Cable] = field(default_factory=dict)
     leads: dict[str, Cable] = field(default_factory=dict)  # of members and RIBs, by label
     owner: Owner = field(init=False)
+    settled_s: float = field(init=False)  # when ``settle`` last ended; before that, when the world began
     _incarnation: int = 0
 
     def __post_init__(self) -> None:
         self.network = MemoryNetwork(self.seed)
+        self.settled_s = self.network.now.mono_s
         self.owner = Owner(SigningKey.generate(), bytes(range(32)))
         self.validity = Validity(int(EPOCH_UNIX_S) - _YEAR_S, int(EPOCH_UNIX_S) + _YEAR_S)
         for domain in self.topology.domains:
@@ -76,11 +81,11 @@ class World:
         for link in self.topology.links:
             cable = Cable(self.delay_s, mtu=link.mtu)
             self.cables[link.ends()] = self.network.connect(link.a, link.b, cable, link.cost)
-        for at in self.topology.attached("rib"):
+        for label, at in self._rib_places().items():
             identity = self.identity(Role.RIB, f"{at.switch}/{at.ifname}", self.topology.domain_of(at.switch).label)
-            self.identities[f"rib:{self.topology.domain_of(at.switch).label}"] = identity
-        for at in self.topology.attached("rib"):
-            self._add_rib(f"{at.switch}/{at.ifname}", at.switch)
+            self.identities[f"rib:{label}"] = identity
+        for label, at in self._rib_places().items():
+            self._add_rib(label, at)
         for at in self.topology.attached("proxy"):
             self.add_member(f"{at.switch}/{at.ifname}", at.switch)
 
@@ -142,16 +147,26 @@ class World:
         self.network.replace(name, switch, table)
         return switch
 
-    def restart_rib(self, domain: str) -> RibHost:
-        """Start a domain's RIB anew with nothing remembered."""
-        label = next(f"{at.switch}/{at.ifname}" for at in self._ribs_of(domain))
-        host = self._rib(domain)
-        self.network.replace(label, host)
+    def restart_rib(self, label: str) -> RibHost:
+        """Start a RIB anew with nothing remembered; ``label`` as in ``ribs``."""
+        host = self._rib(label)
+        self.network.replace(self.rib_node(label), host)
         return host
+
+    def kill_rib(self, label: str) -> None:
+        """Stop a RIB without a goodbye; ``restart_rib`` brings it back."""
+        self.network.stop(self.rib_node(label))
+
+    def rib_node(self, label: str) -> str:
+        """Return what a RIB is called in ``network`` and ``leads``: ``switch/device``."""
+        at = self._rib_places()[label]
+        return f"{at.switch}/{at.ifname}"
 
     def settle(self, duration_s: float = 10.0) -> bool:
         """Let time go on until every member is attached; return whether that came true."""
-        return self.network.run(duration_s, lambda: all(m.attachment.is_attached for m in self.members.values()))
+        settled = self.network.run(duration_s, lambda: all(m.attachment.is_attached for m in self.members.values()))
+        self.settled_s = self.network.now.mono_s
+        return settled
 
     def _add_switch(self, name: str, domain: str) -> None:
         self.identity(Role.SWITCH, name, domain)
@@ -162,20 +177,31 @@ class World:
         switch = self.switches[name] = Switch(self.identities[name], self.policy(domain), table, self._settings())
         return switch, table
 
-    def _ribs_of(self, domain: str) -> list[Attachment]:
-        return [at for at in self.topology.attached("rib") if self.topology.domain_of(at.switch).label == domain]
+    def _rib_places(self) -> dict[str, Attachment]:
+        """Return where the RIBs stand: a domain's first by its label, further ones as ``domain#2``, ``domain#3``."""
+        places: dict[str, Attachment] = {}
+        for domain in self.topology.domains:
+            of_domain = [at for at in self.topology.attached("rib") if at.switch in domain.switches]
+            for number, at in enumerate(of_domain, 1):
+                places[domain.label if number == 1 else f"{domain.label}#{number}"] = at
+        return places
 
-    def _add_rib(self, label: str, switch: str) -> None:
-        self.network.add(label, self._rib(self.topology.domain_of(switch).label))
-        self.leads[label] = self.network.connect(switch, label, Cable(0.0001, mtu=self.lead_mtu))
+    def _rib_names(self, domain: str | None) -> tuple[Name, ...]:
+        labels = [label for label in self._rib_places() if label.split("#", maxsplit=1)[0] == domain]
+        return tuple(self.identities[f"rib:{label}"].name for label in labels)
+
+    def _add_rib(self, label: str, at: Attachment) -> None:
+        node = self.rib_node(label)
+        self.network.add(node, self._rib(label))
+        self.leads[node] = self.network.connect(at.switch, node, Cable(0.0001, mtu=self.lead_mtu))
 
     def _rib(self, label: str) -> RibHost:
-        domain = next(each for each in self.topology.domains if each.label == label)
-        upper = None if domain.upper is None else self.identities[f"rib:{domain.upper}"].name
-        identity = self.identities[f"rib:{domain.label}"]
+        domain = next(each for each in self.topology.domains if each.label == label.split("#", maxsplit=1)[0])
+        upper, peers = self._rib_names(domain.upper), self._rib_names(domain.label)
+        identity = self.identities[f"rib:{label}"]
         policy = self.policy(domain.label)
-        rib = Rib(identity, policy, MemoryStore(), RibSettings(upper))
-        host = self.ribs[domain.label] = RibHost(identity, policy, rib, self._settings())
+        rib = Rib(identity, policy, MemoryStore(), RibSettings(upper, peers))
+        host = self.ribs[label] = RibHost(identity, policy, rib, self._settings())
         return host
 
     def _settings(self) -> NodeSettings:
@@ -186,4 +212,5 @@ class World:
             self.network.random_bytes,
             self.hello_s,
             self.dead_s,
+            self.lease_s,
         )

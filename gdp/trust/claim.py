@@ -21,7 +21,7 @@ from gdp.crypto.statements import Statement, StatementType
 from gdp.crypto.subject import Subject
 from gdp.errors import LocalError
 from gdp.limits import CHAIN_MAX, LEASE_MAX_S, LEASE_MIN_S
-from gdp.names import Name
+from gdp.names import ZERO, Name
 from gdp.trust.adcert import Chain
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
@@ -46,6 +46,7 @@ class Claim:
         lease_s: how long it holds unless refreshed, within the bounds of ``limits``.
         is_global: whether it climbs to the tier above.
         wire: the bytes that were verified, to be relayed as they are.
+        previous: the switch that the node has come from, or ``ZERO``.
     """
 
     subject: Subject
@@ -58,6 +59,7 @@ class Claim:
     lease_s: float
     is_global: bool
     wire: bytes = field(repr=False)
+    previous: Name = ZERO
 
     @property
     def name(self) -> Name:
@@ -105,6 +107,7 @@ class ClaimBody:
     membership: bytes
     chain: tuple[bytes, ...]
     rtcert: bytes
+    previous: Name = ZERO
 
     @classmethod
     def from_statement(cls, statement: Statement) -> ClaimBody:
@@ -124,11 +127,14 @@ class ClaimBody:
             membership=fields.bytes_("member"),
             chain=tuple(fields.byte_strings("chain", CHAIN_MAX)),
             rtcert=fields.bytes_("rt"),
+            previous=fields.name("prev") if "prev" in fields else ZERO,
         )
 
     def to_fields(self) -> dict[str, object]:
         """Return the statement's body."""
+        moved = {} if self.previous == ZERO else {"prev": self.previous}
         return {
+            **moved,
             **self.subject.to_fields(),
             "name": self.subject.name,
             "right": self.right.value,
@@ -153,6 +159,7 @@ def make_claim(
     lease_s: float,
     is_global: bool,
     chain: Sequence[bytes] = (),
+    previous: Name = ZERO,
 ) -> bytes:
     """Return a node's signed claim; costs about 50 us.
 
@@ -166,6 +173,7 @@ def make_claim(
         lease_s: within the bounds of ``limits``.
         is_global: whether other domains may find it.
         chain: the AdCerts of the delegation.
+        previous: the switch that the node was attached to a moment ago, to be told; ``ZERO``: it has not moved.
 
     Raises:
         LocalError: a lease out of bounds, or more than one statement can carry.
@@ -182,5 +190,6 @@ def make_claim(
         membership=identity.membership,
         chain=tuple(chain),
         rtcert=rtcert,
+        previous=previous,
     )
     return identity.sign(StatementType.ADVERTISE, body.to_fields())

@@ -94,6 +94,7 @@ class ClaimVerifier:
             lease_s=body.lease_ms / _MS,
             is_global=body.is_global,
             wire=statement.wire,
+            previous=body.previous,
         )
         self._check_evidence(claim, unix_s)
         return claim

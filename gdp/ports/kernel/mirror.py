@@ -227,7 +227,7 @@ class Mirror:
 
     def _head(self, key: bytes, hops: Hops) -> bytes:
         """Return the beginning of an entry; empty where the kernel cannot do it."""
-        if len(hops) > BRANCHES_MAX or any(port >= PORTS_MAX for port, _ in hops):
+        if len(hops) > BRANCHES_MAX or any(port >= PORTS_MAX for hop in hops for port in hop[::2]):
             return b""
         if len(hops) >= _GROUP_FROM:
             return self._join_group(key, hops)

@@ -12,6 +12,9 @@ rare::
     to our station? -> leased, and over? -> whole header? -> version, kind, hops, length good? -> known?
           no: up            yes: up             no: up                 no: up                     no: up
                                                                known -> nowhere | one hop | a group
+
+While a hop's port is down its alternate is taken. A port goes down by one write into the map of ports, however many
+entries name it.
 """
 
 from __future__ import annotations
@@ -189,17 +192,27 @@ class _Story(Assembler):
         # any other falls into ``_one_hop``, its port in R2
 
     def _one_hop(self) -> None:
-        """R2: the port."""
+        """R2: the port. R4 becomes where the entry names the port that is taken, and its addresses behind it."""
+        self._find(self._maps.ports, Reg.R2)
+        self.jump_if(Reg.R0, "==", 0, "up")
+        self.move(Reg.R4, _ENTRY)
+        self.load(Reg.R2, Reg.R0, PortAt.IFINDEX, 4)
+        self.jump_if(Reg.R2, "!=", 0, "port chosen")
+        self.load(Reg.R2, _ENTRY, EntryAt.ALTERNATE, 4)
+        self.jump_if(Reg.R2, "==", NOWHERE_PORT, "down")
         self._find(self._maps.ports, Reg.R2)
         self.jump_if(Reg.R0, "==", 0, "up")
         self.load(Reg.R2, Reg.R0, PortAt.IFINDEX, 4)
         self.jump_if(Reg.R2, "==", 0, "down")
+        self.move(Reg.R4, _ENTRY)
+        self.add(Reg.R4, EntryAt.ALTERNATE)
+        self.label("port chosen")
         self._frame_bytes(Reg.R2)
         self.load(Reg.R3, Reg.R0, PortAt.MTU, 4)
         self.jump_if(Reg.R2, ">", Reg.R3, "up")
         self._one_hop_fewer()
         for at in range(0, MACS_BYTES, 4):
-            self.load(Reg.R2, _ENTRY, EntryAt.MACS + at, 4)
+            self.load(Reg.R2, Reg.R4, EntryAt.MACS + at, 4)
             self.store(_FRAME, at, Reg.R2, 4)
         self.move(_PORT, Reg.R0)  # the frame is done with
         self._count(Total.TAKEN)
@@ -238,7 +251,15 @@ class _Story(Assembler):
         self._find(self._maps.ports, Reg.R2)
         self.jump_if(Reg.R0, "==", 0, "branch down")
         self.load(Reg.R2, Reg.R0, PortAt.IFINDEX, 4)
+        self.jump_if(Reg.R2, "!=", 0, "branch chosen")
+        self.load(Reg.R2, _BRANCH, GROUP_HEAD_BYTES + EntryAt.ALTERNATE, 4)
+        self.jump_if(Reg.R2, "==", NOWHERE_PORT, "branch down")
+        self._find(self._maps.ports, Reg.R2)
+        self.jump_if(Reg.R0, "==", 0, "branch down")
+        self.load(Reg.R2, Reg.R0, PortAt.IFINDEX, 4)
         self.jump_if(Reg.R2, "==", 0, "branch down")
+        self.add(_BRANCH, EntryAt.ALTERNATE)
+        self.label("branch chosen")
         self.store(Reg.R10, _IFINDEX, Reg.R2, 8)
         self._frame_bytes(Reg.R2)
         self.load(Reg.R3, Reg.R0, PortAt.MTU, 4)

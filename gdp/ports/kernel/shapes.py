@@ -3,9 +3,11 @@
 Place: pure; numbers only. In this machine's byte order, but for names and addresses, which are bytes as in a frame::
 
     key      destination (32)  source, or zero for every source (32)
-    entry    port, or GROUP or NOWHERE (4)  addresses (12)  group (4)  counter (4)
+    entry    port, or GROUP or NOWHERE (4)  addresses (12)  alternate port or NOWHERE (4)  its addresses (12)
+             group (4)  counter (4)
     port     ifindex, 0 when it is down (4)  MTU (4)  flags (4)  unused (4)
-    group    number of branches (4)  unused (4)  64 times: port (4)  addresses (12)
+    group    number of branches (4)  unused (4)
+             64 times: port (4)  addresses (12)  alternate port or NOWHERE (4)  its addresses (12)
     count    frames (8)  bytes (8), on each CPU
     totals   drops by reason (8 each), then the rest of ``Total`` (8 each), on each CPU
 """
@@ -18,7 +20,7 @@ from typing import Final
 
 from gdp.errors import DropReason
 from gdp.names import NAME_BYTES
-from gdp.switch.table import MACS_BYTES
+from gdp.switch.table import MACS_BYTES, Hops
 
 __all__ = [
     "BRANCHES_MAX",
@@ -63,8 +65,9 @@ class EntryAt(IntEnum):
 
     PORT = 0
     MACS = 4
-    GROUP = 4 + MACS_BYTES
-    COUNTER = 8 + MACS_BYTES
+    ALTERNATE = 4 + MACS_BYTES  # as port and addresses
+    GROUP = 2 * (4 + MACS_BYTES)
+    COUNTER = GROUP + 4
 
 
 class PortAt(IntEnum):
@@ -89,10 +92,11 @@ class Total(IntEnum):
     BYTES = TAKEN + 2  # of those copies, Ethernet header included
 
 
-_HEAD: Final = struct.Struct(f"=I{MACS_BYTES}sI")
+_HEAD: Final = struct.Struct(f"=I{MACS_BYTES}sI{MACS_BYTES}sI")
 _PORT: Final = struct.Struct("=IIII")
 _GROUP_HEAD: Final = struct.Struct("=II")
-_BRANCH: Final = struct.Struct(f"=I{MACS_BYTES}s")
+_BRANCH: Final = struct.Struct(f"=I{MACS_BYTES}sI{MACS_BYTES}s")
+_NO_ALTERNATE: Final = (NOWHERE_PORT, bytes(MACS_BYTES))
 
 ENTRY_BYTES: Final = _HEAD.size + INDEX_BYTES
 PORT_BYTES: Final = _PORT.size
@@ -103,9 +107,16 @@ COUNT_BYTES: Final = 16
 TOTALS_BYTES: Final = 8 * (max(Total) + 1)
 
 
-def entry_head(port: int, macs: bytes = bytes(MACS_BYTES), group: int = 0) -> bytes:
+def entry_head(
+    port: int,
+    macs: bytes = bytes(MACS_BYTES),
+    alternate_port: int = NOWHERE_PORT,
+    alternate_macs: bytes = bytes(MACS_BYTES),
+    *,
+    group: int = 0,
+) -> bytes:
     """Return an entry up to its counter."""
-    return _HEAD.pack(port, macs, group)
+    return _HEAD.pack(port, macs, alternate_port, alternate_macs, group)
 
 
 def port(ifindex: int, mtu: int, flags: int) -> bytes:
@@ -113,7 +124,7 @@ def port(ifindex: int, mtu: int, flags: int) -> bytes:
     return _PORT.pack(ifindex, mtu, flags, 0)
 
 
-def group(branches: tuple[tuple[int, bytes], ...]) -> bytes:
+def group(branches: Hops) -> bytes:
     """Return a group of at most ``BRANCHES_MAX`` branches."""
-    body = b"".join(_BRANCH.pack(*branch) for branch in branches)
+    body = b"".join(_BRANCH.pack(*branch, *(_NO_ALTERNATE if len(branch) == 2 else ())) for branch in branches)
     return (_GROUP_HEAD.pack(len(branches), 0) + body).ljust(GROUP_BYTES, b"\0")

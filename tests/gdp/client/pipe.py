@@ -22,6 +22,11 @@ SECRETS: Secrets = {1: b"1" * 32}
 DELAY_S = 0.002
 
 
+def sequenced(sequence: int, body: bytes) -> bytes:
+    """Return what a publisher seals: a message or a bundle behind its sequence number."""
+    return sequence.to_bytes(8, "big") + body
+
+
 def publisher_of(
     *, incarnation: int = 1, secrets: Secrets = SECRETS, reliable: bool = True, depth: int = 0
 ) -> Publisher:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from gdp.client.attachment import CLAIM_LEASE_S, Claimed
+from gdp.client.attachment import Claimed
 from gdp.client.member import Topic
 from gdp.crypto.subject import Subject
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
+from gdp.limits import CLAIM_LEASE_S
 from gdp.metadata import Metadata
+from gdp.testbed.topology import ring5
 from gdp.testbed.world import World
 from gdp.trust.right import Right
 from tests.journeys.flows import ROBOT, SERVER, Tap, advertise, ring
@@ -45,7 +47,7 @@ def test_a_refused_claim_is_not_made_again_at_once() -> None:
     claim_without_delegation(world)
     tap = Tap(ROBOT, "nuc1")
     world.network.taps.append(tap)
-    world.network.run(CLAIM_LEASE_S / 3 - 1)
+    world.network.run(world.lease_s / 3 - 0.05)
     first = {each.number for each in tap.headers if each.kind == Kind.ADVERTISE}
     assert len(first) <= 3
 
@@ -92,6 +94,19 @@ def test_who_falls_silent_is_gone_when_its_lease_ends() -> None:
     world.network.stop(ROBOT)
     world.network.run(CLAIM_LEASE_S + 1)
     assert [host.rib.names for host in world.ribs.values()] == [0, 1, 1]
+
+
+@pytest.mark.parametrize("lease_s", [2.0, 60.0])
+def test_the_lease_is_what_the_settings_say(lease_s: float) -> None:
+    world = World(ring5(), lease_s=lease_s)
+    assert world.settle()
+    world.network.run(lease_s + 1)
+    assert world.ribs["school"].rib.names == 1  # it was renewed
+    world.network.stop(ROBOT)
+    world.network.run(2 * lease_s / 3 - 1)
+    assert world.ribs["school"].rib.names == 1
+    world.network.run(lease_s / 3 + 2)
+    assert world.ribs["school"].rib.names == 0
 
 
 def test_without_a_switch_what_is_sent_is_counted_as_lost() -> None:

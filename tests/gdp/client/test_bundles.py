@@ -13,7 +13,7 @@ from gdp.frame.kinds import Flag, Kind
 from gdp.limits import MESSAGE_MAX_BYTES, WINDOW_BYTES
 from gdp.message.bundle import BUNDLE_BYTES, pack
 from gdp.names import Name
-from tests.gdp.client.pipe import SECRETS, TOPIC, WRITER, End, Pipe, publisher_of
+from tests.gdp.client.pipe import SECRETS, TOPIC, WRITER, End, Pipe, publisher_of, sequenced
 
 SMALL = [b"%d " % at * (at % 40) for at in range(2_000)]
 
@@ -174,7 +174,7 @@ def test_a_bundle_that_is_not_exact_is_counted_and_nothing_of_it_delivered(body:
     pipe, (end,) = live(publisher_of())
     sealer = Sealer(SECRETS[1], 1, Kind.DATA, Name(b"p" * 32), 1, TOPIC, WRITER)
     for number, message, flags in ((1, body, Flag.RELIABLE | Flag.BUNDLE), (2, b"next", Flag.RELIABLE)):
-        for frame in sealer.seal(number, int(flags), message, 1_500):
+        for frame in sealer.seal(number, int(flags), sequenced(number, message), 1_500):
             end.feed.receive(decode(frame), frame, pipe.now_s)
     assert [each.message for each in end.feed.take_delivered()] == [b"next"]
     drops = end.feed.drops

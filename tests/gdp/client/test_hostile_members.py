@@ -18,7 +18,7 @@ from gdp.message.move import Move
 from gdp.message.report import Missing, Report, ReportFlag
 from gdp.message.status import Status
 from gdp.names import Name
-from tests.gdp.client.pipe import SECRETS, TOPIC, WRITER, End, Pipe, publisher_of
+from tests.gdp.client.pipe import SECRETS, TOPIC, WRITER, End, Pipe, publisher_of, sequenced
 
 PUBLISHER = Name(b"p" * 32)
 MALLORY = SigningKey.generate()
@@ -91,7 +91,7 @@ def test_messages_that_come_before_the_first_status_are_kept_within_bounds() -> 
     end = pipe.join(b"a")
     sealer = Sealer(SECRETS[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, WRITER)
     for number in range(1, 80):
-        give(pipe, end, list(sealer.seal(number, Flag.RELIABLE, bytes(1 << 20), 65_000)))
+        give(pipe, end, list(sealer.seal(number, Flag.RELIABLE, sequenced(number, bytes(1 << 20)), 65_000)))
         assert end.budget.held_bytes <= JOIN_SOURCE_BYTES
     assert end.feed.drops[DropReason.MEMORY_FULL] > 0
     end.feed.close()
@@ -102,7 +102,7 @@ def test_messages_behind_a_gap_that_is_never_filled_are_kept_within_bounds() -> 
     pipe, end = live()
     sealer = Sealer(SECRETS[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, WRITER)
     for number in range(2, 80):
-        give(pipe, end, list(sealer.seal(number, Flag.RELIABLE, bytes(1 << 20), 65_000)))
+        give(pipe, end, list(sealer.seal(number, Flag.RELIABLE, sequenced(number, bytes(1 << 20)), 65_000)))
         assert end.budget.held_bytes <= JOIN_TOTAL_BYTES
     assert [each.number for each in end.feed.take_delivered()][:3] == [2, 3, 4]
     assert end.feed.lost == 1
@@ -136,7 +136,7 @@ def test_a_message_whose_number_has_no_next_is_refused_and_ends_nobody(reliable:
     give(pipe, end, forge(500, status, kind=Kind.STATUS, signer=WRITER))
     for number in ((1 << 64) - 2, (1 << 64) - 1):
         sealer = Sealer(SECRETS[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, WRITER)
-        give(pipe, end, list(sealer.seal(number, reliable, b"last", 1_500)))
+        give(pipe, end, list(sealer.seal(number, reliable, sequenced(number, b"last"), 1_500)))
     assert end.feed.take_report(pipe.now_s) is not None
     assert end.feed.drops[DropReason.MALFORMED] == 1
 

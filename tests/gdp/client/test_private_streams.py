@@ -72,7 +72,7 @@ def test_an_idle_stream_is_forgotten_and_its_numbers_are_not() -> None:
         stream.timeout(READER_LEASE_S + 1)
     desk.forget_idle(2 * IDLE_S)
     assert (len(desk), len(pasts)) == (0, 1)
-    assert desk.stream(CLIENT, 1500, 200.0).past == Past(2, 0)
+    assert desk.stream(CLIENT, 1500, 200.0).past == Past(2, 0, 1)
 
 
 def test_a_former_life_of_a_client_does_not_close_the_stream_to_its_present_one() -> None:

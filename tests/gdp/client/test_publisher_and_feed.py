@@ -12,7 +12,7 @@ from gdp.frame.codec import decode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import READER_LEASE_S
 from gdp.names import Name
-from tests.gdp.client.pipe import SECRETS, TOPIC, WRITER, Pipe, publisher_of
+from tests.gdp.client.pipe import SECRETS, TOPIC, WRITER, Pipe, publisher_of, sequenced
 
 MESSAGES = [bytes([at % 251]) * (at * 37 % 6_000) for at in range(200)]
 
@@ -223,11 +223,11 @@ def test_an_older_epoch_still_opens_and_an_unknown_one_is_counted() -> None:
     pipe.run(1.0)
     assert end.messages == [b"old key"]
     sealer = Sealer(b"2" * 32, 2, Kind.DATA, Name(b"p" * 32), 1, TOPIC, WRITER)
-    (frame,) = list(sealer.seal(2, Flag.RELIABLE, b"new key", 1500))
+    (frame,) = list(sealer.seal(2, Flag.RELIABLE, sequenced(2, b"new key"), 1500))
     end.feed.receive(decode(frame), frame, pipe.now_s)
     assert [each.message for each in end.feed.take_delivered()] == [b"new key"]
     sealer = Sealer(b"3" * 32, 3, Kind.DATA, Name(b"p" * 32), 1, TOPIC, WRITER)
-    (frame,) = list(sealer.seal(3, Flag.RELIABLE, b"strange key", 1500))
+    (frame,) = list(sealer.seal(3, Flag.RELIABLE, sequenced(3, b"strange key"), 1500))
     end.feed.receive(decode(frame), frame, pipe.now_s)
     assert end.feed.drops[DropReason.UNKNOWN_EPOCH] == 1
 

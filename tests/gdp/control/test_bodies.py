@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from gdp.control.hello import Hello
 from gdp.control.join import Join
-from gdp.control.link_state import Adjacency, LinkState, Scope
+from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
 from gdp.control.query import Answer, Query
 from gdp.control.relay import Relay
 from gdp.control.verdict import Verdict
@@ -23,7 +23,8 @@ NODE = node("n")
 A, B, C = Name(b"a" * 32), Name(b"b" * 32), Name(b"c" * 32)
 HELLO = Hello(b"n" * 8, 7, (b"h" * 8,), 1_500, b"d" * 8, b"cert")
 JOIN = Join(A, B, C, A, frozenset({A, B}), 1_400, 7.0, b"evidence", b"s" * 8, 99)
-STATE = LinkState(NODE.name, A, Scope.BORDER, 5, (Adjacency(B, A, 10, 1_500),), (Adjacency(C, A, 3, 1),), (C,))
+LINKS, INSIDE, RIBS = (Adjacency(B, A, 10, 1_500),), (Adjacency(C, A, 3, 1),), (AttachedRib(C, A, bytes(8)),)
+STATE = LinkState(NODE.name, A, Scope.BORDER, 5, LINKS, INSIDE, RIBS, (A, B))
 ANSWER = Answer(A, B, b"claim", C, (A, B), 30.0)
 
 Read = Callable[[Fields], object]

@@ -16,7 +16,7 @@ from gdp.crypto.keys import PublicKey, SigningKey
 from gdp.errors import DropReason, EnvelopeError, LocalError, StatementError
 from gdp.frame.codec import HEADER_BYTES, HOPS_AT, authenticated, decode
 from gdp.frame.kinds import Flag, Kind
-from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES
+from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, SEQUENCE_BYTES
 from tests.gdp.message.sealed import INCARNATION, MTU, SECRET, SOURCE, TOPIC, WRITER, opener_of, seal
 
 FILE = json.loads((Path(__file__).parents[2] / "vectors" / "envelope.json").read_text())
@@ -163,7 +163,7 @@ def test_a_number_is_sealed_once() -> None:
 def test_what_is_above_the_limits_is_refused_before_a_number_is_spent() -> None:
     sealer = Sealer(SECRET, 1, Kind.DATA, SOURCE, INCARNATION, TOPIC, WRITER)
     with pytest.raises(LocalError):
-        list(sealer.seal(1, 0, bytes(MESSAGE_MAX_BYTES + 1), FRAME_MAX_BYTES))
+        list(sealer.seal(1, 0, bytes(MESSAGE_MAX_BYTES + SEQUENCE_BYTES + 1), FRAME_MAX_BYTES))
     with pytest.raises(LocalError):
         list(sealer.seal(1, 0, b"", HEADER_BYTES + TAG_BYTES + SIGNATURE_BYTES))
     assert decode(sealer.seal(1, 0, b"", MTU)[0]).hops_left == HOPS_MAX

@@ -21,7 +21,7 @@ from gdp.frame.codec import (
     ethernet,
 )
 from gdp.frame.kinds import ETHERTYPE, Kind
-from gdp.frame.layers import GDP, Statement, layout
+from gdp.frame.layers import GDP, Keepalive, Statement, layout
 from gdp.limits import PARTS_MAX
 from tests.gdp.frame.frames import frames
 
@@ -204,9 +204,19 @@ def test_a_statement_is_shown_in_words() -> None:
     assert packet[Statement].signature == b"s" * 64
 
 
-@pytest.mark.parametrize("kind", [kind for kind in Kind if kind >= 0x80] + [Kind.RIB_REQUEST, Kind.RIB_ANSWER])
+CARRIERS = [kind for kind in Kind if kind >= 0x80 and kind is not Kind.KEEPALIVE] + [Kind.RIB_REQUEST, Kind.RIB_ANSWER]
+
+
+@pytest.mark.parametrize("kind", CARRIERS)
 def test_every_kind_that_carries_a_statement_shows_it(kind: Kind) -> None:
     assert Ether(bytes(Ether() / GDP(kind=kind) / Raw(statement({"t": "x"})))).haslayer(Statement)
+
+
+def test_a_keepalive_is_shown_field_by_field() -> None:
+    packet = Ether(bytes(Ether() / GDP(kind=Kind.KEEPALIVE) / Raw(b"\x05\x03" + b"d" * 8 + b"t" * 16)))
+    shown = packet[Keepalive]
+    said = str(shown.flags), shown.multiplier, shown.digest, shown.tag
+    assert said == ("poll+heard", 3, b"d" * 8, b"t" * 16)
 
 
 def test_a_statement_can_be_built() -> None:

@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gdp.errors import FrameError
-from gdp.message.bundle import BUNDLE_MAX_BYTES, Counts, Gathered, pack, unpack
-from gdp.message.move import Move
+from gdp.message.bundle import BUNDLE_MAX_BYTES, Gathered, pack, unpack
 
 
 @given(st.lists(st.binary(max_size=40), min_size=1, max_size=20))
@@ -47,7 +46,7 @@ def test_what_waits_goes_together_in_order_as_far_as_there_is_room() -> None:
     gathered = Gathered()
     messages = [bytes([at]) * 100 for at in range(10)]
     for message in messages:
-        gathered.add(message)
+        gathered.add(1, message)
     first, second = gathered.take(4 * 104), gathered.take(4 * 104 + 50)
     assert [*first, *second] == messages[:8]
     assert len(gathered) == 2
@@ -55,34 +54,17 @@ def test_what_waits_goes_together_in_order_as_far_as_there_is_room() -> None:
 
 def test_a_message_for_which_there_is_no_room_any_more_goes_alone() -> None:
     gathered = Gathered()
-    gathered.add(bytes(100))
-    gathered.add(bytes(100))
+    gathered.add(1, bytes(100))
+    gathered.add(1, bytes(100))
     assert gathered.take(50) == [bytes(100)]
 
 
 def test_all_that_was_held_is_given_back() -> None:
     gathered = Gathered()
     for size in (0, 1, 1_000):
-        gathered.add(bytes(size))
+        gathered.add(1, bytes(size))
     held_bytes = gathered.held_bytes
     while gathered:
         gathered.take(0)
     assert held_bytes > 1_001
     assert gathered.held_bytes == 0
-
-
-def test_messages_are_counted_up_to_any_number_that_is_kept() -> None:
-    counts = Counts()
-    for number, messages in ((1, 1), (2, 5), (3, 1), (4, 10)):
-        counts.note(number, messages)
-    assert [number + counts.beyond_one(number) for number in (1, 2, 3, 4)] == [1, 6, 7, 17]
-    assert counts.forget(4) == 4
-    assert 4 + counts.beyond_one(4) == 17
-
-
-def test_a_bundle_is_one_under_its_new_number_too() -> None:
-    counts = Counts()
-    counts.note(3, 5)
-    counts.move(Move(2, 4, 10))
-    assert 11 in counts
-    assert 3 not in counts

@@ -8,19 +8,25 @@ from hypothesis import strategies as st
 
 from gdp.errors import FrameError
 from gdp.limits import NACKS_PER_REPORT
+from gdp.message.loss import GONE_MAX, LossReason, LostRange
 from gdp.message.move import MOVES_MAX, Move
 from gdp.message.report import Missing, Report, ReportFlag
-from gdp.message.status import STARTS_MAX, Status
+from gdp.message.status import STARTS_MAX, Start, Status
 
 U64 = st.integers(0, (1 << 64) - 1)
 U32 = st.integers(0, (1 << 32) - 1)
 MISSING = st.lists(st.builds(Missing, U64, U32, U32), max_size=NACKS_PER_REPORT).map(tuple)
-REPORTS = st.builds(Report, st.sampled_from([ReportFlag.NONE, ReportFlag.NEW, ReportFlag.BYE]), U64, U32, MISSING)
+FLAGS = st.sampled_from([ReportFlag.NONE, ReportFlag.NEW, ReportFlag.BYE])
+REPORTS = st.builds(Report, FLAGS, U64, U32, MISSING, U64, U64)
 MOVES = st.lists(
     st.builds(lambda first, span, gap: Move(first, span, first + span + gap), *[st.integers(1, 1 << 60)] * 3),
     max_size=MOVES_MAX,
 ).map(tuple)
-STARTS = st.dictionaries(st.binary(min_size=32, max_size=32), U64, max_size=STARTS_MAX)
+STARTS = st.dictionaries(st.binary(min_size=32, max_size=32), st.builds(Start, U64, U64, U64), max_size=STARTS_MAX)
+RANGES = st.tuples(U64, U64).map(sorted)
+GONE = st.lists(
+    st.builds(lambda ends, reason: LostRange(*ends, reason), RANGES, st.sampled_from(LossReason)), max_size=GONE_MAX
+).map(tuple)
 
 
 @given(REPORTS)
@@ -28,11 +34,16 @@ def test_a_report_comes_back_as_it_was(report: Report) -> None:
     assert Report.from_wire(report.to_wire()) == report
 
 
-@given(U64, U64, STARTS, st.binary(max_size=100), MOVES)
+@given(U64, U64, STARTS, st.binary(max_size=100), MOVES, GONE)
 def test_a_status_comes_back_as_it_was(
-    one: int, other: int, starts: dict[bytes, int], description: bytes, moves: tuple[Move, ...]
+    one: int,
+    other: int,
+    starts: dict[bytes, Start],
+    description: bytes,
+    moves: tuple[Move, ...],
+    gone: tuple[LostRange, ...],
 ) -> None:
-    status = Status(min(one, other), max(one, other), one % (1 << 32), starts, description, moves)
+    status = Status(min(one, other), max(one, other), one % (1 << 32), starts, description, moves, one, other, gone)
     assert Status.from_wire(status.to_wire()) == status
 
 
@@ -43,7 +54,7 @@ def test_a_move_that_leads_back_is_malformed() -> None:
 
 @given(st.binary(max_size=200))
 @example(b"")
-@example(bytes(13) + b"\xff\xff")
+@example(bytes(29) + b"\xff\xff")
 def test_arbitrary_bytes_are_a_report_or_a_frame_error(wire: bytes) -> None:
     try:
         report = Report.from_wire(wire)
@@ -53,7 +64,7 @@ def test_arbitrary_bytes_are_a_report_or_a_frame_error(wire: bytes) -> None:
 
 
 @given(st.binary(max_size=200))
-@example(bytes(16) + b"\xff\xff")
+@example(bytes(36) + b"\xff\xff")
 def test_arbitrary_bytes_are_a_status_or_a_frame_error(wire: bytes) -> None:
     try:
         status = Status.from_wire(wire)

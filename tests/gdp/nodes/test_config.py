@@ -93,6 +93,7 @@ def test_a_missing_key_is_told_at_what_should_hold_it(place: Path) -> None:
         ("attach: [a, a]", "attach: a stands twice"),
         ("attach: [fourteen_chars]", "attach[0]: at most 13 characters, for the switch's end is fourteen_chars-s"),
         ("dead_s: 0.3", "dead_s: at least twice hello_s (0.25), so that one lost hello loses no neighbour"),
+        ("lease_s: 0.5", "lease_s: expected greater than or equal to 1, not 0.5"),
         ("hello_s: .inf", "hello_s: expected a number, not '.inf'"),
         ("metrics: {port: 70000}", "metrics.port: expected less than or equal to 65535, not 70000"),
         ("attach: proxy", "attach: expected a list, not 'proxy'"),
@@ -118,22 +119,30 @@ def test_a_rib_names_the_tier_above(place: Path) -> None:
     upper = Name(bytes(range(32)))
     (place / "rib.yaml").write_text(f"{SWITCH}iface: rib\nupper: {upper.to_text()}\n")
     config = RibConfig.load(place / "rib.yaml")
-    assert config.upper == upper
-    assert isinstance(config.upper, Name)
+    assert config.upper == (upper,)
+    assert isinstance(config.upper[0], Name)
+
+
+def test_a_rib_names_several_of_the_tier_above_and_its_peers(place: Path) -> None:
+    one, two = Name(b"\xa1" * 32), Name(b"\xa2" * 32)
+    names = f"[{one.to_text()}, {two.to_text()}]"
+    (place / "rib.yaml").write_text(f"{SWITCH}iface: rib\nupper: {names}\npeers: {names}\n")
+    config = RibConfig.load(place / "rib.yaml")
+    assert (config.upper, config.peers) == ((one, two), (one, two))
 
 
 @pytest.mark.parametrize("line", ["", "upper: null\n", "upper: ~\n"])
 def test_the_top_tier_has_none_above(place: Path, line: str) -> None:
     (place / "rib.yaml").write_text(f"{SWITCH}iface: rib\n{line}")
     config = RibConfig.load(place / "rib.yaml")
-    assert config.upper is None
+    assert config.upper == ()
     assert not config.allow_unowned
     assert config.quotas.names_per_sender == RIB_NAMES_PER_SENDER
 
 
 def test_a_name_of_digits_alone_is_read_as_text(place: Path) -> None:
     (place / "rib.yaml").write_text(f"{SWITCH}iface: rib\nupper: {'1' * 64}\n")
-    assert RibConfig.load(place / "rib.yaml").upper == Name(b"\x11" * 32)
+    assert RibConfig.load(place / "rib.yaml").upper == (Name(b"\x11" * 32),)
 
 
 def test_a_shortened_name_is_refused(place: Path) -> None:

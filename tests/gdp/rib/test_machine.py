@@ -56,7 +56,7 @@ START = at(0.0)
 
 def rib(upper: Name | None = None, **settings: object) -> Rib:
     policy = Policy(SCHOOL.root, [CLOUD.root])
-    return Rib(RIB, policy, MemoryStore(), replace(RibSettings(upper), **settings))  # type: ignore[arg-type]
+    return Rib(RIB, policy, MemoryStore(), replace(RibSettings(() if upper is None else (upper,)), **settings))  # type: ignore[arg-type]
 
 
 def relay(statement: bytes, by: Identity = SWITCH) -> bytes:
@@ -111,6 +111,21 @@ def local_claim(sequence: int = 1) -> bytes:
         incarnation=7,
         lease_s=60.0,
         is_global=False,
+        chain=[adcert()],
+    )
+
+
+def foreign_claim(*, is_global: bool = True, sequence: int = 1) -> bytes:
+    """Return a claim of the robot at a switch of the cloud's domain."""
+    return make_claim(
+        ROBOT,
+        Right.PUBLISH,
+        CAMERA,
+        rtcert=RtCert.make(ROBOT, CLOUD_SWITCH.name, DAY),
+        sequence=sequence,
+        incarnation=7,
+        lease_s=60.0,
+        is_global=is_global,
         chain=[adcert()],
     )
 
@@ -199,10 +214,30 @@ def test_a_claim_of_a_stranger_is_refused() -> None:
     assert at_rib.refusals == {DropReason.WRONG_DOMAIN: 1}
 
 
-@pytest.mark.parametrize("by", [ROBOT, CLOUD_SWITCH], ids=["a proxy", "a switch of another domain"])
-def test_only_switches_of_the_domain_and_ribs_relay(by: Identity) -> None:
+def test_a_proxy_relays_nothing() -> None:
     at_rib = rib()
-    assert tell(at_rib, claim(), by) == []
+    assert tell(at_rib, claim(), ROBOT) == []
+    assert at_rib.refusals == {DropReason.WRONG_DOMAIN: 1}
+
+
+def test_a_switch_of_a_trusted_domain_relays_global_names_which_stand_in_its_own_domain() -> None:
+    at_rib = rib()
+    (verdict,) = verdicts(tell(at_rib, foreign_claim(), CLOUD_SWITCH))
+    assert verdict.refused is None
+    (answer,) = answers(ask(at_rib))
+    assert (answer.domain, answer.transit) == (CLOUD.root.domain, (SCHOOL.root.domain,))
+    assert [each.domain for each in answers(ask(at_rib, CLOUD_SWITCH))] == [CLOUD.root.domain]
+
+
+def test_a_local_name_of_another_domain_is_refused() -> None:
+    at_rib = rib()
+    (verdict,) = verdicts(tell(at_rib, foreign_claim(is_global=False), CLOUD_SWITCH))
+    assert (verdict.refused, at_rib.names) == (DropReason.WRONG_DOMAIN, 0)
+
+
+def test_a_switch_of_a_domain_that_is_not_trusted_relays_nothing() -> None:
+    at_rib = Rib(RIB, Policy(SCHOOL.root), MemoryStore(), RibSettings())
+    assert tell(at_rib, foreign_claim(), CLOUD_SWITCH) == []
     assert at_rib.refusals == {DropReason.WRONG_DOMAIN: 1}
 
 
@@ -340,10 +375,12 @@ def test_a_question_signed_by_another_key_gets_no_answer() -> None:
     assert (at_rib.take(), at_rib.watching) == ([], 0)
 
 
-def test_a_switch_of_another_domain_asks_its_own_rib() -> None:
+def test_a_switch_of_another_domain_hears_of_global_names_only() -> None:
     at_rib = rib()
-    assert ask(at_rib, CLOUD_SWITCH) == []
-    assert at_rib.refusals == {DropReason.WRONG_DOMAIN: 1}
+    tell(at_rib, local_claim())
+    assert [each.is_nobody for each in answers(ask(at_rib, CLOUD_SWITCH, watch_s=20.0))] == [True]
+    assert [letter.to for letter in tell(at_rib, local_claim(2))] == [SWITCH.name]
+    assert CLOUD_SWITCH.name in [letter.to for letter in tell(at_rib, claim(sequence=3)) if answers([letter])]
 
 
 def test_who_watches_is_told_of_what_is_new_and_of_what_is_gone() -> None:
@@ -386,7 +423,29 @@ def test_a_switch_that_loses_a_name_to_another_is_told() -> None:
     assert [letter.to for letter in letters if answers([letter])] == [SWITCH.name]
 
 
+def test_a_switch_that_relays_an_old_claim_of_a_node_that_moved_hears_where_it_is() -> None:
+    at_rib = rib()
+    tell(at_rib, claim(rtcert=RtCert.make(ROBOT, OTHER_SWITCH.name, DAY), sequence=2), OTHER_SWITCH)
+    letters = tell(at_rib, claim())
+    assert [each.refused for each in verdicts(letters)] == [DropReason.STALE]
+    assert [parse(each.claim).fields.uint("seq") for each in answers(letters)] == [2]
+
+
+def test_a_switch_whose_node_is_withdrawn_elsewhere_is_told() -> None:
+    at_rib = rib()
+    tell(at_rib, claim())
+    letters = tell(at_rib, withdrawal(2), OTHER_SWITCH)
+    assert [(letter.to, answers([letter])[0].claim) for letter in letters if answers([letter])] == [(SWITCH.name, b"")]
+
+
 # -- tiers
+
+
+def test_a_switch_hears_from_above_that_its_node_has_moved_to_another_domain() -> None:
+    at_rib = rib(UPPER.name)
+    tell(at_rib, claim(sequence=1))
+    letters = answer_from_above(at_rib, claim(sequence=2))
+    assert [(letter.to, answers([letter])[0].domain) for letter in letters] == [(SWITCH.name, CLOUD.root.domain)]
 
 
 def test_a_global_name_climbs() -> None:

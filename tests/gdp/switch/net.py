@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gdp.control.link_state import Adjacency, LinkState, Scope
+from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
 from gdp.names import Name
 from gdp.switch.link_states import LinkStates
 from gdp.switch.paths import Paths
@@ -29,9 +29,12 @@ def state(
     sequence: int = 1,
     inside: tuple[Adjacency, ...] = (),
     ribs: tuple[str, ...] = (),
+    members: tuple[str, ...] = (),
 ) -> LinkState:
     """Return a link state."""
-    return LinkState(name(origin), domain, scope, sequence, links, inside, tuple(name(rib) for rib in ribs))
+    attached = tuple(AttachedRib(name(rib), domain, bytes(8)) for rib in ribs)
+    listed = tuple(name(member) for member in members)
+    return LinkState(name(origin), domain, scope, sequence, links, inside, attached, listed)
 
 
 def known(*states: LinkState) -> LinkStates:

@@ -67,7 +67,7 @@ def test_a_rib_may_stand_in_a_domain_that_is_not_passed_through() -> None:
 def test_a_rib_at_ones_own_switch_needs_no_way() -> None:
     found = paths("a", state("a", ribs=("rib",)))
     assert found.to_rib(name("rib"), ALL) == (None, name("a"))
-    assert found.ribs() == {name("rib")}
+    assert set(found.ribs()) == {name("rib")}
 
 
 def test_a_rib_that_nobody_names_is_nowhere() -> None:
@@ -116,3 +116,76 @@ def test_paths_follow_the_link_states() -> None:
     found._link_states.put(state("b", sequence=2), b"", 0.0)
     assert found.to_switch(name("b"), HOME, ALL) is None
     assert found.is_switch(name("b"))
+
+
+def parted_home() -> Paths:
+    """Return a's paths, whose domain is parted: d and its inner e are reached over x of AWAY only."""
+    border = Scope.BORDER
+    return paths(
+        "a",
+        state("a", link("b", 5), link("x", 5, AWAY)),
+        state("b", link("a", 5)),
+        state("d", link("e", 5), link("x", 5, AWAY)),
+        state("d", link("x", 5, AWAY), scope=border, members=("d", "e"), ribs=("rib",)),
+        state("e", link("d", 5), link("gone", 5)),
+        state("x", link("a", 5), link("d", 5), domain=AWAY, scope=border),
+    )
+
+
+def test_a_part_of_our_domain_that_is_cut_off_is_reached_through_another_domain() -> None:
+    assert parted_home().to_switch(name("e"), HOME, ALL) == Way(name("x"), 10)
+    assert parted_home().to_rib(name("rib"), ALL) == (Way(name("x"), 10), name("d"))
+
+
+def test_a_part_that_is_cut_off_is_not_reached_through_a_domain_that_is_not_allowed() -> None:
+    assert parted_home().to_switch(name("e"), HOME, frozenset({HOME})) is None
+
+
+def test_what_an_old_link_state_says_of_the_part_that_is_cut_off_is_not_believed() -> None:
+    assert parted_home().to_switch(name("gone"), HOME, ALL) is None
+    assert parted_home().members() == {name("a"), name("b")}
+
+
+def test_of_two_parts_of_another_domain_the_one_that_lists_a_switch_leads_to_it() -> None:
+    border = Scope.BORDER
+    found = paths(
+        "a",
+        state("a", link("x", 5, AWAY), link("y", 50, AWAY)),
+        state("x", link("a", 5), domain=AWAY, scope=border, members=("x",)),
+        state("y", link("a", 50), domain=AWAY, scope=border, members=("y", "inner")),
+    )
+    assert found.to_switch(name("inner"), AWAY, ALL) == Way(name("y"), 50)
+
+
+def square(ab: int = 10, ac: int = 10, bd: int = 10, cd: int = 10) -> Paths:
+    """Return a's paths in the ring a, b, d, c, with alternates."""
+    found = paths(
+        "a",
+        state("a", link("b", ab), link("c", ac)),
+        state("b", link("a", ab), link("d", bd)),
+        state("c", link("a", ac), link("d", cd)),
+        state("d", link("b", bd), link("c", cd)),
+    )
+    found.has_alternates = True
+    return found
+
+
+def test_a_neighbour_whose_own_way_does_not_lead_back_is_an_alternate() -> None:
+    assert square().to_switch(name("d"), HOME, ALL) == Way(name("b"), 20, name("c"))
+
+
+def test_a_neighbour_whose_own_way_leads_back_is_no_alternate() -> None:
+    assert square(cd=30).to_switch(name("d"), HOME, ALL) == Way(name("b"), 20, None)
+    assert square(cd=29).to_switch(name("d"), HOME, ALL) == Way(name("b"), 20, name("c"))
+
+
+def test_alternates_are_left_out_until_they_are_wanted() -> None:
+    found = square()
+    found.has_alternates = False
+    assert found.to_switch(name("d"), HOME, ALL) == Way(name("b"), 20)
+
+
+def test_a_neighbour_of_another_domain_is_no_alternate() -> None:
+    found = three_domains()
+    found.has_alternates = True
+    assert found.to_switch(name("x"), AWAY, ALL) == Way(name("t"), 10, None)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from gdp.limits import NEGATIVE_LEASE_S
+from itertools import pairwise
+
+from gdp.limits import CLAIM_LEASE_S, NEGATIVE_LEASE_S
 from gdp.names import Name
-from gdp.switch.places import QUESTIONS_MAX, RETRY_S, TRIES_MAX, WATCH_AGAIN_S, Place, Places
+from gdp.switch.places import QUESTIONS_MAX, RETRY_S, TRIES_MAX, Place, Places
 from gdp.trust.right import Right
 from tests.gdp.switch.net import HOME, name
 
@@ -15,7 +17,7 @@ def place(advertiser: str = "robot", expires_s: float = 30.0) -> Place:
     return Place(TOPIC, name(advertiser), Right.PUBLISH, name("switch"), HOME, frozenset(), b"claim", expires_s)
 
 
-def asked(places: Places, now_s: float) -> list[tuple[Name, bool]]:
+def asked(places: Places, now_s: float) -> list[tuple[Name, float]]:
     return places.due(now_s)[0]
 
 
@@ -35,7 +37,7 @@ def test_wanting_twice_asks_once() -> None:
     places = Places()
     places.want(TOPIC, 0.0, watch=False)
     places.want(TOPIC, 0.0, watch=False)
-    assert asked(places, 0.0) == [(TOPIC, False)]
+    assert asked(places, 0.0) == [(TOPIC, 0.0)]
     assert asked(places, 0.0) == []
 
 
@@ -51,15 +53,15 @@ def test_a_watch_goes_on_after_its_answer() -> None:
     places.want(TOPIC, 0.0, watch=True)
     places.put(place(), 0.0)
     assert asked(places, 1.0) == []
-    assert asked(places, WATCH_AGAIN_S) == [(TOPIC, True)]
+    assert asked(places, CLAIM_LEASE_S / 4) == [(TOPIC, places.watch_s)]
 
 
 def test_a_watch_is_asked_at_once_though_the_name_was_asked_for_before() -> None:
     places = Places()
     places.want(TOPIC, 0.0, watch=False)
-    assert asked(places, 0.0) == [(TOPIC, False)]
+    assert asked(places, 0.0) == [(TOPIC, 0.0)]
     places.want(TOPIC, 0.1, watch=True)
-    assert asked(places, 0.1) == [(TOPIC, True)]
+    assert asked(places, 0.1) == [(TOPIC, places.watch_s)]
 
 
 def test_a_new_rib_is_asked_everything_at_once() -> None:
@@ -67,7 +69,7 @@ def test_a_new_rib_is_asked_everything_at_once() -> None:
     places.want(TOPIC, 0.0, watch=True)
     places.put(place(), 0.0)
     places.ask_again(1.0)
-    assert asked(places, 1.0) == [(TOPIC, True)]
+    assert asked(places, 1.0) == [(TOPIC, places.watch_s)]
 
 
 def test_what_is_watched_no_more_is_asked_no_more() -> None:
@@ -120,9 +122,21 @@ def test_open_questions_are_bounded_and_watches_stand_apart() -> None:
 def test_the_echo_of_a_claim_that_was_brought_from_here_answers_no_question_until_it_is_told_again() -> None:
     places = Places()
     places.want(TOPIC, 0.0, watch=True)
-    assert asked(places, 0.0) == [(TOPIC, True)]
+    assert asked(places, 0.0) == [(TOPIC, places.watch_s)]
     places.put(place(), 0.01, is_ours=True)
-    assert asked(places, RETRY_S) == [(TOPIC, True)]
+    assert asked(places, RETRY_S) == [(TOPIC, places.watch_s)]
     places.put(place(), RETRY_S + 0.01, is_ours=True)
     assert asked(places, 2 * RETRY_S + 0.1) == []
-    assert asked(places, WATCH_AGAIN_S + 1) == [(TOPIC, True)]
+    assert asked(places, CLAIM_LEASE_S / 4 + 1) == [(TOPIC, places.watch_s)]
+
+
+def test_a_watch_is_renewed_in_time_however_often_the_rib_tells_of_the_name() -> None:
+    places = Places()
+    places.want(TOPIC, 0.0, watch=True)
+    asked_s = []
+    for now_s in range(60):
+        asked_s += [now_s] if asked(places, now_s) else []
+        places.put(place(expires_s=now_s + 30.0), now_s)
+    assert asked_s[0] == 0
+    assert all(b - a <= CLAIM_LEASE_S / 4 for a, b in pairwise(asked_s))
+    assert len(asked_s) >= 60 / (CLAIM_LEASE_S / 4)

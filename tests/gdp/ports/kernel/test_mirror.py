@@ -14,8 +14,10 @@ from gdp.ports.kernel.shapes import BRANCHES_MAX, GROUP, NOWHERE_PORT, PORTS_MAX
 from gdp.switch.table import NOWHERE, Hops, Table
 
 ONE_HOP: Hops = ((1, b"m" * 12),)
+PROTECTED: Hops = ((1, b"m" * 12, 2, b"n" * 12),)
 PAIR: Hops = ((1, b"m" * 12), (2, b"n" * 12))
 TRIPLE: Hops = (*PAIR, (3, b"o" * 12))
+GUARDED: Hops = (*PAIR, (3, b"o" * 12, 1, b"m" * 12))
 WIDE: Hops = tuple((port, b"w" * 12) for port in range(BRANCHES_MAX + 1))
 FAR: Hops = ((PORTS_MAX, b"f" * 12),)
 
@@ -37,9 +39,12 @@ def in_kernel(loaded: Loaded, key: bytes) -> Hops | None:
     if port == NOWHERE_PORT:
         return NOWHERE
     if port != GROUP:
-        return ((port, value[EntryAt.MACS : EntryAt.GROUP]),)
+        macs, alternate = value[EntryAt.MACS : EntryAt.ALTERNATE], number(EntryAt.ALTERNATE)
+        if alternate == NOWHERE_PORT:
+            return ((port, macs),)
+        return ((port, macs, alternate, value[EntryAt.ALTERNATE + EntryAt.MACS : EntryAt.GROUP]),)
     body = loaded.groups.get(value[EntryAt.GROUP : EntryAt.GROUP + 4])
-    return next(hops for hops in (PAIR, TRIPLE) if group(hops) == body)
+    return next(hops for hops in (PAIR, TRIPLE, GUARDED) if group(hops) == body)
 
 
 def watched(loaded: Loaded) -> tuple[Table, Mirror]:
@@ -53,7 +58,9 @@ KEYS = st.builds(lambda a, b: name(a) + (name(b) if b else b""), st.integers(1, 
     lambda a: name(a) + bytes(32), st.integers(1, 3)
 )
 CHANGES = st.lists(
-    st.tuples(KEYS, st.sampled_from([None, NOWHERE, ONE_HOP, PAIR, TRIPLE, WIDE, FAR])), min_size=1, max_size=20
+    st.tuples(KEYS, st.sampled_from([None, NOWHERE, ONE_HOP, PROTECTED, PAIR, TRIPLE, GUARDED, WIDE, FAR])),
+    min_size=1,
+    max_size=20,
 )
 
 

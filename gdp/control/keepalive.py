@@ -1,0 +1,204 @@
+"""Keepalives: short frames between neighbours that are up, authenticated by a key of their two sessions.
+
+Sans-I/O. Source: RFC 5880 (BFD): intervals and detection time, section 6.8; poll and final, section 6.5; keyed digest
+with a meticulously rising sequence number, section 6.7.4. What differs: sessions begin with signed hellos
+(``hello.py``), and a poll is sent where silence begins, so that a few lost frames do not end a session.
+
+The payload of a frame of kind KEEPALIVE, whose message number is the sequence number::
+
+    0 flags (1)  1 detect multiplier (1)  2 digest of link states (8)  10 tag (16)
+
+The tag is HMAC-SHA256 over header and payload up to the tag, cut to 16 bytes. A node that finds itself without time
+says a larger multiplier (``Slowness``), so that its neighbours are patient with it while its machine is busy.
+"""
+
+from __future__ import annotations
+
+import hmac
+import math
+from dataclasses import dataclass
+from enum import IntFlag
+from typing import Final
+
+from gdp.control.hello import DIGEST_BYTES, MULTIPLIER_MAX, Timing
+from gdp.crypto.exchange import ExchangeKey
+from gdp.errors import DropReason, FrameError
+from gdp.frame.codec import HEADER_BYTES, Header, encode
+from gdp.frame.kinds import Flag, Kind
+from gdp.limits import HOPS_MAX
+from gdp.names import ZERO
+
+__all__ = ["KeepaliveFlag", "KeepaliveSession", "Slowness", "open_keepalive", "seal_keepalive"]
+
+_TAG_BYTES: Final = 16
+_DIGEST_AT: Final = HEADER_BYTES + 2
+_TAGGED_BYTES: Final = _DIGEST_AT + DIGEST_BYTES
+_FRAME_BYTES: Final = _TAGGED_BYTES + _TAG_BYTES
+_DIGEST: Final = "sha256"
+_PURPOSE: Final = b"gdp-keepalive-1"
+_SUSPECT_AFTER: Final = 1.25  # intervals without a frame, after which the neighbour is polled
+_POLLS_PER_INTERVAL: Final = 4
+_FORGET_S: Final = 10.0
+_JITTER: Final = 0.1 / 255  # of an interval, for each value of a byte; RFC 5880, 6.8.7 asks for up to 0.25
+
+
+class KeepaliveFlag(IntFlag):
+    """What a keepalive says besides being there."""
+
+    NONE = 0
+    POLL = 1  # answer at once
+    FINAL = 2  # the answer to a poll
+    HEARD = 4  # the sender hears the receiver's keepalives
+
+
+def seal_keepalive(key: bytes, header: Header, flags: int, multiplier: int, digest: bytes) -> bytes:
+    """Return a frame."""
+    tagged = encode(header) + bytes((flags, multiplier)) + digest
+    return tagged + hmac.digest(key, tagged, _DIGEST)[:_TAG_BYTES]
+
+
+def open_keepalive(key: bytes, frame: bytes) -> tuple[int, int, bytes]:
+    """Return flags, detect multiplier and digest of a frame, which may end in padding.
+
+    Raises:
+        FrameError: BAD_TAG, it was not sealed by this key, or TRUNCATED.
+    """
+    if len(frame) < _FRAME_BYTES:
+        raise FrameError(DropReason.TRUNCATED, "keepalive")
+    tag = hmac.digest(key, frame[:_TAGGED_BYTES], _DIGEST)[:_TAG_BYTES]
+    if not hmac.compare_digest(tag, frame[_TAGGED_BYTES:_FRAME_BYTES]):
+        raise FrameError(DropReason.BAD_TAG, "keepalive")
+    return frame[HEADER_BYTES], frame[HEADER_BYTES + 1], frame[_DIGEST_AT:_TAGGED_BYTES]
+
+
+class Slowness:
+    """How late a node has been called lately, forgotten by half every ten seconds."""
+
+    def __init__(self) -> None:
+        self._late_s = 0.0
+        self._at_s = float("-inf")
+
+    def late(self, late_s: float, now_s: float) -> None:
+        """Note that a timer fired so late."""
+        if late_s >= self._now(now_s):
+            self._late_s, self._at_s = late_s, now_s
+
+    def multiplier(self, timing: Timing, most_s: float, now_s: float) -> int:
+        """Return the detect multiplier that neighbours are asked for.
+
+        Args:
+            most_s: longest detection time; a node that is late by more counts as gone.
+        """
+        late_ms = 1_000 * self._now(now_s)
+        if not timing.transmit_ms or late_ms < timing.transmit_ms / 2:
+            return timing.multiplier
+        most = max(int(1_000 * most_s / timing.transmit_ms), timing.multiplier)
+        return min(timing.multiplier + math.ceil(2 * late_ms / timing.transmit_ms), most, MULTIPLIER_MAX)
+
+    def _now(self, now_s: float) -> float:
+        return self._late_s * math.pow(2.0, (self._at_s - now_s) / _FORGET_S)
+
+
+@dataclass(slots=True)
+class KeepaliveSession:
+    """Keepalives with one neighbour, for as long as both ends' sessions last.
+
+    Attributes:
+        out_interval_s: between those that are sent.
+        in_interval_s: between those that the neighbour sends.
+        detect_s: the neighbour is gone when silent for so long.
+        received: highest sequence number that came.
+        is_heard: one has come.
+        hears_us: the neighbour says that ours come.
+    """
+
+    out_key: bytes
+    in_key: bytes
+    out_interval_s: float
+    in_interval_s: float
+    detect_s: float
+    received: int
+    send_at_s: float
+    poll_at_s: float = 0.0
+    is_final_due: bool = False
+    is_heard: bool = False
+    hears_us: bool = False
+
+    @classmethod
+    def begin(
+        cls,
+        key: ExchangeKey,
+        far_key: bytes,
+        ends: tuple[bytes, bytes],
+        timings: tuple[Timing, Timing],
+        received: int,
+        now_s: float,
+    ) -> KeepaliveSession | None:
+        """Return a session, or None where one of the ends wants none.
+
+        Args:
+            ends: nonce and name, ours and the neighbour's.
+            timings: ours and the neighbour's.
+            received: the sequence number above which its keepalives are new.
+
+        Raises:
+            StatementError: MALFORMED, the neighbour's key is none.
+        """
+        own, far = timings
+        out_interval_s, in_interval_s = own.interval_s(far), far.interval_s(own)
+        if not out_interval_s or not in_interval_s:
+            return None
+        out_key, in_key = key.agree(far_key, _PURPOSE + ends[0] + ends[1], _PURPOSE + ends[1] + ends[0])
+        detect_s = in_interval_s * far.multiplier
+        return cls(out_key, in_key, out_interval_s, in_interval_s, detect_s, received, now_s)
+
+    def seal(
+        self,
+        source: tuple[bytes, int],
+        sequence: int,
+        multiplier: int,
+        digest: bytes,
+        now_s: float,
+        *,
+        poll: bool,
+    ) -> bytes:
+        """Return the next keepalive, and set when another one is due.
+
+        Args:
+            source: our name and incarnation.
+        """
+        flags = KeepaliveFlag.POLL if poll else KeepaliveFlag.NONE
+        if self.is_final_due:
+            flags |= KeepaliveFlag.FINAL
+        if self.is_heard:
+            flags |= KeepaliveFlag.HEARD
+        self.is_final_due = False
+        length = _FRAME_BYTES - HEADER_BYTES
+        name, incarnation = source
+        header = Header(Kind.KEEPALIVE, Flag.LAST, HOPS_MAX, 0, length, sequence, 0, 1, incarnation, ZERO, name)
+        frame = seal_keepalive(self.out_key, header, flags, multiplier, digest)
+        self.send_at_s = now_s + self.out_interval_s * (1 - frame[-1] * _JITTER)
+        self.poll_at_s = now_s + self.in_interval_s / _POLLS_PER_INTERVAL
+        return frame
+
+    def open(self, header: Header, frame: bytes, now_s: float) -> bytes:
+        """Take a keepalive of the neighbour; return the digest that it says.
+
+        Raises:
+            FrameError: REPLAYED, it or a later one came before; or as ``open_keepalive``.
+        """
+        if header.number <= self.received:
+            raise FrameError(DropReason.REPLAYED, "keepalive")
+        flags, multiplier, digest = open_keepalive(self.in_key, frame)
+        self.detect_s = self.in_interval_s * max(multiplier, 1)
+        self.received, self.is_heard = header.number, True
+        self.hears_us = bool(flags & KeepaliveFlag.HEARD)
+        if flags & KeepaliveFlag.POLL:
+            self.is_final_due, self.send_at_s = True, now_s
+        return digest
+
+    def suspect_at_s(self, heard_s: float) -> float:
+        """Return when a neighbour last heard at ``heard_s`` is polled next; never before its first keepalive."""
+        if not self.is_heard:
+            return float("inf")
+        return max(heard_s + _SUSPECT_AFTER * self.in_interval_s, self.poll_at_s)

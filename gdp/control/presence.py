@@ -1,0 +1,118 @@
+"""Whether the older of two nodes with one identity is still there.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). A node that runs twice (copied keys, a cloned disk) has two
+incarnations. A node that was restarted has two as well, but the older one is dead. So a RIB that is brought a node's
+own name in a new incarnation, from another switch, asks the older one's switch::
+
+    newer node --claim--> its switch --relay--> RIB --presence question--> older node's switch --the same--> older node
+                                     <-IN_USE--     <--presence answer--   (heard since: there; lost: gone)
+
+The newer one asks again until the older one is gone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from gdp.crypto.fields import Fields
+from gdp.crypto.keys import SigningKey
+from gdp.crypto.statements import StatementType, sign
+from gdp.names import Name
+
+__all__ = ["IdentityChecks", "Presence"]
+
+NO_ANSWER_S: Final = 1.5  # above the time after which a switch gives up a silent neighbour
+_BELIEVED_S: Final = 0.5  # an answer "is there" stands for so long before the switch is asked again
+_CHECKS_MAX: Final = 1_024
+
+
+@dataclass(frozen=True, slots=True)
+class Presence:
+    """A RIB's question about a node that is attached to a switch, or the switch's answer.
+
+    Args:
+        node: the identity.
+        incarnation: of the older node.
+        other: the switch that the newer node claims through.
+        is_answer: whether this answers the question; then ``is_there`` says how.
+    """
+
+    node: Name
+    incarnation: int
+    other: Name
+    is_answer: bool = False
+    is_there: bool = False
+
+    def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:
+        """Return the signed statement."""
+        body: Mapping[str, object] = {
+            "n": self.node,
+            "i": self.incarnation,
+            "w": self.other,
+            "q": not self.is_answer,
+            "y": self.is_there,
+            "c": membership,
+        }
+        return sign(StatementType.PRESENCE, body, signer, key)
+
+    @classmethod
+    def from_fields(cls, fields: Fields) -> Presence:
+        """Read a parsed statement's body.
+
+        Raises:
+            StatementError: MALFORMED.
+        """
+        return cls(fields.name("n"), fields.uint("i"), fields.name("w"), not fields.flag("q"), fields.flag("y"))
+
+
+@dataclass(slots=True)
+class _Check:
+    incarnation: int
+    switch: Name
+    asked_s: float
+    answer: bool | None = None
+    answered_s: float = 0.0
+
+
+class IdentityChecks:
+    """A RIB's open questions, by identity; bounded.
+
+    Attributes:
+        clashes: how often a newer node was refused because the older one is there.
+    """
+
+    def __init__(self) -> None:
+        self._checks: dict[Name, _Check] = {}
+        self.clashes = 0
+
+    def is_free(self, node: Name, incarnation: int, switch: Name, now_s: float) -> bool:
+        """Return whether the older node of this incarnation, at that switch, is gone; not while that is unknown."""
+        check = self._checks.get(node)
+        if check is None or (check.incarnation, check.switch) != (incarnation, switch):
+            return False
+        is_silent = check.answer is None and now_s >= check.asked_s + NO_ANSWER_S
+        if check.answer is False or is_silent:
+            del self._checks[node]
+            return True
+        self.clashes += check.answer is True
+        return False
+
+    def must_ask(self, node: Name, incarnation: int, switch: Name, now_s: float) -> bool:
+        """Return whether the switch is to be asked now, and note that it is."""
+        check = self._checks.get(node)
+        is_same = check is not None and (check.incarnation, check.switch) == (incarnation, switch)
+        if check is not None and is_same and (check.answer is None or now_s < check.answered_s + _BELIEVED_S):
+            return False
+        self._checks.pop(node, None)
+        if len(self._checks) >= _CHECKS_MAX:
+            del self._checks[next(iter(self._checks))]
+        self._checks[node] = _Check(incarnation, switch, now_s)
+        return True
+
+    def answered(self, presence: Presence, switch: Name, now_s: float) -> None:
+        """Take a verified answer of a switch; one to no open question is ignored."""
+        check = self._checks.get(presence.node)
+        if check is not None and (check.incarnation, check.switch) == (presence.incarnation, switch):
+            check.answer, check.answered_s = presence.is_there, now_s

@@ -1,0 +1,132 @@
+"""What a node that makes no progress waits for.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). ``port_waits`` and a node's own rules (in ``waiting.py`` of
+``gdp/client`` and ``gdp/switch``) say what is waited for now; ``WaitLog`` decides when to report it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final
+
+from gdp.control.greeter import Greeter, LinkPort
+from gdp.control.neighbour import NeighbourState
+from gdp.crypto.certificates import Role
+from gdp.errors import DropReason
+from gdp.limits import WAIT_REPORT_S
+from gdp.names import Name
+
+__all__ = ["Wait", "WaitLog", "WaitReason", "port_waits", "stranger_waits"]
+
+_SETTLE_S: Final = 1.0  # a change of the reason is reported after it has held for so long
+_STRANGER_S: Final = 2.0  # a refused neighbour that was silent for longer is gone
+
+
+class WaitReason(Enum):
+    """Why a node makes no progress. The value is the label of the metric ``gdp_waiting``."""
+
+    LINK_DOWN = "link-down"
+    NO_NEIGHBOUR = "no-neighbour"
+    STRANGER = "neighbour-refused"  # its certificate is not accepted here
+    ONE_WAY = "not-heard"  # we hear a neighbour that does not hear us, or refuses us
+    NO_SWITCH = "no-switch"  # neighbours, but none is a switch
+    NO_RIB = "no-rib"
+    REFUSED = "claim-refused"
+    IN_USE = "identity-in-use"
+
+
+@dataclass(frozen=True, slots=True)
+class Wait:
+    """One thing that a node waits for.
+
+    Args:
+        port: index of the port that it is about, where it is about one.
+        domain: label of a stranger's domain; unproven, maybe empty.
+        name: of the neighbour, or of the advertisement that was refused.
+        refused: why a hello or an advertisement was refused.
+    """
+
+    reason: WaitReason
+    port: int | None = None
+    domain: str = ""
+    name: Name | None = None
+    refused: DropReason | None = None
+
+    @property
+    def subject(self) -> tuple[object, ...]:
+        """Return what has one reason at a time: a port, a stranger's domain, an advertisement, or the node."""
+        if self.reason is WaitReason.STRANGER:
+            return "stranger", self.port, self.domain
+        if self.reason is WaitReason.REFUSED:
+            return "claim", self.name
+        return "port", self.port
+
+
+def port_waits(port: LinkPort, wanted: Collection[Role]) -> Iterator[Wait]:
+    """Yield why a port has no neighbour of a wanted role; nothing where it has one."""
+    if not port.is_up:
+        yield Wait(WaitReason.LINK_DOWN, port.index)
+        return
+    neighbours = list(port.neighbours.values())
+    if any(each.state is NeighbourState.UP and each.role in wanted for each in neighbours):
+        return
+    deaf = next((each for each in neighbours if each.state is not NeighbourState.UP and each.role in wanted), None)
+    if deaf is not None:
+        yield Wait(WaitReason.ONE_WAY, port.index, name=deaf.name)
+    elif neighbours:
+        yield Wait(WaitReason.NO_SWITCH, port.index)
+    else:
+        yield Wait(WaitReason.NO_NEIGHBOUR, port.index)
+
+
+def stranger_waits(greeter: Greeter, now_s: float) -> Iterator[Wait]:
+    """Yield the neighbours that are refused at present, one for each port, domain and reason."""
+    for port in greeter.ports.values():
+        for each in port.strangers.since(now_s - _STRANGER_S):
+            yield Wait(WaitReason.STRANGER, port.index, each.domain, refused=each.reason)
+
+
+@dataclass(slots=True)
+class _Subject:
+    wait: Wait
+    since_s: float  # no progress since
+    changed_s: float  # the present reason holds since
+    reported: Wait | None = None
+
+
+class WaitLog:
+    """Picks what is to be reported: what lasts, once, and again when it changes.
+
+    Args:
+        after_s: how long a node may make no progress before that is reported.
+    """
+
+    def __init__(self, after_s: float = WAIT_REPORT_S) -> None:
+        self._after_s = after_s
+        self._subjects: dict[tuple[object, ...], _Subject] = {}
+
+    @property
+    def lasting(self) -> list[Wait]:
+        """Return what has been reported and still holds."""
+        return [each.wait for each in self._subjects.values() if each.reported == each.wait]
+
+    def update(self, waits: Sequence[Wait], now_s: float) -> list[Wait]:
+        """Learn what is waited for now; return what is to be reported."""
+        current = {wait.subject: wait for wait in waits}
+        for subject in self._subjects.keys() - current.keys():
+            del self._subjects[subject]
+        due = []
+        for subject, wait in current.items():
+            known = self._subjects.get(subject)
+            if known is None:
+                known = self._subjects[subject] = _Subject(wait, now_s, now_s)
+            elif known.wait != wait:
+                known.wait, known.changed_s = wait, now_s
+            has_lasted = now_s >= known.since_s + self._after_s
+            is_settled = known.reported is None or now_s >= known.changed_s + _SETTLE_S
+            if known.reported != wait and has_lasted and is_settled:
+                known.reported = wait
+                due.append(wait)
+        return due

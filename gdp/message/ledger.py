@@ -1,0 +1,92 @@
+"""Sequence numbers of one publisher's messages: which message number carries which, and what nobody confirmed.
+
+Sans-I/O. A message number belongs to what is sealed as one, which may be a bundle of several messages. A sequence
+number belongs to each message that the application published, sealed or not.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+
+from gdp.message.loss import GONE_MAX, Losses, LossReason, LostRange, RangeSet, append
+from gdp.message.move import Move
+
+__all__ = ["Ledger"]
+
+
+class Ledger:
+    """The sequence numbers of one publisher.
+
+    Args:
+        last: the highest sequence number that was used before.
+
+    Attributes:
+        last: the highest sequence number in use.
+        losses: what this publisher did not bring to a reader that was due to get it.
+        gone: the latest ranges that no reader can get, for statuses.
+    """
+
+    def __init__(self, last: int) -> None:
+        self._before = last
+        self.last = last
+        self.losses = Losses()
+        self.gone: deque[LostRange] = deque(maxlen=GONE_MAX)
+        self._unconfirmed = RangeSet()
+        self._of: dict[int, tuple[int, int]] = {}  # message number -> first sequence number, messages; numbers rise
+
+    @property
+    def messages(self) -> int:
+        """Return how many messages were published here."""
+        return self.last - self._before
+
+    def next(self) -> int:
+        """Return the sequence number of a message that is published now."""
+        self.last += 1
+        return self.last
+
+    def put(self, number: int, sequence: int, messages: int) -> None:
+        """Note what the newest message number carries."""
+        self._of[number] = sequence, messages
+
+    def is_bundle(self, number: int) -> bool:
+        """Return whether a message number carries several messages."""
+        return self._of[number][1] > 1
+
+    def begin_of(self, number: int, otherwise: int) -> int:
+        """Return the first sequence number that a message number carries; ``otherwise`` if nothing is known of it."""
+        known = self._of.get(number)
+        return otherwise if known is None else known[0]
+
+    def forget(self, below: int) -> None:
+        """Keep nothing of message numbers under ``below``."""
+        while self._of and (first := next(iter(self._of))) < below:
+            del self._of[first]
+
+    def move(self, move: Move) -> None:
+        """Go on under new message numbers."""
+        self._of = {move.of(number): carried for number, carried in self._of.items()}
+
+    def let_go(self, numbers: Iterable[int], reason: LossReason) -> int:
+        """Note that message numbers are gone before every reader had them; return how many messages that are."""
+        gone = 0
+        for number in numbers:
+            sequence, messages = self._of[number]
+            self.lose(sequence, sequence + messages - 1, reason)
+            gone += messages
+        return gone
+
+    def lose(self, first: int, last: int, reason: LossReason) -> None:
+        """Note that no reader can get messages ``first`` to ``last`` any more."""
+        append(self.gone, LostRange(first, last, reason))
+        self.give_up(first, last, reason)
+
+    def give_up(self, first: int, last: int, reason: LossReason = LossReason.GIVEN_UP) -> None:
+        """Note that some reader does not get messages ``first`` to ``last``; none if ``last`` lies below ``first``."""
+        if first <= last:
+            self.losses.add(LostRange(first, last, reason))
+            self._unconfirmed.add(first, last)
+
+    def confirmed(self, below: int) -> int:
+        """Return how many messages with sequence numbers under ``below`` were not given up for any reader."""
+        return max(below - 1 - self._before - self._unconfirmed.count_below(below), 0)

@@ -1,0 +1,141 @@
+"""What the log of a node says about its neighbours and about what it waits for, in words with device names.
+
+Layer: I/O; it looks at the control plane twice a second and logs what changed.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from gdp.control.greeter import Greeter
+from gdp.control.waiting import Wait, WaitLog, WaitReason
+from gdp.effects import Instant
+from gdp.errors import DropReason
+from gdp.names import Name
+from gdp.ports.plane import MAC_BYTES, Plane
+from gdp.trust.domain import Policy
+
+__all__ = ["LOOK_S", "NodeLog", "OnWait", "no_name"]
+
+log = logging.getLogger(__name__)
+
+LOOK_S: Final = 0.5
+
+OnWait = Callable[[str, str], None]  # reason and text
+
+
+def no_name(name: Name) -> str:
+    """Return a name as logs show one that this node knows no better word for."""
+    return name.short
+
+
+class NodeLog:
+    """Logs neighbours that come and go, the RIB in use, and what a node waits for.
+
+    Args:
+        waits: what is waited for at a monotonic second.
+        rib: the RIB that a switch uses; None where a node uses none itself.
+        rival: the switch of a newer node with this identity, once it has been reported.
+        local_name: what the node's user calls an advertised name.
+        on_wait: called for each report as well, for JSON output.
+    """
+
+    def __init__(
+        self,
+        greeter: Greeter,
+        policy: Policy,
+        plane: Plane,
+        waits: Callable[[float], list[Wait]],
+        *,
+        rib: Callable[[], Name | None] | None = None,
+        rival: Callable[[], Name | None] = lambda: None,
+        local_name: Callable[[Name], str] = no_name,
+        on_wait: OnWait | None = None,
+    ) -> None:
+        self._greeter = greeter
+        self._policy = policy
+        self._plane = plane
+        self._waits = waits
+        self._rib = rib
+        self._known_rib: Name | None = None
+        self._rival = rival
+        self._known_rival: Name | None = None
+        self._local_name = local_name
+        self._on_wait = on_wait
+        self._neighbours: set[tuple[int, Name]] = set()
+        self._wait_log = WaitLog()
+
+    def look(self, now: Instant) -> None:
+        """Log what changed since the last look."""
+        self._look_at_neighbours()
+        if self._rib is not None and (rib := self._rib()) != self._known_rib:
+            self._known_rib = rib
+            log.info("RIB in use name=%s", "none" if rib is None else rib.short)
+        if (rival := self._rival()) is not None and rival != self._known_rival:
+            self._known_rival = rival
+            log.error("another node with this identity asked for its place at switch %s and was refused", rival.short)
+        for wait in self._wait_log.update(self._waits(now.mono_s), now.mono_s):
+            text = self._text(wait)
+            log.log(logging.ERROR if wait.reason is WaitReason.IN_USE else logging.WARNING, "waiting: %s", text)
+            if self._on_wait is not None:
+                self._on_wait(wait.reason.value, text)
+
+    def metrics(self) -> Mapping[str, int]:
+        """Return for each reason whether the node waits for it, 1 or 0."""
+        lasting = {wait.reason for wait in self._wait_log.lasting}
+        return {reason.value: int(reason in lasting) for reason in WaitReason}
+
+    def _look_at_neighbours(self) -> None:
+        now = {(each.port, each.name): each for each in self._greeter.all_up()}
+        for (port, name), each in now.items():
+            if (port, name) not in self._neighbours:
+                ifname, domain = self._ifname(port), self._domain(each.domain)
+                log.info("neighbour up port=%s role=%s name=%s domain=%s", ifname, each.role.value, name.short, domain)
+        for port, name in self._neighbours - now.keys():
+            log.info("neighbour lost port=%s name=%s", self._ifname(port), name.short)
+        self._neighbours = set(now)
+
+    def _domain(self, domain: Name) -> str:
+        root = self._policy.roots.get(domain)
+        return domain.short if root is None else root.label
+
+    def _ifname(self, port: int | None) -> str:
+        known = None if port is None else self._plane.ports.get(port)
+        return "?" if known is None else known.ifname
+
+    def _text(self, wait: Wait) -> str:
+        ifname = self._ifname(wait.port)
+        name = "?" if wait.name is None else wait.name.short
+        match wait.reason:
+            case WaitReason.LINK_DOWN:
+                return f"there is no device {ifname}" if self._is_absent(wait.port) else f"link down on {ifname}"
+            case WaitReason.NO_NEIGHBOUR:
+                return f"no neighbour on {ifname}: nobody answers there"
+            case WaitReason.STRANGER:
+                return _refusal(ifname, wait)
+            case WaitReason.ONE_WAY:
+                return f"neighbour {name} on {ifname} does not hear this node, or does not trust its domain"
+            case WaitReason.NO_SWITCH:
+                return f"no switch on {ifname}: its neighbours are RIBs or proxies"
+            case WaitReason.NO_RIB:
+                return "no RIB of this domain can be reached" if self._rib is not None else "no RIB answers the switch"
+            case WaitReason.REFUSED:
+                reason = "" if wait.refused is None else wait.refused.label
+                return f"advertisement of {'?' if wait.name is None else self._local_name(wait.name)} refused: {reason}"
+            case WaitReason.IN_USE:
+                return "another node with this identity is attached elsewhere; this one starts when that one is gone"
+
+    def _is_absent(self, port: int | None) -> bool:
+        known = None if port is None else self._plane.ports.get(port)
+        return known is not None and known.mac == bytes(MAC_BYTES)
+
+
+def _refusal(ifname: str, wait: Wait) -> str:
+    of = f"neighbour on {ifname} of domain {wait.domain or '?'}"
+    if wait.refused is DropReason.WRONG_DOMAIN:
+        return f"{of}, which is not trusted here (domain.trusts)"
+    if wait.refused is DropReason.EXPIRED:
+        return f"{of}: its certificate is not valid now; has it expired, or is a clock wrong?"
+    return f"{of} refused: {'' if wait.refused is None else wait.refused.label}"

@@ -1,0 +1,73 @@
+"""The care of a store that is a cluster: other RIBs' changes are heard and told to who watches.
+
+Layer: I/O.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Final
+
+from gdp.effects import Instant
+from gdp.ports.plane import HasFileno
+from gdp.rib.machine import Rib
+from gdp.rib.store import Store
+from gdp.stores.cluster import ClusterStore, load_functions
+from gdp.stores.cluster_address import ClusterAddress
+from gdp.stores.cluster_link import ClusterLink
+from gdp.trust.domain import Policy
+from gdp.trust.verifier import ClaimVerifier
+
+__all__ = ["ClusterUpkeep"]
+
+log = logging.getLogger(__name__)
+
+KEEP_ALIVE_S: Final = 0.25
+
+
+class ClusterUpkeep:
+    """A connection to the cluster and the store over it.
+
+    Raises:
+        LocalError: the cluster cannot be reached, or does not take the RIB's functions.
+    """
+
+    def __init__(self, address: ClusterAddress, policy: Policy, *, allow_unowned: bool) -> None:
+        self._link = ClusterLink(address)
+        load_functions(self._link)
+        self._cluster = ClusterStore(self._link, ClaimVerifier(policy, allow_unowned=allow_unowned))
+        self._rib: Rib | None = None
+        self._failures = 0
+
+    @property
+    def store(self) -> Store:
+        """Return the store."""
+        return self._cluster
+
+    @property
+    def every_s(self) -> float:
+        """Return how often the connections are looked after."""
+        return KEEP_ALIVE_S
+
+    def begin(self, rib: Rib, now: Instant) -> None:
+        """Listen for changes."""
+        self._rib = rib
+        self.work(now)
+
+    def sources(self) -> Sequence[HasFileno]:
+        """Return the connections that listen, as one source."""
+        return (self._link,)
+
+    def work(self, now: Instant) -> None:
+        """Tell of what other RIBs changed; look after the connections."""
+        self._link.keep_alive(now.mono_s)
+        if self._rib is not None:
+            self._rib.changed(self._cluster.changed(), now)
+        if self._link.failures != self._failures:
+            log.warning("cluster failures=%d; requests are refused where no primary answers", self._link.failures)
+            self._failures = self._link.failures
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._link.close()

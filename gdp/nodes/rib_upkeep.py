@@ -1,0 +1,97 @@
+"""What a RIB's store needs beside the machine's own calls: a snapshot kept up to date, or a cluster listened to.
+
+Layer: I/O.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Final, Protocol
+
+from gdp.effects import Instant
+from gdp.ports.plane import HasFileno
+from gdp.rib.machine import Rib
+from gdp.rib.store import MemoryStore, Store
+from gdp.stores.snapshot import SLICE, Snapshot
+
+__all__ = ["MemoryUpkeep", "Upkeep"]
+
+log = logging.getLogger(__name__)
+
+SNAPSHOT_S: Final = 0.1  # between two slices
+
+
+class Upkeep(Protocol):
+    """The care of one store."""
+
+    @property
+    def store(self) -> Store:
+        """Return the store."""
+
+    @property
+    def every_s(self) -> float:
+        """Return how often ``work`` is due."""
+
+    def begin(self, rib: Rib, now: Instant) -> None:
+        """Fill the store with what is known from before."""
+
+    def sources(self) -> Sequence[HasFileno]:
+        """Return what makes ``work`` due when it can be read."""
+
+    def work(self, now: Instant) -> None:
+        """Do what is due."""
+
+    def close(self) -> None:
+        """End."""
+
+
+class MemoryUpkeep:
+    """A store in memory, with a snapshot on disk if there is a path for it."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._memory = MemoryStore()
+        self._snapshot = None if path is None else Snapshot(path)
+        self._rib: Rib | None = None
+
+    @property
+    def store(self) -> Store:
+        """Return the store."""
+        return self._memory
+
+    @property
+    def every_s(self) -> float:
+        """Return how often a slice of changes is handed over."""
+        return SNAPSHOT_S
+
+    def begin(self, rib: Rib, now: Instant) -> None:
+        """Load the snapshot, whose entries are verified again."""
+        self._rib = rib
+        if self._snapshot is None:
+            return
+        live = sum(rib.load(entries, now) for entries in self._snapshot.load(now.unix_s))
+        log.info(
+            "snapshot read live=%d unreadable=%d refused=%d", live, self._snapshot.unreadable, rib.refusals.total()
+        )
+        self._memory.changes = set()
+        self._snapshot.start()
+
+    def sources(self) -> Sequence[HasFileno]:
+        """Return nothing."""
+        return ()
+
+    def work(self, now: Instant) -> None:
+        """Hand one slice of changes to the snapshot, if it is not behind."""
+        changes, snapshot, rib = self._memory.changes, self._snapshot, self._rib
+        if changes is None or snapshot is None or rib is None or not changes or not snapshot.is_ready:
+            return
+        keys = list(islice(changes, SLICE))
+        changes.difference_update(keys)
+        snapshot.write([(key, rib.entry_of(key, now.mono_s)) for key in keys], now.unix_s)
+
+    def close(self) -> None:
+        """Write what waits in the snapshot's queue."""
+        if self._snapshot is not None:
+            self._snapshot.close()

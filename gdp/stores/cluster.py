@@ -1,0 +1,344 @@
+"""A RIB's routes in a Valkey or Redis Cluster, shared by any number of RIBs of one domain.
+
+Layer: I/O; blocking, with short time limits (``cluster_link.py``). What the machine needs for one turn is fetched in
+one round trip for each primary, and what it wrote goes out in one. A function on the server decides whether a claim is
+newer, so RIBs that write at once agree. Leases are the expiry of keys; a change is published on the channel of its
+slot. What is read is verified like what a peer sends: the store is relied upon, not trusted.
+"""
+
+from __future__ import annotations
+
+import heapq
+import secrets
+import zlib
+from collections import Counter, OrderedDict
+from collections.abc import Collection
+from dataclasses import dataclass
+from hashlib import blake2b
+from pathlib import Path
+from typing import Final
+
+from redis.exceptions import RedisError
+
+from gdp.control.replica import Key
+from gdp.crypto import cbor, cbor_writer
+from gdp.crypto.fields import Fields
+from gdp.crypto.statements import parse
+from gdp.effects import Instant
+from gdp.errors import DropReason, LocalError, RemoteError, StatementError, StoreError
+from gdp.names import NAME_BYTES, Name
+from gdp.rib.route import Route, Withdrawn
+from gdp.stores.cluster_link import ClusterLink, Command, tag_of
+from gdp.trust.claim import ClaimBody
+from gdp.trust.verifier import ClaimVerifier
+
+__all__ = ["ClusterStore", "load_functions"]
+
+FUNCTIONS: Final = Path(__file__).with_name("cluster_functions.lua")
+CACHE_MAX: Final = 65_536  # names
+CONTEXTS_MAX: Final = 16_384
+_ID_BYTES: Final = 16
+_RECORD_BYTES: Final = NAME_BYTES + 8 + 8 + 4
+_SEQUENCE_MAX: Final = (1 << 64) - 1
+_KEPT, _NEWER, _NO_CONTEXT = 1, 0, 2
+
+
+def load_functions(link: ClusterLink) -> None:
+    """Bring the functions to every primary; they replicate from there.
+
+    Raises:
+        LocalError: a server refuses them.
+    """
+    code = FUNCTIONS.read_text()
+    for client in link.primaries():
+        try:
+            client.execute_command("FUNCTION LOAD", "REPLACE", code)
+        except RedisError as error:
+            raise LocalError(f"the cluster does not take the RIB's functions: {error}") from error
+
+
+@dataclass(slots=True)
+class _Write:
+    """A route or a withdrawal on its way out."""
+
+    key: Key
+    sequence: int
+    tag: bytes
+    command: Command
+    context: bytes = b""
+
+
+class ClusterStore:
+    """The Store of RIBs that share a cluster.
+
+    Args:
+        verifier: of the RIB: what is read is verified before it is used.
+    """
+
+    def __init__(self, link: ClusterLink, verifier: ClaimVerifier) -> None:
+        self._link = link
+        self._verifier = verifier
+        self._me = secrets.token_bytes(8)
+        self._now = Instant(0.0, 0.0)
+        self._cache: OrderedDict[Name, dict[Name, Route]] = OrderedDict()
+        self._contexts: OrderedDict[bytes, bytes] = OrderedDict()  # by hash tag and id
+        self._floors: OrderedDict[Key, Withdrawn] = OrderedDict()  # what the cluster said is newer
+        self._writes: list[_Write] = []
+        self._ends: list[tuple[float, Name, Name]] = []
+        self._senders: dict[Name, dict[int, float]] = {}  # ends of leases, of what came through this RIB
+        self.refusals: Counter[DropReason] = Counter()  # of what was read and does not hold
+        self.digests = None
+
+    def __len__(self) -> int:
+        return sum(map(len, self._cache.values()))
+
+    def prefetch(self, names: Collection[Name], now: Instant) -> None:
+        """Read the names that are not in memory, in one round trip for each primary.
+
+        Names that could not be read raise when they are asked for.
+        """
+        self._now = now
+        wanted = [name for name in dict.fromkeys(names) if name not in self._cache]
+        replies = self._link.execute([(tag_of(name), (b"GET", _routes_key(name))) for name in wanted])
+        for name, reply in zip(wanted, replies, strict=True):
+            if not isinstance(reply, StoreError | LocalError):
+                self._keep(name, self._decoded(name, reply if isinstance(reply, bytes) else b""))
+
+    def routes(self, name: Name) -> list[Route]:
+        """Return a name's routes."""
+        return list(self._of(name).values())
+
+    def get(self, name: Name, advertiser: Name) -> Route | Withdrawn | None:
+        """Return what is known of one advertiser of a name."""
+        route = self._of(name).get(advertiser)
+        return route if route is not None else self._floors.get((name, advertiser))
+
+    def put(self, route: Route) -> None:
+        """Add or replace a route; ``commit`` says whether the cluster took it."""
+        self._of(route.name)[route.advertiser] = route
+        self._floors.pop((route.name, route.advertiser), None)
+        heapq.heappush(self._ends, (route.expires_s, route.name, route.advertiser))
+        held = self._senders.setdefault(route.sender, {})
+        held[hash((route.name, route.advertiser))] = route.expires_s
+        if not route.is_from_above:
+            self._writes.append(self._put_command(route))
+
+    def withdraw(self, name: Name, advertiser: Name, withdrawn: Withdrawn | None = None) -> Route | None:
+        """Take a route away and return it."""
+        route = self._of(name).pop(advertiser, None)
+        if route is None and withdrawn is None:
+            return None
+        if withdrawn is None and route is not None:
+            withdrawn = Withdrawn(route.sender, route.sequence, route.valid_until_unix_s)
+        assert withdrawn is not None
+        tag = tag_of(name)
+        sequence = withdrawn.sequence.to_bytes(8, "big")
+        until = withdrawn.valid_until_unix_s * 1_000
+        command: Command = (
+            *(b"FCALL", b"gdp_rib_withdraw", 2, _routes_key(name), _sequence_key(name, advertiser)),
+            *(bytes(advertiser), sequence, until, tag, self._me + name),
+        )
+        if route is None or not route.is_from_above:
+            self._writes.append(_Write((name, advertiser), withdrawn.sequence, tag, command))
+        self._set_floor((name, advertiser), withdrawn)
+        return route
+
+    def commit(self) -> list[Key]:
+        """Send what was written; return the keys that were not taken: another RIB's is newer, or the cluster failed."""
+        writes, self._writes = self._writes, []
+        if not writes:
+            return []
+        replies = self._link.execute([(write.tag, write.command) for write in writes])
+        again = [at for at, reply in enumerate(replies) if _code(reply) == _NO_CONTEXT]
+        with_context = [(writes[at].tag, _with_context(writes[at])) for at in again]
+        for at, reply in zip(again, self._link.execute(with_context), strict=True):
+            replies[at] = reply
+        refused = []
+        for write, reply in zip(writes, replies, strict=True):
+            if _code(reply) == _KEPT:
+                continue
+            refused.append(write.key)
+            self._cache.pop(write.key[0], None)
+            if isinstance(reply, list) and _code(reply) == _NEWER:
+                held = int.from_bytes(reply[1], "big")
+                self._set_floor(write.key, Withdrawn(write.key[1], held, int(self._now.unix_s) + 1))
+            else:
+                self.refusals[DropReason.UNAVAILABLE] += 1
+        return refused
+
+    def expire(self, now_s: float, unix_s: float) -> list[Route]:
+        """Take away and return the routes in memory whose lease ended; the cluster does so by itself."""
+        self._now = Instant(now_s, unix_s)
+        gone = []
+        while self._ends and self._ends[0][0] <= now_s:
+            _, name, advertiser = heapq.heappop(self._ends)
+            routes = self._cache.get(name, {})
+            route = routes.get(advertiser)
+            if route is not None and route.expires_s <= now_s:
+                del routes[advertiser]
+                gone.append(route)
+        return gone
+
+    def next_expiry(self) -> float | None:
+        """Return a monotonic second that is no later than the next lease end in memory, or None."""
+        return self._ends[0][0] if self._ends else None
+
+    def count_of(self, sender: Name) -> int:
+        """Return how many routes of a sender came through this RIB and hold still."""
+        held = self._senders.get(sender, {})
+        if len(held) > 1_000 and min(held.values()) <= self._now.mono_s:
+            held = self._senders[sender] = {key: end for key, end in held.items() if end > self._now.mono_s}
+        return len(held)
+
+    def resting_on(self, fingerprint: bytes) -> list[Route]:
+        """Return the routes in memory whose evidence includes a certificate; others are found out when read."""
+        every = (route for routes in self._cache.values() for route in routes.values())
+        return [route for route in every if fingerprint in route.fingerprints]
+
+    def changed(self) -> list[tuple[Name, list[Route]]]:
+        """Return the names that other RIBs changed since the last call, each with the routes that were in memory."""
+        found: dict[Name, list[Route]] = {}
+        if self._link.listen():
+            self._forget_all(found)  # what was changed while nobody listened is not known
+        for notification in self._link.notifications():
+            if notification[:8] != self._me:
+                name = Name(notification[8:])
+                found.setdefault(name, list(self._cache.pop(name, {}).values()))
+        return list(found.items())
+
+    # -- memory
+
+    def _of(self, name: Name) -> dict[Name, Route]:
+        """Return a name's routes in memory, read from the cluster where they are not.
+
+        Raises:
+            StoreError: the cluster did not answer.
+        """
+        routes = self._cache.get(name)
+        if routes is None:
+            self.prefetch([name], self._now)
+            routes = self._cache.get(name)
+            if routes is None:
+                raise StoreError("the cluster did not answer")
+        return routes
+
+    def _keep(self, name: Name, routes: dict[Name, Route]) -> None:
+        self._cache[name] = routes
+        while len(self._cache) > CACHE_MAX:
+            self._cache.popitem(last=False)
+        for route in routes.values():
+            heapq.heappush(self._ends, (route.expires_s, route.name, route.advertiser))
+
+    def _set_floor(self, key: Key, withdrawn: Withdrawn) -> None:
+        self._floors[key] = withdrawn
+        while len(self._floors) > CACHE_MAX:
+            self._floors.popitem(last=False)
+
+    def _forget_all(self, found: dict[Name, list[Route]]) -> None:
+        for name, routes in self._cache.items():
+            found[name] = list(routes.values())
+        self._cache.clear()
+
+    # -- records
+
+    def _put_command(self, route: Route) -> _Write:
+        """Return the call of the server's function; the claim is compressed against what its node's claims share."""
+        body = ClaimBody.from_statement(parse(route.claim))
+        context = cbor_writer.encode(
+            {
+                "w": route.sender,
+                "d": route.domain,
+                "x": list(route.transit),
+                "m": body.membership,
+                "r": body.rtcert,
+            }
+        )
+        tag = tag_of(route.name)
+        context_id = blake2b(context, digest_size=_ID_BYTES).digest()
+        squeeze = zlib.compressobj(6, zlib.DEFLATED, -15, zdict=context)
+        data = context_id + squeeze.compress(route.claim) + squeeze.flush()
+        end_ms = int((self._now.unix_s + route.expires_s - self._now.mono_s) * 1_000)
+        keys = (_routes_key(route.name), _sequence_key(route.name, route.advertiser), _context_key(tag, context_id))
+        sequence = min(route.sequence, _SEQUENCE_MAX).to_bytes(8, "big")
+        command: Command = (
+            *(b"FCALL", b"gdp_rib_put", 3, *keys, bytes(route.advertiser), sequence, end_ms, data),
+            *(route.valid_until_unix_s * 1_000, b"", tag, self._me + route.name),
+        )
+        return _Write((route.name, route.advertiser), route.sequence, tag, command, context)
+
+    def _decoded(self, name: Name, value: bytes) -> dict[Name, Route]:
+        """Return the routes in a value that hold; what does not is counted."""
+        routes: dict[Name, Route] = {}
+        at = 0
+        while at + _RECORD_BYTES <= len(value):
+            end_ms = int.from_bytes(value[at + 40 : at + 48], "big")
+            stop = at + _RECORD_BYTES + int.from_bytes(value[at + 48 : at + _RECORD_BYTES], "big")
+            try:
+                route = self._route(name, value[at + _RECORD_BYTES : stop], end_ms / 1_000)
+                if route.expires_s > self._now.mono_s:
+                    routes[route.advertiser] = route
+            except RemoteError as error:
+                self.refusals[error.reason] += 1
+            at = stop
+        return routes
+
+    def _route(self, name: Name, data: bytes, end_unix_s: float) -> Route:
+        context = self._context(tag_of(name), data[:_ID_BYTES])
+        try:
+            claim_wire = zlib.decompressobj(-15, zdict=context).decompress(data[_ID_BYTES:], 1 << 16)
+        except zlib.error as error:
+            raise StatementError(DropReason.MALFORMED, "a record of the store") from error
+        decoded = cbor.decode(context)
+        if not isinstance(decoded, dict):
+            raise StatementError(DropReason.MALFORMED, "a context of the store")
+        fields = Fields(decoded)
+        claim = self._verifier.verify(claim_wire, self._now.unix_s)
+        if claim.name != name:
+            raise StatementError(DropReason.WRONG_NAME, "a record of the store under another name")
+        return Route(
+            name=name,
+            advertiser=claim.node,
+            sender=fields.name("w"),
+            switch=claim.switch,
+            domain=fields.name("d"),
+            transit=tuple(fields.names("x", 64)),
+            sequence=claim.sequence,
+            is_global=claim.is_global,
+            claim=claim_wire,
+            is_from_above=False,
+            expires_s=self._now.mono_s + min(end_unix_s - self._now.unix_s, claim.lease_s),
+            valid_until_unix_s=claim.valid_until_unix_s,
+            fingerprints=claim.fingerprints,
+        )
+
+    def _context(self, tag: bytes, context_id: bytes) -> bytes:
+        known = self._contexts.get(tag + context_id)
+        if known is None:
+            (reply,) = self._link.execute([(tag, (b"GET", _context_key(tag, context_id)))])
+            if not isinstance(reply, bytes):
+                raise StatementError(DropReason.UNAVAILABLE, "a context that is not there")
+            known = self._contexts[tag + context_id] = reply
+            while len(self._contexts) > CONTEXTS_MAX:
+                self._contexts.popitem(last=False)
+        return known
+
+
+def _routes_key(name: Name) -> bytes:
+    return tag_of(name) + b"r" + name
+
+
+def _sequence_key(name: Name, advertiser: Name) -> bytes:
+    return tag_of(name) + b"s" + blake2b(name + advertiser, digest_size=_ID_BYTES).digest()
+
+
+def _context_key(tag: bytes, context_id: bytes) -> bytes:
+    return tag + b"c" + context_id
+
+
+def _with_context(write: _Write) -> Command:
+    """Return the call with the context that the server said it has not."""
+    return (*write.command[:-3], write.context, *write.command[-2:])
+
+
+def _code(reply: object) -> int | None:
+    return reply[0] if isinstance(reply, list) and len(reply) == 2 and isinstance(reply[0], int) else None

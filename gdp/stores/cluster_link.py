@@ -1,0 +1,231 @@
+"""Connections to the primaries of a Valkey or Redis Cluster: which one has a slot, commands in batches, notifications.
+
+Layer: I/O; blocking, with short time limits. A primary that fails is left alone for a moment, and the map of slots is
+read again from the others, so that its replica is found once it was promoted.
+"""
+
+from __future__ import annotations
+
+import select
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+from redis import Redis
+from redis.backoff import NoBackoff
+from redis.client import PubSub
+from redis.crc import key_slot
+from redis.exceptions import RedisError, ResponseError
+from redis.retry import Retry
+
+from gdp.errors import LocalError, StoreError
+from gdp.names import Name
+from gdp.stores.cluster_address import Address, ClusterAddress
+
+__all__ = ["CHANNELS", "ClusterLink", "Command", "tag_of"]
+
+_ALPHABET: Final = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_"
+CHANNELS: Final = tuple(b"{%c}" % char for char in _ALPHABET)  # hash tags: names share 64 slots, and one channel each
+_TIMEOUT_S: Final = 0.5  # a primary that does not answer for so long has failed
+_REFRESH_S: Final = 0.1  # between two readings of the map of slots while something fails
+_PING_S: Final = 1.0  # between two signs of life on a connection that only listens
+_MOVED: Final = ("MOVED", "ASK", "CLUSTERDOWN", "READONLY", "LOADING", "TRYAGAIN", "NOREPLICAS", "MASTERDOWN")
+
+Command = tuple[bytes | int, ...]  # the second item of which decides: a key
+
+
+def tag_of(name: Name) -> bytes:
+    """Return the hash tag, and channel, of a name."""
+    return CHANNELS[name[0] & 63]
+
+
+class ClusterLink:
+    """Blocking access to the primaries.
+
+    Raises:
+        LocalError: no server can be reached at the start, or they are no cluster.
+    """
+
+    def __init__(self, address: ClusterAddress) -> None:
+        self._address = address
+        self._clients: dict[Address, Redis] = {}
+        self._primaries: dict[bytes, Address] = {}  # by hash tag
+        self._refreshed_s = float("-inf")
+        self._listening: dict[Address, PubSub] = {}
+        self._readable = select.epoll()
+        self._pinged_s = 0.0
+        self.failures = 0
+        try:
+            self._refresh()
+        except StoreError as error:
+            raise LocalError(f"the cluster cannot be reached: {error}") from error
+
+    def fileno(self) -> int:
+        """Return a descriptor that is readable while notifications wait."""
+        return self._readable.fileno()
+
+    def primaries(self) -> list[Redis]:
+        """Return a client of each primary."""
+        return [self._client(at) for at in dict.fromkeys(self._primaries.values())]
+
+    def execute(self, commands: Sequence[tuple[bytes, Command]]) -> list[object]:
+        """Send commands, each with the hash tag of its keys, in one batch for each primary.
+
+        Returns the replies in order; in the place of one that did not come stands a ``StoreError``.
+        """
+        replies: list[object] = [StoreError("not sent")] * len(commands)
+        for _attempt in range(2):
+            open_ = [index for index, reply in enumerate(replies) if isinstance(reply, StoreError)]
+            if not open_:
+                break
+            if _attempt and not self._try_refresh():
+                break
+            by_primary: dict[Address, list[int]] = defaultdict(list)
+            for index in open_:
+                by_primary[self._primaries[commands[index][0]]].append(index)
+            for at, indices in by_primary.items():
+                for index, reply in zip(indices, self._batch(at, [commands[i][1] for i in indices]), strict=True):
+                    replies[index] = reply
+        return replies
+
+    def listen(self) -> bool:
+        """See that every channel is listened to; return whether that begins only now: changes may have been missed."""
+        wanted = set(self._primaries.values())
+        if wanted == self._listening.keys():
+            return False
+        self._stop_listening()
+        try:
+            for at in wanted:
+                subscription = self._client(at).pubsub()
+                self._listening[at] = subscription
+                for channel in (each for each in CHANNELS if self._primaries[each] == at):
+                    subscription.ssubscribe(channel)
+                assert subscription.connection is not None
+                self._readable.register(subscription.connection._sock, select.EPOLLIN)
+        except RedisError:
+            self._failed()
+            return False
+        return True
+
+    def notifications(self) -> Iterator[bytes]:
+        """Yield what came on the channels; where a connection fails all are made again by the next ``listen``."""
+        for subscription in list(self._listening.values()):
+            try:
+                while (message := subscription.get_message(timeout=0)) is not None:
+                    if message["type"] == "smessage":
+                        yield message["data"]
+                    elif message["type"] == "sunsubscribe":  # the slot has moved
+                        raise RedisError("unsubscribed")
+            except (RedisError, OSError):
+                self._failed()
+                return
+
+    def keep_alive(self, now_s: float) -> None:
+        """Ask for a sign of life on the connections that only listen, now and then."""
+        if now_s - self._pinged_s < _PING_S:
+            return
+        self._pinged_s = now_s
+        try:
+            for subscription in self._listening.values():
+                subscription.ping()
+        except (RedisError, OSError):
+            self._failed()
+        if not self._listening:
+            self._try_refresh()
+
+    def close(self) -> None:
+        """Close every connection."""
+        self._stop_listening()
+        self._readable.close()
+        for client in self._clients.values():
+            client.close()
+        self._clients.clear()
+
+    def _batch(self, at: Address, commands: list[Command]) -> list[object]:
+        pipeline = self._client(at).pipeline(transaction=False)
+        for command in commands:
+            pipeline.execute_command(*command)
+        try:
+            replies: list[object] = pipeline.execute(raise_on_error=False)
+        except (RedisError, OSError) as error:
+            self.failures += 1
+            return [StoreError(str(error))] * len(commands)
+        return [_translated(reply) for reply in replies]
+
+    def _client(self, at: Address) -> Redis:
+        client = self._clients.get(at)
+        if client is None:
+            its = self._address
+            client = self._clients[at] = Redis(
+                host=at[0],
+                port=at[1],
+                username=its.username or None,
+                password=its.password or None,
+                socket_timeout=_TIMEOUT_S,
+                socket_connect_timeout=_TIMEOUT_S,
+                retry=Retry(NoBackoff(), 0),
+                ssl=its.ca is not None,
+                ssl_ca_certs=None if its.ca is None else str(its.ca),
+                ssl_certfile=None if its.cert is None else str(its.cert),
+                ssl_keyfile=None if its.key is None else str(its.key),
+            )
+        return client
+
+    def _try_refresh(self) -> bool:
+        try:
+            self._refresh()
+        except StoreError:
+            return False
+        return True
+
+    def _refresh(self) -> None:
+        """Read the map of slots from the first server that has one.
+
+        Raises:
+            StoreError: none has.
+        """
+        if time.monotonic() - self._refreshed_s < _REFRESH_S:
+            raise StoreError("read the map of slots a moment ago")
+        reason = "no server is configured"
+        for at in dict.fromkeys([*self._primaries.values(), *self._address.nodes]):
+            try:
+                shards = self._client(at).execute_command("CLUSTER SLOTS")
+            except (RedisError, OSError) as error:
+                reason = f"{at[0]}:{at[1]}: {error}"
+                continue
+            primaries = dict(_primaries(shards))
+            if len(primaries) == len(CHANNELS):
+                self._primaries = primaries
+                self._refreshed_s = time.monotonic()
+                return
+            reason = f"{at[0]}:{at[1]}: not every slot is served"
+        self._refreshed_s = time.monotonic()
+        raise StoreError(reason)
+
+    def _failed(self) -> None:
+        self.failures += 1
+        self._stop_listening()
+        self._try_refresh()
+
+    def _stop_listening(self) -> None:
+        for subscription in self._listening.values():
+            subscription.close()
+        self._listening.clear()
+
+
+def _primaries(shards: Sequence[Sequence[object]]) -> Iterator[tuple[bytes, Address]]:
+    slots = {key_slot(tag): tag for tag in CHANNELS}
+    for shard in shards:
+        first, last, primary = int(str(shard[0])), int(str(shard[1])), shard[2]
+        assert isinstance(primary, list)
+        host, port = primary[0], int(primary[1])
+        at = (host.decode() if isinstance(host, bytes) else str(host), port)
+        yield from ((tag, at) for slot, tag in slots.items() if first <= slot <= last)
+
+
+def _translated(reply: object) -> object:
+    """Return a reply; one that means "not here, not now" as a ``StoreError``."""
+    if isinstance(reply, ResponseError) and not str(reply).startswith(_MOVED):
+        return LocalError(str(reply))
+    return StoreError(str(reply)) if isinstance(reply, RedisError) else reply

@@ -1,0 +1,150 @@
+"""What a RIB with its store in memory held, on disk: read at the start, kept up to date in the background.
+
+Layer: I/O. SQLite, written by one thread in slices; a full disk or a broken file is reported, and the RIB goes on
+without. Entries prove themselves, so what is read is verified like what a peer sends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import queue
+import sqlite3
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from gdp.control.replica import Entry, Key
+from gdp.crypto import cbor, cbor_writer
+from gdp.crypto.fields import Fields
+from gdp.errors import RemoteError
+from gdp.limits import LEASE_MAX_S
+
+__all__ = ["SLICE", "Snapshot"]
+
+log = logging.getLogger(__name__)
+
+SLICE: Final = 512  # entries at once
+_SLICES_WAITING_MAX: Final = 4
+_SCHEMA: Final = """
+CREATE TABLE IF NOT EXISTS entries (key BLOB PRIMARY KEY, entry BLOB NOT NULL, end_unix_s REAL NOT NULL) WITHOUT ROWID
+"""
+
+Change = tuple[Key, Entry | None]  # None: it is gone
+
+
+class Snapshot:
+    """One file.
+
+    Args:
+        path: of the database; a file that is none is put aside as ``PATH.broken``.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._slices: queue.Queue[tuple[Sequence[Change], float] | None] = queue.Queue(_SLICES_WAITING_MAX)
+        self.failures = 0
+        self.unreadable = 0
+        self._has_failed = False
+        self._thread = threading.Thread(target=self._work, name="snapshot", daemon=True)
+
+    def load(self, unix_s: float) -> Iterator[list[Entry]]:
+        """Yield what was held, in slices, without leases that ended."""
+        try:
+            with contextlib.closing(_opened(self._path)) as database:
+                rows = database.execute("SELECT entry, end_unix_s FROM entries WHERE end_unix_s > ?", (unix_s,))
+                while slice_ := rows.fetchmany(SLICE):
+                    yield [entry for row in slice_ if (entry := self._read(row[0], row[1] - unix_s)) is not None]
+        except sqlite3.OperationalError as error:
+            self._report(error)
+        except sqlite3.DatabaseError as error:
+            self._put_aside(error)
+
+    def start(self) -> None:
+        """Begin to write what ``write`` is given."""
+        self._thread.start()
+
+    @property
+    def is_ready(self) -> bool:
+        """Return whether ``write`` takes another slice."""
+        return not self._slices.full()
+
+    def write(self, changes: Sequence[Change], unix_s: float) -> None:
+        """Have changes written; the caller has asked ``is_ready``."""
+        self._slices.put_nowait((changes, unix_s))
+
+    def close(self) -> None:
+        """Write what waits, and end."""
+        if self._thread.is_alive():
+            self._slices.put(None)
+            self._thread.join()
+
+    def _read(self, wire: bytes, left_s: float) -> Entry | None:
+        try:
+            decoded = cbor.decode(wire)
+            entry = Entry.from_fields(Fields(decoded if isinstance(decoded, dict) else {}))
+        except RemoteError:
+            self.unreadable += 1
+            return None
+        return replace(entry, lease_s=min(entry.lease_s, left_s))
+
+    def _work(self) -> None:
+        database: sqlite3.Connection | None = None
+        while (item := self._slices.get()) is not None:
+            try:
+                database = database or _opened(self._path)
+                with database:
+                    _write(database, *item)
+                if self._has_failed:
+                    log.info("snapshot written again path=%s", self._path)
+                self._has_failed = False
+            except sqlite3.Error as error:
+                self._report(error)
+        if database is not None:
+            database.close()
+
+    def _report(self, error: sqlite3.Error) -> None:
+        """Count each failure, report the first of a row: the RIB goes on without."""
+        self.failures += 1
+        if not self._has_failed:
+            log.warning("snapshot failed path=%s reason=%s; the RIB goes on without it", self._path, error)
+        self._has_failed = True
+
+    def _put_aside(self, error: sqlite3.DatabaseError) -> None:
+        self.failures += 1
+        aside = self._path.with_name(self._path.name + ".broken")
+        log.warning("snapshot cannot be read path=%s reason=%s; put aside as %s", self._path, error, aside)
+        try:
+            self._path.replace(aside)
+        except OSError as failure:
+            log.warning("snapshot cannot be put aside path=%s reason=%s", self._path, failure)
+
+
+def _opened(path: Path) -> sqlite3.Connection:
+    database = sqlite3.connect(path, timeout=1.0)
+    database.execute("PRAGMA journal_mode=WAL")
+    database.execute("PRAGMA synchronous=NORMAL")
+    database.execute(_SCHEMA)
+    return database
+
+
+def _write(database: sqlite3.Connection, changes: Sequence[Change], unix_s: float) -> None:
+    gone = [(_key(key),) for key, entry in changes if entry is None]
+    kept = [
+        (
+            _key(key),
+            cbor_writer.encode(entry.to_fields()),
+            unix_s + (LEASE_MAX_S if entry.membership else entry.lease_s),
+        )
+        for key, entry in changes
+        if entry is not None
+    ]
+    database.executemany("DELETE FROM entries WHERE key = ?", gone)
+    database.executemany("INSERT OR REPLACE INTO entries VALUES (?, ?, ?)", kept)
+
+
+def _key(key: Key) -> bytes:
+    name, advertiser = key
+    return bytes(name) + bytes(advertiser)

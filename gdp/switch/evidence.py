@@ -1,0 +1,85 @@
+"""From a signed statement to a place: what proves where a node is attached.
+
+Place: pure. A RIB's answer and a switch's relay both carry the node's own claim. It names the switch by an RtCert and
+is verified here like anywhere else. Only the domain and its transit are the word of the signer.
+"""
+
+from __future__ import annotations
+
+from gdp.control.query import Answer
+from gdp.control.relay import Relay
+from gdp.crypto.certificates import Role
+from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.effects import Instant
+from gdp.errors import DropReason, StatementError
+from gdp.names import Name
+from gdp.switch.places import Place
+from gdp.trust.claim import Claim
+from gdp.trust.domain import Policy
+from gdp.trust.verifier import ClaimVerifier
+
+__all__ = ["Evidence"]
+
+
+class Evidence:
+    """Verifies where nodes are.
+
+    Args:
+        verifier: shared with the switch's other rooms, so that a claim seen before is cheap.
+    """
+
+    def __init__(self, policy: Policy, verifier: ClaimVerifier) -> None:
+        self._policy = policy
+        self._verifier = verifier
+
+    def from_answer(self, answer: Answer, now: Instant) -> Place:
+        """Return the place that an answer, whose signature was verified, tells of.
+
+        Raises:
+            StatementError: the claim in it does not hold, or is about something else.
+        """
+        claim = self._verifier.verify(answer.claim, now.unix_s)
+        if claim.name != answer.name or claim.node != answer.advertiser:
+            raise StatementError(DropReason.WRONG_NAME, "an answer about something else than its claim")
+        return _place(claim, answer.domain, frozenset(answer.transit), answer.lease_s, now)
+
+    def from_relay(self, statement: Statement, now: Instant) -> Place:
+        """Return the place that a switch tells of a node that is attached to it.
+
+        Raises:
+            StatementError: it does not hold, or the node lets another switch speak for it.
+        """
+        relay = Relay.from_fields(statement.expect(StatementType.RELAY))
+        member = self._policy.verify_membership(relay.membership, now.unix_s)
+        if member.name != statement.signer or member.role is not Role.SWITCH:
+            raise StatementError(DropReason.BAD_CERTIFICATE, "a relay that is not from a switch")
+        statement.verify(member.key)
+        claim = self._verifier.verify_statement(parse(relay.statement), now.unix_s)
+        if claim.switch != member.name:
+            raise StatementError(DropReason.NOT_DELEGATED, "the RtCert names another switch")
+        return _place(claim, member.domain, frozenset(relay.transit), claim.lease_s, now)
+
+    def still_holds(self, place: Place, now: Instant) -> bool:
+        """Return whether the proofs of a place hold; one made without proofs does."""
+        if place.proof is None:
+            return True
+        try:
+            self._verifier.recheck(place.proof, now.unix_s)
+        except StatementError:
+            return False
+        return True
+
+
+def _place(claim: Claim, domain: Name, transit: frozenset[Name], lease_s: float, now: Instant) -> Place:
+    return Place(
+        claim.name,
+        claim.node,
+        claim.right,
+        claim.switch,
+        domain,
+        transit,
+        claim.wire,
+        now.mono_s + lease_s,
+        claim,
+        now.mono_s + claim.valid_until_unix_s - now.unix_s,
+    )

@@ -1,0 +1,76 @@
+"""A switch's answers to the question whether an attached node is still there.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). A node is there when it has given a sign of life since the
+question came, and gone when it is no neighbour any more; one of the two comes within the time of a dead neighbour.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+from gdp.control.greeter import Greeter
+from gdp.control.presence import Presence
+from gdp.crypto.identity import Identity
+from gdp.frame.kinds import Kind
+from gdp.names import Name
+from gdp.switch.attached import Attached
+from gdp.switch.outbox import Outbox
+from gdp.switch.unicast import Unicast
+
+__all__ = ["PresenceAnswers"]
+
+_OPEN_MAX: Final = 256
+
+
+@dataclass(frozen=True, slots=True)
+class _Question:
+    presence: Presence
+    rib: Name
+    asked_s: float
+
+
+class PresenceAnswers:
+    """Open questions of RIBs about attached nodes."""
+
+    def __init__(
+        self, identity: Identity, greeter: Greeter, attached: Attached, unicast: Unicast, outbox: Outbox
+    ) -> None:
+        self._identity = identity
+        self._greeter = greeter
+        self._attached = attached
+        self._unicast = unicast
+        self._outbox = outbox
+        self._open: dict[Name, _Question] = {}
+
+    def ask(self, presence: Presence, rib: Name, wire: bytes, now_s: float) -> None:
+        """Take a RIB's verified question; the node hears of it, too, if it is there."""
+        if len(self._open) >= _OPEN_MAX and presence.node not in self._open:
+            return  # the RIB asks again
+        self._open[presence.node] = _Question(presence, rib, now_s)
+        held = self._attached.get(presence.node, presence.node)
+        if held is not None and held.claim.incarnation == presence.incarnation:
+            self._outbox.say_at(held.port, held.mac, Kind.VERDICT, wire)
+        self.answer(now_s)
+
+    def answer(self, now_s: float) -> None:
+        """Answer what can be answered; cheap when nothing is open."""
+        for question in list(self._open.values()):
+            is_there = self._is_there(question)
+            if is_there is not None:
+                del self._open[question.presence.node]
+                answer = replace(question.presence, is_answer=True, is_there=is_there)
+                wire = answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)
+                frames = self._outbox.far(Kind.RIB_REQUEST, wire, question.rib)
+                self._unicast.send(frames, question.rib, self._identity.name, now_s)
+
+    def _is_there(self, question: _Question) -> bool | None:
+        """Return None while that is not known."""
+        node = question.presence.node
+        held = self._attached.get(node, node)
+        if held is None or held.claim.incarnation != question.presence.incarnation:
+            return False
+        neighbour = self._greeter.neighbour(held.port, node)
+        if neighbour is None:
+            return False
+        return True if neighbour.heard_s > question.asked_s else None

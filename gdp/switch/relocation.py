@@ -1,0 +1,184 @@
+"""Nodes that move from one switch to another: the former switch is told, forwards, and sends those who ask on.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Source: in spirit, the binding update of RFC 6275 (section 11.7), the fast neighbour advertisement and the context
+transfer of RFC 5568 and RFC 4067, and the ICMP redirect of RFC 1122 (section 3.2.2.2). No RIB takes part, so it works
+while none answers.
+
+::
+
+    node --claim (previous: old)--> new switch --RELOCATE (the claim, relayed)--> old switch
+    old switch --RIB_ANSWER (understood; whom the node hears)--> new switch
+    neighbour --frame for the node--> old switch --frame--> new switch
+    neighbour <--REDIRECT (the same relay)-- old switch
+    neighbour <--WHERE, while no RIB answers-- switch that got its frame for a node it does not know
+
+A claim proves itself and names the new switch, so neither the old switch nor a neighbour need believe anybody.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Final
+
+from gdp.control.neighbour import Neighbour
+from gdp.control.query import Query
+from gdp.control.relay import Relay
+from gdp.crypto.certificates import Role
+from gdp.crypto.identity import Identity
+from gdp.frame.kinds import Kind
+from gdp.names import ZERO, Name
+from gdp.switch.outbox import Outbox
+from gdp.switch.places import Place
+from gdp.switch.planter import Planter
+from gdp.switch.unicast import Unicast
+from gdp.trust.claim import Claim
+from gdp.trust.domain import Policy
+
+__all__ = ["GRACE_S", "Relocations"]
+
+GRACE_S: Final = 4.0  # how long the former switch handles frames for a moved node itself, and sends others on
+_DEPARTED_S: Final = 30.0  # how long it is known that a node was attached here
+_REMEMBERED_MAX: Final = 4_096
+_NOTICE_AT_S: Final = (0.0, 0.1, 0.4, 1.2)  # one datagram may be lost
+_FORMER_S: Final = 3.0  # how long the answers of a former switch are taken
+_SAY_EVERY_S: Final = 0.1  # to one neighbour about one node
+
+_Key = tuple[Name, Name]  # name and advertiser
+
+
+@dataclass(slots=True)
+class _Notice:
+    to: Name
+    statement: bytes
+    sequence: int
+    begun_s: float
+    sent: int = 0
+
+    @property
+    def due_s(self) -> float:
+        return self.begun_s + _NOTICE_AT_S[self.sent]
+
+
+@dataclass(slots=True)
+class _Moved:
+    statement: bytes  # what proves the new place
+    until_s: float
+
+
+class Relocations:
+    """What one switch does for nodes that have come from, or gone to, another switch."""
+
+    def __init__(self, identity: Identity, policy: Policy, planter: Planter, unicast: Unicast, outbox: Outbox) -> None:
+        self._identity = identity
+        self._policy = policy
+        self._planter = planter
+        self._unicast = unicast
+        self._outbox = outbox
+        self._notices: OrderedDict[_Key, _Notice] = OrderedDict()
+        self._former: OrderedDict[Name, float] = OrderedDict()  # switches whose answers are taken, until when
+        self._departed: OrderedDict[_Key, float] = OrderedDict()
+        self._moved: OrderedDict[_Key, _Moved] = OrderedDict()
+        self._moved_names: dict[Name, float] = {}  # of ``_moved``, until when
+        self._said: OrderedDict[tuple[Name, int, bytes], float] = OrderedDict()
+
+    def arrived(self, claim: Claim, now_s: float) -> None:
+        """Tell the former switch of a node that claims a name here."""
+        if claim.previous in (ZERO, self._identity.name):
+            return
+        relay = Relay(claim.wire, tuple(sorted(self._policy.transit)), self._identity.membership)
+        statement = relay.to_wire(self._identity.name, self._identity.key)
+        _remember(self._notices, (claim.name, claim.node), _Notice(claim.previous, statement, claim.sequence, now_s))
+        _remember(self._former, claim.previous, now_s + _FORMER_S)
+        self.timeout(now_s)
+
+    def acknowledged(self, name: Name, advertiser: Name, sequence: int) -> None:
+        """Learn that the former switch knows; ``sequence``: of the claim that it was told."""
+        notice = self._notices.get((name, advertiser))
+        if notice is not None and sequence >= notice.sequence:
+            del self._notices[name, advertiser]
+
+    def departed(self, claim: Claim, now_s: float) -> None:
+        """Note that a node is not attached here any more."""
+        _remember(self._departed, (claim.name, claim.node), now_s + _DEPARTED_S)
+
+    def was_here(self, name: Name, advertiser: Name, now_s: float) -> bool:
+        """Return whether an advertiser of a name was attached here a moment ago."""
+        return self._departed.get((name, advertiser), 0.0) > now_s
+
+    def is_former(self, switch: Name, now_s: float) -> bool:
+        """Return whether a switch was asked a moment ago what a node that came from it hears."""
+        return self._former.get(switch, 0.0) > now_s
+
+    def moved(self, place: Place, statement: bytes, now_s: float) -> None:
+        """Note where a node is now that others may look for here; tell those who take its topic from here."""
+        until_s = now_s + GRACE_S
+        _remember(self._moved, (place.name, place.advertiser), _Moved(statement, until_s))
+        if len(self._moved_names) > 2 * _REMEMBERED_MAX:
+            self._moved_names = {name: end_s for name, end_s in self._moved_names.items() if end_s > now_s}
+        self._moved_names[place.name] = until_s
+        for at in self._planter.below(place.name, place.advertiser):
+            self._outbox.say_at(*at, Kind.REDIRECT, statement)
+
+    def frame_came(self, destination: Name, neighbour: Neighbour, now_s: float) -> None:
+        """Send the neighbour on that sent a frame here for a node that has moved.
+
+        For ``GRACE_S`` no entry stands for such a node, so that each of its frames is seen here.
+        """
+        if self._moved_names.get(destination, 0.0) <= now_s:
+            return
+        self._unicast.forget(destination)
+        if neighbour.role is not Role.SWITCH:
+            return
+        for (name, _), moved in self._moved.items():
+            if name == destination and moved.until_s > now_s:
+                self._redirect(neighbour, name, moved.statement, now_s)
+
+    def redirect_join(self, name: Name, advertiser: Name, neighbour: Neighbour, now_s: float) -> None:
+        """Send the neighbour on that joins a publisher at its former place."""
+        moved = self._moved.get((name, advertiser))
+        if moved is not None and moved.until_s > now_s:
+            self._redirect(neighbour, name, moved.statement, now_s)
+
+    def ask_neighbour(self, name: Name, neighbour: Neighbour, now_s: float) -> None:
+        """Ask the neighbour that sent a frame where its node is: no RIB answers, and it must have known."""
+        if neighbour.role is Role.SWITCH and self._may_say(name, neighbour, now_s):
+            identity = self._identity
+            query = Query(name, 0.0).to_wire(identity.name, identity.key, identity.membership)
+            self._outbox.say(neighbour, Kind.WHERE, query)
+
+    def timeout(self, now_s: float) -> None:
+        """Send the notices that are due."""
+        for key, notice in list(self._notices.items()):
+            if notice.due_s > now_s:
+                continue
+            frames = self._outbox.far(Kind.RELOCATE, notice.statement, notice.to)
+            self._unicast.send(frames, notice.to, self._identity.name, now_s)
+            notice.sent += 1
+            if notice.sent == len(_NOTICE_AT_S):
+                del self._notices[key]
+
+    def next_timeout(self) -> float | None:
+        """Return the monotonic second of the next notice, or None."""
+        return min((notice.due_s for notice in self._notices.values()), default=None)
+
+    def _redirect(self, neighbour: Neighbour, name: Name, statement: bytes, now_s: float) -> None:
+        if self._may_say(name, neighbour, now_s):
+            self._outbox.say(neighbour, Kind.REDIRECT, statement)
+
+    def _may_say(self, name: Name, neighbour: Neighbour, now_s: float) -> bool:
+        """Return whether a neighbour was told or asked nothing about a name for a moment, and note that it is now."""
+        key = (name, neighbour.port, neighbour.mac)
+        if now_s - self._said.get(key, float("-inf")) < _SAY_EVERY_S:
+            return False
+        _remember(self._said, key, now_s)
+        return True
+
+
+def _remember(memory: OrderedDict, key: object, value: object) -> None:  # type: ignore[type-arg]
+    """Put a value as the newest; the oldest gives way."""
+    memory[key] = value
+    memory.move_to_end(key)
+    if len(memory) > _REMEMBERED_MAX:
+        memory.popitem(last=False)

@@ -1,0 +1,89 @@
+"""When to compute paths after news of links: at once in quiet times, less often while news keep coming.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: RFC 8405, sections 5 and 6. The delays are shorter
+than its examples, for domains are small; what is lost at this switch's own ports waits for none of them::
+
+    QUIET --news--> SHORT_WAIT --time to learn is over--> LONG_WAIT
+      ^-- hold-down ----'    ^------- hold-down ----------' (to QUIET)
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Final
+
+__all__ = ["TRANSITIONS", "SpfDelay", "SpfEvent", "SpfState"]
+
+INITIAL_S: Final = 0.005
+SHORT_S: Final = 0.05
+LONG_S: Final = 0.3
+TIME_TO_LEARN_S: Final = 0.5
+HOLD_DOWN_S: Final = 2.0
+
+
+class SpfState(Enum):
+    """How calm the network is."""
+
+    QUIET = "quiet"
+    SHORT_WAIT = "short-wait"
+    LONG_WAIT = "long-wait"
+
+
+class SpfEvent(Enum):
+    """What moves the state."""
+
+    NEWS = "news"  # a link state that changes paths
+    LEARNED = "learned"  # TIME_TO_LEARN_S after the first of them
+    HELD_DOWN = "held-down"  # HOLD_DOWN_S after the last of them
+
+
+_S, _E = SpfState, SpfEvent
+TRANSITIONS: Final[dict[tuple[SpfState, SpfEvent], SpfState]] = {
+    (_S.QUIET, _E.NEWS): _S.SHORT_WAIT,
+    (_S.QUIET, _E.LEARNED): _S.QUIET,
+    (_S.QUIET, _E.HELD_DOWN): _S.QUIET,
+    (_S.SHORT_WAIT, _E.NEWS): _S.SHORT_WAIT,
+    (_S.SHORT_WAIT, _E.LEARNED): _S.LONG_WAIT,
+    (_S.SHORT_WAIT, _E.HELD_DOWN): _S.QUIET,
+    (_S.LONG_WAIT, _E.NEWS): _S.LONG_WAIT,
+    (_S.LONG_WAIT, _E.LEARNED): _S.LONG_WAIT,
+    (_S.LONG_WAIT, _E.HELD_DOWN): _S.QUIET,
+}
+_DELAYS_S: Final = {_S.QUIET: INITIAL_S, _S.SHORT_WAIT: SHORT_S, _S.LONG_WAIT: LONG_S}
+
+
+class SpfDelay:
+    """The back-off of one switch.
+
+    Attributes:
+        state: how calm it is.
+        due_s: monotonic second at which paths are to be computed, or None.
+    """
+
+    def __init__(self) -> None:
+        self.state = SpfState.QUIET
+        self.due_s: float | None = None
+        self._learned_s = float("inf")
+        self._held_down_s = float("inf")
+
+    def news(self, now_s: float) -> None:
+        """Note that link states have changed paths."""
+        self._settle(now_s)
+        if self.state is SpfState.QUIET:
+            self._learned_s = now_s + TIME_TO_LEARN_S
+        if self.due_s is None:
+            self.due_s = now_s + _DELAYS_S[self.state]
+        self._held_down_s = now_s + HOLD_DOWN_S
+        self.state = TRANSITIONS[self.state, SpfEvent.NEWS]
+
+    def computed(self) -> None:
+        """Note that paths are as the link states say now."""
+        self.due_s = None
+
+    def _settle(self, now_s: float) -> None:
+        """Let the timers fire that were due since the last news; nothing else depends on them."""
+        if now_s >= self._learned_s:
+            self.state, self._learned_s = TRANSITIONS[self.state, SpfEvent.LEARNED], float("inf")
+        if now_s >= self._held_down_s:
+            self.state, self._held_down_s = TRANSITIONS[self.state, SpfEvent.HELD_DOWN], float("inf")
+            self._learned_s = float("inf")

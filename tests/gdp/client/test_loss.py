@@ -1,0 +1,278 @@
+"""Every message published is delivered, or counted as lost at its reader, exactly, with a range and a reason."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gdp.client.feed import FeedState
+from gdp.errors import DropReason
+from gdp.frame.codec import decode
+from gdp.limits import READER_GRACE_S, READER_LEASE_S, WINDOW_BYTES
+from gdp.message.loss import LossReason, LostRange
+from tests.gdp.client.pipe import End, Pipe, publisher_of
+
+
+def live(pipe: Pipe, *names: bytes) -> list[End]:
+    ends = [pipe.join(name) for name in names]
+    assert pipe.run(2.0, lambda: all(end.feed.state is FeedState.LIVE for end in ends))
+    return ends
+
+
+def silence(end: End, *, is_silent: bool) -> None:
+    end.deaf = end.mute = is_silent
+
+
+def stream(pipe: Pipe, seconds: float, every_s: float = 0.1, size: int = 100) -> None:
+    """Publish a message from time to time, for so long."""
+    for _ in range(round(seconds / every_s)):
+        pipe.publish([pipe.publisher.messages.to_bytes(4, "big") + bytes(size)])
+        pipe.run(every_s)
+
+
+def got(end: End) -> list[int]:
+    """Return which messages came, as ``stream`` counted them."""
+    return [int.from_bytes(message[:4], "big") for message in end.messages]
+
+
+def sequences(end: End) -> list[int]:
+    return [each.sequence for each in end.delivered]
+
+
+def assert_complete(pipe: Pipe, end: End) -> None:
+    """Nothing doubled, in order, and each message delivered or in a range of lost ones."""
+    pipe.run(5.0)
+    numbers = sequences(end)
+    lost = [each for span in end.feed.losses.ranges for each in range(span.first, span.last + 1)]
+    assert numbers == sorted(set(numbers))
+    assert sorted(numbers + lost) == list(range(numbers[0], pipe.publisher.messages + 1))
+    assert end.feed.lost == len(lost)
+
+
+@pytest.mark.parametrize("away_s", [3.0, 10.0, 30.0])
+def test_a_reader_that_was_away_within_the_grace_time_loses_nothing(away_s: float) -> None:
+    pipe = Pipe(publisher_of())
+    (end,) = live(pipe, b"a")
+    stream(pipe, 2.0)
+    silence(end, is_silent=True)
+    stream(pipe, away_s)
+    silence(end, is_silent=False)
+    stream(pipe, 2.0)
+    assert pipe.run(5.0, pipe.publisher.is_acknowledged)
+    assert_complete(pipe, end)
+    assert (end.feed.lost, pipe.publisher.losses.total) == (0, 0)
+    assert got(end) == list(range(pipe.publisher.messages))
+    assert pipe.publisher.acknowledged == pipe.publisher.messages
+
+
+def test_a_reader_that_was_away_for_longer_is_told_exactly_what_it_lost_and_why() -> None:
+    pipe = Pipe(publisher_of())
+    (end,) = live(pipe, b"a")
+    stream(pipe, 2.0)
+    silence(end, is_silent=True)
+    stream(pipe, READER_LEASE_S + READER_GRACE_S + 5.0)
+    published = pipe.publisher.messages
+    silence(end, is_silent=False)
+    pipe.run(5.0)
+    stream(pipe, 2.0)
+    assert_complete(pipe, end)
+    first, last = end.feed.losses.ranges[0].first, end.feed.losses.ranges[-1].last
+    assert (first, last) == (21, published)
+    assert {each.reason for each in end.feed.losses.ranges} == {LossReason.GIVEN_UP, LossReason.NO_READER}
+    assert pipe.publisher.losses.counts.keys() == {LossReason.GIVEN_UP, LossReason.NO_READER}
+    assert pipe.publisher.messages - pipe.publisher.acknowledged == end.feed.lost
+
+
+def test_a_suspended_reader_holds_up_nobody_and_gets_what_it_lacks_when_it_returns() -> None:
+    pipe = Pipe(publisher_of())
+    stays, moves = live(pipe, b"a", b"b")
+    silence(moves, is_silent=True)
+    pipe.run(READER_LEASE_S + 1.0)
+    for _ in range(60):
+        pipe.publish([bytes(100_000)])
+        assert pipe.publisher.has_room()
+    assert pipe.run(3.0, lambda: len(stays.delivered) == 60)
+    silence(moves, is_silent=False)
+    assert pipe.run(10.0, lambda: len(moves.delivered) == 60)
+    assert_complete(pipe, moves)
+    assert moves.feed.lost == 0
+
+
+def test_others_do_not_wait_for_a_reader_that_catches_up() -> None:
+    pipe = Pipe(publisher_of())
+    stays, moves = live(pipe, b"a", b"b")
+    silence(moves, is_silent=True)
+    stream(pipe, 10.0, size=50_000)
+    silence(moves, is_silent=False)
+    moves.loss = 0.3
+    for _ in range(100):
+        before = len(stays.delivered)
+        pipe.publish([bytes(1_000)])
+        assert pipe.run(0.05, lambda now=before: len(stays.delivered) > now)
+    moves.loss = 0.0
+    assert pipe.run(30.0, pipe.publisher.is_acknowledged)
+    assert_complete(pipe, moves)
+    assert moves.feed.lost == 0
+
+
+def test_what_a_full_window_pushes_out_of_a_suspended_reader_is_lost_and_named() -> None:
+    pipe = Pipe(publisher_of())
+    (end,) = live(pipe, b"a")
+    stream(pipe, 1.0)
+    silence(end, is_silent=True)
+    pipe.run(READER_LEASE_S + 1.0)
+    for _ in range(50):
+        pipe.publish([bytes(1 << 20)])
+        assert pipe.publisher.has_room()
+    gone = pipe.publisher.drops[DropReason.MEMORY_FULL]
+    assert WINDOW_BYTES // (1 << 20) - 4 < 50 - gone < WINDOW_BYTES // (1 << 20)  # frames have headers, too
+    silence(end, is_silent=False)
+    assert pipe.run(20.0, pipe.publisher.is_acknowledged)
+    assert_complete(pipe, end)
+    assert list(end.feed.losses.ranges) == [LostRange(11, 10 + gone, LossReason.WINDOW_OVERFLOW)]
+    assert pipe.publisher.messages - pipe.publisher.acknowledged == gone
+
+
+def test_a_reader_that_was_killed_is_given_up_after_the_grace_time_and_counted() -> None:
+    pipe = Pipe(publisher_of())
+    (end,) = live(pipe, b"a")
+    stream(pipe, 1.0)
+    silence(end, is_silent=True)
+    stream(pipe, 2.0)
+    assert not pipe.run(READER_GRACE_S, pipe.publisher.is_acknowledged)
+    assert pipe.publisher.losses.total == 0
+    pipe.run(READER_LEASE_S + 1.0)
+    assert list(pipe.publisher.losses.ranges) == [LostRange(11, 30, LossReason.GIVEN_UP)]
+    assert pipe.publisher.acknowledged == 10
+
+
+def test_a_reader_that_starts_again_counts_what_came_between_its_lives() -> None:
+    pipe = Pipe(publisher_of())
+    (first,) = live(pipe, b"a")
+    stream(pipe, 1.0)
+    pipe.run(2.0)
+    silence(first, is_silent=True)
+    stream(pipe, 3.0)
+    second = pipe.join(b"a", incarnation=8)
+    pipe.run(2.0)
+    stream(pipe, 1.0)
+    assert list(second.feed.losses.ranges) == [LostRange(11, 40, LossReason.READER_RESTARTED)]
+    assert sequences(second) == list(range(41, 51))
+
+
+def test_a_reader_that_said_goodbye_has_lost_nothing_when_it_comes_again() -> None:
+    pipe = Pipe(publisher_of())
+    (first,) = live(pipe, b"a")
+    stream(pipe, 1.0)
+    note = first.feed.close()
+    pipe.publisher.receive_report(decode(note), note, pipe.now_s)
+    del pipe.ends[first.reader.name]
+    stream(pipe, 1.0)
+    second = pipe.join(b"a", incarnation=8)
+    pipe.run(1.0)
+    stream(pipe, 1.0)
+    assert second.feed.lost == 0
+    assert len(second.delivered) == 10
+
+
+def test_the_first_contact_with_a_publisher_that_has_published_for_long_is_no_loss() -> None:
+    pipe = Pipe(publisher_of())
+    stream(pipe, 5.0)
+    (end,) = live(pipe, b"a")
+    stream(pipe, 1.0)
+    pipe.run(2.0)
+    assert end.feed.lost == 0
+    assert sequences(end) == list(range(51, 61))
+    assert pipe.publisher.losses.counts == {LossReason.NO_READER: 50}
+
+
+@pytest.mark.parametrize("reliable", [True, False])
+@pytest.mark.parametrize("burst", [1, 40], ids=["alone", "bundles"])
+def test_best_effort_and_reliable_gaps_are_counted_in_messages(burst: int, *, reliable: bool) -> None:
+    pipe = Pipe(publisher_of(reliable=reliable), seed=3)
+    (end,) = live(pipe, b"a")
+    end.loss = 0.2
+    for _ in range(100):
+        for _ in range(burst):
+            pipe.publisher.publish(bytes(50))
+        pipe.run(0.01)
+    end.loss = 0.0
+    assert_complete(pipe, end)
+    assert len(end.delivered) + end.feed.lost == 100 * burst
+    assert (end.feed.lost == 0) == reliable
+    assert end.feed.losses.counts.keys() <= {LossReason.GAP}
+
+
+def test_the_last_messages_of_a_best_effort_topic_are_counted_though_none_follows() -> None:
+    pipe = Pipe(publisher_of(reliable=False))
+    (end,) = live(pipe, b"a")
+    stream(pipe, 1.0)
+    end.deaf = True
+    pipe.publish([b"gone"] * 5)
+    end.deaf = False
+    pipe.run(3.0)
+    assert list(end.feed.losses.ranges) == [LostRange(11, 15, LossReason.GAP)]
+
+
+def test_what_a_publisher_passes_over_is_lost_for_its_reason() -> None:
+    pipe = Pipe(publisher_of())
+    (end,) = live(pipe, b"a")
+    stream(pipe, 1.0)
+    pipe.publisher.skip(LossReason.TOO_LARGE)
+    stream(pipe, 1.0)
+    pipe.publisher.skip(LossReason.WINDOW_OVERFLOW)
+    pipe.run(3.0)
+    wanted = [LostRange(11, 11, LossReason.TOO_LARGE), LostRange(22, 22, LossReason.WINDOW_OVERFLOW)]
+    assert list(end.feed.losses.ranges) == wanted
+    assert pipe.publisher.messages - pipe.publisher.acknowledged == 2
+
+
+def test_a_suspended_reader_is_counted_once_however_often_it_falls_silent() -> None:
+    pipe = Pipe(publisher_of())
+    (end,) = live(pipe, b"a")
+    stream(pipe, 1.0)
+    for _ in range(3):
+        silence(end, is_silent=True)
+        stream(pipe, READER_LEASE_S + READER_GRACE_S + 3.0, every_s=1.0)
+        silence(end, is_silent=False)
+        pipe.run(3.0)
+        stream(pipe, 5.0, every_s=1.0)
+    assert_complete(pipe, end)
+    assert pipe.publisher.messages - pipe.publisher.acknowledged == end.feed.lost > 100
+
+
+OUTAGES = st.lists(
+    st.tuples(
+        st.sampled_from(["none", "deaf", "mute", "silent", "lossy"]),
+        st.sampled_from([0.3, 2.0, 8.0, 75.0]),
+        st.integers(1, 8),  # messages at once
+        st.sampled_from([20, 3_000]),
+    ),
+    min_size=1,
+    max_size=5,
+)
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(OUTAGES, st.booleans(), st.integers(0, 1_000))
+def test_through_any_outages_published_is_delivered_or_lost(
+    outages: list[tuple[str, float, int, int]], reliable: bool, seed: int
+) -> None:
+    pipe = Pipe(publisher_of(reliable=reliable), seed=seed)
+    one, other = live(pipe, b"a", b"b")
+    pipe.publish([b"first"])
+    pipe.run(1.0)
+    for kind, for_s, burst, size in outages:
+        one.deaf, one.mute = kind in {"deaf", "silent"}, kind in {"mute", "silent"}
+        one.loss = 0.3 if kind == "lossy" else 0.0
+        for _ in range(10):
+            for _ in range(burst):
+                pipe.publisher.publish(bytes(size))
+            pipe.run(for_s / 10)
+    one.deaf = one.mute = False
+    one.loss = 0.0
+    pipe.run(20.0)
+    for end in (one, other):
+        assert_complete(pipe, end)
+    assert other.feed.lost == 0

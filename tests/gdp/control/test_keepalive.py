@@ -1,0 +1,316 @@
+"""Keepalives: how fast silence is noticed, what a recording is worth, and who is given time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from gdp.control.frames import ControlSplitter
+from gdp.control.greeter import Greeter
+from gdp.control.hello import Hello, Timing
+from gdp.control.keepalive import KeepaliveFlag, Slowness, open_keepalive
+from gdp.control.neighbour import NeighbourState
+from gdp.crypto.exchange import ExchangeKey
+from gdp.crypto.identity import Identity
+from gdp.crypto.statements import parse
+from gdp.crypto.validity import Validity
+from gdp.effects import Arrival
+from gdp.errors import DropReason, FrameError, RemoteError, StatementError
+from gdp.frame.codec import HEADER_BYTES, decode
+from gdp.frame.kinds import Kind
+from gdp.limits import DEAD_S, HELLO_IDLE, HELLO_S
+from tests.gdp.control.members import POLICY, UNIX_S, YEAR, Nonces, at, node
+
+A, B = node("a"), node("b")
+STEP_S = 0.005
+FAST = Timing(70, 70, 3)
+DETECT_S = 0.21
+
+Filter = Callable[[str, bytes], bool]
+
+
+class Pair:
+    """Two greeters on one link, under a clock that goes on in small steps."""
+
+    def __init__(self, one: Timing = FAST, two: Timing = FAST, identities: tuple[Identity, Identity] = (A, B)) -> None:
+        self.now_s = 0.0
+        self.ends = {
+            name: self.greeter(identity, salt, timing)
+            for name, identity, salt, timing in zip("ab", identities, (1, 2), (one, two), strict=True)
+        }
+        self.frames: list[tuple[str, bytes]] = []  # sender, frame
+        self.refused: list[DropReason] = []
+        self.frozen: set[str] = set()
+        self.passes: Filter = lambda _sender, _frame: True
+        self.gone_s: dict[str, float] = {}
+
+    @staticmethod
+    def greeter(identity: Identity, salt: int, timing: Timing) -> Greeter:
+        splitter = ControlSplitter(identity.name, salt)
+        made = Greeter(identity, POLICY, splitter, Nonces(salt), timing=timing, incarnation=salt)
+        made.add_port(0, bytes([2, salt, 0, 0, 0, 0]), 1_500, 10, 0.0)
+        return made
+
+    def hear(self, name: str, frame: bytes) -> None:
+        header = decode(frame)
+        arrival = Arrival(0, b"\x02far\x00\x00", frame)
+        try:
+            if header.kind == Kind.KEEPALIVE:
+                self.ends[name].receive_keepalive(arrival, header, at(self.now_s, UNIX_S + self.now_s))
+            else:
+                statement = parse(frame[HEADER_BYTES : HEADER_BYTES + header.length])
+                self.ends[name].receive(arrival, statement, at(self.now_s, UNIX_S + self.now_s))
+        except RemoteError as error:
+            self.refused.append(error.reason)
+
+    def run(self, duration_s: float) -> None:
+        end_s = self.now_s + duration_s
+        while self.now_s < end_s:
+            self.now_s += STEP_S
+            for name, other in ("a", "b"), ("b", "a"):
+                if name in self.frozen:
+                    continue
+                end = self.ends[name]
+                due_s = end.next_timeout()
+                if due_s is None or due_s > self.now_s:
+                    continue
+                if end.expire(self.now_s):
+                    self.gone_s.setdefault(name, self.now_s)
+                for transmit in end.take(self.now_s):
+                    for frame in transmit.frames:
+                        self.frames.append((name, frame))
+                        if other not in self.frozen and self.passes(name, frame):
+                            self.hear(other, frame)
+
+    def is_up(self, name: str) -> bool:
+        return bool(self.ends[name].all_up())
+
+    def count(self, kind: Kind) -> int:
+        return sum(decode(frame).kind == kind for _, frame in self.frames)
+
+
+def up(pair: Pair) -> Pair:
+    pair.run(3.0)
+    assert pair.is_up("a")
+    assert pair.is_up("b")
+    pair.frames.clear()
+    return pair
+
+
+def test_a_silent_cut_is_noticed_within_the_detection_time() -> None:
+    pair = up(Pair())
+    cut_s = pair.now_s
+    pair.passes = lambda _sender, _frame: False
+    pair.run(0.3)
+    assert {name: gone_s - cut_s <= DETECT_S + 2 * STEP_S for name, gone_s in pair.gone_s.items()} == {
+        "a": True,
+        "b": True,
+    }
+
+
+def test_neighbours_that_hear_keepalives_sign_few_hellos() -> None:
+    pair = up(Pair())
+    pair.run(HELLO_IDLE * HELLO_S)
+    assert pair.count(Kind.HELLO) <= 4
+    assert pair.count(Kind.KEEPALIVE) >= 2 * HELLO_IDLE * HELLO_S / 0.07
+
+
+@pytest.mark.parametrize(
+    ("one", "two", "interval_s"),
+    [
+        (Timing(70, 70, 3), Timing(200, 70, 3), 0.07),
+        (Timing(70, 70, 3), Timing(70, 200, 3), 0.2),
+        (Timing(300, 70, 3), Timing(70, 70, 3), 0.3),
+        (Timing(0, 70, 3), Timing(70, 70, 3), 0.0),
+        (Timing(70, 70, 3), Timing(70, 0, 3), 0.0),
+    ],
+)
+def test_the_slower_of_what_one_sends_and_the_other_takes_wins(one: Timing, two: Timing, interval_s: float) -> None:
+    assert one.interval_s(two) == interval_s
+
+
+def test_the_senders_multiplier_decides_how_long_silence_may_last() -> None:
+    pair = up(Pair(two=Timing(100, 100, 5)))
+    (neighbour,) = pair.ends["a"].all_up()
+    assert neighbour.keepalives is not None
+    assert neighbour.keepalives.detect_s == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("silent", [Timing(0, 0, 3), Timing(0, 70, 3), Timing(70, 0, 3)])
+def test_where_one_end_wants_no_keepalives_hellos_go_on(silent: Timing) -> None:
+    pair = up(Pair(two=silent))
+    pair.run(5.0)
+    assert pair.count(Kind.KEEPALIVE) == 0
+    assert pair.is_up("a")
+    assert pair.is_up("b")
+
+
+def test_who_is_heard_but_does_not_hear_is_let_go_at_both_ends() -> None:
+    pair = up(Pair())
+    cut_s = pair.now_s
+    pair.passes = lambda sender, _frame: sender == "a"
+    pair.run(DETECT_S + 0.05)
+    assert not pair.is_up("a")
+    assert not pair.is_up("b")
+    assert pair.gone_s["a"] - cut_s <= DETECT_S + 2 * STEP_S
+
+
+def test_a_neighbour_comes_back_in_the_same_session() -> None:
+    pair = up(Pair())
+    pair.passes = lambda _sender, _frame: False
+    pair.run(1.0)
+    pair.passes = lambda _sender, _frame: True
+    pair.refused.clear()
+    pair.run(1.0)
+    assert pair.is_up("a")
+    assert pair.is_up("b")
+    assert set(pair.refused) <= {DropReason.UNKNOWN_SENDER}  # until the other has heard our echo
+
+
+def test_two_keepalives_lost_in_a_row_lose_no_neighbour_and_are_followed_by_polls() -> None:
+    pair = up(Pair())
+    lost = [2]
+
+    def passes(sender: str, _frame: bytes) -> bool:
+        if sender == "b" and lost[0]:
+            lost[0] -= 1
+            return False
+        return True
+
+    pair.passes = passes
+    pair.run(0.5)
+    assert pair.gone_s == {}
+    assert any(frame[HEADER_BYTES] & KeepaliveFlag.POLL for sender, frame in pair.frames if sender == "a")
+    assert any(frame[HEADER_BYTES] & KeepaliveFlag.FINAL for sender, frame in pair.frames if sender == "b")
+
+
+def keepalives_of(pair: Pair, sender: str) -> list[bytes]:
+    return [frame for name, frame in pair.frames if name == sender and decode(frame).kind == Kind.KEEPALIVE]
+
+
+def refusal(pair: Pair, frame: bytes) -> list[DropReason]:
+    pair.refused.clear()
+    pair.hear("a", frame)
+    return pair.refused
+
+
+def test_a_keepalive_played_back_is_refused_even_after_a_silence() -> None:
+    pair = up(Pair())
+    pair.run(0.5)
+    recorded = keepalives_of(pair, "b")
+    assert refusal(pair, recorded[-1]) == [DropReason.REPLAYED]
+    pair.passes = lambda _sender, _frame: False
+    pair.run(1.0)
+    pair.passes = lambda _sender, frame: decode(frame).kind == Kind.HELLO
+    pair.run(0.3)
+    assert pair.is_up("a")
+    assert {reason for frame in recorded for reason in refusal(pair, frame)} == {DropReason.REPLAYED}
+
+
+def test_a_keepalive_of_an_earlier_session_is_refused() -> None:
+    pair = up(Pair())
+    pair.run(0.2)
+    recorded = keepalives_of(pair, "b")[-1]
+    for end in pair.ends.values():
+        end.port_changed(0, False, pair.now_s)
+        end.port_changed(0, True, pair.now_s)
+    up(pair)
+    newer = keepalives_of(pair, "b")
+    assert newer == []
+    assert refusal(pair, recorded) in ([DropReason.BAD_TAG], [DropReason.REPLAYED])
+
+
+def test_a_keepalive_that_was_changed_is_refused() -> None:
+    pair = up(Pair())
+    pair.passes = lambda sender, _frame: sender == "a"
+    pair.run(0.1)
+    frame = keepalives_of(pair, "b")[-1]
+    for at_byte in (2, 15, HEADER_BYTES, HEADER_BYTES + 1, len(frame) - 1):
+        assert refusal(pair, frame[:at_byte] + bytes([frame[at_byte] ^ 1]) + frame[at_byte + 1 :]) == [
+            DropReason.BAD_TAG
+        ]
+    assert refusal(pair, frame) == []
+
+
+def test_a_strangers_keepalive_is_refused_and_not_answered() -> None:
+    pair = up(Pair())
+    pair.run(0.1)
+    frame = keepalives_of(pair, "a")[-1]  # a's own, come back
+    pair.ends["a"].take(pair.now_s)  # what is due anyhow
+    assert refusal(pair, frame) == [DropReason.UNKNOWN_SENDER]
+    assert pair.ends["a"].take(pair.now_s) == []
+
+
+def test_a_short_keepalive_is_refused() -> None:
+    with pytest.raises(FrameError) as caught:
+        open_keepalive(bytes(32), bytes(HEADER_BYTES + 25))
+    assert caught.value.reason is DropReason.TRUNCATED
+
+
+def test_keepalives_do_not_keep_up_whose_membership_ran_out() -> None:
+    short = node("short", validity=Validity(YEAR.not_before_unix_s, UNIX_S + 5))
+    pair = up(Pair(identities=(A, short)))
+    pair.run(130.0)  # two minutes of skew are forgiven
+    assert not pair.is_up("a")
+
+
+def test_a_node_that_had_no_time_itself_calls_nobody_silent() -> None:
+    pair = up(Pair())
+    pair.frozen.add("a")
+    pair.run(0.15)
+    pair.frozen.clear()
+    pair.run(1.0)
+    assert pair.gone_s == {}
+
+
+def test_a_frozen_node_is_let_go_and_comes_back() -> None:
+    pair = up(Pair())
+    pair.frozen.add("a")
+    pair.run(5.0)
+    assert not pair.is_up("b")
+    pair.frozen.clear()
+    pair.run(2.0)
+    assert pair.is_up("a")
+    assert pair.is_up("b")
+
+
+def test_a_node_whose_timers_are_late_asks_for_patience_and_less_so_later() -> None:
+    slow = Slowness()
+    assert slow.multiplier(FAST, DEAD_S, 0.0) == 3
+    slow.late(0.14, 0.0)
+    assert slow.multiplier(FAST, DEAD_S, 0.0) == 7
+    assert slow.multiplier(FAST, DEAD_S, 10.0) == 5
+    assert slow.multiplier(FAST, DEAD_S, 60.0) == 3
+    slow.late(60.0, 60.0)
+    assert slow.multiplier(FAST, DEAD_S, 60.0) == int(DEAD_S / 0.07)
+
+
+def test_a_key_that_makes_a_secret_everybody_knows_is_refused() -> None:
+    key = ExchangeKey.from_random(bytes(range(32)))
+    with pytest.raises(StatementError) as caught:
+        key.agree(bytes(32), b"purpose")
+    assert caught.value.reason is DropReason.MALFORMED
+
+
+@pytest.mark.parametrize("timing", [[70, 70], [70, 70, 0], [70, 70, 256], [-1, 70, 3], [70, 60_001, 3], [70, "x", 3]])
+def test_a_timing_out_of_bounds_is_refused(timing: list[object]) -> None:
+    hello = Hello(b"n" * 8, 1, (), 1_500, bytes(8), B.membership)
+    object.__setattr__(hello, "timing", timing)
+    statement = parse(hello.to_wire(B.name, B.key))
+    with pytest.raises(StatementError) as caught:
+        Hello.from_fields(statement.fields)
+    assert caught.value.reason is DropReason.MALFORMED
+
+
+def test_a_hello_with_timing_and_key_comes_back_as_it_was() -> None:
+    hello = Hello(b"n" * 8, 1, (), 1_500, bytes(8), B.membership, FAST, b"k" * 32)
+    assert Hello.from_fields(parse(hello.to_wire(B.name, B.key)).fields) == hello
+
+
+def test_a_neighbour_that_is_up_by_hellos_alone_is_given_their_time() -> None:
+    pair = Pair()
+    pair.passes = lambda _sender, frame: decode(frame).kind == Kind.HELLO
+    pair.run(5.0)
+    assert pair.gone_s == {}
+    assert [n.state for n in pair.ends["a"].all_up()] == [NeighbourState.UP]

@@ -1,0 +1,214 @@
+"""A domain in the present, for stores whose servers have a clock of their own, and RIBs over each kind of store."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from gdp.control.query import Answer, Query
+from gdp.control.relay import Relay
+from gdp.control.verdict import Verdict
+from gdp.crypto.certificates import Role
+from gdp.crypto.identity import Identity, NodeKeys
+from gdp.crypto.issuing import DomainAuthority
+from gdp.crypto.keys import SigningKey
+from gdp.crypto.statements import StatementType, parse, sign
+from gdp.crypto.subject import Subject
+from gdp.crypto.validity import Validity
+from gdp.effects import Instant
+from gdp.metadata import Metadata
+from gdp.names import Name
+from gdp.nodes.config import ClusterConfig
+from gdp.rib.machine import Letter, Rib, RibSettings
+from gdp.rib.store import MemoryStore, Store
+from gdp.stores.cluster import ClusterStore, load_functions
+from gdp.stores.cluster_link import ClusterLink
+from gdp.stores.snapshot import Snapshot
+from gdp.trust.claim import make_claim
+from gdp.trust.domain import Policy
+from gdp.trust.right import Right
+from gdp.trust.rtcert import RtCert
+from gdp.trust.verifier import ClaimVerifier
+
+START_CLUSTER = Path(__file__).parents[3] / "scripts" / "start_cluster.sh"
+
+
+@dataclass
+class Site:
+    """One domain with a switch, a robot and two RIBs."""
+
+    unix_s: float = field(default_factory=time.time)
+
+    def __post_init__(self) -> None:
+        self.validity = Validity.lasting(self.unix_s, 86_400)
+        self.authority = DomainAuthority.found("site", SigningKey.generate(), self.validity)
+        self.switch, self.robot = self.node(Role.SWITCH, "switch"), self.node(Role.PROXY, "robot")
+        self.ribs = self.node(Role.RIB, "one"), self.node(Role.RIB, "two")
+        self.rtcert = RtCert.make(self.robot, self.switch.name, self.validity)
+
+    def node(self, role: Role, label: str) -> Identity:
+        return NodeKeys.generate(role, label).join(self.authority, self.validity)
+
+    def policy(self) -> Policy:
+        return Policy(self.authority.root)
+
+    def now(self, later_s: float = 0.0) -> Instant:
+        return Instant(1_000.0 + later_s, self.unix_s + later_s)
+
+    def subject(self, name: str) -> Subject:
+        return Subject.of(Metadata({"kind": "topic", "name": name}), self.robot.key.public.compressed)
+
+    def relay(self, name: str, sequence: int, lease_s: float = 60.0) -> bytes:
+        wire = make_claim(
+            self.robot,
+            Right.PUBLISH,
+            self.subject(name),
+            rtcert=self.rtcert,
+            sequence=sequence,
+            incarnation=1,
+            lease_s=lease_s,
+            is_global=False,
+        )
+        return self.relayed(wire)
+
+    def withdrawal(self, name: str, sequence: int) -> bytes:
+        body = {"n": self.subject(name).name, "s": sequence}
+        return self.relayed(sign(StatementType.WITHDRAW, body, self.robot.name, self.robot.key))
+
+    def relayed(self, statement: bytes) -> bytes:
+        return Relay(statement, (), self.switch.membership).to_wire(self.switch.name, self.switch.key)
+
+    def query(self, name: str, watch_s: float = 0.0) -> bytes:
+        query = Query(self.subject(name).name, watch_s)
+        return query.to_wire(self.switch.name, self.switch.key, self.switch.membership)
+
+
+class Pair:
+    """Two RIBs of a domain; ``sync`` lets the second learn what the first took."""
+
+    def __init__(self, site: Site, stores: tuple[Store, Store], peers: tuple[Name, ...] = ()) -> None:
+        self.site = site
+        self.one, self.two = (
+            Rib(identity, site.policy(), store, RibSettings(peers=peers))
+            for identity, store in zip(site.ribs, stores, strict=True)
+        )
+        self.sent: list[Letter] = []
+
+    def give(self, rib: Rib, wire: bytes, later_s: float = 0.0) -> list[Letter]:
+        """Hand a statement of the switch to a RIB; return what goes back to the switch."""
+        rib.receive_all([(wire, self.site.switch.name)], self.site.now(later_s))
+        return self.take(rib)
+
+    def take(self, rib: Rib) -> list[Letter]:
+        letters = rib.take()
+        self.sent += [letter for letter in letters if letter.to != self.site.switch.name]
+        return [letter for letter in letters if letter.to == self.site.switch.name]
+
+    def sync(self, later_s: float = 0.0) -> list[Letter]:
+        """Return what the second RIB tells the switch of it."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        pass
+
+
+class MemoryPair(Pair):
+    """Two stores in memory, replicated."""
+
+    def __init__(self, site: Site) -> None:
+        super().__init__(site, (MemoryStore(), MemoryStore()), tuple(identity.name for identity in site.ribs))
+
+    def sync(self, later_s: float = 0.0) -> list[Letter]:
+        told = self.take(self.two)
+        now = self.site.now(later_s)
+        by_name = {identity.name: rib for identity, rib in zip(self.site.ribs, (self.one, self.two), strict=True)}
+        for rib in by_name.values():
+            rib.connected(now)
+            rib.timeout(now)
+            told += self.take(rib)
+        while self.sent:
+            letter = self.sent.pop(0)
+            sender = parse(letter.statement).signer
+            by_name[letter.to].receive(letter.statement, sender, now)
+            told += self.take(by_name[letter.to])
+        return told
+
+
+class SnapshotPair(Pair):
+    """The second RIB reads what the first wrote to disk."""
+
+    def __init__(self, site: Site, path: Path) -> None:
+        self._path = path
+        self._memory = MemoryStore()
+        self._memory.changes = set()
+        super().__init__(site, (self._memory, MemoryStore()))
+
+    def sync(self, later_s: float = 0.0) -> list[Letter]:
+        now = self.site.now(later_s)
+        writer = Snapshot(self._path)
+        writer.start()
+        assert self._memory.changes is not None
+        writer.write([(key, self.one.entry_of(key, now.mono_s)) for key in self._memory.changes], now.unix_s)
+        self._memory.changes.clear()
+        writer.close()
+        for entries in Snapshot(self._path).load(now.unix_s):
+            self.two.load(entries, now)
+        return self.take(self.two)
+
+
+class ClusterPair(Pair):
+    """Two RIBs that share a cluster."""
+
+    def __init__(self, site: Site, config: ClusterConfig) -> None:
+        self.links = [ClusterLink(config.address()) for _ in range(2)]
+        load_functions(self.links[0])
+        self.stores = [ClusterStore(link, ClaimVerifier(site.policy())) for link in self.links]
+        super().__init__(site, (self.stores[0], self.stores[1]))
+        for store in self.stores:
+            store.changed()  # begin to listen
+
+    def sync(self, later_s: float = 0.0) -> list[Letter]:
+        select.select([self.links[1]], [], [], 5.0)
+        self.two.changed(self.stores[1].changed(), self.site.now(later_s))
+        return self.take(self.two)
+
+    def close(self) -> None:
+        for link in self.links:
+            link.close()
+
+
+@contextmanager
+def cluster(folder: Path) -> Iterator[Path]:
+    """Run six servers; yield the file that says how to reach them."""
+    started = subprocess.run([START_CLUSTER, folder], capture_output=True, text=True, check=False, timeout=120)
+    try:
+        assert started.returncode == 0, started.stderr
+        yield Path(started.stdout.strip())
+    finally:
+        subprocess.run([START_CLUSTER, "--stop", folder], check=True, timeout=60)
+
+
+def kill_server(folder: Path, port: int) -> None:
+    """Kill the server that listens on a port."""
+    for conf in folder.glob("*/server.conf"):
+        if f"tls-port {port}\n" in conf.read_text():
+            os.kill(int((conf.parent / "server.pid").read_text()), signal.SIGKILL)
+            return
+    raise AssertionError(f"no server on port {port}")
+
+
+def verdicts(letters: list[Letter]) -> list[Verdict]:
+    found = [parse(letter.statement) for letter in letters]
+    return [Verdict.from_fields(each.fields) for each in found if each.type is StatementType.VERDICT]
+
+
+def answers(letters: list[Letter]) -> list[Answer]:
+    found = [parse(letter.statement) for letter in letters]
+    return [Answer.from_fields(each.fields) for each in found if each.type is StatementType.ANSWER]

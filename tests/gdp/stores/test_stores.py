@@ -1,0 +1,164 @@
+"""What holds of every store: in memory and replicated, read back from a snapshot, shared in a cluster."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+from gdp.errors import DropReason
+from gdp.nodes.config import ClusterConfig
+from gdp.rib.machine import Rib
+from gdp.rib.store import MemoryStore
+from gdp.stores.cluster_link import ClusterLink, tag_of
+from gdp.stores.snapshot import Snapshot
+from tests.gdp.stores.sites import (
+    ClusterPair,
+    MemoryPair,
+    Pair,
+    Site,
+    SnapshotPair,
+    answers,
+    cluster,
+    kill_server,
+    verdicts,
+)
+
+HAS_SERVER = shutil.which("redis-server") or shutil.which("valkey-server")
+
+
+@pytest.fixture(scope="module")
+def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    if not HAS_SERVER:
+        pytest.skip("neither redis-server nor valkey-server is installed")
+    with cluster(tmp_path_factory.mktemp("cluster")) as store:
+        yield store
+
+
+def config_of(store: Path) -> ClusterConfig:
+    values = yaml.safe_load(store.read_text())["store"]["cluster"]
+    paths = {key: Path(values[key]) for key in ("password_file", "ca")}
+    return ClusterConfig(**{**values, "nodes": tuple(values["nodes"]), **paths})
+
+
+@pytest.fixture(params=["memory", "snapshot", "cluster"])
+def pair(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Pair]:
+    made: Pair
+    if request.param == "memory":
+        made = MemoryPair(Site())
+    elif request.param == "snapshot":
+        made = SnapshotPair(Site(), tmp_path / "rib.sqlite")
+    else:
+        made = ClusterPair(Site(), config_of(request.getfixturevalue("servers")))
+    yield made
+    made.close()
+
+
+class TestEveryStore:
+    def test_what_one_rib_took_the_other_answers(self, pair: Pair) -> None:
+        assert verdicts(pair.give(pair.one, pair.site.relay("/a", 1)))[0].refused is None
+        pair.sync()
+        (answer,) = answers(pair.give(pair.two, pair.site.query("/a")))
+        assert (answer.advertiser, answer.domain) == (pair.site.robot.name, pair.site.authority.root.domain)
+
+    def test_a_watch_at_one_rib_hears_what_the_other_took(self, pair: Pair) -> None:
+        if isinstance(pair, MemoryPair):
+            pair.sync()  # a RIB that has not met its peer denies nothing
+        pair.give(pair.two, pair.site.query("/a", watch_s=20.0))
+        pair.give(pair.one, pair.site.relay("/a", 1))
+        assert [each.claim != b"" for each in answers(pair.sync())] == [True]
+
+    def test_an_older_claim_is_stale_whichever_rib_it_comes_to(self, pair: Pair) -> None:
+        pair.give(pair.one, pair.site.relay("/a", 5))
+        pair.sync()
+        (verdict,) = verdicts(pair.give(pair.two, pair.site.relay("/a", 4)))
+        assert (verdict.refused, verdict.sequence) == (DropReason.STALE, 5)
+
+    def test_a_withdrawal_holds_at_both(self, pair: Pair) -> None:
+        pair.give(pair.one, pair.site.relay("/a", 1))
+        pair.sync()
+        pair.give(pair.one, pair.site.withdrawal("/a", 2))
+        pair.sync()
+        assert [each.is_nobody for each in answers(pair.give(pair.two, pair.site.query("/a")))] == [True]
+        assert [each.refused for each in verdicts(pair.give(pair.two, pair.site.relay("/a", 1)))] != [None]
+
+    def test_a_lease_ends_at_both(self, pair: Pair) -> None:
+        pair.give(pair.one, pair.site.relay("/a", 1, lease_s=5.0))
+        pair.sync()
+        assert len(answers(pair.give(pair.two, pair.site.query("/a"), 4.0))) == 1
+        for rib in (pair.one, pair.two):
+            rib.timeout(pair.site.now(5.1))
+            pair.take(rib)
+        assert [each.is_nobody for each in answers(pair.give(pair.two, pair.site.query("/a"), 5.1))] == [True]
+
+
+def test_of_two_writes_at_once_the_newer_wins_and_the_other_is_not_confirmed(servers: Path) -> None:
+    pair = ClusterPair(Site(), config_of(servers))
+    for rib in (pair.one, pair.two):
+        pair.give(rib, pair.site.query("/a"))  # both believe that there is nobody
+    assert verdicts(pair.give(pair.one, pair.site.relay("/a", 9)))[0].refused is None
+    assert verdicts(pair.give(pair.two, pair.site.relay("/a", 8))) == []
+    (verdict,) = verdicts(pair.give(pair.two, pair.site.relay("/a", 8)))
+    assert (verdict.refused, verdict.sequence) == (DropReason.STALE, 9)
+    pair.close()
+
+
+# redis-py leaves the socket of a TLS handshake that broke off to the garbage collector.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore:unclosed:ResourceWarning")
+def test_names_outlive_a_primary(servers: Path) -> None:
+    config = config_of(servers)
+    pair = ClusterPair(Site(), config)
+    name = pair.site.subject("/a").name
+    pair.give(pair.one, pair.site.relay("/a", 1))
+    link = ClusterLink(config.address())
+    primary = link._primaries[tag_of(name)]
+    kill_server(servers.parent, primary[1])
+    pair.stores[1]._cache.clear()
+    deadline_s = time.monotonic() + 60
+    while not (found := answers(pair.give(pair.two, pair.site.query("/a")))) and time.monotonic() < deadline_s:
+        time.sleep(0.05)  # the servers promote the replica in their own time
+    assert [each.is_nobody for each in found] == [False]
+    while not verdicts(pair.give(pair.one, pair.site.relay("/a", 2))):
+        assert time.monotonic() < deadline_s
+        time.sleep(0.05)
+    pair.close()
+    link.close()
+
+
+def test_a_broken_snapshot_is_put_aside_and_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "rib.sqlite"
+    path.write_bytes(b"this is no database" * 100)
+    snapshot = Snapshot(path)
+    assert list(snapshot.load(0.0)) == []
+    assert (snapshot.failures, path.exists(), (tmp_path / "rib.sqlite.broken").exists()) == (1, False, True)
+    assert "cannot be read" in caplog.text
+
+
+def test_a_snapshot_that_cannot_be_written_is_reported_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    if not os.path.exists("/dev/full"):
+        pytest.skip("no /dev/full here")
+    snapshot = Snapshot(tmp_path / "missing" / "rib.sqlite")
+    snapshot.start()
+    for _ in range(3):
+        while not snapshot.is_ready:
+            time.sleep(0.01)
+        snapshot.write([], 0.0)
+    snapshot.close()
+    assert snapshot.failures == 3
+    assert caplog.text.count("snapshot failed") == 1
+
+
+def test_an_altered_entry_of_a_snapshot_is_not_believed(tmp_path: Path) -> None:
+    pair = SnapshotPair(Site(), tmp_path / "rib.sqlite")
+    pair.give(pair.one, pair.site.relay("/a", 1))
+    pair.sync()
+    other = Site()
+    rib = Rib(other.ribs[0], other.policy(), MemoryStore(), pair.one._settings)
+    for entries in Snapshot(tmp_path / "rib.sqlite").load(other.unix_s):
+        rib.load(entries, other.now())
+    assert (rib.names, rib.refusals) == (0, {DropReason.WRONG_DOMAIN: 1})
