@@ -37,6 +37,10 @@ def proxy(
         if check:
             from proxy.checking import check_proxy
 
+            if not settings.ros:
+                from proxy.recording import refuse_existing_file
+
+                refuse_existing_file(settings)
             check_proxy(settings, json=json)
             return
         if settings.ros:

@@ -21,6 +21,8 @@ from pydantic.config import JsonDict
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from gdp.errors import LocalError
+from gdp.limits import CLAIM_LEASE_S
+from gdp.nodes.config import LeaseSeconds
 from gdp.nodes.schema import Directory, Domain, Ifname, Metrics, NewFile, Section, load
 from gdp.nodes.spin import SPIN_MAX_US, SPIN_US
 from proxy.json_schema import JsonSchema, editor_schema
@@ -68,6 +70,10 @@ class ProxyConfig(Section):
     imports: tuple[Rule, ...] = Field(default=(), alias="import", description="Rules for what comes from elsewhere.")
     record: Record | None = Field(default=None, description="Write what arrives into a file.")
     metrics: Metrics | None = Field(default=None, description="Serve Prometheus text on 127.0.0.1.")
+    lease_s: LeaseSeconds = Field(
+        default=CLAIM_LEASE_S,
+        description="Lease of this node's claims, in seconds; each is renewed after a third of it.",
+    )
     spin_us: int = Field(
         default=SPIN_US,
         ge=0,

@@ -6,17 +6,19 @@ Place: command.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from gdp.cli.node import Json, emit, failing_clearly
-from gdp.errors import StatementError
+from gdp.crypto.keys import PublicKey
+from gdp.errors import LocalError, StatementError
 from gdp.limits import CHAIN_MAX
+from gdp.nodes.yaml_source import read_yaml
 from gdp.stores.issue import DELEGATION_DAYS, delegate
-from gdp.stores.keyring import CARD, load_card, load_delegations, load_owner, save_delegation
+from gdp.stores.keyring import CARD, OWNER_PUBLIC, load_card, load_delegations, load_owner, save_delegation
 from gdp.trust.adcert import AdCertCache, Chain
 from gdp.trust.card import Card
 from gdp.trust.delegation import Delegation
@@ -50,6 +52,7 @@ def delegate_what_is_needed(
     with failing_clearly():
         key = load_owner(owner).key.public
         configs = [ProxyConfig.load(file) for file in files]
+        _refuse_other_owners(owner, key, files, configs)
         cards = [load_card(config.identity / CARD) for config in configs]
         machines = [
             Machine(config, load_delegations(config.delegations), _graphs(config, card) if live and not index else ())
@@ -69,6 +72,32 @@ def delegate_what_is_needed(
 def main() -> None:
     """Run the command."""
     app()
+
+
+def _refuse_other_owners(owner: Path, key: PublicKey, files: Sequence[Path], configs: Sequence[ProxyConfig]) -> None:
+    """Refuse to delegate where no rule is of this owner; warn of a single file where other files have such rules.
+
+    Raises:
+        LocalError: none of the files has a rule of this owner.
+    """
+    missing = [
+        f"no rule of {file} names this owner ({owner / OWNER_PUBLIC}); {_owners_named(file)}"
+        for file, config in zip(files, configs, strict=True)
+        if all(rule.owner.compressed != key.compressed for rule in (*config.expose, *config.imports))
+    ]
+    if len(missing) == len(files):
+        raise LocalError("\n".join(missing))
+    for text in missing:
+        typer.echo(text, err=True)
+
+
+def _owners_named(file: Path) -> str:
+    """Return the owners that a file's rules name, as it writes them."""
+    data = read_yaml(file).data
+    sides = [data.get(side) for side in ("expose", "import")] if isinstance(data, dict) else []
+    rules = [rule for side in sides if isinstance(side, list) for rule in side if isinstance(rule, dict)]
+    named = dict.fromkeys(str(rule.get("owner")) for rule in rules)
+    return f"they name {', '.join(str(file.parent / each) for each in named)}" if named else "it has no rules"
 
 
 def _graphs(config: ProxyConfig, card: Card) -> list[Graph]:

@@ -65,11 +65,12 @@ class Inbound:
     @property
     def lost(self) -> int:
         """Return how many messages are known to be lost."""
-        return sum(self.lost_of(name) for name in self.tallies)
+        self._count_losses()
+        return sum(tally.lost for tally in self.tallies.values())
 
-    def lost_of(self, name: Name) -> int:
-        """Return how many messages of one topic are known to be lost."""
-        return sum(feed.lost for feed in self._node.member.feeds_of(name)) + self.tallies[name].refused
+    def _count_losses(self) -> None:
+        for name, tally in self.tallies.items():
+            tally.losses = self._node.member.losses_of(name)
 
     def take(self) -> None:
         """Hand over what has arrived."""
@@ -83,7 +84,8 @@ class Inbound:
 
     def to_fields(self) -> list[dict[str, object]]:
         """Return the figures of every topic."""
-        return [{**tally.to_fields(), "lost": self.lost_of(name)} for name, tally in self.tallies.items()]
+        self._count_losses()
+        return [tally.to_fields() for tally in self.tallies.values()]
 
     def _take(self, message: Message, tally: Tally) -> None:
         source = self._source(message)

@@ -13,7 +13,7 @@ from typing import Final
 
 import typer
 
-from gdp.cli.node import emit
+from gdp.cli.node import emit, emit_wait
 from gdp.errors import GdpError
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.site import Site
@@ -44,7 +44,7 @@ def carry(path: Path, settings: ProxyConfig, *, json: bool) -> None:
         LocalError: keys, delegations or the device are not as the configuration says, or an endpoint cannot be had.
     """
     sys.setswitchinterval(_TURN_S)
-    with run_node(settings) as node:
+    with run_node(settings, emit_wait if json else None) as node:
         name = proxy_node_name(node.identity.name.to_text())
         with open_endpoints(settings.ros, name) as endpoints:
             held = Held(settings.delegations, node.identity)
@@ -66,8 +66,11 @@ def carry(path: Path, settings: ProxyConfig, *, json: bool) -> None:
             emit("done", topics=[tally.to_fields() for tally in bridge.tallies], faults=dict(node.faults.counts))
         else:
             for tally in bridge.tallies:
-                if median_ms := percentile(sorted(tally.latencies_ms), 0.5):
-                    typer.echo(f"  {tally.topic}: {tally.received} received, median {median_ms:.1f} ms")
+                median_ms = percentile(sorted(tally.latencies_ms), 0.5)
+                if median_ms is not None or tally.lost:
+                    median = "-" if median_ms is None else f"{median_ms:.1f} ms"
+                    lost = f", {tally.losses.words()}" if tally.losses.total else ""
+                    typer.echo(f"  {tally.topic}: {tally.received} received, median {median}{lost}")
             carried = f"{node.traffic.messages_out} messages sent, {node.traffic.messages_in} received"
             typer.echo(f"{carried}, {node.faults.total} faults")
 
@@ -110,16 +113,23 @@ def _tell_ready(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
 
 
 def _tell_progress(node: ProxyNode, bridge: Bridge) -> None:
+    tallies = bridge.tallies
     emit(
         "progress",
         sent=node.traffic.messages_out,
         received=node.traffic.messages_in,
         flows=len(bridge.flows),
         faults=node.faults.total,
+        lost=sum(tally.lost for tally in tallies),
         topics=[
-            {"topic": tally.topic, "received": tally.received, "latency_ms": tally.latencies_ms[-1]}
-            for tally in bridge.tallies
-            if tally.latencies_ms
+            {
+                "topic": tally.topic,
+                "received": tally.received,
+                "lost": tally.lost,
+                "latency_ms": tally.latencies_ms[-1] if tally.latencies_ms else None,
+            }
+            for tally in tallies
+            if tally.latencies_ms or tally.lost
         ],
     )
 

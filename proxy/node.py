@@ -16,16 +16,20 @@ from types import FrameType
 from typing import Final
 
 from gdp.client.member import Member, Topic
+from gdp.client.waiting import attachment_waits
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import GdpError, LocalError
+from gdp.message.loss import by_label
 from gdp.names import Name
 from gdp.nodes.counts import count_list
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
+from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.runtime import Runtime
+from gdp.nodes.single_instance import run_alone
+from gdp.nodes.uplink import open_uplink
 from gdp.ports.plane import Plane
-from gdp.ports.raw import RawPlane
 from gdp.telemetry.sources import Sources
 from proxy.config import ProxyConfig
 from proxy.faults import Faults
@@ -53,6 +57,7 @@ class ProxyNode:
     member: Member
     runtime: Runtime
     plane: Plane
+    node_log: NodeLog
     on_reload: Callable[[], None] | None = None
     is_leaving: bool = False
     drains: bool = False
@@ -91,27 +96,44 @@ class ProxyNode:
             messages=self.traffic.messages,
             message_bytes=self.traffic.message_bytes,
             repairs=lambda: {"sent": sum(publisher.repairs for publisher in member.publishers())},
+            lost=lambda: by_label(member.lost()),
+            unconfirmed=lambda: by_label(member.unconfirmed()),
             faults=lambda: self.faults.counts,
             calls=self.traffic.calls,
             latency=lambda: self.traffic.latency,
+            waiting=self.node_log.metrics,
+            clashes=lambda: member.attachment.clashes,
         )
 
 
 @contextlib.contextmanager
-def run_node(config: ProxyConfig) -> Iterator[ProxyNode]:
+def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[ProxyNode]:
     """Open everything that a proxy needs; close it on leaving.
 
+    Args:
+        on_wait: called with reason and text when the proxy reports what it waits for.
+
     Raises:
-        LocalError: keys, delegations or the device are not as the configuration says.
+        LocalError: keys, delegations or the device are not as the configuration says, or this proxy already runs.
     """
     identity, policy = load_member(config.identity, config.domain, Role.PROXY)
-    settings = NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes)
+    settings = NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes, lease_s=config.lease_s)
     member = Member(identity, policy, settings)
     with contextlib.ExitStack() as stack:
-        plane = RawPlane([config.iface])
-        stack.callback(plane.close)
+        stack.enter_context(run_alone("proxy", identity.name))
+        plane = stack.enter_context(open_uplink(config.iface))
         runtime = Runtime(member, plane, spin_s=config.spin_us / 1e6)
-        node = ProxyNode(identity, member, runtime, plane)
+        node_log = NodeLog(
+            member.attachment.greeter,
+            policy,
+            plane,
+            lambda now_s: attachment_waits(member.attachment, now_s),
+            rival=lambda: member.attachment.rival_at,
+            local_name=_local_names(config),
+            on_wait=on_wait,
+        )
+        runtime.every(LOOK_S, node_log.look)
+        node = ProxyNode(identity, member, runtime, plane, node_log)
         stack.callback(signal.signal, signal.SIGUSR1, signal.signal(signal.SIGUSR1, node.leave_soon))
         stack.enter_context(runtime.signals(node.reload))
         if config.metrics is not None:
@@ -122,6 +144,13 @@ def run_node(config: ProxyConfig) -> Iterator[ProxyNode]:
             stack.callback(metrics.close)
         log.info("proxy up name=%s iface=%s", identity.name.short, config.iface)
         yield node
+
+
+def _local_names(config: ProxyConfig) -> Callable[[Name], str]:
+    """Return what the rules with a type call each overlay name; a pattern's names are shown short."""
+    rules = [rule for rule in (*config.expose, *config.imports) if rule.type_name and not rule.is_pattern]
+    names = {rule.overlay_name: rule.name for rule in rules}
+    return lambda name: names.get(name, name.short)
 
 
 def open_topics(config: ProxyConfig, held: Held) -> dict[Name, Topic]:

@@ -13,6 +13,7 @@ from typing import Final
 
 from gdp.client.member import Topic
 from gdp.client.publisher import Publisher
+from gdp.message.loss import LossReason
 from gdp.names import Name
 from proxy.config import Rule
 from proxy.node import ProxyNode
@@ -53,6 +54,7 @@ class Outbound:
         self._topics = topics
         self._ways: dict[int, _Way] = {}
         self.publishers: dict[str, Publisher] = {}
+        self.channels_of: dict[str, list[int]] = {}  # by topic
         self.too_large = 0
         by_topic = {(rule.name, rule.type_name): rule for rule in rules}
         for key, rule in by_topic.items():
@@ -71,13 +73,14 @@ class Outbound:
     def publish(self, channel: int, raw: bytes) -> bool:
         """Publish one message; return False when it is above the rule's limit.
 
-        It is counted as lost by the publisher when nobody reads the topic.
+        Its publisher counts it as unconfirmed when nobody reads the topic, and readers find it lost.
         """
         way = self._ways[channel]
         stamp_ns = time.time_ns()
         if len(raw) > way.max_bytes:
             self.too_large += 1
             log.warning("message too large topic=%s bytes=%d", way.serializer.channel.topic, len(raw))
+            way.publisher.skip(LossReason.TOO_LARGE)
             return False
         message = Parcel(way.number, stamp_ns, way.serializer.encode(raw)).to_wire()
         way.publisher.publish(message)
@@ -99,6 +102,7 @@ class Outbound:
             urgent=rule.priority == "urgent",
         )
         self.publishers[rule.name] = publisher
+        self.channels_of[rule.name] = list(indexes)
         for number, at in enumerate(indexes):
             serializer = Serializer(channels[at], rule.encoding)
             if serializer.opaque:

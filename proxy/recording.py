@@ -12,14 +12,15 @@ from typing import Final
 
 import typer
 
-from gdp.cli.node import emit
+from gdp.cli.node import emit, emit_wait
+from gdp.errors import LocalError
 from proxy.config import ProxyConfig
 from proxy.endpoints.bag import BagWriter
 from proxy.held import Held
 from proxy.inbound import Inbound
 from proxy.node import GOODBYE_S, ProxyNode, open_topics, renew_topics, run_node
 
-__all__ = ["record"]
+__all__ = ["record", "refuse_existing_file"]
 
 TICK_S: Final = 0.5
 
@@ -30,7 +31,8 @@ def record(settings: ProxyConfig, *, json: bool) -> None:
     Raises:
         LocalError: keys, delegations, the device or the file are not as the configuration says.
     """
-    with run_node(settings) as node, contextlib.ExitStack() as stack:
+    refuse_existing_file(settings)
+    with run_node(settings, emit_wait if json else None) as node, contextlib.ExitStack() as stack:
         topics = open_topics(settings, Held(settings.delegations, node.identity))
         node.on_reload = partial(renew_topics, node, settings)
         writer = None
@@ -48,6 +50,20 @@ def record(settings: ProxyConfig, *, json: bool) -> None:
             emit("done", topics=inbound.to_fields())
         else:
             typer.echo(f"{inbound.received} messages received, {inbound.lost} lost")
+            for tally in inbound.tallies.values():
+                if tally.lost:
+                    refused = f", {tally.refused} not handed over" if tally.refused else ""
+                    typer.echo(f"  {tally.topic}: {tally.received} received, {tally.losses.words()}{refused}")
+
+
+def refuse_existing_file(settings: ProxyConfig) -> None:
+    """Refuse to record into a file that exists.
+
+    Raises:
+        LocalError: it does.
+    """
+    if settings.record is not None and settings.record.path.exists():
+        raise LocalError(f"{settings.record.path} exists already; move or delete it, or change record.path")
 
 
 def _work(node: ProxyNode, inbound: Inbound, *, json: bool) -> None:

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 
-from gdp.cli.node import Check, Config, Json, Verbose, emit, failing_clearly, set_up_logging
+from gdp.cli.node import Check, Config, Json, Verbose, emit, emit_wait, failing_clearly, set_up_logging
 from gdp.errors import LocalError
 from proxy.checking import check_proxy
 from proxy.config import ProxyConfig
@@ -21,7 +23,7 @@ from proxy.endpoints.bag import BagReader
 from proxy.held import Held
 from proxy.node import GOODBYE_S, ProxyNode, open_topics, renew_topics, run_node
 from proxy.outbound import Outbound
-from proxy.replayer import Played, Replayer
+from proxy.replayer import Played, Replayer, Unconfirmed
 
 __all__ = ["main"]
 
@@ -42,7 +44,11 @@ def replay(
     json: Json = False,
     verbose: Verbose = False,
 ) -> None:
-    """Replay a recording's exposed topics onto the overlay with the recorded timing."""
+    """Replay a recording's exposed topics onto the overlay with the recorded timing.
+
+    Exit 1: a message of a reliable topic was not confirmed by every reader of it, or had none, latched or not; or was
+    too large, or the overlay refused a topic. Best effort is sent, and confirmed by nobody.
+    """
     set_up_logging(verbose=verbose)
     with failing_clearly():
         settings = ProxyConfig.load(config)
@@ -50,7 +56,7 @@ def replay(
             if check:
                 check_proxy(settings, json=json)
                 return
-            with run_node(settings) as node:
+            with run_node(settings, emit_wait if json else None) as node:
                 is_complete = _replay(node, reader, settings, rate, wait_readers, json=json)
     raise typer.Exit(0 if is_complete else 1)
 
@@ -71,47 +77,79 @@ def _replay(
     if json:
         emit("ready", name=node.member.name.to_text())
 
+    total = _exposed_total(reader, outbound)
+
     def tick(played: Played) -> None:
         if json:
             emit(
                 "progress",
                 sent=played.sent,
-                total=reader.count,
+                total=total,
                 bytes=played.sent_bytes,
-                acknowledged=replayer.acknowledged,
+                confirmed=replayer.confirmed,
+                unconfirmed={each.topic: each.messages - each.confirmed for each in replayer.unconfirmed()},
             )
 
     replayer = Replayer(node, reader, outbound, rate, tick)
     for topic in replayer.wait_for_readers(wait_s):
         log.warning("nobody reads topic=%s", topic)
-    is_complete = replayer.play() and replayer.finish() and not refused and not outbound.too_large
+    is_whole = replayer.play() and replayer.finish()
     tick(replayer.played)
+    unconfirmed = replayer.unconfirmed()
+    is_complete = is_whole and not (unconfirmed or refused or outbound.too_large)
+    _report(reader, replayer, outbound, unconfirmed, json=json)
     node.member.leave()
     node.linger(GOODBYE_S)
-    _report(reader, replayer, is_complete=is_complete, json=json)
     return is_complete
 
 
-def _report(reader: BagReader, replayer: Replayer, *, is_complete: bool, json: bool) -> None:
+def _exposed_total(reader: BagReader, outbound: Outbound) -> int | None:
+    """Return how many messages of the recording are exposed; None where its index does not say."""
+    if all(outbound.is_exposed(at) for at in range(len(reader.channels))):
+        return reader.count
+    if reader.counts is None:
+        return None
+    return sum(count for at, count in enumerate(reader.counts) if outbound.is_exposed(at))
+
+
+def _report(
+    reader: BagReader, replayer: Replayer, outbound: Outbound, unconfirmed: Sequence[Unconfirmed], *, json: bool
+) -> None:
     played = replayer.played
+    confirming = {
+        at for topic, each in outbound.publishers.items() if each.confirms for at in outbound.channels_of[topic]
+    }
     topics = [
         {
             "topic": channel.topic,
             "type": channel.type_name,
             "messages": played.by_channel[at],
             "bytes": played.bytes_by_channel[at],
+            "reliable": at in confirming,
         }
         for at, channel in enumerate(reader.channels)
         if played.by_channel[at]
     ]
     if json:
-        emit("done", sent=played.sent, topics=topics, unread=reader.unread or None)
+        emit(
+            "done",
+            sent=played.sent,
+            confirmed=replayer.confirmed,
+            best_effort=replayer.sent_best_effort,
+            unconfirmed=[asdict(each) for each in unconfirmed],
+            topics=topics,
+            unread=reader.unread or None,
+        )
         return
-    typer.echo(f"{played.sent} messages sent, {replayer.acknowledged} confirmed")
+    reliable = sum(played.by_channel[at] for at in confirming)
+    told = [f"{reliable} messages sent, {replayer.confirmed} confirmed"] if confirming else []
+    if reliable < played.sent:
+        told.append(f"{played.sent - reliable} messages sent, best effort")
+    typer.echo("; ".join(told) or "0 messages sent")
     if reader.unread:
         typer.echo(f"the recording could not be read to its end: {reader.unread}", err=True)
-    if not is_complete:
-        typer.echo("not everything was confirmed by its readers", err=True)
+    for each in unconfirmed:
+        typer.echo(each.words(), err=True)
 
 
 def main() -> None:

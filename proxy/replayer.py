@@ -8,15 +8,17 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
+from gdp.client.publisher import Publisher
+from gdp.message.loss import LossReason
 from proxy.endpoints.bag import BagReader
 from proxy.node import ProxyNode
 from proxy.outbound import Outbound
 
-__all__ = ["Played", "Replayer"]
+__all__ = ["Played", "Replayer", "Unconfirmed"]
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +34,35 @@ class Played:
     sent_bytes: int = 0  # as recorded
     by_channel: Counter[int] = field(default_factory=Counter)
     bytes_by_channel: Counter[int] = field(default_factory=Counter)
+
+
+_WHY: Final = {
+    LossReason.NO_READER: "published while nobody read it",
+    LossReason.GIVEN_UP: "given up for a reader that fell silent or behind",
+    LossReason.WINDOW_OVERFLOW: "pushed out of the full window",
+    LossReason.TOO_LARGE: "above the rule's max_bytes",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Unconfirmed:
+    """A reliable topic of which some message was not confirmed by each of its readers.
+
+    Attributes:
+        messages: how many were published, those above the rule's limit included.
+        why: in words, as far as it is known.
+        reasons: messages by reason, a message once for each reader; what is still waited for has none.
+    """
+
+    topic: str
+    messages: int
+    confirmed: int
+    why: str
+    reasons: Mapping[str, int]
+
+    def words(self) -> str:
+        """Return it as one line."""
+        return f"{self.topic}: {self.confirmed} of {self.messages} confirmed: {self.why}"
 
 
 class Replayer:
@@ -54,9 +85,24 @@ class Replayer:
         self.played = Played()
 
     @property
-    def acknowledged(self) -> int:
-        """Return how many messages every reader has confirmed."""
-        return sum(publisher.acknowledged for publisher in self._outbound.publishers.values())
+    def confirmed(self) -> int:
+        """Return how many messages of reliable topics every reader has confirmed."""
+        return sum(publisher.acknowledged for publisher in self._outbound.publishers.values() if publisher.confirms)
+
+    @property
+    def sent_best_effort(self) -> int:
+        """Return how many messages of best-effort topics were sent: nobody confirms them."""
+        publishers = [publisher for publisher in self._outbound.publishers.values() if not publisher.confirms]
+        return sum(publisher.messages - publisher.losses.total for publisher in publishers)
+
+    def unconfirmed(self) -> list[Unconfirmed]:
+        """Return the reliable topics of which something was not confirmed."""
+        publishers = self._outbound.publishers.items()
+        return [
+            Unconfirmed(topic, each.messages, each.acknowledged, _why(each), each.losses.by_label())
+            for topic, each in publishers
+            if each.confirms and each.acknowledged < each.messages
+        ]
 
     def wait_for_readers(self, patience_s: float) -> list[str]:
         """Wait until every topic has a reader; return the topics that have none when patience ends."""
@@ -85,15 +131,15 @@ class Replayer:
         return True
 
     def finish(self) -> bool:
-        """Wait until everything reliable is confirmed; return False when readers stop confirming, or when stopped."""
+        """Wait until readers have confirmed what they may get; return False when they stop to, or when stopped."""
         publishers = self._outbound.publishers.values()
-        progress, stalled_s = self.acknowledged, time.monotonic()
-        while not all(publisher.is_acknowledged() for publisher in publishers):
+        progress, stalled_s = self.confirmed, time.monotonic()
+        while any(publisher.is_wanted and not publisher.is_acknowledged() for publisher in publishers):
             if self._node.runtime.is_stopped:
                 return False
             self._step(TICK_S)
-            if self.acknowledged != progress:
-                progress, stalled_s = self.acknowledged, time.monotonic()
+            if self.confirmed != progress:
+                progress, stalled_s = self.confirmed, time.monotonic()
             elif time.monotonic() - stalled_s > STALL_S:
                 return False
         return True
@@ -117,3 +163,14 @@ class Replayer:
         if moment_s >= self._tick_at_s:
             self._tick_at_s = moment_s + TICK_S
             self._tick(self.played)
+
+
+def _why(publisher: Publisher) -> str:
+    """Return why not everything that a publisher has published was confirmed, as far as it is known."""
+    if not publisher.is_wanted and publisher.losses.counts.keys() <= {LossReason.NO_READER}:
+        return "nobody reads it"
+    known = [f"{count} {_WHY[reason]}" for reason, count in publisher.losses.counts.items() if reason in _WHY]
+    rest = publisher.messages - publisher.acknowledged - publisher.losses.total
+    if rest > 0:
+        known.append(f"{rest} not confirmed by a reader that {'lags' if publisher.readers else 'fell silent'}")
+    return ", ".join(known)

@@ -9,6 +9,8 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import Final
 
+from gdp.message.loss import Losses
+
 __all__ = ["Tally", "percentile"]
 
 SAMPLES_MAX: Final = 200_000  # latencies kept for percentiles; the oldest go
@@ -21,7 +23,7 @@ class Tally:
     topic: str
     type_name: str
     received: int = 0
-    lost: int = 0
+    losses: Losses = field(default_factory=Losses)  # on the way here
     duplicated: int = 0
     refused: int = 0  # arrived, but could not be handed to the endpoint
     parts: int = 0  # of the message that had most
@@ -29,6 +31,11 @@ class Tally:
     latencies_ms: deque[float] = field(default_factory=lambda: deque(maxlen=SAMPLES_MAX))
     newest: dict[tuple[bytes, int], tuple[int, int]] = field(default_factory=dict)
     # publisher, incarnation -> message number, place in its bundle
+
+    @property
+    def lost(self) -> int:
+        """Return how many messages did not come to the endpoint: lost on the way, or refused here."""
+        return self.losses.total + self.refused
 
     def count_number(self, publisher: bytes, incarnation: int, number: int, place: int = 0) -> None:
         """Count a message that came again: numbers rise within an incarnation, places within a bundle."""
@@ -53,6 +60,8 @@ class Tally:
             "type": self.type_name,
             "received": self.received,
             "lost": self.lost,
+            "lost_by_reason": self.losses.by_label(),
+            "losses": self.losses.to_fields(),
             "duplicated": self.duplicated,
             "refused": self.refused,
             "latency_ms": latency,

@@ -124,7 +124,10 @@ class Bridge:
     @property
     def tallies(self) -> list[Tally]:
         """Return the figures of every topic that comes in, those that ended included."""
-        return [*self._ended, *(flow.tally for _, flow in self.flows if isinstance(flow, ImportedTopic))]
+        imported = [flow for _, flow in self.flows if isinstance(flow, ImportedTopic)]
+        for flow in imported:
+            flow.count_losses()
+        return [*self._ended, *(flow.tally for flow in imported)]
 
     @property
     def is_settled(self) -> bool:

@@ -12,6 +12,7 @@ from typing import Final
 
 from gdp.client.member import Message, Topic
 from gdp.errors import LocalError, RemoteError
+from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.service.follower import Refuse
 from gdp.service.ordered import FollowerWord
@@ -346,15 +347,18 @@ class ExposedService:
     def _publish(self, event: Heard) -> None:
         """Tell all clients what an action's topic says."""
         at, what = self._topics.index(event.handle), self._wish.local
-        if not self._publisher.readers:
+        if not self._publisher.is_wanted:
             self._site.traffic.unread += 1
+            self._publisher.skip(LossReason.NO_READER)
             return
         if not self._publisher.has_room():
             self._site.faults.tell(what, Fault.TOO_FAST, "news come faster than clients confirm them")
+            self._publisher.skip(LossReason.WINDOW_OVERFLOW)
             return
         body = self._news[at].encode(event.raw)
         if reason := too_large("news", len(event.raw), self._wish.rule.max_bytes, len(body)):
             self._site.faults.tell(what, Fault.TOO_LARGE, reason)
+            self._publisher.skip(LossReason.TOO_LARGE)
             return
         wire = News(len(self._exchange.services) + at, event.stamp_ns, body).to_wire()
         self._publisher.publish(wire)

@@ -11,6 +11,7 @@ from dataclasses import replace
 from gdp.client.member import Topic
 from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
+from gdp.message.loss import LossReason
 from proxy.bridge.pace import Pace
 from proxy.bridge.seat import Seat
 from proxy.bridge.site import Site
@@ -138,18 +139,22 @@ class ExposedTopic:
         if len(event.raw) > rule.max_bytes:
             detail = f"a message of {len(event.raw)} bytes; the rule's max_bytes is {rule.max_bytes}"
             self._site.faults.tell(self._wish.local, Fault.TOO_LARGE, detail)
+            publisher.skip(LossReason.TOO_LARGE)
             return
-        if not publisher.readers and not self._depth():
+        if not publisher.is_wanted and not self._depth():
             traffic.unread += 1
+            publisher.skip(LossReason.NO_READER)
             return
         if not publisher.has_room():
             self._site.faults.tell(self._wish.local, Fault.TOO_FAST, "messages come faster than readers confirm them")
+            publisher.skip(LossReason.WINDOW_OVERFLOW)
             return
         message = Parcel(0, event.stamp_ns, serializer.encode(event.raw)).to_wire()
         try:
             publisher.publish(message)
         except LocalError as error:
             self._site.faults.tell(self._wish.local, Fault.TOO_LARGE, str(error))
+            publisher.skip(LossReason.TOO_LARGE)
             return
         traffic.sent(len(message))
 

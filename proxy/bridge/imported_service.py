@@ -30,6 +30,7 @@ from proxy.endpoints.endpoint import Asked, Event, Faulted
 from proxy.exchange import PATIENCE_MAX_MS, Answer, Exchange, News, Outcome, Request, too_large
 from proxy.faults import Fault
 from proxy.ordering import follower_word, is_word
+from proxy.serial.empty import NoAnswer
 from proxy.serial.serializer import Serializer
 
 __all__ = ["ImportedService"]
@@ -92,6 +93,7 @@ class ImportedService:
         self._counted: tuple[int, ...] = (0, 0, 0)  # late, strange and hedged, as told
         self._servers: dict[Name, FarServer] = {}
         self._requests: tuple[Serializer, ...] = ()
+        self._no_answers: tuple[NoAnswer | None, ...] = ()  # None: the dialect has errors
         self._handles: list[int] = []
         self._topics: list[int] = []
         self._publisher = site.member.call(
@@ -225,6 +227,7 @@ class ImportedService:
     def _open(self, ours: Exchange) -> None:
         self._publisher.describe(ours.to_wire())
         self._requests = tuple(Serializer(each.request, ours.encoding) for each in ours.services)
+        self._no_answers = tuple(NoAnswer.of(each) for each in ours.services)
         self._topics = [
             self._seat.advertise(self, replace(each, qos=(profile,), latched=profile.durability == "transient_local"))
             for each, profile in zip(ours.topics, PROFILES, strict=False)
@@ -369,9 +372,16 @@ class ImportedService:
 
     def _failed(self, waiting: _Waiting, failure: Failure, reason: str) -> None:
         self._forget(waiting)
-        if failure is Failure.TIMED_OUT:
-            reason = f"no answer within {self._wish.rule.timeout_s:g} s"
-        self._refuse(waiting, _FAULTS[failure], reason)
+        if failure is not Failure.TIMED_OUT:
+            self._refuse(waiting, _FAULTS[failure], reason)
+            return
+        reason = f"no answer within {self._wish.rule.timeout_s:g} s"
+        no_answer = self._no_answers[waiting.part] if self._handles else None
+        if no_answer is None or no_answer.says_reason or self._wish.rule.on_timeout == "silent":
+            self._refuse(waiting, Fault.TIMED_OUT, reason)
+            return
+        self._site.faults.tell(self._wish.local, Fault.TIMED_OUT, reason)
+        self._seat.endpoint.answer(self._handles[waiting.part], waiting.ticket, no_answer.to_raw(reason))
 
     def _forget(self, waiting: _Waiting) -> None:
         self._about.pop((waiting.part, waiting.call), None)

@@ -14,6 +14,7 @@ from dataclasses import replace
 
 from gdp.client.member import Message, Topic
 from gdp.errors import LocalError, RemoteError
+from gdp.message.loss import Losses
 from proxy.bridge.incoming import Incoming
 from proxy.bridge.pace import Pace
 from proxy.bridge.seat import Seat
@@ -53,6 +54,7 @@ class ImportedTopic:
         self._kept = deque[bytes]()  # what the virtual publisher keeps for late joiners, for another one in its place
         self._sources: dict[tuple[bytes, bytes], Incoming | None] = {}
         self._is_joined = False
+        self._past_losses = Losses()  # of when a local reader stood before
         self._pace = Pace(wish.rule.max_hz)
         self.tally = Tally(wish.local, wish.type_name, latencies_ms=deque(maxlen=_SAMPLES_MAX))
         if (known := self._known()) is not None:  # else the far side's own definition may do
@@ -93,6 +95,7 @@ class ImportedTopic:
         del now_s
         if self._is_joined:
             self._leave()
+        self.count_losses()
         self._shut()
 
     def renew(self, topic: Topic) -> None:
@@ -101,8 +104,16 @@ class ImportedTopic:
         if self._is_joined:
             self._site.member.renew(topic)
 
+    def count_losses(self) -> None:
+        """Bring the tally's losses up to date."""
+        self.tally.losses = losses = Losses()
+        losses.update(self._past_losses)
+        if self._is_joined:
+            losses.update(self._site.member.losses_of(self._topic.name))
+
     def _leave(self) -> None:
         self._is_joined = False
+        self._past_losses.update(self._site.member.losses_of(self._topic.name))
         self._site.member.unsubscribe(self._topic.name)
 
     def _shut(self) -> None:

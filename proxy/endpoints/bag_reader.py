@@ -88,6 +88,11 @@ class BagReader:
         return self._source.count
 
     @property
+    def counts(self) -> list[int] | None:
+        """Messages of each channel; None where the recording has no index that says it."""
+        return self._source.counts if isinstance(self._source, _IndexedSource) else None
+
+    @property
     def unread(self) -> str:
         """Why some messages could not be read, and about how many; empty where all could. Final after ``messages``."""
         return self._source.unread
@@ -172,6 +177,7 @@ class _IndexedSource:
     def __init__(self, connections: list[Connection], count: int) -> None:
         self.channels = [from_connection(connection) for connection in connections]
         self.count = count
+        self.counts = [connection.msgcount for connection in connections]
         self.unread = ""
         self._index = {_key(connection): index for index, connection in enumerate(connections)}
 

@@ -17,7 +17,7 @@ from proxy.ring.events import Event
 
 __all__ = ["READY_S", "Children", "cancel"]
 
-READY_S: Final = 30.0
+READY_S: Final = 60.0
 
 T = TypeVar("T")
 
@@ -35,6 +35,7 @@ class Children:
         self._kept = kept
         self._all: list[Child] = []
         self._standing: list[Child] = []
+        self._changed = asyncio.Event()  # what must stand is another set than before
 
     def start(self, label: str, argv: Sequence[str], *, heard: bool = True) -> Child:
         """Start a process; its log is called like its label."""
@@ -66,11 +67,19 @@ class Children:
         """
         said = await self.guarded(_all(child.wait_for("ready", READY_S) for child in children))
         self._standing += children
+        self._changed.set()
         return said
 
     def may_end(self, child: Child) -> None:
         """Expect the end of this process from now on."""
         self._standing.remove(child)
+        self._changed.set()
+
+    async def kill(self, child: Child) -> None:
+        """Kill a process that must stand; return when it has ended."""
+        self.may_end(child)
+        child.kill()
+        await child.ended
 
     async def guarded(self, work: Coroutine[None, None, T]) -> T:
         """Do ``work``, but stop at once if a process that must stand ends.
@@ -95,10 +104,21 @@ class Children:
             child.forget()
 
     async def _first_to_fall(self) -> Child:
-        nobody: asyncio.Future[int] = asyncio.get_running_loop().create_future()
-        endings = [child.ended for child in self._standing]
-        await asyncio.wait([nobody, *endings], return_when=asyncio.FIRST_COMPLETED)
-        return next(child for child in self._standing if child.ended.done())
+        while True:
+            for child in self._standing:
+                if child.ended.done():
+                    return child
+            self._changed.clear()
+            changed = asyncio.ensure_future(self._change())
+            try:
+                endings = [child.ended for child in self._standing]
+                await asyncio.wait([changed, *endings], return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                changed.cancel()
+
+    async def _change(self) -> int:
+        await self._changed.wait()
+        return len(self._standing)
 
 
 async def cancel(*tasks: asyncio.Future[T] | asyncio.Future[Child]) -> None:

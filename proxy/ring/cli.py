@@ -19,17 +19,19 @@ from rich.console import Console
 from rich.markup import escape
 
 from gdp.errors import GdpError, LocalError
+from gdp.limits import CLAIM_LEASE_S
 from gdp.testbed.interruption import Interrupted, interruptible, let_nothing_interrupt
 from gdp.testbed.runs import Run, Runs
 from gdp.testbed.topology import MTU_BYTES
 from proxy.config import Encoding
 from proxy.ring.child import ChildError
+from proxy.ring.faults import Cut, Kill, Roam
 from proxy.ring.hints import hints, live_hints
 from proxy.ring.live_run import LiveRing
-from proxy.ring.options import LIVE_S, Cut, Live, Options, RingPlane
+from proxy.ring.options import LIVE_S, Live, Options, RingPlane
 from proxy.ring.progress import Teller
 from proxy.ring.result import Result
-from proxy.ring.run import Ring, make_demo
+from proxy.ring.run import DEMO_S, Ring, make_demo
 from proxy.ring.table import table, verdict
 
 __all__ = ["main", "spelled_out"]
@@ -50,6 +52,10 @@ Examples:
   scripts/ring_topology.sh --live mixed              ROS 1 at the robot, ROS 2 at the server
   scripts/ring_topology.sh --rate 0 --json out.json  as fast as it goes
   scripts/ring_topology.sh --cut nuc2-nuc3@5         a link fails after 5 s
+  scripts/ring_topology.sh --cut nuc4-nuc5@3-6       and one that comes back
+  scripts/ring_topology.sh --roam robot:nuc3@5       the robot drives on to another switch
+  scripts/ring_topology.sh --kill rib:school@5       a RIB dies
+  scripts/ring_topology.sh --live --seconds 70 --cut nuc1-nuc2@5 --kill switch:nuc3@20-30 --roam server:nuc4@40
   scripts/ring_topology.sh --keep                    leave it up to look around
   scripts/ring_topology.sh --down                    and take it down
 """
@@ -65,7 +71,9 @@ def ring(
     live: Annotated[
         str | None, typer.Option(metavar="[ROS]", help=f"Real nodes instead: {', '.join(LIVES)}; ros2 where not said.")
     ] = None,
-    seconds: Annotated[float | None, typer.Option(help=f"Of live traffic; {LIVE_S:g} where not said.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help=f"Of traffic; a recording is stretched. Live: {LIVE_S:g} where not said.")
+    ] = None,
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON.")] = None,
     rate: Annotated[float, typer.Option(help="Pace of the replay; 0: as fast as it goes.")] = 1.0,
     encoding: Annotated[str, typer.Option(help=f"Of messages: {', '.join(ENCODINGS)}.")] = "json",
@@ -73,7 +81,19 @@ def ring(
     mtu: Annotated[int, typer.Option(help="Of the links, in bytes.")] = MTU_BYTES,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the received recording here.")] = None,
     pcap: Annotated[Path | None, typer.Option(metavar="FILE", help="Write what an eavesdropper on nuc3 sees.")] = None,
-    cut: Annotated[list[str] | None, typer.Option(metavar="A-B@S", help="Cut a link S seconds later.")] = None,
+    cut: Annotated[
+        list[str] | None, typer.Option(metavar="A-B@S[-T]", help="Cut a link after S seconds; heal it after T.")
+    ] = None,
+    roam: Annotated[
+        list[str] | None, typer.Option(metavar="WHO:SWITCH@S", help="Plug the robot or server in at another switch.")
+    ] = None,
+    kill: Annotated[
+        list[str] | None,
+        typer.Option(metavar="WHAT@S[-T]", help="Kill rib:DOMAIN or switch:NAME after S seconds; restart it after T."),
+    ] = None,
+    lease: Annotated[
+        float, typer.Option(help="Of names, in seconds: what is not renewed is forgotten.")
+    ] = CLAIM_LEASE_S,
     keep: Annotated[bool, typer.Option("--keep", help="Leave the ring up, and say what to try.")] = False,
     down: Annotated[bool, typer.Option("--down", help="Take down every ring that was kept, and end.")] = False,
 ) -> None:
@@ -81,7 +101,8 @@ def ring(
 
     With --live it is real nodes that talk: a talker, a camera, a mapper and a service at nuc1, and at nuc5 those who
     listen and call. Switches, RIBs and proxies are processes in network namespaces; keys and certificates are made for
-    the run. The exit code is 0 only if every message came out identical and in order.
+    the run. Links, switches and RIBs may fail meanwhile, and the ends may move: --cut, --kill and --roam, each as often
+    as wanted. The exit code is 0 only if every message came out identical and in order, and every call was answered.
     """
     errors = Console(stderr=True)
     try:
@@ -100,6 +121,9 @@ def ring(
             json=_absolute(json_file),
             pcap=_absolute(pcap),
             cuts=tuple(Cut.from_text(text) for text in cut or ()),
+            roams=tuple(Roam.from_text(text) for text in roam or ()),
+            kills=tuple(Kill.from_text(text) for text in kill or ()),
+            lease_s=lease,
             keep=keep,
             live=None if live is None else _one_of("live", live, LIVES),
             seconds=seconds,
@@ -153,8 +177,9 @@ async def _go(options: Options, run: Run, errors: Console) -> int:
     with Teller(errors) as teller:
         bag = options.bag
         if bag is None:
-            teller.step("making a recording: ten seconds of a robot's drive")
-            bag = await make_demo(run)
+            duration_s = options.seconds or DEMO_S
+            teller.step(f"making a recording: {duration_s:g} seconds of a robot's drive")
+            bag = await make_demo(run, duration_s)
         if options.out is not None:
             options.out.mkdir(parents=True, exist_ok=True)
         standing = Ring(options, run, teller, bag)

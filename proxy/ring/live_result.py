@@ -64,7 +64,7 @@ def _lamp(heard: Heard) -> TopicResult:
     )
     latency = heard.caller.part("latency_ms")
     median_ms, p99_ms, max_ms = (latency.number_or_none(key) for key in ("median", "p99", "max"))
-    way = Journey(median_ms, p99_ms, max_ms)
+    way = Journey(median_ms, p99_ms, max_ms, silent_ms=heard.caller.number_or_none("silent_ms"))
     return TopicResult(comparison, way, is_service=True)
 
 
@@ -76,4 +76,5 @@ def _of(topic: str, events: Sequence[Event]) -> Event:
 
 
 def _with_latency(carried: Event, listener: Event) -> Event:
-    return Event({**carried.fields, "latency_ms": listener.fields.get("latency_ms")})
+    measured = {key: listener.fields.get(key) for key in ("latency_ms", "silent_ms")}
+    return Event({**carried.fields, **measured})

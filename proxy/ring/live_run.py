@@ -6,6 +6,7 @@ Place: shell.
 from __future__ import annotations
 
 import importlib.util
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,9 +17,9 @@ from gdp.testbed.runs import Run
 from gdp.testbed.topology import Attachment
 from proxy.endpoints.ros1.install import rospy_folder
 from proxy.ring.child import Child
-from proxy.ring.cutting import Cutting
 from proxy.ring.events import Event
 from proxy.ring.fabric import Fabric
+from proxy.ring.injection import Injection
 from proxy.ring.live_plan import CARRIED, FAST_DDS_PROFILES, MASTER_PORT, Graph, Side, calls_in, graphs_of, messages_in
 from proxy.ring.live_result import Heard, rows
 from proxy.ring.live_session import ENDING_S, Cast, LiveSession
@@ -63,7 +64,7 @@ class LiveRing:
 
         Raises:
             ChildError: a process failed.
-            LocalError: a link cannot be cut.
+            LocalError: a fault cannot be injected.
         """
         fabric, children = self.fabric, self.fabric.children
         await fabric.stand_up()
@@ -74,13 +75,15 @@ class LiveRing:
         session = LiveSession(children, cast, self._teller)
         await session.meet()
         self._teller.step(f"they hear each other; {self._options.live_s:g} s of traffic")
-        cutting = Cutting(fabric.namespaces, self._options.cuts, self._teller)
+        injection, begun_s = Injection(fabric, self._options.faults, self._teller), time.monotonic()
         try:
             heard = await session.talk(self._options.live_s)
         finally:
-            await cutting.stop()
+            await injection.stop()
+        traffic_s = time.monotonic() - begun_s
         self._teller.step("comparing what was published with what was heard")
-        return await self._compare(heard, cutting.complaints())
+        result = await self._compare(heard, injection.complaints())
+        return replace(result, traffic_s=traffic_s, silent_s=session.silent_s)
 
     def go_on(self) -> None:
         """Start proxies that outlive us, in place of those that have reported, and let the nodes talk on."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from collections.abc import Awaitable, Coroutine, Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -15,7 +16,9 @@ from proxy.ring.child import Child
 from proxy.ring.children import Children, cancel
 from proxy.ring.events import Event
 from proxy.ring.live_result import Heard
+from proxy.ring.nodes.content import LAMP
 from proxy.ring.progress import Teller, Traffic
+from proxy.ring.silence import Silence
 
 __all__ = ["Cast", "LiveSession"]
 
@@ -48,10 +51,17 @@ class LiveSession:
         self._cast = cast
         self._teller = teller
         self._sent: dict[Child, int] = {}
-        self._received = 0
+        self._received: dict[str, int] = {}
+        self._asked = 0
         self._answered = 0
+        self._silence = Silence()
         self._latency_ms: float | None = None
         self._moved = asyncio.Event()
+
+    @property
+    def silent_s(self) -> float:
+        """Return the longest time that something was due and nothing came, to half a second."""
+        return self._silence.longest_s
 
     async def meet(self) -> None:
         """Wait until the far end hears every topic and sees the service.
@@ -100,23 +110,36 @@ class LiveSession:
         raise child.failed(f"ended with code {await child.ended} before its report")
 
     def _note(self, child: Child, event: Event) -> None:
-        before = (self._received, self._answered)
+        now_s, silence = time.monotonic(), self._silence
         if child is self._cast.listener:
-            self._received = event.count("received")
+            received = {each.text("topic"): each.count("received") for each in event.parts("topics")}
+            if received != self._received:
+                self._moved.set()
+            for topic, count in received.items():
+                silence.received(topic, count, now_s)
+            self._received = received
             self._latency_ms = event.number_or_none("latency_ms")
         elif child is self._cast.caller:
-            self._answered = event.count("answered")
+            self._asked, self._answered = event.count("asked"), event.count("answered")
+            silence.sent(LAMP, self._asked, now_s)
+            silence.received(LAMP, self._answered, now_s)
         else:
             self._sent[child] = event.count("sent")
-        if (self._received, self._answered) != before:
-            self._moved.set()
-        sent = sum(self._sent.values()) + self._answered
-        total = self._cast.messages + self._cast.calls
-        self._teller.traffic(Traffic(total, sent, self._received + self._answered, 0, self._latency_ms))
+            silence.sent(event.text("topic"), event.count("sent"), now_s)
+        self._teller.traffic(
+            Traffic(
+                total=self._cast.messages + self._cast.calls,
+                sent=sum(self._sent.values()) + self._asked,
+                received=sum(self._received.values()) + self._answered,
+                behind=silence.behind,
+                silent=tuple(silence.silent(now_s)),
+                latency_ms=self._latency_ms,
+            )
+        )
 
     async def _until_quiet(self) -> None:
         """Wait until all came, or nothing came for a while."""
-        while self._received < self._cast.messages:
+        while sum(self._received.values()) < self._cast.messages:
             self._moved.clear()
             try:
                 await asyncio.wait_for(self._moved.wait(), QUIET_S)

@@ -10,13 +10,14 @@ Place: shell. Every run has new keys; they go with the run::
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import yaml
 
 from gdp.crypto.certificates import Role
+from gdp.limits import CLAIM_LEASE_S
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
@@ -40,9 +41,21 @@ class Materials:
         topology: who there is.
         directory: the run's own.
         metrics: whether nodes serve metrics on their loopback.
+        roamers: proxies that will be plugged in at other switches, too.
+        lease_s: of claims and watches.
     """
 
-    def __init__(self, topology: Topology, directory: Path, *, metrics: bool) -> None:
+    def __init__(
+        self,
+        topology: Topology,
+        directory: Path,
+        *,
+        metrics: bool,
+        roamers: Collection[Attachment] = (),
+        lease_s: float = CLAIM_LEASE_S,
+    ) -> None:
+        self._roamers = roamers
+        self._lease_s = lease_s
         self._topology = topology
         self._directory = directory
         self._metrics = metrics
@@ -59,14 +72,24 @@ class Materials:
     def switch(self, node: str, data_plane: str) -> Path:
         """Write ``switch.yaml`` of a switch; return the file."""
         credentials = self._credentials(Role.SWITCH, node)
-        content = switch_yaml(self._topology, node, credentials, data_plane, metrics=self._metrics)
+        content = switch_yaml(
+            self._topology,
+            node,
+            credentials,
+            data_plane,
+            metrics=self._metrics,
+            roamers=self._roamers,
+            lease_s=self._lease_s,
+        )
         return self._write(Role.SWITCH, node, content)
 
     def rib(self, at: Attachment) -> Path:
         """Write ``rib.yaml`` of a RIB; return the file."""
         above = upper_rib(self._topology, self._topology.domain_of(at.switch))
         upper = self._names[_title(Role.RIB, above.switch)] if above is not None else None
-        content = rib_yaml(at, self._credentials(Role.RIB, at.switch), upper, metrics=self._metrics)
+        content = rib_yaml(
+            at, self._credentials(Role.RIB, at.switch), upper, metrics=self._metrics, lease_s=self._lease_s
+        )
         return self._write(Role.RIB, at.switch, content)
 
     def sender(self, at: Attachment, topics: Sequence[Topic], encoding: Encoding, ros: RosVersion) -> Path:
@@ -86,12 +109,18 @@ class Materials:
             self._delegate(node, each.metadata, each.right(side))
         rules: dict[str, Sequence[Yaml]] = {side: [each.rule(self._owner / OWNER_PUBLIC, encoding) for each in carried]}
         credentials = self._credentials(Role.PROXY, at.switch)
-        content = proxy_yaml(at, credentials, node / DELEGATIONS, 2, rules, None, metrics=self._metrics)
+        content = proxy_yaml(
+            at, credentials, node / DELEGATIONS, 2, rules, None, metrics=self._metrics, lease_s=self._lease_s
+        )
         return self._write(Role.PROXY, at.switch, {**content, "ros": graph})
 
     def proxy_file(self, at: Attachment) -> Path:
         """Return where ``proxy.yaml`` of a proxy is written."""
-        return self._directory / f"{_title(Role.PROXY, at.switch)}.yaml"
+        return self.file("proxy", at.switch)
+
+    def file(self, role: Literal["switch", "rib", "proxy"], switch: str) -> Path:
+        """Return where a node's configuration is written."""
+        return self._directory / f"{_title(Role(role), switch)}.yaml"
 
     def _proxy(
         self,
@@ -109,7 +138,9 @@ class Materials:
             side: [rule_yaml(topic, self._owner / OWNER_PUBLIC, encoding) for topic in topics]
         }
         credentials = self._credentials(Role.PROXY, at.switch)
-        content = proxy_yaml(at, credentials, node / DELEGATIONS, ros, rules, record, metrics=self._metrics)
+        content = proxy_yaml(
+            at, credentials, node / DELEGATIONS, ros, rules, record, metrics=self._metrics, lease_s=self._lease_s
+        )
         return self._write(Role.PROXY, at.switch, content)
 
     def _delegate(self, node: Path, metadata: Metadata, right: Right) -> None:

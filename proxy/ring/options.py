@@ -6,54 +6,23 @@ Place: pure.
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
 from gdp.errors import LocalError
+from gdp.limits import CLAIM_LEASE_S, LEASE_MAX_S, LEASE_MIN_S
 from gdp.testbed.topology import MTU_BYTES, Topology, ring5
 from proxy.config import Encoding
+from proxy.ring.faults import Cut, Fault, Kill, Roam, check_faults
 
-__all__ = ["LIVE_S", "Cut", "Live", "Options", "RingPlane"]
+__all__ = ["LIVE_S", "Live", "Options", "RingPlane"]
 
 RingPlane = Literal["auto", "kernel", "raw", "scapy"]
 Live = Literal["ros2", "ros1", "mixed"]
 
 LIVE_S: Final = 10.0
 _LIVE_MAX_S: Final = 3_600.0
-
-_CUT: Final = re.compile(r"([^@]+?)-([^@-]+)@(\d+(?:\.\d+)?)\Z")
-
-
-@dataclass(frozen=True, slots=True)
-class Cut:
-    """A link that goes down while the recording is replayed.
-
-    Args:
-        a: one end.
-        b: the other end.
-        after_s: seconds after the first message may leave.
-    """
-
-    a: str
-    b: str
-    after_s: float
-
-    @classmethod
-    def from_text(cls, text: str) -> Cut:
-        """Read ``nuc2-nuc3@5``.
-
-        Raises:
-            LocalError: anything else.
-        """
-        found = _CUT.match(text)
-        if found is None:
-            raise LocalError(f"a cut is written like nuc2-nuc3@5 (link, seconds after the start), not {text!r}")
-        return cls(found[1], found[2], float(found[3]))
-
-    def __str__(self) -> str:
-        return f"{self.a}-{self.b}@{self.after_s:g}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,10 +36,12 @@ class Options:
         out: directory, made if need be, where the received recording stays; None: it goes with the run.
         pcap: where to write what passes through the middle of the ring.
         live: real nodes instead of a recording; of which ROS. ``mixed``: ROS 1 at the robot, ROS 2 at the server.
-        seconds: of live traffic; None: ``LIVE_S``.
+        seconds: of traffic; a recording is replayed slower or faster to last so long, a generated one is made so
+            long. None: ``LIVE_S`` live, else the recording's own time.
+        lease_s: of every node's claims and watches.
 
     Raises:
-        LocalError: a rate that is no pace, a cut of a link that is not there, a directory that is missing, a recording
+        LocalError: a rate that is no pace, a fault that cannot be injected, a directory that is missing, a recording
             for a live run.
     """
 
@@ -83,17 +54,22 @@ class Options:
     json: Path | None = None
     pcap: Path | None = None
     cuts: tuple[Cut, ...] = ()
+    roams: tuple[Roam, ...] = ()
+    kills: tuple[Kill, ...] = ()
     keep: bool = False
     live: Live | None = None
     seconds: float | None = None
+    lease_s: float = CLAIM_LEASE_S
 
     def __post_init__(self) -> None:
         if self.live is not None and (self.bag is not None or self.rate != 1 or self.out is not None):
             raise LocalError("--live is without a recording: neither BAG nor --rate nor --out goes with it")
-        if self.live is None and self.seconds is not None:
-            raise LocalError("--seconds goes with --live; a recording takes its own time")
-        if not 1 <= self.live_s <= _LIVE_MAX_S:
-            raise LocalError(f"--seconds is 1 to {_LIVE_MAX_S:g}, not {self.live_s:g}")
+        if self.seconds is not None and self.rate != 1:
+            raise LocalError("--seconds and --rate both say how fast: give one of them")
+        if self.seconds is not None and not 1 <= self.seconds <= _LIVE_MAX_S:
+            raise LocalError(f"--seconds is 1 to {_LIVE_MAX_S:g}, not {self.seconds:g}")
+        if not LEASE_MIN_S <= self.lease_s <= LEASE_MAX_S:
+            raise LocalError(f"--lease is {LEASE_MIN_S:g} to {LEASE_MAX_S:g} seconds, not {self.lease_s:g}")
         if not 0 <= self.rate < math.inf:
             raise LocalError(f"a rate is 0 or more, not {self.rate:g}")
         if self.bag is not None and not self.bag.exists():
@@ -105,9 +81,12 @@ class Options:
                 raise LocalError(f"a directory, where a file was expected: {file}")
         if self.out is not None and self.out.exists() and not self.out.is_dir():
             raise LocalError(f"a file, where a directory was expected: {self.out}")
-        topology = self.topology()
-        for cut in self.cuts:
-            topology.link(cut.a, cut.b)
+        check_faults(self.topology(), self.faults, self.live_s if self.live is not None else self.seconds)
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """Return all that is to go wrong."""
+        return (*self.cuts, *self.roams, *self.kills)
 
     @property
     def live_s(self) -> float:
@@ -124,11 +103,14 @@ class Options:
 
     def settings(self) -> dict[str, object]:
         """Return the options as the JSON result states them."""
-        recorded = {"recording": str(self.bag) if self.bag else "demo", "rate": self.rate}
+        recorded = {"recording": str(self.bag) if self.bag else "demo", "rate": self.rate, "seconds": self.seconds}
         return {
             **({"live": self.live, "seconds": self.live_s} if self.live else recorded),
             "encoding": self.encoding,
             "data_plane": self.data_plane,
             "mtu": self.mtu,
+            "lease_s": self.lease_s,
             "cuts": [str(cut) for cut in self.cuts],
+            "roams": [str(roam) for roam in self.roams],
+            "kills": [str(kill) for kill in self.kills],
         }

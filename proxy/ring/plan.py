@@ -5,11 +5,12 @@ Place: pure. What is written here is what the commands' own ``--check`` accepts.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, TypeAlias
 
+from gdp.limits import CLAIM_LEASE_S
 from gdp.names import Name
 from gdp.testbed.topology import Attachment, DomainPlan, Topology
 from proxy.config import Encoding
@@ -74,23 +75,41 @@ def topics_of(channels: Iterable[Channel]) -> tuple[Topic, ...]:
     return tuple(Topic(topic, type_name, latch) for (topic, type_name), latch in latched.items())
 
 
-def switch_yaml(topology: Topology, node: str, credentials: Credentials, data_plane: str, *, metrics: bool) -> Yaml:
-    """Return ``switch.yaml`` of one switch."""
+def switch_yaml(
+    topology: Topology,
+    node: str,
+    credentials: Credentials,
+    data_plane: str,
+    *,
+    metrics: bool,
+    roamers: Collection[Attachment] = (),
+    lease_s: float = CLAIM_LEASE_S,
+) -> Yaml:
+    """Return ``switch.yaml`` of one switch.
+
+    Args:
+        roamers: proxies that may be plugged in here or elsewhere; the switch's end of their cable is made by others.
+    """
+    ports: list[Yaml] = [{"iface": link.other(node), "cost": link.cost} for link in topology.links_of(node)]
     return {
         **credentials.to_yaml(),
-        "ports": [{"iface": link.other(node), "cost": link.cost} for link in topology.links_of(node)],
-        "attach": [at.ifname for at in topology.attachments if at.switch == node],
+        "ports": [*ports, *({"iface": f"{at.ifname}-s", "optional": True} for at in roamers)],
+        "attach": [at.ifname for at in topology.attachments if at.switch == node and at not in roamers],
         "data_plane": data_plane,
+        "lease_s": lease_s,
         **_metrics("switch", wanted=metrics),
     }
 
 
-def rib_yaml(at: Attachment, credentials: Credentials, upper: Name | None, *, metrics: bool) -> Yaml:
+def rib_yaml(
+    at: Attachment, credentials: Credentials, upper: Name | None, *, metrics: bool, lease_s: float = CLAIM_LEASE_S
+) -> Yaml:
     """Return ``rib.yaml`` of one domain's RIB."""
     return {
         **credentials.to_yaml(),
         "iface": at.ifname,
         "upper": upper.to_text() if upper is not None else None,
+        "lease_s": lease_s,
         **_metrics("rib", wanted=metrics),
     }
 
@@ -119,6 +138,7 @@ def proxy_yaml(
     record: Path | None,
     *,
     metrics: bool,
+    lease_s: float = CLAIM_LEASE_S,
 ) -> Yaml:
     """Return ``proxy.yaml`` of one proxy.
 
@@ -135,6 +155,7 @@ def proxy_yaml(
         **credentials.to_yaml(),
         "iface": at.ifname,
         "delegations": str(delegations),
+        "lease_s": lease_s,
         **{side: list(each) for side, each in rules.items()},
         **({"record": {"path": str(record), "format": form}} if record is not None else {}),
         **_metrics("proxy", wanted=metrics),

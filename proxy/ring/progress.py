@@ -23,6 +23,10 @@ class Traffic:
     """How far the replay is, put together from both ends.
 
     Args:
+        total: messages and calls that are to come.
+        lost: what a reader says that it will never get.
+        behind: published, or asked, and not yet delivered.
+        silent: flows that stand still though they are behind, with seconds.
         latency_ms: one way, of the latest message; None before the first.
     """
 
@@ -30,6 +34,8 @@ class Traffic:
     sent: int = 0
     received: int = 0
     lost: int = 0
+    behind: int = 0
+    silent: tuple[tuple[str, float], ...] = ()
     latency_ms: float | None = None
 
     def rate(self, before: Traffic, elapsed_s: float) -> float:
@@ -39,7 +45,9 @@ class Traffic:
     def words(self, rate: float) -> str:
         """Return the figures as one line."""
         latency = "-" if self.latency_ms is None else f"{self.latency_ms:.1f} ms"
-        return f"{rate:5.0f} msg/s  delivered {self.received}  lost {self.lost}  latency {latency}"
+        words = f"{rate:5.0f} msg/s  published {self.sent}  delivered {self.received}  behind {self.behind}"
+        words += f"  lost {self.lost}  latency {latency}"
+        return words + "".join(f"  {flow} silent for {seconds:.0f} s" for flow, seconds in self.silent)
 
 
 class Teller:
@@ -65,7 +73,8 @@ class Teller:
 
     def step(self, text: str) -> None:
         """Tell what is being done now."""
-        self._console.print(f"[dim]{time.monotonic() - self._began_s:6.1f} s[/dim]  {text}", highlight=False)
+        at = f"[dim]{time.monotonic() - self._began_s:6.1f} s[/dim]"
+        self._console.print(f"{at}  {text}", highlight=False, soft_wrap=True)
 
     def begin_traffic(self, total: int) -> None:
         """Begin to tell traffic of ``total`` messages."""

@@ -22,6 +22,7 @@ class Journey:
         parts: of the largest message.
         hops: switches that most messages passed.
         hops_seen: every number of switches that some message passed.
+        silent_ms: the longest time between two messages, or between two answers; None: not measured.
     """
 
     median_ms: float | None = None
@@ -31,6 +32,7 @@ class Journey:
     parts: int = 0
     hops: int = 0
     hops_seen: tuple[int, ...] = ()
+    silent_ms: float | None = None
 
     @classmethod
     def from_event(cls, topic: Event) -> Journey:
@@ -44,6 +46,7 @@ class Journey:
             parts=topic.count("parts"),
             hops=topic.count("hops"),
             hops_seen=tuple(topic.counts("hops_seen")),
+            silent_ms=topic.number_or_none("silent_ms"),
         )
 
 
@@ -90,6 +93,7 @@ class TopicResult:
             "identical": of.identical,
             "in_order": of.in_order,
             "latency_ms": {"median": way.median_ms, "p99": way.p99_ms, "max": way.max_ms},
+            "silent_ms": way.silent_ms,
             "parts": way.parts,
             "hops": way.hops,
             "hops_seen": list(way.hops_seen),
@@ -103,12 +107,16 @@ class Result:
     Args:
         unread: why the end of the recording could not be read; None if all of it was.
         complaints: what else went wrong, such as an end that did not finish.
+        traffic_s: how long the traffic took.
+        silent_s: the longest time that something was due and nothing came, to half a second.
     """
 
     topics: tuple[TopicResult, ...]
     settings: Mapping[str, object]
     unread: str | None = None
     complaints: tuple[str, ...] = ()
+    traffic_s: float = 0.0
+    silent_s: float = 0.0
 
     @property
     def faults(self) -> list[str]:
@@ -129,6 +137,8 @@ class Result:
             "topics": [row.to_json() for row in self.topics],
             "settings": dict(self.settings),
             "unread": self.unread,
+            "traffic_s": round(self.traffic_s, 3),
+            "silent_s": round(self.silent_s, 3),
             "faults": self.faults,
         }
 

@@ -17,6 +17,7 @@ from proxy.endpoints.bag import BagReader
 from proxy.ring.child import Child
 from proxy.ring.children import READY_S, Children
 from proxy.ring.fabric import Fabric
+from proxy.ring.injection import Injection
 from proxy.ring.options import Options
 from proxy.ring.plan import Topic, topics_of
 from proxy.ring.progress import Teller
@@ -24,9 +25,10 @@ from proxy.ring.replay import Replay
 from proxy.ring.result import Result, put_together
 from proxy.serial.channel import RosVersion
 
-__all__ = ["Ring", "make_demo"]
+__all__ = ["DEMO_S", "Ring", "make_demo"]
 
-_DEMO_S: Final = 120.0  # patience with the making of the demonstration recording
+DEMO_S: Final = 10.0
+_MAKING_S: Final = 240.0  # patience with the making of the demonstration recording
 _DEMO_SCRIPT: Final = Path(__file__).parents[2] / "scripts" / "make_demo_bag.py"
 
 
@@ -47,6 +49,7 @@ class Ring:
     def __init__(self, options: Options, run: Run, teller: Teller, bag: Path) -> None:
         with BagReader(bag) as reader:
             channels, self._total = list(reader.channels), reader.count
+            self._rate = options.rate if options.seconds is None else _recorded_s(reader) / options.seconds
         if not channels:
             raise ConfigError(str(bag), "", "holds no topic")
         self.bag = bag
@@ -80,12 +83,12 @@ class Ring:
         sender = self._start_sender()
         await self._children.guarded(sender.wait_for("ready", READY_S))
         replay = Replay(self._children, sender, receiver, self._total, self._teller)
-        report = await replay.report(self.fabric.namespaces, self.options.cuts)
+        report = await replay.report(lambda: Injection(self.fabric, self.options.faults, self._teller))
         self._teller.step("comparing what was sent with what was recorded")
         exact = self.options.encoding == "cdr"
         comparisons = await self._children.guarded(asyncio.to_thread(compare, self.bag, self.recording, exact=exact))
         topics = put_together(comparisons, report.topics)
-        return Result(topics, self.fabric.settings, report.unread, report.complaints)
+        return Result(topics, self.fabric.settings, report.unread, report.complaints, report.traffic_s, report.silent_s)
 
     def start_again(self) -> Path:
         """Start a receiver that outlives us, in place of the one that has ended; return the file it records into."""
@@ -112,11 +115,16 @@ class Ring:
         at, encoding = self.fabric.robot, self.options.encoding
         config = self.fabric.materials.sender(at, self._topics, encoding, self._ros)
         argv = ["-m", "proxy.replay_cli", str(self.bag), "--config", str(config), "--json"]
-        return self.fabric.start(at.switch, "replay", [*argv, "--rate", str(self.options.rate)])
+        return self.fabric.start(at.switch, "replay", [*argv, "--rate", str(self._rate)])
 
 
-async def make_demo(run: Run) -> Path:
-    """Make the demonstration recording in the run's directory; return the file.
+def _recorded_s(reader: BagReader) -> float:
+    stamps_ns = [stamp_ns for _, stamp_ns, _ in reader.messages()]
+    return max((max(stamps_ns) - min(stamps_ns)) / 1e9, 1e-3) if stamps_ns else 1.0
+
+
+async def make_demo(run: Run, seconds: float) -> Path:
+    """Make a demonstration recording of this length in the run's directory; return the file.
 
     Raises:
         ChildError: the script fails.
@@ -124,8 +132,10 @@ async def make_demo(run: Run) -> Path:
     path = run.directory / "demo.mcap"
     children = Children(run, kept=False)
     try:
-        maker = children.start("recording", [sys.executable, str(_DEMO_SCRIPT), "-o", str(path)], heard=False)
-        if code := await maker.wait(_DEMO_S):
+        maker = children.start(
+            "recording", [sys.executable, str(_DEMO_SCRIPT), "--seconds", str(seconds), "-o", str(path)], heard=False
+        )
+        if code := await maker.wait(_MAKING_S):
             raise maker.failed(f"ended with code {code}")
     finally:
         children.forget()

@@ -21,16 +21,17 @@ def table(result: Result) -> Table:
     title = f"{of['encoding']}, {of['data_plane']}, MTU {of['mtu']}"
     if "live" in of:
         title = f"live {of['live']}, {title}"
-    cuts = of["cuts"]
-    if isinstance(cuts, list) and cuts:
-        title += ", cut " + ", ".join(f"{cut} s" for cut in cuts)
+    for what in ("cuts", "roams", "kills"):
+        faults = of.get(what)
+        if isinstance(faults, list) and faults:
+            title += f", {what.removesuffix('s')} " + ", ".join(f"{fault} s" for fault in faults)
     drawn = Table(title=title, title_justify="left", title_style="bold")
     for heading in ("topic", "type"):
         drawn.add_column(heading, overflow="fold")
     for heading in ("messages", "bytes", "delivered", "lost", "duplicated"):
         drawn.add_column(heading, justify="right", no_wrap=True)
     drawn.add_column("identical", no_wrap=True)
-    for heading in ("median ms", "p99 ms", "max ms", "parts"):
+    for heading in ("median ms", "p99 ms", "max ms", "silent ms", "parts"):
         drawn.add_column(heading, justify="right", no_wrap=True)
     drawn.add_column("hops")
     for row in result.topics:
@@ -73,6 +74,7 @@ def _cells(row: TopicResult) -> list[str]:
         _ms(way.median_ms),
         _ms(way.p99_ms),
         _ms(way.max_ms),
+        _ms(way.silent_ms),
         str(way.parts or "-"),
         hops_in_words(way),
     ]

@@ -50,7 +50,7 @@ _TYPES: Final[dict[Kind, tuple[str, str]]] = {
 }
 _OWN_KEYS: Final = ("kind", "name", "type")
 _OF_TOPICS: Final = ("reliable", "latched", "max_hz")
-_OF_CALLS: Final = ("timeout_s", "replication")
+_OF_CALLS: Final = ("timeout_s", "on_timeout", "replication")
 _OF_SERVICES: Final = ("stop", "at_once", "state", "state_node")
 _FOREIGN: Final[dict[Kind, tuple[str, ...]]] = {
     "topic": (*_OF_CALLS, *_OF_SERVICES),
@@ -168,6 +168,12 @@ class Rule(Section):
         default=CALL_S,
         description="Services and actions: seconds that an answer may take. An action's result may always take as long"
         " as it wants. `null`: no limit.",
+    )
+    on_timeout: Literal["empty", "silent"] = Field(
+        default="empty",
+        description="Services and actions of ROS 2, under `import`: what a client gets when no answer came in time."
+        " `empty`: a response of zeros. `silent`: nothing. A response with `success` and `message` says why in any"
+        " case, and a client of ROS 1 gets an error.",
     )
     replication: Spread = Field(
         default_factory=Spread,
@@ -337,7 +343,7 @@ class Rule(Section):
             raise ValueError("only topics have this")
         return value
 
-    @field_validator("timeout_s", "replication")
+    @field_validator("timeout_s", "on_timeout", "replication")
     @classmethod
     def _is_of_calls(cls, value: object, info: ValidationInfo) -> object:
         if info.data.get("kind", "service") == "topic":

@@ -12,6 +12,7 @@ from gdp.cli.gdp import main
 from gdp.stores.issue import delegate
 from gdp.stores.keyring import load_delegations, save_delegation
 from gdp.trust.right import Right
+from proxy.cli import app as proxy_app
 from proxy.config import ProxyConfig
 from proxy.delegate_cli import app
 
@@ -101,3 +102,20 @@ def test_a_rule_of_which_nothing_is_known_is_said() -> None:
 def test_an_owner_that_is_none_is_refused() -> None:
     done = CliRunner().invoke(app, ["--owner", "lab", "robot/proxy.yaml"])
     assert (done.exit_code, done.output.startswith("error: ")) == (2, True)
+
+
+def test_an_owner_whom_no_rule_names_is_refused_with_those_that_they_name() -> None:
+    with pytest.raises(SystemExit):
+        main(["keygen", "owner", "other"])
+    done = CliRunner().invoke(app, ["--owner", "other", "robot/proxy.yaml"])
+    assert done.exit_code == 2
+    assert "no rule of robot/proxy.yaml names this owner (other/owner.pub)" in done.output
+    assert "they name robot/owner.pub" in done.output
+
+
+def test_a_recording_that_exists_is_refused_by_the_check_too() -> None:
+    Path("there.mcap").touch()
+    Path("server/proxy.yaml").write_text(f"{_HEAD}import:\n{_MAP}record: {{path: ../there.mcap}}\n")
+    done = CliRunner().invoke(proxy_app, ["--config", "server/proxy.yaml", "--check"])
+    assert done.exit_code == 2
+    assert "there.mcap exists already; move or delete it, or change record.path" in done.output

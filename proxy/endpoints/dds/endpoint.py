@@ -19,6 +19,7 @@ from proxy.endpoints.dds.topics import Publication, Subscription
 from proxy.endpoints.dds.types import hash_of, known_channel
 from proxy.endpoints.endpoint import Event, Graph, GraphChanged, Role
 from proxy.serial.channel import Channel, Qos, RosVersion
+from proxy.serial.empty import NoAnswer
 from proxy.serial.service import Service
 
 __all__ = ["DdsEndpoint"]
@@ -148,7 +149,8 @@ class DdsEndpoint:
             raise LocalError(f"{service.name}: a service of ROS {service.ros} cannot be served in DDS")
         handle, hashed = next(self._numbers), service.hash if service.hash.startswith("RIHS01_") else ""
         what = (service.name, service.type_name, hashed)
-        server = Server(self._node, self._survey, handle, self._tell, *what, lambda: next(self._numbers))
+        no_answer = NoAnswer.of(service)
+        server = Server(self._node, self._survey, handle, self._tell, *what, no_answer, lambda: next(self._numbers))
         return self._keep(handle, server)
 
     def answer(self, handle: int, ticket: int, raw: bytes) -> None:
@@ -156,9 +158,8 @@ class DdsEndpoint:
         self._find(handle, Server).answer(ticket, raw)
 
     def refuse(self, handle: int, ticket: int, reason: str) -> None:
-        """Forget a request: ROS 2 services have no way to say a reason."""
-        del reason
-        self._find(handle, Server).refuse(ticket)
+        """Answer {success: false, message: reason} where the response has these; ROS 2 knows no other way."""
+        self._find(handle, Server).refuse(ticket, reason)
 
     def dial(self, name: str, type_name: str) -> int:
         """Be a client of a service of servers that speak Cyclone DDS; others are told of as ``Faulted``."""

@@ -19,6 +19,7 @@ from proxy.endpoints.dds.profile import offered, requested
 from proxy.endpoints.dds.survey import Survey
 from proxy.endpoints.endpoint import Answered, Asked, Event, Failed, Faulted, Role
 from proxy.qos import default
+from proxy.serial.empty import NoAnswer
 
 __all__ = ["Client", "Server"]
 
@@ -73,12 +74,14 @@ class Server(_Halves):
         name: str,
         type_name: str,
         type_hash: str,
+        no_answer: NoAnswer | None,
         tickets: Callable[[], int],
     ) -> None:
         self._survey = survey
         self._handle = handle
         self._tell = tell
         self._name = name
+        self._no_answer = no_answer
         self._tickets = tickets
         self._asks: dict[int, _Ask] = {}
         self._early = deque[Sample](maxlen=_WAITING_MAX)  # of clients that are not known yet
@@ -113,9 +116,12 @@ class Server(_Halves):
         else:
             self._late.append((ask, raw))
 
-    def refuse(self, ticket: int) -> None:
-        """Forget a request: ROS 2 has no word for a failure, and the client's own patience must end it."""
-        self._asks.pop(ticket, None)
+    def refuse(self, ticket: int, reason: str) -> None:
+        """Answer with the reason, if the response can say one; else the client's own patience must end it."""
+        if self._no_answer is not None and self._no_answer.says_reason:
+            self.answer(ticket, self._no_answer.to_raw(reason))
+        else:
+            self._asks.pop(ticket, None)
 
     def matched(self) -> None:
         """Answer those whose replies found nobody yet."""

@@ -31,10 +31,10 @@ class _Pace:
         self._tell_at_s = self._next_s
 
     def step(self, **progress: object) -> None:
-        """Wait for the next step; twice a second, tell how far we are."""
+        """Wait for the next step; twice a second, tell how far we are, if anything is given to tell."""
         self._next_s += self._period_s
         self._orders.wait_until(self._next_s)
-        if time.monotonic() >= self._tell_at_s:
+        if progress and time.monotonic() >= self._tell_at_s:
             self._tell_at_s = time.monotonic() + 0.5
             say("progress", **progress)
 
@@ -65,7 +65,7 @@ def talk(node: Node, orders: Orders, of: Talk, count: int) -> NoReturn:
             publish(0)
     pace = _Pace(of.hz, orders)
     for number in range(len(sent) + 1, count + 1):
-        pace.step(sent=len(sent))
+        pace.step(topic=of.topic, sent=len(sent))
         publish_counted(number)
     say("done", topic=of.topic, type=of.type_name, bytes=size, sent=sent)
     orders.wait_for(Order.GO)
@@ -73,6 +73,20 @@ def talk(node: Node, orders: Orders, of: Talk, count: int) -> NoReturn:
         count += 1
         orders.wait(1 / of.hz)
         publish(count)
+
+
+class Gap:
+    """The longest time between two of a series of moments."""
+
+    def __init__(self) -> None:
+        self._newest_ns: int | None = None
+        self.longest_ms: float | None = None
+
+    def note(self, now_ns: int) -> None:
+        """Note a moment."""
+        if self._newest_ns is not None:
+            self.longest_ms = max(self.longest_ms or 0.0, (now_ns - self._newest_ns) / 1e6)
+        self._newest_ns = now_ns
 
 
 class _Ear:
@@ -83,15 +97,20 @@ class _Ear:
         self.is_awake = False
         self.heard: list[str] = []
         self.latencies_ms: list[float] = []
+        self._gap = Gap()
 
     def take(self, message: object) -> None:
         now_ns = time.time_ns()
         mark: Mark = self._of.read(message)
         if mark.number:
             self.heard.append(digest(message))
+            self._gap.note(now_ns)
             if self.is_awake:
                 self.latencies_ms.append((now_ns - mark.stamp_ns) / 1e6)
         self.is_awake = True
+
+    def progress(self) -> dict[str, object]:
+        return {"topic": self._of.topic, "received": len(self.heard)}
 
     def report(self) -> dict[str, object]:
         return {
@@ -99,6 +118,7 @@ class _Ear:
             "type": self._of.type_name,
             "heard": list(self.heard),
             "latency_ms": _latency(list(self.latencies_ms)),
+            "silent_ms": self._gap.longest_ms,
         }
 
 
@@ -113,7 +133,7 @@ def listen(node: Node, orders: Orders, talks: Sequence[Talk]) -> NoReturn:
     while orders.wait(_LOOK_S) is not Order.REPORT:
         latest = [ear.latencies_ms[-1] for ear in ears if ear.latencies_ms]
         mean = sum(latest) / len(latest) if latest else None
-        say("progress", received=sum(len(ear.heard) for ear in ears), latency_ms=mean)
+        say("progress", topics=[ear.progress() for ear in ears], latency_ms=mean)
     say("done", topics=[ear.report() for ear in ears])
     orders.wait_for_the_end()
 
@@ -144,20 +164,24 @@ def call(node: Node, orders: Orders, count: int) -> NoReturn:
     pace = _Pace(LAMP_HZ, orders)
     size = right = newest = 0
     latencies_ms = list[float]()
+    gap = Gap()
     give_up_s = time.monotonic() + count / LAMP_HZ + _CALL_S
     for number in range(1, count + 1):
-        pace.step(answered=len(latencies_ms))
+        pace.step()
         if time.monotonic() > give_up_s:
             break  # calls that wait for nothing take long
+        say("progress", asked=number, answered=len(latencies_ms))
         on = bool(number % 2)
         began_ns = time.perf_counter_ns()
         answer = client.call(on=on, patience_s=_CALL_S)
         if answer is not None:
             latencies_ms.append((time.perf_counter_ns() - began_ns) / 1e6)
+            gap.note(time.perf_counter_ns())
             size += answer.size
             at = _switched(answer, on=on)
             right += at > newest
             newest = max(newest, at)
+    say("progress", asked=count, answered=len(latencies_ms))
     say(
         "done",
         calls=count,
@@ -165,6 +189,7 @@ def call(node: Node, orders: Orders, count: int) -> NoReturn:
         answered=len(latencies_ms),
         right=right,
         latency_ms=_latency(latencies_ms),
+        silent_ms=gap.longest_ms,
     )
     orders.wait_for(Order.GO)
     while True:

@@ -109,6 +109,26 @@ def test_a_call_without_an_answer_fails_in_time_on_both_sides(sites: Sites) -> N
     assert (server.faults, client.faults) == ({"timed-out": 1}, {"timed-out": 1})
 
 
+@pytest.mark.parametrize(
+    ("more", "outcomes"), [("", [b"\0\1\0\0" + bytes(16)]), (", on_timeout: silent", ["no answer within 2 s"])]
+)
+def test_a_timeout_answers_an_empty_response_unless_it_is_to_be_silent(
+    sites: Sites, more: str, outcomes: list[bytes | str]
+) -> None:
+    plan = known.service("test_msgs/srv/Plan", "int64 goal\n", "int32[] path\nfloat64 cost\n")
+    services = {plan.type_name: plan}
+    graphs = [FakeGraph(2, known.channels(), services) for _ in range(2)]
+    rule = "kind: service, name: /plan, type: test_msgs/srv/Plan"
+    sites.add(SERVER, expose=[rule], graph=graphs[0])
+    client = sites.add(ROBOT, imports=[f"{rule}, timeout_s: 2{more}"], graph=graphs[1])
+    LocalServer(graphs[0], name="/plan", type_name="test_msgs/srv/Plan")
+    caller = Client(graphs[1], name="/plan")
+    assert sites.run(3, caller.sees_server)
+    caller.call(b"\0\1\0\0" + bytes(8))
+    assert sites.run(2.2, lambda: caller.outcomes == outcomes)
+    assert client.faults == {"timed-out": 1}
+
+
 def test_a_late_answer_never_answers_the_next_call(sites: Sites) -> None:
     _, _, local, caller = pair(sites, ", timeout_s: 2")
     caller.call(switch(on=True))

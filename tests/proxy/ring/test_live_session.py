@@ -27,12 +27,11 @@ def wait(number):
     while signal.sigwait([signal.SIGINT, signal.SIGUSR1]) != number: pass
 say('ready')
 """
-TALKER = HEAD + "wait(signal.SIGUSR1); say('progress', sent=1); say('done', sent=['aa', 'bb']); signal.pause()"
+SAYS = "say('progress', topic='/a', sent=1); say('done', sent=['aa', 'bb']);"
+TALKER = HEAD + "wait(signal.SIGUSR1);" + SAYS + "signal.pause()"
 LAMP = HEAD + "wait(signal.SIGINT); say('done', served=1); signal.pause()"
-LISTENER = (
-    HEAD
-    + "say('hears'); say('progress', received=2, latency_ms=1.5); wait(signal.SIGINT); say('done'); signal.pause()"
-)
+HEARS = "say('hears'); say('progress', topics=[dict(topic='/a', received=2)], latency_ms=1.5);"
+LISTENER = HEAD + HEARS + "wait(signal.SIGINT); say('done'); signal.pause()"
 CALLER = HEAD + "say('hears'); wait(signal.SIGUSR1); say('done', answered=1); signal.pause()"
 
 

@@ -8,19 +8,8 @@ import pytest
 
 from gdp.errors import LocalError
 from proxy.ring.cli import spelled_out
-from proxy.ring.options import Cut, Options
-
-
-def test_a_cut_names_link_and_second() -> None:
-    assert Cut.from_text("nuc2-nuc3@5") == Cut("nuc2", "nuc3", 5.0)
-    assert Cut.from_text("nuc3-nuc2@0.5") == Cut("nuc3", "nuc2", 0.5)
-    assert str(Cut("nuc2", "nuc3", 5.0)) == "nuc2-nuc3@5"
-
-
-@pytest.mark.parametrize("text", ["", "nuc2", "nuc2-nuc3", "nuc2@5", "nuc2-nuc3@", "nuc2-nuc3@-1", "nuc2-nuc3@soon"])
-def test_a_cut_written_otherwise_is_refused(text: str) -> None:
-    with pytest.raises(LocalError, match="a cut is written like nuc2-nuc3@5"):
-        Cut.from_text(text)
+from proxy.ring.faults import Cut, Kill, Roam
+from proxy.ring.options import Options
 
 
 @pytest.mark.parametrize(
@@ -35,7 +24,12 @@ def test_a_cut_written_otherwise_is_refused(text: str) -> None:
         {"json": Path("/nowhere/result.json")},
         {"pcap": Path("/nowhere/seen.pcap")},
         {"cuts": (Cut("nuc1", "nuc3", 1.0),)},
-        {"seconds": 4.0},
+        {"live": "ros2", "cuts": (Cut("nuc1", "nuc2", 10.0),)},
+        {"kills": (Kill("switch", "nuc1", 1.0),)},
+        {"roams": (Roam("cat", "nuc2", 1.0),)},
+        {"seconds": 4.0, "rate": 2.0},
+        {"seconds": 0.5},
+        {"lease_s": 0.5},
         {"live": "ros2", "seconds": 0.5},
         {"live": "ros2", "seconds": float("nan")},
         {"live": "ros2", "rate": 0.0},
@@ -49,13 +43,18 @@ def test_what_cannot_be_done_is_refused_before_anything_starts(options: dict[str
 
 
 def test_settings_are_what_json_can_write() -> None:
-    assert Options(cuts=(Cut("nuc2", "nuc3", 5.0),)).settings() == {
+    faults = {"roams": (Roam("robot", "nuc2", 6.0),), "kills": (Kill("rib", "school", 7.0, 9.0),)}
+    assert Options(cuts=(Cut("nuc2", "nuc3", 5.0),), **faults).settings() == {  # type: ignore[arg-type]
         "recording": "demo",
         "rate": 1.0,
+        "seconds": None,
         "encoding": "json",
         "data_plane": "auto",
         "mtu": 1_500,
+        "lease_s": 24.0,
         "cuts": ["nuc2-nuc3@5"],
+        "roams": ["robot:nuc2@6"],
+        "kills": ["rib:school@7-9"],
     }
 
 

@@ -15,6 +15,7 @@ from gdp.testbed.runs import Run, Runs
 from proxy.ring import replay as replay_module
 from proxy.ring.child import Child, ChildError
 from proxy.ring.children import Children
+from proxy.ring.injection import Injection
 from proxy.ring.progress import Teller
 from proxy.ring.replay import Replay, Report
 
@@ -22,13 +23,23 @@ HEAD = """
 import json, signal, sys
 def say(**fields): print(json.dumps(fields), flush=True)
 """
-SENDER = HEAD + "say(event='ready'); say(event='progress', sent=2); say(event='done', unread=None)"
+SENDER = HEAD + "say(event='ready'); say(event='progress', sent=2); say(event='done', unread=None, unconfirmed=[])"
 RECEIVER = """
 def finish(*_): say(event='done', topics=[{'topic': '/a'}]); sys.exit(0)
 signal.signal(signal.SIGINT, finish); say(event='ready'); say(event='progress', received=2, lost=0, latency_ms=1.5)
 while True: signal.pause()
 """
 RECEIVER = HEAD + RECEIVER
+
+
+class Nothing:
+    """An overlay in which nothing fails."""
+
+    async def cut(self, cut: object) -> None: ...
+    async def heal(self, cut: object) -> None: ...
+    async def kill(self, kill: object) -> None: ...
+    async def restart(self, kill: object) -> None: ...
+    async def roam(self, roam: object) -> None: ...
 
 
 @pytest.fixture
@@ -47,7 +58,7 @@ def play(run: Run, sender: str, receiver: str, told: io.StringIO | None = None) 
         await children.ready([far])
         near = children.start("sender", [sys.executable, "-c", sender])
         await children.guarded(near.wait_for("ready", 10))
-        return await Replay(children, near, far, 2, teller).report(None, ())  # type: ignore[arg-type]
+        return await Replay(children, near, far, 2, teller).report(lambda: Injection(Nothing(), (), teller))
 
     return within(run, both)
 
@@ -74,6 +85,12 @@ def test_when_the_sender_has_finished_the_receiver_is_asked_for_its_report(run: 
 
 def test_what_could_not_be_read_is_passed_on(run: Run) -> None:
     assert play(run, SENDER.replace("unread=None", "unread='cut off'"), RECEIVER).unread == "cut off"
+
+
+def test_what_was_never_confirmed_is_a_complaint_that_names_the_topic(run: Run) -> None:
+    lacking = "unconfirmed=[{'topic': '/imu', 'messages': 9, 'confirmed': 7}]"
+    report = play(run, SENDER.replace("unconfirmed=[]", lacking), RECEIVER)
+    assert report.complaints == ("/imu: 2 of 9 were never confirmed",)
 
 
 def test_an_end_that_ends_badly_is_a_complaint(run: Run) -> None:

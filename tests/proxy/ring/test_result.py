@@ -97,6 +97,7 @@ def test_json_has_a_row_for_each_topic() -> None:
             "identical": True,
             "in_order": True,
             "latency_ms": {"median": 0.5, "p99": 2.0, "max": 9.25},
+            "silent_ms": None,
             "parts": 1,
             "hops": 5,
             "hops_seen": [5, 2],

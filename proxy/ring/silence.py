@@ -1,0 +1,61 @@
+"""Which reliable flows stand still, and for how long.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+__all__ = ["TOLD_FROM_S", "Silence"]
+
+TOLD_FROM_S: Final = 1.5  # both ends report twice a second
+
+
+@dataclass(slots=True)
+class _Flow:
+    sent: int = 0
+    received: int = 0
+    since_s: float = 0.0  # nothing has come since, though something was sent
+
+    @property
+    def is_behind(self) -> bool:
+        return self.received < self.sent
+
+
+class Silence:
+    """A flow is silent while something was sent that has not been received, and nothing is received."""
+
+    def __init__(self) -> None:
+        self._flows: dict[str, _Flow] = {}
+        self.longest_s = 0.0
+
+    @property
+    def behind(self) -> int:
+        """Return how many messages were sent and not received, over all flows."""
+        return sum(max(flow.sent - flow.received, 0) for flow in self._flows.values())
+
+    def sent(self, name: str, count: int, now_s: float) -> None:
+        """Note how many messages of a flow were sent in all."""
+        flow = self._flows.setdefault(name, _Flow())
+        if not flow.is_behind:
+            flow.since_s = now_s
+        flow.sent = count
+
+    def received(self, name: str, count: int, now_s: float) -> None:
+        """Note how many messages of a flow were received in all."""
+        flow = self._flows.setdefault(name, _Flow())
+        if flow.is_behind:
+            self.longest_s = max(self.longest_s, now_s - flow.since_s)
+        if count != flow.received:
+            flow.received, flow.since_s = count, now_s
+
+    def silent(self, now_s: float) -> list[tuple[str, float]]:
+        """Return the flows that have been silent for ``TOLD_FROM_S`` or longer, with seconds, longest first."""
+        found = [
+            (name, now_s - flow.since_s)
+            for name, flow in self._flows.items()
+            if flow.is_behind and now_s - flow.since_s >= TOLD_FROM_S
+        ]
+        return sorted(found, key=lambda each: -each[1])
