@@ -1,4 +1,4 @@
-"""The first listing of the FogROS2-FT paper: a detector on two machines, the robot's client beside the robot.
+"""The first listing of the FogROS2-FT paper: a detector on two machines, the robot's client on the robot.
 
 ``fog launch examples/listing1.launch.py --dry-run``; the packages are the reader's own.
 """
@@ -8,11 +8,11 @@ from fog import CloudMachine, FogCluster, LaunchDescription, Node, SpotMachine
 
 def generate_launch_description():
     detector = Node(package="detection", executable="detector")
-    cluster = FogCluster(
+    FogCluster(
         cloud_nodes=[detector],
         deployments=[
             CloudMachine(region="us-west-1", hardware="cpu:16"),
             SpotMachine(region="us-east-1", hardware="T4"),
         ],
     )
-    return LaunchDescription([cluster, Node(package="robot", executable="robot_client")])
+    return LaunchDescription([Node(package="robot", executable="robot_client")])

@@ -69,6 +69,8 @@ class ClusterPlan:
     Args:
         idle_s: without a call for this long all machines are given back; None: never.
         budget_usd: when its machines have cost this much, they are given back; None: no limit.
+        availability: share of time for which a machine is to serve; ``fog launch`` adds to ``machines`` as many as
+            that takes. None: ``machines`` says how many there are.
     """
 
     name: str
@@ -77,6 +79,7 @@ class ClusterPlan:
     carried: tuple[Carried, ...] = ()
     idle_s: float | None = None
     budget_usd: float | None = None
+    availability: float | None = None
 
     def to_json(self) -> str:
         """Return what ``from_json`` reads."""
@@ -100,7 +103,13 @@ class ClusterPlan:
             ]
             carried = [Carried(**each) for each in items["carried"]]
             return cls(
-                items["name"], tuple(nodes), tuple(machines), tuple(carried), items["idle_s"], items["budget_usd"]
+                items["name"],
+                tuple(nodes),
+                tuple(machines),
+                tuple(carried),
+                items["idle_s"],
+                items["budget_usd"],
+                items.get("availability"),
             )
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise LocalError(f"not the plan of a cluster: {error!r}") from error

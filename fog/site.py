@@ -15,28 +15,32 @@ import json
 import os
 import secrets
 import shutil
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, TypedDict
 
 from pydantic import AfterValidator, Field, model_validator
 
 from fog.enrolment.boots import RobotDevices, robot_boot
 from fog.enrolment.members import Authority
 from fog.host.bundle import install
+from fog.latency.config import LatencyConfig
+from fog.latency.known import Latencies
 from fog.providers.aws.config import AwsConfig
 from fog.providers.skypilot.config import SkyPilotConfig
 from fog.topology import AUTOMATIC, Gateway
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError
-from gdp.nodes.config import SwitchConfig
+from gdp.limits import CLAIM_LEASE_S
+from gdp.nodes.config import LeaseSeconds, SwitchConfig
 from gdp.nodes.schema import Directory, ExistingFile, Ifname, Section, Unique, load, relative
 from gdp.stores.files import private, read_private, write_all
 from gdp.stores.issue import make_domain, make_node, make_owner
 
-__all__ = ["SCRATCH", "ProviderName", "Site", "SiteConfig", "open_site", "state_folder"]
+__all__ = ["SCRATCH", "ProviderName", "Site", "SiteConfig", "open_site", "peek_site", "state_folder"]
 
 ProviderName = Literal["local", "aws", "skypilot"]
 
@@ -81,10 +85,18 @@ class SiteConfig(Section):
     papers_days: float = Field(
         default=7.0, gt=0, le=3_650, description="How long a machine's keys hold; it is replaced before they end."
     )
+    lease_s: LeaseSeconds = Field(
+        default=CLAIM_LEASE_S,
+        description="Lease of the machines' claims, in seconds: `lease_s` of their proxy.yaml.",
+    )
     idle_s: float | None = Field(default=None, gt=0, description="Default of a cluster's idle limit, in seconds.")
     budget_usd: float | None = Field(default=None, gt=0, description="Default of a cluster's budget.")
     latency_ms: Mapping[str, Annotated[float, Field(ge=0)]] = Field(
-        default_factory=dict, description="Region: round trip from the robot, in ms; weighed against the price."
+        default_factory=dict,
+        description="Region: round trip from the robot, in ms; weighed against the price. Stands for a measurement.",
+    )
+    latency: LatencyConfig = Field(
+        default=LatencyConfig(), description="How latency is measured: an endpoint a region, and for how long it holds."
     )
 
     @property
@@ -123,6 +135,20 @@ class SiteConfig(Section):
         return load(cls, path)
 
 
+class _Settings(TypedDict):
+    provider: ProviderName
+    aws: AwsConfig
+    skypilot: SkyPilotConfig
+    topology: Gateway
+    machine_iface: str
+    papers_days: float
+    lease_s: float
+    idle_s: float | None
+    budget_usd: float | None
+    latency_ms: Mapping[str, float]
+    latency: LatencyConfig
+
+
 @dataclass(frozen=True, slots=True)
 class Site:
     """A site as the commands and the supervisor use it.
@@ -151,9 +177,16 @@ class Site:
     topology: Gateway = AUTOMATIC
     machine_iface: str = "eth0"
     papers_days: float = 7.0
+    lease_s: float = CLAIM_LEASE_S
     idle_s: float | None = None
     budget_usd: float | None = None
     latency_ms: Mapping[str, float] = field(default_factory=dict)
+    latency: LatencyConfig = field(default_factory=LatencyConfig)
+
+    @property
+    def latencies(self) -> Latencies:
+        """Return what is known of how far regions are."""
+        return Latencies(self.state, self.latency, self.latency_ms)
 
     @property
     def robot(self) -> Path | None:
@@ -187,10 +220,7 @@ def open_site(file: Path | None, state: Path | None = None) -> Site:
     Raises:
         ConfigError, LocalError: the file, keys or folders are not as they should be.
     """
-    if file is None and state is None and Path(_FILE).is_file():
-        file = Path(_FILE)
-    config = SiteConfig.load(file) if file is not None else None
-    folder = (state or (config.state if config is not None else None) or state_folder()).absolute()
+    file, config, folder = _stands_where(file, state)
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
@@ -202,6 +232,33 @@ def open_site(file: Path | None, state: Path | None = None) -> Site:
         if config is None or file is None:
             return _own(folder, identifier)
         return _stated(config, file.absolute(), folder, identifier)
+
+
+@contextmanager
+def peek_site(file: Path | None, state: Path | None = None) -> Iterator[Site]:
+    """Yield the same for those who only look: nothing is made, and no key drawn. One that is not there yet is empty.
+
+    Raises:
+        ConfigError, LocalError: as ``open_site``.
+    """
+    file, config, folder = _stands_where(file, state)
+    if (folder / _SITE).exists():
+        yield open_site(file, state)
+        return
+    with tempfile.TemporaryDirectory(prefix="gdp-fog-") as empty:
+        authority = Authority(folder / "domain", folder / "owner")
+        site = Site("000000", Path(empty), None, authority, (), None, None, "")
+        if config is not None:
+            site = replace(site, file=file, **_settings(config))
+        yield site
+
+
+def _stands_where(file: Path | None, state: Path | None) -> tuple[Path | None, SiteConfig | None, Path]:
+    """Return the site's file, what it says, and its folder."""
+    if file is None and state is None and Path(_FILE).is_file():
+        file = Path(_FILE)
+    config = SiteConfig.load(file) if file is not None else None
+    return file, config, (state or (config.state if config is not None else None) or state_folder()).absolute()
 
 
 def _identifier(folder: Path) -> str:
@@ -268,13 +325,22 @@ def _stated(config: SiteConfig, file: Path, folder: Path, identifier: str) -> Si
         revocations=revocations,
         watch=watch,
         uplink=config.uplink or f"fog{identifier}-up",
-        provider=config.provider,
-        aws=config.aws,
-        skypilot=config.skypilot,
-        topology=config.topology,
-        machine_iface=config.device,
-        papers_days=config.papers_days,
-        idle_s=config.idle_s,
-        budget_usd=config.budget_usd,
-        latency_ms=config.latency_ms,
+        **_settings(config),
     )
+
+
+def _settings(config: SiteConfig) -> _Settings:
+    """Return what a site takes from its file as it is."""
+    return {
+        "provider": config.provider,
+        "aws": config.aws,
+        "skypilot": config.skypilot,
+        "topology": config.topology,
+        "machine_iface": config.device,
+        "papers_days": config.papers_days,
+        "lease_s": config.lease_s,
+        "idle_s": config.idle_s,
+        "budget_usd": config.budget_usd,
+        "latency_ms": config.latency_ms,
+        "latency": config.latency,
+    }

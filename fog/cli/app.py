@@ -6,6 +6,8 @@ Place: command; each verb has its function elsewhere. Exit 0 when done, 2 when t
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib import metadata
+from typing import Annotated
 
 import typer
 
@@ -18,34 +20,52 @@ from fog.site import open_site
 
 __all__ = ["app", "main"]
 
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"fog {metadata.version('gdp-ros')}")
+        raise typer.Exit
+
+
 app = typer.Typer(
     name="fog",
     help="Replicated ROS services on machines that may be taken away.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command("launch", no_args_is_help=True)(launch)
+app.command("launch")(launch)
 app.command("ls")(looking.ls)
 app.command("status")(looking.status)
 app.add_typer(changing.scale, name="scale")
-app.command("logs", no_args_is_help=True)(changing.logs)
-app.command("ssh", no_args_is_help=True)(changing.ssh)
+app.command("logs")(changing.logs)
+app.command("ssh")(changing.ssh)
 app.command("cost")(looking.cost)
-app.command("plan", no_args_is_help=True)(plan)
+app.command("plan")(plan)
 app.command("prices")(cost_table)
 app.command("down")(down)
 app.command("supervise")(changing.supervise)
-app.add_typer(local_app(lambda: open_site(None).state / "local"), name="local", hidden=True)
+app.add_typer(local_app(lambda: open_site(None).state / "local"), name="local")
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+@app.callback()
+def _fog(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="print the version and end")
+    ] = False,
+) -> None:
+    del version
+
+
+def main(arguments: Sequence[str] | None = None, *, name: str = "fog") -> None:
     """Run the command and leave with its exit code.
 
     Args:
         arguments: as after the program's name; those of this process if not given.
+        name: of the program, for its help.
     """
-    app(args=None if arguments is None else list(arguments), prog_name="fog")
+    app(args=None if arguments is None else list(arguments), prog_name=name)
 
 
 if __name__ == "__main__":

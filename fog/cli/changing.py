@@ -13,7 +13,8 @@ from typing import Annotated, Final, Optional
 
 import typer
 
-from fog.cli.launching import choices, follow
+from fog.cli.launching import follow
+from fog.cli.market import choices, market, refusal
 from fog.cli.options import AsJson, ClusterOption, SiteFile, State, opened, the_cluster
 from fog.cli.views import print_json, stage
 from fog.enrolment.boots import PROXY
@@ -63,10 +64,10 @@ def up(
         plan = the_cluster(journal, cluster).plan
         more = [replace(plan.machines[-1], region="")] * count
         with closing(open_provider(here)) as provider:
-            offers = choices(provider, more, here.latency_ms)
+            offers = choices(market(provider, more, here.latencies), more)
+            if None in offers:
+                raise LocalError(refusal(provider, more, offers))
         usd = sum(each.usd_per_hour for each in offers if each is not None)
-        if None in offers:
-            raise LocalError(f"{more[0].hardware.to_text()}: not to be had")
         if dry_run:
             _say({"cluster": plan.name, "adds": count, "usd_per_hour": round(usd, 6)}, as_json=as_json)
             return

@@ -12,10 +12,9 @@ from contextlib import closing, suppress
 from typing import Annotated, Final
 
 import typer
-from rich.console import Console
 
 from fog.cli.options import AsJson, ClusterName, SiteFile, State, opened
-from fog.cli.views import event_line, print_json
+from fog.cli.views import a_console, event_line, print_json
 from fog.machine import MachineState
 from fog.site import Site
 from fog.supervisor.background import ensure, is_running, pid_of
@@ -30,11 +29,17 @@ _LEAVE_S: Final = 5.0
 _STEP_S: Final = 0.05
 _TRIES: Final = 5
 
+IfUp = Annotated[bool, typer.Option("--if-up", hidden=True)]  # of a launch that need not have begun
 All = Annotated[bool, typer.Option("--all", help="every cluster, and all that they stand on")]
 
 
 def down(
-    cluster: ClusterName = None, all_: All = False, site: SiteFile = None, state: State = None, as_json: AsJson = False
+    cluster: ClusterName = None,
+    all_: All = False,
+    if_up: IfUp = False,
+    site: SiteFile = None,
+    state: State = None,
+    as_json: AsJson = False,
 ) -> None:
     """Give all machines of a cluster back; of the only one, if no name is given.
 
@@ -48,6 +53,9 @@ def down(
     """
     with opened(site, state, supervised=False) as (here, journal):
         known = {each.plan.name: each for each in journal.clusters()}
+        if cluster is not None and cluster not in known and not if_up and not _has_machines(here, cluster):
+            up = ", ".join(name for name in sorted(known) if known[name].is_up) or "none"
+            raise LocalError(f"no cluster is called {cluster}; up: {up}")
         names = [cluster] if cluster is not None else sorted({*known, *(_standing(here) if all_ else ())})
         if cluster is None and not all_:
             names = [name for name in names if known[name].is_up] or names[:1]
@@ -74,7 +82,7 @@ def end_cluster(site: Site, journal: Journal, name: str, why: str, *, as_json: b
     Raises:
         StoreError: the provider cannot be asked.
     """
-    console = Console(stderr=as_json, highlight=False)
+    console = a_console(stderr=as_json)
     last = max((each.id for each in journal.events(last=1)), default=0)
     journal.unwant(name, why, time.time())
     is_known = any(each.plan.name == name for each in journal.clusters())
@@ -120,6 +128,12 @@ def _standing(site: Site) -> set[str]:
     from fog.providers.local.standing import standing
 
     return {each.file.spec.cluster for each in standing(local_provider(site).runs)}
+
+
+def _has_machines(site: Site, cluster: str) -> bool:
+    """Return whether the provider has machines of a cluster that no journal knows."""
+    with closing(open_provider(site)) as provider:
+        return any(each.state is not MachineState.GONE for each in provider.describe(cluster))
 
 
 def _leave(site: Site) -> None:

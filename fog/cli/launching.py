@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import signal
 import time
-from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -18,20 +17,18 @@ import typer
 from rich.console import Console
 
 from fog.cli.ending import clear, end_cluster
-from fog.cli.options import AsJson, SiteFile, State, opened
+from fog.cli.market import choices, market, reached, refusal
+from fog.cli.options import AsJson, SiteFile, State, opened, peeked
 from fog.cli.robot_nodes import INTERRUPTED, resolved, run
-from fog.cli.views import event_line, print_json
-from fog.cluster import ClusterPlan, Wanted
-from fog.offer import Offer
-from fog.plan.choice import choose
-from fog.providers.provider import Provider
+from fog.cli.views import a_console, event_line, print_json
+from fog.cluster import ClusterPlan
 from fog.site import Site
 from fog.supervisor.background import LOG, ensure
 from fog.supervisor.ground import command_of, open_provider, stand
 from fog.supervisor.journal import Entry, Journal
 from gdp.errors import LocalError
 
-__all__ = ["begin", "choices", "follow", "launch"]
+__all__ = ["begin", "follow", "launch"]
 
 log = logging.getLogger(__name__)
 
@@ -70,23 +67,35 @@ def launch(
       fog launch demo.launch.py
       fog launch demo.launch.py rate:=10 --detach
     """
-    from fog.cli.launch import BY_HAND, loaded_from, show_plan  # rules and their messages: half a second to import
+    from fog.cli.launch import BY_HAND, Priced, loaded_from, show_plan  # half a second to import
 
-    with opened(site, state) as (here, journal):
+    def priced(here: Site) -> Priced:
         loaded = loaded_from(file, arguments or [], dry_run=dry_run)
+        said = loaded.plan
         plan = replace(
-            loaded.plan,
-            idle_s=here.idle_s if loaded.plan.idle_s is None else loaded.plan.idle_s,
-            budget_usd=here.budget_usd if loaded.plan.budget_usd is None else loaded.plan.budget_usd,
+            said,
+            idle_s=here.idle_s if said.idle_s is None else said.idle_s,
+            budget_usd=here.budget_usd if said.budget_usd is None else said.budget_usd,
         )
         with closing(open_provider(here, [each.region for each in plan.machines if each.region])) as provider:
-            offers = choices(provider, plan.machines, here.latency_ms)
+            found = market(provider, plan.machines, here.latencies)
+            if None in (chosen := choices(found, plan.machines)):
+                raise LocalError(refusal(provider, plan.machines, chosen))
+            plan, target = reached(plan, found)
+            whole = Priced(replace(loaded, plan=plan), choices(found, plan.machines), found.latencies, target)
+        ends = ends_with
         if not (detach or keep or loaded.keep) and loaded.robot_nodes:
-            ends_with = "the robot's nodes"
-        ends = f"with {ends_with}, or {BY_HAND}" if ends_with else BY_HAND
-        show_plan(replace(loaded, plan=plan), offers, ends, as_json=as_json)
-        if dry_run:
-            return
+            ends = "the robot's nodes"
+        show_plan(whole, f"with {ends}, or {BY_HAND}" if ends else BY_HAND, as_json=as_json)
+        return whole
+
+    if dry_run:
+        with peeked(site, state) as here:
+            priced(here)
+        return
+    with opened(site, state) as (here, journal):
+        loaded = priced(here).loaded
+        plan = loaded.plan
         for node in plan.nodes:
             command_of(here, node)  # complains before anything is started
         robot = [] if detach else [resolved(each) for each in loaded.robot_nodes]
@@ -111,21 +120,6 @@ def launch(
         raise typer.Exit(code)
 
 
-def choices(provider: Provider, machines: Sequence[Wanted], latency_ms: Mapping[str, float]) -> list[Offer | None]:
-    """Return for each machine what it would be now; None: nothing like it is to be had."""
-    offers: dict[Offer, None] = {}
-    for each in dict.fromkeys(machines):
-        offers |= dict.fromkeys(provider.offers(each.hardware, spot=each.is_spot))
-    found: list[Offer | None] = []
-    for each in machines:
-        used = [offer.region for offer in found if offer is not None]
-        try:
-            found.append(choose(list(offers), [each], latency_ms, used=used)[0].offer)
-        except LocalError:
-            found.append(None)
-    return found
-
-
 def begin(site: Site, journal: Journal, plan: ClusterPlan) -> None:
     """Write that a cluster is wanted, and see to it that somebody cares for it.
 
@@ -138,15 +132,17 @@ def begin(site: Site, journal: Journal, plan: ClusterPlan) -> None:
 
 
 def follow(site: Site, journal: Journal, plan: ClusterPlan, after: int, patience_s: float, *, as_json: bool) -> None:
-    """Show what happens until all replicas serve.
+    """Show what happens until all replicas serve; where no watch can tell, until all machines are up.
 
     Raises:
         LocalError: they do not in time, or the cluster is given up.
     """
-    console = Console(stderr=as_json, highlight=False)
+    console = a_console(stderr=as_json)
     end_s = time.monotonic() + patience_s
     wanted = len(plan.machines)
     trouble = ""
+    is_watched = site.watch is not None
+    serve = "replicas serve" if is_watched else "machines up (not watched)"
 
     def news() -> tuple[int, str]:
         last, told = after, trouble
@@ -159,7 +155,7 @@ def follow(site: Site, journal: Journal, plan: ClusterPlan, after: int, patience
     with console.status("") as spinner:
         while True:
             serving = sum(each.is_serving for each in journal.machines(plan.name, gone=False))
-            spinner.update(f"{serving} of {wanted} replicas serve")
+            spinner.update(f"{serving} of {wanted} {serve}")
             after, trouble = news()
             if serving >= wanted:
                 break
@@ -168,13 +164,13 @@ def follow(site: Site, journal: Journal, plan: ClusterPlan, after: int, patience
             if time.monotonic() >= end_s:
                 why = f"; last trouble: {trouble}" if trouble else ""
                 raise LocalError(
-                    f"{serving} of {wanted} replicas serve after {patience_s:g} s{why}; it goes on: fog status;"
+                    f"{serving} of {wanted} {serve} after {patience_s:g} s{why}; it goes on: fog status;"
                     f" the supervisor's words are in {site.state / LOG}"
                 )
             ensure(site)
             time.sleep(_STEP_S)
     if not as_json:
-        console.print(f"[green]{wanted} replicas serve[/]")
+        console.print(f"{wanted} {serve}", style="green" if is_watched else "yellow")
 
 
 def _tell(entry: Entry, console: Console, *, as_json: bool) -> None:

@@ -5,16 +5,19 @@ Place: command.
 
 from __future__ import annotations
 
+import sys
 import time
-from typing import Annotated, Final, Optional
+from collections.abc import Callable, Sequence
+from typing import Annotated, Final, NoReturn, Optional
 
 import typer
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 
 from fog.cli.options import AsJson, ClusterName, SiteFile, State, opened, the_cluster
 from fog.cli.views import (
+    a_console,
     cluster_fields,
     clusters_table,
     cost_fields,
@@ -29,12 +32,14 @@ from fog.cli.views import (
 from fog.site import Site
 from fog.supervisor.background import pid_of
 from fog.supervisor.journal import Cluster, Journal
+from fog.supervisor.record import Record
 
 __all__ = ["cost", "ls", "status"]
 
 _STEP_S: Final = 0.2
 _EVENTS: Final = 20
 _LATEST: Final = 6
+_FLEETING: Final = {"age_s", "usd", "usd_ever"}
 
 Everything = Annotated[bool, typer.Option("--all", "-a", help="those that are gone as well")]
 Events = Annotated[bool, typer.Option("--events", help="what happened, the newest last")]
@@ -84,9 +89,14 @@ def status(
             if events:
                 _events(journal, name, last or _EVENTS, follow=follow, as_json=as_json)
             elif as_json:
-                print_json(_status(here, journal, found, gone=all_))
+                _as_json(lambda: _status(here, journal, journal.cluster(name), gone=all_), follow=follow)
+            elif follow and not a_console().is_terminal:
+                show(_page(here, journal, found, gone=all_))
+                _follow(
+                    journal, name, max((each.id for each in journal.events(name, last=1)), default=0), as_json=False
+                )
             elif follow:
-                with Live(console=Console(highlight=False), auto_refresh=False) as live:
+                with Live(console=a_console(), auto_refresh=False) as live:
                     while True:
                         live.update(_page(here, journal, journal.cluster(name), gone=all_), refresh=True)
                         time.sleep(_STEP_S)
@@ -127,14 +137,15 @@ def _status(site: Site, journal: Journal, cluster: Cluster, *, gone: bool) -> di
     return {
         **cluster_fields(cluster, records, now_s),
         "supervisor_pid": pid_of(site),
-        "members": [machine_fields(each, now_s, site.latency_ms) for each in records if gone or not each.is_gone],
+        "watched": site.watch is not None,
+        "members": _members(site, records, now_s, gone=gone),
         "cost": cost_fields(cluster, records, now_s),
     }
 
 
 def _page(site: Site, journal: Journal, cluster: Cluster, *, gone: bool) -> Group:
     now_s, records = time.time(), journal.machines(cluster.plan.name)
-    rows = [machine_fields(each, now_s, site.latency_ms) for each in records if gone or not each.is_gone]
+    rows = _members(site, records, now_s, gone=gone)
     pid = pid_of(site)
     supervisor = f"pid {pid}" if pid is not None else "begins" if cluster.is_up else "none lives, none is needed"
     parts: list[Table | str | Group] = [
@@ -155,12 +166,45 @@ def _events(journal: Journal, name: str, last: int, *, follow: bool, as_json: bo
             print_json(entry)
     else:
         show(events_table(entries))
-    console, after = Console(highlight=False), max((each.id for each in entries), default=0)
-    while follow:
+    if follow:
+        _follow(journal, name, max((each.id for each in entries), default=0), as_json=as_json)
+
+
+def _follow(journal: Journal, name: str, after: int, *, as_json: bool) -> NoReturn:
+    """Print what happens, a line each, until Ctrl-C."""
+    console = a_console()
+    while True:
         for entry in journal.events(name, after=after):
             after = entry.id
             if as_json:
                 print_json(entry)
             else:
                 console.print(event_line(entry))
+        sys.stdout.flush()
         time.sleep(_STEP_S)
+
+
+def _as_json(look: Callable[[], dict[str, object]], *, follow: bool) -> None:
+    """Print what there is as a line of JSON; with ``follow`` again whenever more than time and cost have changed."""
+    told: object = None
+    while True:
+        now = look()
+        if (state := _lasting(now)) != told:
+            told = state
+            print_json(now)
+            sys.stdout.flush()
+        if not follow:
+            return
+        time.sleep(_STEP_S)
+
+
+def _lasting(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _lasting(each) for key, each in value.items() if key not in _FLEETING}
+    return [_lasting(each) for each in value] if isinstance(value, list) else value
+
+
+def _members(site: Site, records: Sequence[Record], now_s: float, *, gone: bool) -> list[dict[str, object]]:
+    shown = [each for each in records if gone or not each.is_gone]
+    latency_ms = site.latencies.ms((each.spec.offer.region for each in shown), now_s)
+    return [machine_fields(each, now_s, latency_ms, is_watched=site.watch is not None) for each in shown]

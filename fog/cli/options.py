@@ -12,13 +12,13 @@ from typing import Annotated, Optional
 
 import typer
 
-from fog.site import Site, open_site
+from fog.site import Site, open_site, peek_site
 from fog.supervisor.background import ensure
 from fog.supervisor.journal import Cluster, Journal
 from gdp.cli.node import failing_clearly
 from gdp.errors import LocalError
 
-__all__ = ["AsJson", "ClusterName", "ClusterOption", "SiteFile", "State", "opened", "the_cluster"]
+__all__ = ["AsJson", "ClusterName", "ClusterOption", "SiteFile", "State", "opened", "peeked", "the_cluster"]
 
 # The command line's library reads these annotations at run time, on Python 3.10 too: hence Optional.
 SiteFile = Annotated[
@@ -50,6 +50,13 @@ def opened(file: Path | None, state: Path | None, *, supervised: bool = True) ->
             if supervised and any(each.is_up for each in journal.clusters()):
                 ensure(site)
             yield site, journal
+
+
+@contextmanager
+def peeked(file: Path | None, state: Path | None) -> Iterator[Site]:
+    """The site for a verb that changes nothing; errors as with ``opened``."""
+    with failing_clearly(), peek_site(file, state) as site:
+        yield site
 
 
 def the_cluster(journal: Journal, name: str | None) -> Cluster:

@@ -6,21 +6,24 @@ Place: command.
 from __future__ import annotations
 
 import json
+import time
 from typing import Annotated, Optional
 
 import typer
-from rich.console import Console
 from rich.table import Column, Table
 
 from fog.catalog.aws import aws_prices
 from fog.catalog.measured import measured
 from fog.catalog.prices import price_list, regions_of
+from fog.cli.options import SiteFile, State
+from fog.cli.views import a_console, latency_lines, ms_text
 from fog.hardware import Hardware
 from fog.offer import Offer
 from fog.plan.answer import Answer, Question, answer
 from fog.plan.choice import BY_BOTH, Weights
 from fog.plan.cost import HOURS_A_MONTH
 from fog.plan.duration import duration_text, seconds_from_text
+from fog.site import peek_site
 from gdp.cli.node import failing_clearly
 from gdp.errors import LocalError
 
@@ -101,9 +104,13 @@ def cost_table(
     region: Regions = [],  # noqa: B006
     provider: Provider = "aws",
     everything: All = False,
+    site: SiteFile = None,
+    state: State = None,
     as_json: AsJson = False,
 ) -> None:
     """Say what machines with enough hardware cost, on demand and as spot machines, by the hour and the month.
+
+    With fog.yaml also how far each region is, as stated or measured there.
 
     \b
     Example:
@@ -115,6 +122,10 @@ def cost_table(
         spots = {(o.region, o.type_name): o for o in price_list(provider, wanted, spot=True, regions=region)}
         if not on_demand:
             raise LocalError(f"{provider} has no price of a machine with {wanted.to_text()}")
+        with peek_site(site, state) as here:
+            regions = list(dict.fromkeys(where for where, _ in on_demand))
+            here.latencies.refresh(regions, time.time())
+            latencies = here.latencies.of(regions, time.time())
         aws = aws_prices()
         rows: list[dict[str, object]] = []
         for (where, name), offer in sorted(
@@ -130,39 +141,44 @@ def cost_table(
                     "on_demand_usd_per_hour": offer.usd_per_hour,
                     "spot_usd_per_hour": spot and spot.usd_per_hour,
                     "taken_a_month": None if band is None else aws.bands[band],
+                    "latency_ms": latencies[where].ms,
+                    "latency_source": latencies[where].source,
                 }
             )
         if as_json:
             typer.echo(json.dumps({"provider": provider, "sources": list(_sources(provider)), "offers": rows}))
             return
         shown = rows if everything else rows[:_MOST_ROWS]
-        table = Table("region", "type", "hardware", *_right("on demand /h", "spot /h", "spot /month"), "taken a month")
+        columns = _right("ms", "on demand /h", "spot /h", "spot /month")
+        table = Table("region", "type", "hardware", *columns, "taken a month")
         for row in shown:
             usd = spots.get((str(row["region"]), str(row["type"])))
             table.add_row(
                 str(row["region"]),
                 str(row["type"]),
                 str(row["hardware"]),
+                ms_text(latencies[str(row["region"])]),
                 f"{on_demand[str(row['region']), str(row['type'])].usd_per_hour:.4f}",
                 f"{usd.usd_per_hour:.4f}" if usd else "-",
                 f"{usd.usd_per_hour * HOURS_A_MONTH:.2f}" if usd else "-",
                 str(row["taken_a_month"] or "-"),
             )
-        console = Console()
+        console = a_console()
         console.print(table)
         if len(shown) < len(rows):
             console.print(f"{len(rows) - len(shown)} more: --all")
+        for line in latency_lines({str(row["region"]): latencies[str(row["region"])] for row in shown}):
+            console.print(f"ms. {line}", style="dim")
         for source in _sources(provider):
-            console.print(f"USD. {source}", style="dim", highlight=False)
+            console.print(f"USD. {source}", style="dim")
 
 
 def _show(question: Question, result: Answer) -> None:
-    console = Console()
+    console = a_console()
     pool = result.independent
     console.print(
         f"[bold]replicas: {result.replicas}[/bold] ({len(result.choices)} to be added): none is up for "
         f"{result.p_system:.4%} of the time, and {question.target:.4%} is allowed; one is down for {result.p_vm:.3%}",
-        highlight=False,
     )
     table = Table("if machines", *_right("replicas", "none up", "in a year"))
     table.add_row("are placed as below", str(result.replicas), *_chance(result.p_system))
@@ -186,7 +202,7 @@ def _show(question: Question, result: Answer) -> None:
         console.print(table)
     console.print("Assumed:")
     for line in result.assumptions:
-        console.print(f"- {line}", style="dim", highlight=False)
+        console.print(f"- {line}", style="dim")
 
 
 def _document(question: Question, result: Answer) -> dict[str, object]:

@@ -16,25 +16,30 @@ from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from fog.latency.known import NO_ENDPOINT, Latency
 from fog.plan.duration import duration_text
 from fog.supervisor.journal import Cluster, Entry
 from fog.supervisor.record import Record, cost_usd
 
 __all__ = [
+    "a_console",
     "cluster_fields",
     "clusters_table",
     "cost_fields",
     "costs_table",
     "event_line",
     "events_table",
+    "latency_lines",
     "machine_fields",
     "machines_table",
+    "ms_text",
     "print_json",
     "show",
     "stage",
 ]
 
 MONTH_H: Final = 730.0
+_PIPE_COLUMNS: Final = 10_000  # whoever reads a pipe reads whole lines
 _STYLES: Final = {
     "serving": "green",
     "unheard": "red",
@@ -51,8 +56,12 @@ _STYLES: Final = {
 }
 
 
-def stage(record: Record) -> str:
-    """Return where a machine is, in one word."""
+def stage(record: Record, *, is_watched: bool = True) -> str:
+    """Return where a machine is, in one word.
+
+    Args:
+        is_watched: whether somebody hears who serves; else a machine is *up* at best.
+    """
     if record.is_gone:
         return "gone" if record.ending is None else record.ending.value
     if record.is_released:
@@ -62,18 +71,20 @@ def stage(record: Record) -> str:
     if record.noticed_unix_s is not None:
         return "notice"
     if record.is_serving:
-        return "serving"
+        return "serving" if is_watched else "up"
     if record.served_unix_s is not None:
         return "unheard"
     return "asked" if not record.id else "booting" if record.up_unix_s is None else "up"
 
 
-def machine_fields(record: Record, now_s: float, latency_ms: Mapping[str, float] | None = None) -> dict[str, object]:
+def machine_fields(
+    record: Record, now_s: float, latency_ms: Mapping[str, float] | None = None, *, is_watched: bool = True
+) -> dict[str, object]:
     """Return what JSON says of a machine; ``latency_ms``: of regions, as far as it is known."""
     offer = record.spec.offer
     return {
         "name": record.name,
-        "stage": stage(record),
+        "stage": stage(record, is_watched=is_watched),
         "serving": record.is_serving,
         "region": offer.region,
         "latency_ms": (latency_ms or {}).get(offer.region),
@@ -210,9 +221,17 @@ def _detail(entry: Entry) -> Text:
     return Text("; ".join(words))
 
 
+def a_console(*, stderr: bool = False) -> Console:
+    """Return where people read: as wide as their terminal, and without a terminal as wide as what is printed."""
+    console = Console(stderr=stderr, highlight=False)
+    if not console.is_terminal:
+        console.width = _PIPE_COLUMNS
+    return console
+
+
 def show(*parts: RenderableType) -> None:
     """Print tables."""
-    console = Console(highlight=False)
+    console = a_console()
     for part in parts:
         console.print(part)
 
@@ -220,6 +239,21 @@ def show(*parts: RenderableType) -> None:
 def print_json(value: object) -> None:
     """Print one JSON value."""
     typer.echo(json.dumps(value, ensure_ascii=False, default=asdict))
+
+
+def ms_text(latency: Latency) -> str:
+    """Return a latency as tables show it."""
+    return "-" if latency.ms is None else f"{latency.ms:g}"
+
+
+def latency_lines(latencies: Mapping[str, Latency]) -> list[str]:
+    """Return where the figures come from, regions with the same source together."""
+    if all(each.source == NO_ENDPOINT for each in latencies.values()):
+        return [NO_ENDPOINT]
+    sources: dict[str, list[str]] = {}
+    for region, each in sorted(latencies.items()):
+        sources.setdefault(each.source, []).append(region if each.ms is None else f"{region} {each.ms:g} ms")
+    return [f"{', '.join(regions)}: {source}" for source, regions in sources.items()]
 
 
 def _table(*headings: str) -> Table:

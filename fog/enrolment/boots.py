@@ -21,6 +21,7 @@ from fog.enrolment.members import Authority
 from fog.enrolment.papers import Papers
 from fog.machine import Boot, Program
 from gdp.crypto.certificates import Membership, Role
+from gdp.limits import CLAIM_LEASE_S
 
 __all__ = ["PROXY", "RobotDevices", "gateway_boot", "machine_boot", "node_names", "robot_boot", "robot_rule"]
 __all__ += ["SWITCH"]
@@ -66,6 +67,7 @@ def machine_boot(
     iface: str,
     days: float,
     shares_host: bool,
+    lease_s: float = CLAIM_LEASE_S,
 ) -> tuple[Boot, Papers]:
     """Enrol a machine of a cluster; return what it boots, and the papers by which it is known.
 
@@ -75,6 +77,7 @@ def machine_boot(
         iface: its device towards the overlay.
         days: how long its papers hold.
         shares_host: whether other machines run on the same host.
+        lease_s: of its claims.
 
     Raises:
         LocalError: as ``Authority.enrol``.
@@ -97,6 +100,7 @@ def machine_boot(
                 **_who(PROXY),
                 "iface": "proxy0",
                 "delegations": f"{PROXY}/delegations",
+                "lease_s": lease_s,
                 "ros": {"endpoint": "ros2", "domain": domain, "alone": True},
                 "expose": rules,
             }

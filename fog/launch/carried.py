@@ -22,8 +22,8 @@ SomeReplication: TypeAlias = Replication | str | Mapping[str, object]
 _BOTH_SIDES: Final = ("encoding", "max_bytes", "metadata", "priority")
 _ROBOT_SIDE: Final[dict[Kind, tuple[str, ...]]] = {
     "topic": (),
-    "service": ("replication", "state", "timeout_s"),
-    "action": ("replication", "timeout_s"),
+    "service": ("on_timeout", "replication", "state", "timeout_s"),
+    "action": ("on_timeout", "replication", "timeout_s"),
 }
 _MACHINE_SIDE: Final[dict[Kind, tuple[str, ...]]] = {
     "topic": ("max_hz",),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import cast
+from typing import Final, cast
 
 import yaml
 
@@ -16,7 +16,9 @@ from fog.launch.description import LaunchConfiguration, Node, Parameters, Text, 
 from fog.launch.ros_args import named, parameters_of_file, parameters_of_map, remapped
 from gdp.errors import LocalError
 
-__all__ = ["cloud_node", "parameters_in"]
+__all__ = ["cloud_node", "parameter_rule", "parameters_in"]
+
+_TUPLE: Final = "!!python/tuple"
 
 
 def cloud_node(node: Node, given: Mapping[str, str]) -> CloudNode:
@@ -41,17 +43,48 @@ def cloud_node(node: Node, given: Mapping[str, str]) -> CloudNode:
     )
 
 
-def parameters_in(path: Path, name: str | None, namespace: str | None) -> list[str]:
+def parameters_in(path: Path, name: str | None, namespace: str | None, *, has_tuples: bool = False) -> list[str]:
     """Return the words that set what a file of parameters says of a node.
+
+    Args:
+        has_tuples: launch_ros wrote it, which makes a tuple of every list.
 
     Raises:
         LocalError: it cannot be read or used.
     """
     try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+        document = yaml.load(path.read_text(encoding="utf-8"), _WithTuples if has_tuples else yaml.SafeLoader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise LocalError(f"parameters: {path}: {error}") from error
     return parameters_of_file(document, str(path), name, namespace)
+
+
+def parameter_rule(rule: str) -> str:
+    """Return ``name:=value`` as a node reads it, where launch_ros wrote the value as a tuple.
+
+    Raises:
+        LocalError: the value is not YAML.
+    """
+    key, _, value = rule.partition(":=")
+    if _TUPLE not in value:
+        return rule
+    try:
+        document = yaml.load(value, _WithTuples)
+    except yaml.YAMLError as error:
+        raise LocalError(f"parameter {key}: {error}") from error
+    (_, rule) = parameters_of_map({key: document})
+    return rule
+
+
+def _list(loader: yaml.SafeLoader, node: yaml.SequenceNode) -> list[object]:
+    return list(loader.construct_sequence(node))
+
+
+class _WithTuples(yaml.SafeLoader):
+    """Reads ``!!python/tuple`` as a list; anything else of Python is refused."""
+
+
+_WithTuples.add_constructor("tag:yaml.org,2002:python/tuple", _list)
 
 
 def _parameters(said: Parameters, given: Mapping[str, str], name: str | None, namespace: str | None) -> list[str]:

@@ -1,6 +1,6 @@
 """``FogCluster``: nodes that run on every machine of a cluster, as a launch file says it.
 
-Place: pure; ``ros_action`` makes an action of ROS 2's ``launch`` of it.
+Place: pure but for ``unreturned``, which remembers it; ``ros_action`` makes an action of ROS 2's ``launch`` of it.
 Source: FogROS2-FT, Listing 1.
 """
 
@@ -10,6 +10,7 @@ from collections.abc import Iterable
 
 from fog.launch.carried import Offered, SomeReplication
 from fog.launch.machines import CloudMachine
+from fog.launch.unreturned import note
 from fog.launch.wish import Wish
 
 __all__ = ["FogCluster"]
@@ -17,6 +18,8 @@ __all__ = ["FogCluster"]
 
 class FogCluster:
     """Nodes on machines, each machine a replica of all of them.
+
+    It takes effect by being made within a launch file; the launch description need not have it.
 
     Args:
         cloud_nodes: ``Node`` each.
@@ -29,6 +32,8 @@ class FogCluster:
         timeout_s: how long an answer may take; None: the proxy's 5 s.
         idle: without a call for this long (seconds, or such as ``"30min"``) the machines are given back.
         budget_usd: when they have cost this much they are given back.
+        availability: share of time for which a machine is to serve, such as 0.9995, in place of ``replicas``:
+            ``fog launch`` adds copies of the listed machines until that is reached, and says what it assumes.
         keep: leave the cluster running when the launch ends.
 
     Raises:
@@ -50,6 +55,7 @@ class FogCluster:
         idle: float | str | None = None,
         budget_usd: float | None = None,
         keep: bool = False,
+        availability: float | None = None,
     ) -> None:
         super().__init__()
         self.cloud_nodes = tuple(cloud_nodes)
@@ -65,4 +71,6 @@ class FogCluster:
             idle=idle,
             budget_usd=budget_usd,
             keep=keep,
+            availability=availability,
         )
+        note(self)

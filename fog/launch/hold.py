@@ -56,7 +56,7 @@ def main() -> None:
     path, separator, *command = sys.argv[1:] if len(sys.argv) > 3 else ("", "")
     if separator != "--":
         sys.exit("expected: GATE -- COMMAND [ARGUMENT ...]")
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, lambda *_: sys.exit(0))  # the launch ends before there is anything to break off
     try:
         with open(path, encoding="utf-8") as gate:
             fcntl.flock(gate, fcntl.LOCK_SH)
@@ -64,6 +64,7 @@ def main() -> None:
     except FileNotFoundError:
         is_serving = False
     if not is_serving:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launch sends it at the same moment
         sys.exit("not started: the cluster does not serve")
     os.execvp(command[0], command)
 

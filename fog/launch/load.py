@@ -19,6 +19,7 @@ from fog.cluster import Carried, CloudNode, ClusterPlan
 from fog.launch.cloud_node import cloud_node
 from fog.launch.description import DeclareLaunchArgument, LaunchDescription, Node
 from fog.launch.entity import FogCluster
+from fog.launch.unreturned import watch
 from fog.launch.wish import Wish
 from fog.launch.words import has_ros_launch
 from gdp.errors import ConfigError, GdpError, LocalError
@@ -181,6 +182,7 @@ def _module(path: Path) -> ModuleType:
     if spec is None or spec.loader is None:
         raise ConfigError(str(path), "", "expected a Python launch file (.py), or a plan (.json)")
     module = importlib.util.module_from_spec(spec)
+    watch(module)
     folder = str(path.resolve().parent)
     sys.path.insert(0, folder)
     try:

@@ -18,7 +18,7 @@ from launch.utilities import normalize_to_list_of_substitutions, perform_substit
 from launch_ros.actions import Node
 
 from fog.cluster import CloudNode
-from fog.launch.cloud_node import parameters_in
+from fog.launch.cloud_node import parameter_rule, parameters_in
 from fog.launch.load import RobotNode
 from fog.launch.ros_action import FogCluster
 from fog.launch.wish import Wish
@@ -52,7 +52,7 @@ def gathered(
         if isinstance(entity, FogCluster):
             clusters.append((entity.wish, [cloud_node(each, context) for each in entity.cloud_nodes]))
         elif isinstance(entity, Node):
-            robot.append(RobotNode(cloud_node(entity, context)))
+            robot.append(RobotNode(cloud_node(entity, context), _output(entity, context)))
         elif isinstance(entity, ExecuteProcess):
             raise LocalError("the launch description starts a process that is no Node: run it with ros2 launch")
         else:
@@ -93,12 +93,25 @@ def _without_files(words: Sequence[str], name: str | None, namespace: str | None
     for word in rest:
         if word == "--params-file":
             path = Path(next(rest))
-            kept += parameters_in(path, name, namespace)
-            if path.name.startswith(_MADE) and path.parent == Path(tempfile.gettempdir()):
+            is_made = path.name.startswith(_MADE) and path.parent == Path(tempfile.gettempdir())
+            kept += parameters_in(path, name, namespace, has_tuples=is_made)
+            if is_made:
                 path.unlink()
+        elif word == "-p":
+            kept += [word, parameter_rule(next(rest))]
         else:
             kept.append(word)
     return [] if kept == ["--ros-args"] else kept
+
+
+def _output(node: Node, context: LaunchContext) -> str:
+    """Return where a node's standard output goes, ``screen`` or ``log``, as ``launch.logging`` reads it."""
+    said = node.output
+    if isinstance(said, dict):
+        words = {*said.get("stdout", ()), *said.get("both", ())}
+    else:
+        words = {perform_substitutions(context, said)}
+    return "screen" if words & {"screen", "both", "full"} else "log"
 
 
 def _inside(entity: object, context: LaunchContext) -> Iterable[object]:

@@ -3,7 +3,10 @@
 Place: shell; imports ROS 2's ``launch``. The cluster itself is the ``fog`` command's business, in processes of its own.
 Processes that come after the cluster in the description start when it serves: ``hold`` is put before them, through
 the launch configuration ``launch-prefix``; a node with a ``prefix`` of its own is not held.
-Source: launch 3.4 (jazzy): ``Action``, ``OnShutdown``, ``Shutdown``; ``descriptions/executable.py`` for the prefix.
+A cluster that cannot start ends the launch as any fault of an action does, with its reason and exit code 1: an
+exception in an event handler does that, ``Shutdown(reason=...)`` does neither.
+Source: launch 3.4.3 (jazzy): ``Action``, ``OnShutdown``, ``LaunchService.run_async``; ``descriptions/executable.py``
+for the prefix, ``actions/group_action.py`` for scopes.
 """
 
 from __future__ import annotations
@@ -12,18 +15,21 @@ import asyncio
 import logging
 import shlex
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from launch import Action, LaunchContext
+from launch import Action, Event, LaunchContext
+from launch.actions import PopLaunchConfigurations, PushLaunchConfigurations
+from launch.event_handler import BaseEventHandler
 from launch.event_handlers import OnShutdown
-from launch.events import Shutdown
 
 from fog.cluster import CloudNode, ClusterPlan
 from fog.launch import entity
 from fog.launch.hold import Gate
 from fog.launch.probe import offered
-from gdp.errors import GdpError
+from fog.launch.unreturned import watch_ros_launch
+from gdp.errors import GdpError, LocalError
 from gdp.testbed.runs import Run, Runs
 
 __all__ = ["FogCluster"]
@@ -32,12 +38,14 @@ log = logging.getLogger(__name__)
 
 FOG: Final = (sys.executable, "-m", "fog.cli.app")
 _PREFIX: Final = "launch-prefix"
+_ERROR: Final = "error: "
 
 
 class FogCluster(entity.FogCluster, Action):  # type: ignore[misc]  # launch has no types
     """Nodes on machines; see ``fog.launch.entity``."""
 
     _starting: asyncio.Task[None] | None = None
+    _is_begun = False  # then there may be a cluster to end
 
     def execute(self, context: LaunchContext) -> None:
         """Start or join the cluster, without waiting for it.
@@ -47,14 +55,16 @@ class FogCluster(entity.FogCluster, Action):  # type: ignore[misc]  # launch has
         """
         from fog.launch.real_node import cloud_node
 
+        if self._starting is not None:
+            return  # it stands twice in the description
         nodes = tuple(cloud_node(node, context) for node in self.cloud_nodes)
         name = self.wish.plan(nodes).name
         for note in self.wish.notes:
             log.warning("cluster %s: %s", name, note)
         run = Runs().start()
         gate = Gate.shut(run.directory / "gate")
-        before = context.launch_configurations.get(_PREFIX, "")
-        context.launch_configurations[_PREFIX] = f"{shlex.join(gate.prefix())} {before}".strip()
+        _hold(context, shlex.join(gate.prefix()))
+        context.register_event_handler(_Fails(lambda event: isinstance(event, _Failed) and event.cluster is self))
         self._starting = context.asyncio_loop.create_task(self._start(context, nodes, run.directory, gate))
         context.register_event_handler(OnShutdown(on_shutdown=lambda *_: _Ending(self, name, run, gate)))
 
@@ -68,40 +78,45 @@ class FogCluster(entity.FogCluster, Action):  # type: ignore[misc]  # launch has
             self._starting.cancel()
             await asyncio.wait([self._starting])
         gate.open(serving=False)
-        if not self.wish.keep:
+        if self._is_begun and not self.wish.keep:
             # In a session of its own: a second Ctrl-C must not leave machines running.
-            process = await asyncio.create_subprocess_exec(*FOG, "down", name, start_new_session=True)
+            process = await asyncio.create_subprocess_exec(*FOG, "down", name, "--if-up", start_new_session=True)
             if await process.wait():
                 log.error("cluster not ended name=%s; try: fog down %s", name, name)
         run.end()
 
     async def _start(self, context: LaunchContext, nodes: tuple[CloudNode, ...], folder: Path, gate: Gate) -> None:
         try:
-            fault = await self._fault(context, nodes, folder / "plan.json")
+            await self._begin(context, nodes, folder / "plan.json")
         except asyncio.CancelledError:
             log.info("start of a cluster broken off")  # by ``end`` alone, so that it goes no further
-            return
-        if fault:
-            await context.emit_event(Shutdown(reason=f"fog: {fault}"))
+        except GdpError as error:
+            await context.emit_event(_Failed(self, str(error)))
         else:
             gate.open(serving=True)
 
-    async def _fault(self, context: LaunchContext, nodes: tuple[CloudNode, ...], file: Path) -> str:
-        """Start or join the cluster; return why it does not serve, or nothing."""
-        try:
-            plan = await self._plan(context, nodes)
-        except GdpError as error:
-            return str(error)
+    async def _begin(self, context: LaunchContext, nodes: tuple[CloudNode, ...], file: Path) -> None:
+        """Start or join the cluster, and return when it serves.
+
+        Raises:
+            GdpError: it does not; the text says why.
+        """
+        plan = await self._plan(context, nodes)
         file.write_text(plan.to_json(), encoding="utf-8")
         ends = () if self.wish.keep else ("--ends-with", "this launch")
-        process = await asyncio.create_subprocess_exec(*FOG, "launch", str(file), "--detach", *ends)
+        self._is_begun = True
+        process = await asyncio.create_subprocess_exec(
+            *FOG, "launch", str(file), "--detach", *ends, stderr=asyncio.subprocess.PIPE
+        )
         try:
+            reason = await _reason(process)
             code = await process.wait()
         except asyncio.CancelledError:
             process.terminate()
             await process.wait()
             raise
-        return f"cluster {plan.name} did not start (exit {code})" if code else ""
+        if code:
+            raise LocalError(f"cluster {plan.name} did not start: {reason or f'exit code {code}'}")
 
     async def _plan(self, context: LaunchContext, nodes: tuple[CloudNode, ...]) -> ClusterPlan:
         if self.wish.carried is not None:
@@ -125,3 +140,56 @@ class _Ending(Action):  # type: ignore[misc]  # launch has no types
 
     def get_asyncio_future(self) -> asyncio.Future[None] | None:
         return self._ending
+
+
+class _Failed(Event):  # type: ignore[misc]  # launch has no types
+    """A cluster that does not serve."""
+
+    name = "fog.launch.Failed"
+
+    def __init__(self, cluster: FogCluster, reason: str) -> None:
+        self.cluster, self.reason = cluster, reason
+
+
+class _Fails(BaseEventHandler):  # type: ignore[misc]  # launch has no types
+    """Ends the launch, with the reason and exit code 1."""
+
+    def __init__(self, matcher: Callable[[Event], bool]) -> None:
+        super().__init__(matcher=matcher)
+
+    def handle(self, event: _Failed, context: LaunchContext) -> None:
+        super().handle(event, context)
+        raise LocalError(event.reason)
+
+
+def _hold(context: LaunchContext, words: str) -> None:
+    """Put words before every process that is started from now on, in this scope and in those that it is in."""
+    scopes: list[dict[str, str]] = []
+    while True:
+        here = context.launch_configurations
+        here[_PREFIX] = f"{words} {here.get(_PREFIX, '')}".strip()
+        scopes.append(dict(here))
+        try:
+            PopLaunchConfigurations().execute(context)
+        except RuntimeError:  # there is no scope around this one
+            break
+    for scope in reversed(scopes[:-1]):
+        PushLaunchConfigurations().execute(context)
+        context.launch_configurations.clear()
+        context.launch_configurations.update(scope)
+
+
+async def _reason(process: asyncio.subprocess.Process) -> str:
+    """Pass on what a ``fog`` command says on its standard error; return the last error of it."""
+    reason = ""
+    assert process.stderr is not None
+    while line := await process.stderr.readline():
+        text = line.decode(errors="replace")
+        if text.startswith(_ERROR):
+            reason = text.removeprefix(_ERROR).strip()
+        else:
+            sys.stderr.write(text)
+    return reason
+
+
+watch_ros_launch()

@@ -30,6 +30,7 @@ class Wish:
         carried: None: what its nodes offer is to be found out.
         defaults: keys of rules on the robot's side for what is found out.
         keep: whether it stays when the launch ends.
+        availability: share of time for which a machine is to serve; None: ``machines`` says how many there are.
         notes: what people should be told.
     """
 
@@ -41,6 +42,7 @@ class Wish:
     budget_usd: float | None
     keep: bool
     notes: tuple[str, ...]
+    availability: float | None = None
 
     @classmethod
     def checked(
@@ -57,6 +59,7 @@ class Wish:
         idle: float | str | None,
         budget_usd: float | None,
         keep: bool,
+        availability: float | None = None,
     ) -> Wish:
         """Check the keywords of a ``FogCluster``.
 
@@ -65,7 +68,11 @@ class Wish:
         """
         if name and not re.fullmatch(_NAME, name):
             raise LocalError(f"name {name!r}: expected small letters, digits and hyphens, at most 32")
-        machines, notes = filled(deployments, replicas)
+        if availability is not None and replicas is not None:
+            raise LocalError("replicas and availability: say how many there are, or how available they are to be")
+        if availability is not None and not 0 < availability < 1:
+            raise LocalError(f"availability={availability}: expected a share of time between 0 and 1, such as 0.9995")
+        machines, notes = filled(deployments, len(deployments) if availability is not None else replicas)
         defaults: dict[str, object] = {}
         if replication is not None:
             defaults["replication"] = replication_rule(replication)
@@ -88,6 +95,7 @@ class Wish:
             None if budget_usd is None else _positive("budget_usd", budget_usd),
             keep,
             notes,
+            availability,
         )
 
     def plan(self, nodes: Sequence[CloudNode], found: Sequence[Carried] = ()) -> ClusterPlan:
@@ -103,7 +111,15 @@ class Wish:
             raise LocalError("cloud_nodes is empty: expected at least one Node")
         name = self.name or re.sub("[^a-z0-9]+", "-", nodes[0].executable.lower()).strip("-")[:32] or "cluster"
         carries = tuple(found) if self.carried is None else self.carried
-        return ClusterPlan(name, tuple(nodes), self.machines, carries, self.idle_s, self.budget_usd)
+        return ClusterPlan(
+            name,
+            tuple(nodes),
+            self.machines,
+            carries,
+            self.idle_s,
+            self.budget_usd,
+            self.availability,
+        )
 
     def carry(self, kind_name_type: Sequence[tuple[str, str, str]]) -> tuple[Carried, ...]:
         """Return what was found out, (kind, name, type) each, with the keys that the launch file gave for all."""

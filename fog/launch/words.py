@@ -19,7 +19,7 @@ _EITHER: Final = {  # word -> where ours is, where ROS 2's is
     "FogCluster": ("fog.launch.entity", "fog.launch.ros_action"),
     "LaunchConfiguration": ("fog.launch.description", "launch.substitutions"),
     "LaunchDescription": ("fog.launch.description", "launch"),
-    "Node": ("fog.launch.description", "launch_ros.actions"),
+    "Node": ("fog.launch.description", "fog.launch.ros_node"),
 }
 _FILES: Final = {"launch": "launch_description.py", "launch_ros": "actions/node.py"}
 

@@ -19,7 +19,7 @@ from fog.plan.failure import chance_down, joint
 from fog.plan.mix import Kind
 from fog.plan.pool import ON_DEMAND_DOWN, PAPER_RECOVERY_S, PAPER_UPTIME_S, Pool, Standing, pool_for
 
-__all__ = ["Answer", "Question", "answer"]
+__all__ = ["Answer", "Question", "answer", "assumptions"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,9 +89,13 @@ def answer(question: Question, offers: Sequence[Offer], seen: Measured) -> Answe
     down = chance_down(uptime_s, recovery_s)
     pool = _pool(question, offers, down, factor)
     choices, p_system = _placed(question, offers, pool, down, factor)
-    assumptions = _assumptions(question, uptime_s, recovery_s, seen)
+    has_on_demand = "on-demand" in question.kinds or question.on_demand > 0
+    kinds = ("spot", "on-demand") if has_on_demand else ("spot",)
+    assumed = assumptions(kinds, seen, question.uptime_s, question.recovery_s)
+    if question.spot:
+        assumed.append("spot machines that run already are in regions of their own")
     if p_system > question.target * (1 + 1e-9):
-        assumptions.append("the target is out of reach in so few regions, as far as those traces tell")
+        assumed.append("the target is out of reach in so few regions, as far as those traces tell")
     return Answer(
         question.spot + question.on_demand + len(choices),
         down if "spot" in question.kinds else ON_DEMAND_DOWN,
@@ -102,7 +106,7 @@ def answer(question: Question, offers: Sequence[Offer], seen: Measured) -> Answe
         tuple(choices),
         pool,
         _pool(question, offers, chance_down(seen.uptime_s, recovery_s), factor),
-        tuple(assumptions),
+        tuple(assumed),
     )
 
 
@@ -149,23 +153,31 @@ def _cheapest(question: Question, offers: Sequence[Offer], *, spot: bool) -> flo
     return choose(offers, [wanted], question.latency_ms, question.weights)[0].offer.usd_per_hour
 
 
-def _assumptions(question: Question, uptime_s: float, recovery_s: float, seen: Measured) -> list[str]:
+def assumptions(
+    kinds: Sequence[str], seen: Measured, uptime_s: float | None = None, recovery_s: float | None = None
+) -> list[str]:
+    """Return what an answer about machines of these kinds (``spot``, ``on-demand``) rests on.
+
+    Args:
+        uptime_s, recovery_s: of a spot machine; None: the paper's worked example.
+    """
     paper = "the worked example of FogROS2-FT, which is not a measurement"
     low, high = seen.factors
-    said = [
-        f"a spot machine serves for {duration_text(uptime_s)} on average" + ("" if question.uptime_s else f": {paper}"),
-        f"{duration_text(recovery_s)} after it is taken another one serves"
-        + ("" if question.recovery_s else f": {paper}"),
-        "machines in different regions fail independently: there are no data that say so, or otherwise",
-        f"machines in one region fail together {low:g} to {high:g} times as often as independent ones; counted with "
-        f"{high:g}; {seen.source}",
-        f"in those traces a spot machine stayed for {duration_text(seen.uptime_s)} on average",
-    ]
-    if "on-demand" in question.kinds or question.on_demand:
+    said = []
+    if "spot" in kinds:
+        said += [
+            f"a spot machine serves for {duration_text(uptime_s or PAPER_UPTIME_S)} on average"
+            + ("" if uptime_s else f": {paper}"),
+            f"{duration_text(recovery_s or PAPER_RECOVERY_S)} after it is taken another one serves"
+            + ("" if recovery_s else f": {paper}"),
+            "machines in different regions fail independently: there are no data that say so, or otherwise",
+            f"machines in one region fail together {low:g} to {high:g} times as often as independent ones; counted with"
+            f" {high:g}; {seen.source}",
+            f"in those traces a spot machine stayed for {duration_text(seen.uptime_s)} on average",
+        ]
+    if "on-demand" in kinds:
         said.append(
             f"an on-demand machine is down {ON_DEMAND_DOWN:.1%} of the time: all that AWS's service level agreement "
             "promises for one; on-demand machines fail independently"
         )
-    if question.spot:
-        said.append("spot machines that run already are in regions of their own")
     return said

@@ -14,12 +14,15 @@ __all__ = [
     "CostVerb",
     "DownVerb",
     "LaunchVerb",
+    "LocalVerb",
     "LogsVerb",
     "LsVerb",
     "PlanVerb",
+    "PricesVerb",
     "ScaleVerb",
     "SshVerb",
     "StatusVerb",
+    "SuperviseVerb",
     "VerbExtension",
 ]
 
@@ -42,7 +45,7 @@ class VerbExtension:
         """Run ``fog NAME WORDS``; leaves with its exit code if that is not 0."""
         from fog.cli.app import main
 
-        main([str(self.NAME), *args.words])
+        main([str(self.NAME), *args.words], name="ros2 fog")
         return 0
 
 
@@ -76,6 +79,18 @@ class CostVerb(VerbExtension):
 
 class PlanVerb(VerbExtension):
     """Compute how many replicas are needed, and their price."""
+
+
+class PricesVerb(VerbExtension):
+    """Show what machines cost, and how far away they are."""
+
+
+class SuperviseVerb(VerbExtension):
+    """Keep clusters as they are wanted."""
+
+
+class LocalVerb(VerbExtension):
+    """Let something happen to a local machine."""
 
 
 class DownVerb(VerbExtension):

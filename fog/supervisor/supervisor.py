@@ -79,6 +79,7 @@ class Supervisor:
         self._grace_s = max(_GRACE_POLLS * provider.poll_s, _GRACE_MIN_S)
         self._woken = threading.Event()
         self._acts = Acts(self._woken.set)
+        self._latencies = site.latencies
         self._offers: dict[Wanted, tuple[float, list[Offer]]] = {}
         self._activities: dict[str, Activity] = {}
         self._asked_s: dict[str, float] = {}  # when activity was last asked about
@@ -224,7 +225,8 @@ class Supervisor:
     def _launch(self, plan: ClusterPlan, wanted: Wanted, records: list[Record], now_s: float) -> None:
         begun_s = self._journal.cluster(plan.name).begun_unix_s
         past = [each for each in self._journal.machines(plan.name) if each.is_gone and each.asked_unix_s >= begun_s]
-        offers, latency_ms = self._offered(wanted, now_s), self._site.latency_ms
+        offers = self._offered(wanted, now_s)
+        latency_ms = self._latencies.ms((each.region for each in offers), now_s)
         choice = place(wanted, offers, [*past, *records], now_s, latency_ms)
         resting = f"{plan.name} rests"
         if choice is None:
@@ -240,6 +242,7 @@ class Supervisor:
             self._command,
             iface=self._site.machine_iface,
             days=self._site.papers_days,
+            lease_s=self._site.lease_s,
             shares_host=self._provider.name == "local",
         )
         record = Record(spec, wanted, papers, now_s)
@@ -253,6 +256,7 @@ class Supervisor:
         if now_s - at_s >= _OFFERS_S or not offers:
             offers = self._provider.offers(wanted.hardware, spot=wanted.is_spot)
             self._offers[wanted] = now_s, offers
+            self._latencies.refresh_in_background((each.region for each in offers), now_s)
         return offers
 
     def _harvest(self, now_s: float) -> None:

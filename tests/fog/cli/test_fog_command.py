@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,6 +13,7 @@ from typer.testing import CliRunner
 
 from fog.cli import options
 from fog.cli.app import app
+from fog.cli.views import stage
 from fog.cluster import ClusterPlan
 from fog.site import open_site
 from fog.supervisor.journal import LAST_WORDS, Journal
@@ -150,3 +152,80 @@ def test_ros_launch_is_named_as_what_ends_its_cluster(fog: Run, tmp_path: Path) 
     (tmp_path / "plan.json").write_text(PLAN.to_json())
     said = fog("launch", "plan.json", "--detach", "--dry-run", "--ends-with", "this launch").output
     assert "ends    with this launch, or by fog down" in said
+
+
+def test_a_cluster_that_nobody_knows_is_not_ended_in_silence(fog: Run, journal: Journal) -> None:
+    up(journal)
+    result = fog("down", "typo")
+    assert (result.exit_code, result.output) == (2, f"error: no cluster is called typo; up: {PLAN.name}\n")
+    assert fog("down", "typo", "--if-up").exit_code == 0
+
+
+LAUNCH = """
+from fog import *
+def generate_launch_description():
+    FogCluster(cloud_nodes=[Node(package="fog.demo", executable="echo")], deployments=[SpotMachine(%s)], services={}%s)
+    return LaunchDescription()
+"""
+
+
+def launch_file(folder: Path, machine: str = "", more: str = "") -> str:
+    (folder / "x.launch.py").write_text(LAUNCH % (machine, more), encoding="utf-8")
+    return str(folder / "x.launch.py")
+
+
+def test_a_dry_run_makes_neither_a_site_nor_keys(fog: Run, tmp_path: Path) -> None:
+    assert fog("launch", launch_file(tmp_path), "--dry-run").exit_code == 0
+    assert not (tmp_path / "state").exists()
+
+
+@pytest.mark.parametrize("options", [["--dry-run"], []])
+def test_hardware_that_nobody_has_is_refused_at_once_with_the_nearest(
+    fog: Run, tmp_path: Path, options: list[str]
+) -> None:
+    result = fog("launch", launch_file(tmp_path, "hardware='cpu:999'"), *options)
+    assert result.exit_code == 2
+    assert "no spot machine with cpu:999; the nearest is" in result.output
+
+
+def test_a_target_becomes_machines_and_says_what_it_assumes(fog: Run, tmp_path: Path) -> None:
+    path = launch_file(tmp_path, more=", availability=0.9995")
+    said = json.loads(fog("launch", path, "--dry-run", "--json").output)
+    assert len(said["machines"]) == said["availability"]["replicas"] == 2
+    assert any("15h on average" in line for line in said["availability"]["assumptions"])
+    assert "target  0.9995 available; 2 replicas: none is up 0.04" in fog("launch", path, "--dry-run").output
+
+
+def test_the_region_that_is_near_enough_is_worth_its_price(fog: Run, tmp_path: Path) -> None:
+    fog("launch", launch_file(tmp_path), "--dry-run")
+    keys = tmp_path / "keys"
+    for name in ("domain", "owner"):
+        (keys / name).mkdir(parents=True)
+    with socket.create_server(("127.0.0.1", 0)) as near:
+        stated = (
+            "latency_ms: {local-a: 40, local-b: 40, local-c: 40}\nlatency: {endpoints: {local-d: '127.0.0.1:%d'}}\n"
+        )
+        (tmp_path / "fog.yaml").write_text(
+            "domain: keys/domain\nowner: keys/owner\n" + stated % near.getsockname()[1], encoding="utf-8"
+        )
+        said = json.loads(fog("launch", launch_file(tmp_path), "--dry-run", "--json").output)
+    assert said["machines"][0]["region"] == "local-d"
+    assert said["latencies"]["local-d"]["source"].startswith("measured now, tcp://127.0.0.1:")
+    assert said["latencies"]["local-a"] == {"ms": 40, "source": "latency_ms of fog.yaml"}
+
+
+def test_tables_in_a_pipe_lose_nothing(fog: Run) -> None:
+    shown = fog("prices", "--hardware", "T4", "--all").output
+    assert "eu-central-1" in shown
+    assert "…" not in shown
+
+
+@pytest.mark.parametrize(("verb", "missing"), [("plan", "--target"), ("logs", "MACHINE"), ("launch", "FILE")])
+def test_a_missing_argument_is_named(fog: Run, verb: str, missing: str) -> None:
+    result = fog(verb)
+    assert result.exit_code == 2
+    assert missing in result.stderr
+
+
+def test_a_machine_that_nobody_watches_is_up_and_not_serving() -> None:
+    assert stage(serving("m1"), is_watched=False) == "up"

@@ -1,9 +1,9 @@
-"""Against stand-ins of ROS 2's ``launch`` and ``launch_ros`` (``ros2/README.md``)."""
+"""Against stand-ins of ROS 2's ``launch`` and ``launch_ros``, or the real ones (``ros2/README.md``)."""
 
 from __future__ import annotations
 
-import asyncio
 import importlib
+import os
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -44,30 +44,57 @@ with open(sys.argv[1], "a") as log:
     log.write(" ".join(sys.argv[3:]).replace("\\\\", "/") + "\\n")
 if sys.argv[3] == "launch":
     pathlib.Path(sys.argv[1] + ".plan").write_text(pathlib.Path(sys.argv[4]).read_text())
-    sys.exit(int(sys.argv[2]))
+    if code := int(sys.argv[2]):
+        sys.stderr.write("a word\\nerror: no machine is to be had\\n")
+        sys.exit(code)
+"""
+CLUSTER = """FogCluster(
+        cloud_nodes=[Node(package="p", executable="e", parameters=[{"size": 640, "rates": [1.0, 2.0]}])],
+        deployments=[CloudMachine()],
+        services={"/echo": "std_srvs/srv/SetBool"},
+        keep=KEEP,
+    )"""
+FILE = """
+from launch.actions import ExecuteProcess, GroupAction, OpaqueFunction
+from fog import CloudMachine, FogCluster, LaunchDescription, Node
+
+def generate_launch_description():
+    robot = ExecuteProcess(cmd=["sh", "-c", "echo robot >> LOG"])
+    BODY
 """
 
 
-def launched(monkeypatch: pytest.MonkeyPatch, folder: Path, *, code: int = 0, keep: bool = False) -> SimpleNamespace:
-    """Launch a cluster and a process that appends a line, with a ``fog`` command that only takes notes."""
+def launched(
+    monkeypatch: pytest.MonkeyPatch,
+    folder: Path,
+    body: str = "return LaunchDescription([CLUSTER, robot])",
+    *,
+    code: int = 0,
+    keep: bool = False,
+) -> SimpleNamespace:
+    """Launch a file in which a process appends a line, with a ``fog`` command that only takes notes."""
     launch, actions = importlib.import_module("launch"), importlib.import_module("launch.actions")
-    action, node = importlib.import_module("fog.launch.ros_action"), importlib.import_module("launch_ros.actions")
+    sources = importlib.import_module("launch.launch_description_sources")
     log = folder / "log"
     script = written(folder, FOG, "fog.py")
-    monkeypatch.setattr(action, "FOG", (sys.executable, str(script), str(log), str(code)))
+    text = FILE.replace("BODY", body).replace("CLUSTER", CLUSTER).replace("KEEP", str(keep)).replace("LOG", str(log))
+    path = written(folder, text)
     monkeypatch.setattr(importlib.import_module("gdp.testbed.runs"), "_default_directory", lambda: folder / "runs")
-    cluster = action.FogCluster(
-        cloud_nodes=[node.Node(package="p", executable="e", parameters=[{"size": 640}])],
-        deployments=[sys.modules["fog.launch.machines"].CloudMachine()],
-        services={"/echo": "std_srvs/srv/SetBool"},
-        keep=keep,
+    action = importlib.import_module("fog.launch.ros_action")
+    monkeypatch.setattr(action, "FOG", (sys.executable, str(script), str(log), str(code)))
+    service = launch.LaunchService(noninteractive=True)
+    source = sources.PythonLaunchDescriptionSource(str(path))
+    service.include_launch_description(launch.LaunchDescription([actions.IncludeLaunchDescription(source)]))
+    exit_code = service.run()
+    lines = [line.split()[0] for line in log.read_text().splitlines()] if log.exists() else []
+    plan = Path(f"{log}.plan")
+    left = list((folder / "runs").iterdir()) if (folder / "runs").exists() else []
+    return SimpleNamespace(
+        lines=lines,
+        code=exit_code,
+        plan=ClusterPlan.from_json(plan.read_text()) if plan.exists() else None,
+        left=left,
     )
-    robot = actions.ExecuteProcess(cmd=["sh", "-c", f"echo robot >> {log}"])
-    service = launch.LaunchService()
-    asyncio.run(service.run_async(launch.LaunchDescription([cluster, robot])))
-    lines = [line.split()[0] for line in log.read_text().splitlines()]
-    plan = ClusterPlan.from_json(Path(f"{log}.plan").read_text())
-    return SimpleNamespace(lines=lines, reason=service.reason, plan=plan, left=list((folder / "runs").iterdir()))
 
 
 def test_the_robots_nodes_start_when_the_cluster_serves_and_it_ends_with_them(
@@ -75,18 +102,97 @@ def test_the_robots_nodes_start_when_the_cluster_serves_and_it_ends_with_them(
 ) -> None:
     told = launched(monkeypatch, tmp_path)
     assert told.lines == ["launch", "robot", "down"]
-    assert told.plan.nodes == (CloudNode("p", "e", ("--ros-args", "-p", "size:=640")),)
-    assert told.left == []
+    assert (told.code, told.left) == (0, [])
+
+
+def test_lists_of_parameters_reach_the_cloud(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    words = launched(monkeypatch, tmp_path).plan.nodes[0].arguments
+    assert words[0] == "--ros-args"
+    assert {*words[1:]} == {"-p", "size:=640", "rates:=[1.0, 2.0]"}
 
 
 def test_a_kept_cluster_outlives_its_launch(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert launched(monkeypatch, tmp_path, keep=True).lines == ["launch", "robot"]
 
 
-def test_a_cluster_that_does_not_start_ends_the_launch(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_cluster_that_does_not_start_ends_the_launch_with_its_reason(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     told = launched(monkeypatch, tmp_path, code=3)
-    assert told.lines == ["launch", "down"]
-    assert told.reason == "fog: cluster e did not start (exit 3)"
+    assert (told.lines, told.code) == (["launch", "down"], 1)
+    said = "".join(capfd.readouterr())
+    assert "[launch]: Caught exception in launch" in said
+    assert "cluster e did not start: no machine is to be had" in said
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "CLUSTER; return LaunchDescription([robot])",
+        "cluster = CLUSTER; return LaunchDescription([robot])",
+        "global kept; kept = CLUSTER; return LaunchDescription([robot])",
+    ],
+    ids=["neither assigned nor returned", "assigned", "assigned to the module"],
+)
+def test_a_cluster_that_is_not_returned_starts_before_the_robots_nodes(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, body: str
+) -> None:
+    assert launched(monkeypatch, tmp_path, body).lines == ["launch", "robot", "down"]
+
+
+def test_a_cluster_that_something_else_is_to_launch_is_left_to_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    body = "cluster = CLUSTER; return LaunchDescription([robot, OpaqueFunction(function=lambda _: [cluster])])"
+    told = launched(monkeypatch, tmp_path, body)
+    assert (sorted(told.lines), told.code) == (["down", "launch", "robot"], 0)
+
+
+def test_a_second_launch_file_of_the_same_process_is_watched_as_well(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name in ("first", "second"):
+        (folder := tmp_path / name).mkdir()
+        told = launched(monkeypatch, folder, "CLUSTER; return LaunchDescription([robot])")
+        assert told.lines == ["launch", "robot", "down"]
+
+
+def test_a_launch_file_that_imports_too_late_to_be_watched_is_refused(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    launch, actions = importlib.import_module("launch"), importlib.import_module("launch.actions")
+    sources = importlib.import_module("launch.launch_description_sources")
+    text = "def generate_launch_description():\n    from fog import CloudMachine, FogCluster, LaunchDescription, Node\n"
+    text += f"    {CLUSTER.replace('KEEP', 'False')}\n    return LaunchDescription([])\n"
+    service = launch.LaunchService(noninteractive=True)
+    source = sources.PythonLaunchDescriptionSource(str(written(tmp_path, text)))
+    service.include_launch_description(launch.LaunchDescription([actions.IncludeLaunchDescription(source)]))
+    assert service.run() == 1
+    assert "import fog at the top of the file" in "".join(capfd.readouterr())
+
+
+def test_a_cluster_in_a_scoped_group_holds_what_comes_after_the_group(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    body = "return LaunchDescription([GroupAction([GroupAction([CLUSTER])]), robot])"
+    assert launched(monkeypatch, tmp_path, body).lines == ["launch", "robot", "down"]
+
+
+def test_a_python_module_runs_as_a_node_under_its_own_name(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "my.robot").mkdir()
+    package = tmp_path / "code" / "robot_code"
+    package.mkdir(parents=True)
+    (package / "__init__.py").touch()
+    (package / "nodes").mkdir()
+    (package / "nodes" / "__init__.py").touch()
+    (package / "nodes" / "client.py").write_text(f"open({str(tmp_path / 'log')!r}, 'a').write('module\\n')\n")
+    monkeypatch.syspath_prepend(str(package.parent))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(package.parent), *sys.path]))
+    body = 'return LaunchDescription([CLUSTER, Node(package="robot_code.nodes", executable="client")])'
+    assert launched(monkeypatch, tmp_path, body).lines == ["launch", "module", "down"]
+    assert "[client-1]" in "".join(capfd.readouterr())
 
 
 def test_the_first_listing_means_the_same_with_ros_2_installed(tmp_path: Path) -> None:
@@ -94,7 +200,7 @@ def test_the_first_listing_means_the_same_with_ros_2_installed(tmp_path: Path) -
     loaded = load(written(tmp_path, LISTING), {})
     assert loaded.plan.nodes == (CloudNode("detection", "detector"),)
     assert loaded.plan.machines[1] == Wanted(Hardware(gpu="T4", gpus=1), "us-east-1", is_spot=True)
-    assert loaded.robot_nodes == (RobotNode(CloudNode("robot", "robot_client")),)
+    assert loaded.robot_nodes == (RobotNode(CloudNode("robot", "robot_client"), "log"),)
 
 
 def test_arguments_parameters_and_remappings_mean_the_same_with_ros_2_installed(tmp_path: Path) -> None:
@@ -105,6 +211,12 @@ def test_arguments_parameters_and_remappings_mean_the_same_with_ros_2_installed(
         *("-v", "--ros-args", "-r", "__node:=n", "-r", "__ns:=/b"),
         *("-p", "deep.rates:=[1, 2]", "-p", "depth:=3", "-r", "in:=/out"),
     )
+
+
+def test_where_a_robots_node_prints_is_kept(tmp_path: Path) -> None:
+    nodes = [f'Node(package="r", executable="{word}", output="{word}")' for word in ("log", "screen", "both")]
+    loaded = gathered(tmp_path, f"cluster, {', '.join(nodes)}")
+    assert [each.output for each in loaded.robot_nodes] == ["log", "screen", "screen"]
 
 
 def gathered(folder: Path, entities: str) -> Loaded:
@@ -121,7 +233,7 @@ def test_groups_are_followed_and_conditions_heeded(tmp_path: Path) -> None:
     ("entities", "says"),
     [
         ("cluster, ExecuteProcess(cmd=['true'])", "run it with ros2 launch"),
-        ("cluster, DeclareLaunchArgument('rate')", "'rate' was not provided"),
+        ("cluster, DeclareLaunchArgument('rate')", "launch argument .rate. was not provided"),
         ("cluster, Node(executable='e')", "with a package"),
     ],
 )

@@ -1,11 +1,28 @@
 """Actions, the context, and the service that visits entities, handles events and shuts down when idle."""
 
 import asyncio
+from types import SimpleNamespace
 
 
-class Action:
+class Event:
+    name = "launch.Event"
+
+
+class LaunchDescriptionEntity:
+    def visit(self, context):
+        return None
+
+    def get_asyncio_future(self):
+        return None
+
+
+class Action(LaunchDescriptionEntity):
     def __init__(self, *, condition=None):
-        self.condition = condition
+        self._condition = condition
+
+    @property
+    def condition(self):
+        return self._condition
 
     def visit(self, context):
         if self.condition is None or self.condition.evaluate(context):
@@ -15,66 +32,106 @@ class Action:
     def execute(self, context):
         return None
 
-    def get_asyncio_future(self):
-        return None
-
 
 class LaunchContext:
-    def __init__(self, *, argv=(), noninteractive=False):
-        self.launch_configurations = {}
-        self.locals = {}
-        self.handlers = []
+    def __init__(self, *, argv=None, noninteractive=False):
+        self._configurations = {}
+        self._configurations_stack = []
+        self._locals = {}
+        self._event_queue = asyncio.Queue()
+        self._event_handlers = []
         self.asyncio_loop = None
         self.is_shutdown = False
-        self.queue = None
 
-    def extend_locals(self, more):
-        self.locals.update(more)
+    @property
+    def launch_configurations(self):
+        return self._configurations
 
-    def register_event_handler(self, handler):
-        self.handlers.insert(0, handler)
+    def _push_launch_configurations(self):
+        self._configurations_stack.append(self._configurations.copy())
+
+    def _pop_launch_configurations(self):
+        if not self._configurations_stack:
+            raise RuntimeError("launch_configurations stack unexpectedly empty")
+        self._configurations = self._configurations_stack.pop()
+
+    @property
+    def locals(self):
+        return SimpleNamespace(**self._locals)
+
+    def extend_locals(self, extensions):
+        self._locals.update(extensions)
+
+    def register_event_handler(self, event_handler, append=False):
+        self._event_handlers.insert(len(self._event_handlers) if append else 0, event_handler)
 
     async def emit_event(self, event):
-        await self.queue.put(event)
+        await self._event_queue.put(event)
 
 
 class LaunchService:
-    """``run_async`` returns when all is done, 1 if an event of ours said why it ended."""
+    """``run`` returns 1 if an action, a handler or a future of an action raised something, else 0."""
 
-    def __init__(self):
-        self.context = LaunchContext()
-        self.pending = []
-        self.reason = None
+    def __init__(self, *, argv=None, noninteractive=False, debug=False):
+        self.context = LaunchContext(argv=argv, noninteractive=noninteractive)
+        self._included = []
+        self._pending = []
 
-    def collect(self, entity):
-        for inner in entity.visit(self.context) or ():
-            self.collect(inner)
+    def include_launch_description(self, launch_description):
+        self._included.append(launch_description)
+
+    def run(self, *, shutdown_when_idle=True):
+        return asyncio.run(self.run_async(shutdown_when_idle=shutdown_when_idle))
+
+    def _visit(self, entity):
+        inner = entity.visit(self.context)
         if (future := entity.get_asyncio_future()) is not None:
-            self.pending.append(future)
+            self._pending.append(future)
+        for each in inner or ():
+            self._visit(each)
 
-    def shut_down(self, reason):
-        if not self.context.is_shutdown:
+    def _handle(self, event):
+        from launch.events import Shutdown
+
+        if isinstance(event, Shutdown):
+            if self.context.is_shutdown:
+                return
             self.context.is_shutdown = True
-            self.reason = reason
-            for handler in tuple(self.context.handlers):
-                entity = handler.handle(None, self.context)
-                if entity is not None:
-                    self.collect(entity)
+        for handler in tuple(self.context._event_handlers):
+            if handler.matches(event):
+                entities = handler.handle(event, self.context)
+                for entity in entities if isinstance(entities, list | tuple) else (entities,):
+                    if entity is not None:
+                        self._visit(entity)
 
-    async def run_async(self, description):
+    async def run_async(self, *, shutdown_when_idle=True):
+        from launch.events import Shutdown
+
+        code = 0
+        queue = self.context._event_queue
         self.context.asyncio_loop = asyncio.get_running_loop()
-        self.context.queue = asyncio.Queue()
-        self.collect(description)
+        work = [lambda each=each: self._visit(each) for each in self._included]
         while True:
-            self.pending = [future for future in self.pending if not future.done()]
-            if not self.pending and self.context.queue.empty():
-                if self.context.is_shutdown:
-                    return 0 if self.reason == "idle" else 1
-                self.shut_down("idle")
-                continue
-            event = asyncio.ensure_future(self.context.queue.get())
-            await asyncio.wait([event, *self.pending], return_when=asyncio.FIRST_COMPLETED)
-            if event.done():
-                self.shut_down(event.result().reason)
-            else:
-                event.cancel()
+            try:
+                while work:
+                    work.pop(0)()
+                while not queue.empty():
+                    self._handle(queue.get_nowait())
+                self._pending = [future for future in self._pending if not future.done()]
+                if not self._pending and queue.empty():
+                    if self.context.is_shutdown:
+                        return code
+                    self._handle(Shutdown(reason="idle"))
+                    continue
+                event = asyncio.ensure_future(queue.get())
+                done, _ = await asyncio.wait([event, *self._pending], return_when=asyncio.FIRST_COMPLETED)
+                if event in done:
+                    self._handle(event.result())
+                else:
+                    event.cancel()
+                for future in done - {event}:
+                    future.result()
+            except Exception as error:
+                code = 1
+                print(f"[ERROR] [launch]: Caught exception in launch (see debug for traceback): {error}")
+                work.append(lambda reason=str(error): self._handle(Shutdown(reason=reason)))

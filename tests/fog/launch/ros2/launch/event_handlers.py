@@ -1,9 +1,14 @@
 """What happens when a launch ends."""
 
+from launch.event_handler import BaseEventHandler
+from launch.events import Shutdown
 
-class OnShutdown:
-    def __init__(self, *, on_shutdown):
-        self.on_shutdown = on_shutdown
+
+class OnShutdown(BaseEventHandler):
+    def __init__(self, *, on_shutdown, **rest):
+        super().__init__(matcher=lambda event: isinstance(event, Shutdown), **rest)
+        self._on_shutdown = on_shutdown
 
     def handle(self, event, context):
-        return self.on_shutdown(event, context)
+        super().handle(event, context)
+        return self._on_shutdown(event, context)

@@ -1,6 +1,10 @@
 """The event that ends a launch."""
 
+from launch.core import Event
 
-class Shutdown:
+
+class Shutdown(Event):
+    name = "launch.events.Shutdown"
+
     def __init__(self, *, reason="reason not given", due_to_sigint=False):
-        self.reason = reason
+        self.reason, self.due_to_sigint = reason, due_to_sigint

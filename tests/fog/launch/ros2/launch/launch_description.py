@@ -1,12 +1,18 @@
 """What is launched; visiting it gives its entities."""
 
+from launch.core import LaunchDescriptionEntity
 
-class LaunchDescription:
-    def __init__(self, initial_entities=None):
-        self.entities = list(initial_entities or ())
+
+class LaunchDescription(LaunchDescriptionEntity):
+    def __init__(self, initial_entities=None, *, deprecated_reason=None):
+        self._entities = list(initial_entities or ())
+
+    @property
+    def entities(self):
+        return self._entities
+
+    def add_action(self, action):
+        self._entities.append(action)
 
     def visit(self, context):
-        return self.entities
-
-    def get_asyncio_future(self):
-        return None
+        return self._entities

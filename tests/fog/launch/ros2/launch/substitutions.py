@@ -16,4 +16,4 @@ class LocalSubstitution:
 
     def perform(self, context):
         name, _, key = self.expression.partition("['")
-        return context.locals[name][key.rstrip("']")]
+        return getattr(context.locals, name)[key.rstrip("']")]

@@ -1,3 +1,1 @@
-"""Stand-in for ``ros2cli``; ``ENTRY_POINTS`` is what installed distributions would name: group -> name -> object."""
-
-ENTRY_POINTS = {}
+"""Stand-in for ``ros2cli`` 0.32.2; commands and verbs are found by the entry points of what is installed."""

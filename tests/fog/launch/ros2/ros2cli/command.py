@@ -1,9 +1,7 @@
 """Commands and their sub-commands; arguments are known a step at a time, so each parser is asked twice."""
 
-import argparse
-import importlib
+from importlib import metadata
 
-import ros2cli
 from ros2cli.plugin_system import PLUGIN_SYSTEM_VERSION, satisfies_version
 
 
@@ -21,7 +19,7 @@ def add_subparsers_on_demand(parser, cli_name, dest, group_name, hide_extensions
     chosen = parser.add_subparsers(title="Commands", metavar=f"Call `{cli_name} <command> -h` for more detailed usage.")
     chosen.dest = " " + dest.lstrip("_")
     chosen.required = required
-    points = ros2cli.ENTRY_POINTS[group_name]
+    points = {each.name: each for each in metadata.entry_points().select(group=group_name)}
     parsers = {name: chosen.add_parser(name) for name in sorted(points)}
     root = getattr(parser, "_root_parser", parser)
     quiet = [(each, each.print_help, each.exit) for each in (parser, *parsers.values())]
@@ -33,22 +31,12 @@ def add_subparsers_on_demand(parser, cli_name, dest, group_name, hide_extensions
         each.print_help, each.exit = show, leave
     name = getattr(known, chosen.dest)
     for each in [name] if name else points:
-        module, _, attribute = points[each].partition(":")
-        extension = getattr(importlib.import_module(module), attribute)()
+        extension = points[each].load()()
         extension.NAME = each
         parsers[each].set_defaults(**{dest: extension})
-        parser.epilog = f"{parser.epilog or ''}  {each}: {extension.__doc__.strip()}  "
+        parser.epilog = f"{parser.epilog or ''}  {each}  {extension.__doc__.strip()}  "
         if name:
             parsers[each]._root_parser = root
             extension.add_arguments(parsers[each], f"{cli_name} {each}")
             del parsers[each]._root_parser
 
-
-def ros2(argv):
-    parser = argparse.ArgumentParser(prog="ros2")
-    import sys
-
-    sys.argv[1:] = argv
-    add_subparsers_on_demand(parser, "ros2", "_command", "ros2cli.command", required=False)
-    args = parser.parse_args(argv)
-    return args._command.main(parser=parser, args=args)

@@ -1,0 +1,89 @@
+"""What a provider offers for the machines of a plan, how far its regions are, and which offer each machine would be.
+
+Command.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from fog.catalog.measured import measured
+from fog.cluster import ClusterPlan, Wanted
+from fog.hardware import Hardware
+from fog.latency.known import Latencies, Latency
+from fog.offer import Offer
+from fog.plan.choice import choose
+from fog.plan.target import Target, machines_for
+from fog.providers.provider import Provider
+from gdp.errors import GdpError, LocalError
+
+__all__ = ["Market", "choices", "market", "reached", "refusal"]
+
+
+@dataclass(frozen=True, slots=True)
+class Market:
+    """What there is.
+
+    Args:
+        offers: of enough hardware for a machine of the plan.
+        latencies: of all regions with an offer.
+    """
+
+    offers: tuple[Offer, ...]
+    latencies: Mapping[str, Latency]
+
+    @property
+    def latency_ms(self) -> dict[str, float]:
+        """Return those that are known."""
+        return {region: each.ms for region, each in self.latencies.items() if each.ms is not None}
+
+
+def market(provider: Provider, machines: Sequence[Wanted], latencies: Latencies) -> Market:
+    """Ask a provider, and measure how far its regions are where that is not known.
+
+    Raises:
+        StoreError: the provider cannot be asked now.
+    """
+    offers: dict[Offer, None] = {}
+    for hardware, is_spot in dict.fromkeys((each.hardware, each.is_spot) for each in machines):
+        offers |= dict.fromkeys(provider.offers(hardware, spot=is_spot))
+    regions = list(dict.fromkeys(offer.region for offer in offers))
+    latencies.refresh(regions, time.time())
+    return Market(tuple(offers), latencies.of(regions, time.time()))
+
+
+def reached(plan: ClusterPlan, found: Market) -> tuple[ClusterPlan, Target | None]:
+    """Return a plan with as many machines as its availability takes; None: it asks for none.
+
+    Raises:
+        LocalError: it is out of reach.
+    """
+    if plan.availability is None:
+        return plan, None
+    target = machines_for(plan.availability, plan.machines, found.offers, measured(), found.latency_ms)
+    return replace(plan, machines=target.machines, availability=None), target
+
+
+def choices(found: Market, machines: Sequence[Wanted]) -> list[Offer | None]:
+    """Return for each machine what it would be now; None: nothing like it is to be had."""
+    chosen: list[Offer | None] = []
+    for each in machines:
+        used = [offer.region for offer in chosen if offer is not None]
+        try:
+            chosen.append(choose(found.offers, [each], found.latency_ms, used=used)[0].offer)
+        except LocalError:
+            chosen.append(None)
+    return chosen
+
+
+def refusal(provider: Provider, machines: Sequence[Wanted], chosen: Sequence[Offer | None]) -> str:
+    """Return why a machine is not to be had, and what comes nearest."""
+    missing = next(each for each, offer in zip(machines, chosen, strict=True) if offer is None)
+    try:
+        everything = [offer for spot in (True, False) for offer in provider.offers(Hardware(), spot=spot)]
+        choose(everything, [missing])
+    except GdpError as error:
+        return str(error)
+    return f"{missing.hardware.to_text()}: not to be had"

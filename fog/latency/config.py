@@ -1,0 +1,81 @@
+"""``latency:`` of ``fog.yaml``: which endpoint stands for which region.
+
+Sans-I/O.
+::
+
+    latency:
+      endpoints:
+        us-west-1: probe.example.org:7            # TCP
+        us-east-1: udp://probe.example.org:7      # a UDP echo service (RFC 862)
+        "*": "ec2.{region}.amazonaws.com:443"     # every other region
+      lifetime_s: 3600
+      timeout_s: 1.0
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Final, Literal, cast
+
+from pydantic import AfterValidator, Field
+
+from gdp.nodes.schema import Section
+
+__all__ = ["Endpoint", "LatencyConfig"]
+
+_FORM: Final = re.compile(r"(?:(tcp|udp)://)?(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._{}-]+):(\d{1,5})")
+_EVERY: Final = "*"
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """Where a probe goes.
+
+    Args:
+        protocol: ``tcp``: the time to connect; ``udp``: the time until an echo service sends a datagram back.
+    """
+
+    protocol: Literal["tcp", "udp"]
+    host: str
+    port: int
+
+    @classmethod
+    def from_text(cls, text: str) -> Endpoint:
+        """Read ``HOST:PORT``, ``tcp://HOST:PORT`` or ``udp://HOST:PORT``.
+
+        Raises:
+            ValueError: it is none of these.
+        """
+        match = _FORM.fullmatch(text)
+        if match is None or not 0 < int(match[3]) < 65_536:
+            raise ValueError(f"{text!r}: expected HOST:PORT, or udp://HOST:PORT of an echo service")
+        return cls(cast("Literal['tcp', 'udp']", match[1] or "tcp"), match[2].strip("[]"), int(match[3]))
+
+    def to_text(self) -> str:
+        """Return the form that ``from_text`` reads, with its protocol."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{self.protocol}://{host}:{self.port}"
+
+
+def _readable(text: str) -> str:
+    Endpoint.from_text(text.replace("{region}", "region"))
+    return text
+
+
+class LatencyConfig(Section):
+    """How latency is measured."""
+
+    endpoints: Mapping[str, Annotated[str, AfterValidator(_readable)]] = Field(
+        default_factory=dict,
+        description="Region: `HOST:PORT` to connect to, or `udp://HOST:PORT` of an echo service. `*`: every other"
+        " region; `{region}` stands for its name. A region without one is not measured.",
+    )
+    lifetime_s: float = Field(default=3_600.0, gt=0, le=86_400, description="For how long a measurement holds.")
+    timeout_s: float = Field(default=1.0, gt=0, le=30, description="How long one try may take.")
+
+    def endpoint(self, region: str) -> Endpoint | None:
+        """Return what stands for a region; None: nothing does."""
+        text = self.endpoints.get(region, self.endpoints.get(_EVERY))
+        return None if text is None else Endpoint.from_text(text.replace("{region}", region))

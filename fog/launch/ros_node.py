@@ -1,0 +1,53 @@
+"""``Node`` of a launch file where ROS 2's ``launch_ros`` is installed: its own, and Python modules as well.
+
+Shell; imports ROS 2's ``launch``. ``package`` and ``executable`` mean what they mean without ROS 2's launch: what
+``ros2 run`` would start, else the Python module ``PACKAGE.EXECUTABLE`` (``resolve``).
+Source: launch_ros 0.26.6 (jazzy): ``actions/node.py``.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import launch_ros.actions
+from launch import LaunchContext, LaunchDescriptionEntity
+from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
+
+from fog.cluster import CloudNode
+from fog.launch.resolve import PYTHON, command_line
+from gdp.errors import LocalError
+
+__all__ = ["Node"]
+
+
+class Node(launch_ros.actions.Node):  # type: ignore[misc]  # launch_ros has no types
+    """A ROS node; see ``launch_ros.actions.Node``.
+
+    Args:
+        exec_name: what its output is marked with; None: its executable, also while it waits for a cluster.
+    """
+
+    def __init__(self, *, executable: object, exec_name: object = None, **keywords: object) -> None:
+        super().__init__(executable=executable, exec_name=executable if exec_name is None else exec_name, **keywords)
+
+    def execute(self, context: LaunchContext) -> list[LaunchDescriptionEntity] | None:
+        """Start it.
+
+        Raises:
+            Exception: whatever launch_ros raises, such as for a package that is neither installed nor a module.
+        """
+        if self.node_package is not None:
+            package, executable = (
+                str(perform_substitutions(context, normalize_to_list_of_substitutions(said)))
+                for said in (self.node_package, self.node_executable)
+            )
+            try:
+                words = command_line(CloudNode(package, executable), os.environ)
+            except LocalError:
+                words = ()  # launch_ros says what is wrong
+            if words[:1] == (PYTHON,):
+                started = (sys.executable, *words[1:])
+                self.cmd[:1] = [normalize_to_list_of_substitutions(word) for word in started]
+        entities: list[LaunchDescriptionEntity] | None = super().execute(context)
+        return entities

@@ -1,0 +1,1 @@
+"""Stand-in for ``ros2launch`` 0.26.6."""
