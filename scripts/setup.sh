@@ -12,7 +12,7 @@ root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 cd "$root"
 venv=$root/.venv
 extras=""
-dev="[dev,bench,dds,ros2,aws,skypilot,experiments]"
+dev="[dev,bench,cluster,dds,ros2,aws,skypilot,experiments]"
 case "${1:-}" in
     --dev) extras=$dev ;;
     --ros2) extras="[ros2]" ;;
@@ -82,6 +82,12 @@ done
 if [[ "$extras" == "$dev" ]]; then
     if [[ $(id -u) -eq 0 ]] && command -v apt-get >/dev/null; then
         scripts/setup_ros1.sh || say "tests of ROS 1 will be skipped"
+    fi
+    if ! command -v redis-server >/dev/null && ! command -v valkey-server >/dev/null; then
+        # no service of the system: tests start servers of their own
+        mask=/etc/systemd/system/redis-server.service
+        if [[ -d /run/systemd/system && ! -e "$mask" ]]; then ln -s /dev/null "$mask"; fi
+        RUNLEVEL=1 package redis-server "tests of RIBs that share a cluster start it"
     fi
     command -v openssl >/dev/null || package openssl "tests read our certificates with it"
 fi

@@ -6,7 +6,7 @@
 
 with ordinary rclpy nodes at both ends, over one cable (``direct``) and over proxies and three kernel switches, in turn,
 round by round; nothing is computed, so a time is the way there and back. ``fogros_tasks.py`` says where the sizes come
-from. The paper's own figures are not at hand.
+from. ``scripts/experiments/offload.py`` computes the tasks, and puts the paper's figures beside ours.
 
     sudo .venv/bin/python scripts/bench/fogros.py                     # the whole; writes docs/benchmarks/fogros.*
     sudo .venv/bin/python scripts/bench/fogros.py --quick --no-save   # a few seconds: does it work?

@@ -6,6 +6,10 @@ Place: shell; makes namespaces and keys, and starts the commands that robots run
     a -- s1 -- s2 -- s3 -- b      overlay: all switches with the plane ``kernel``, the RIB beside s2
     |______________________|      direct: one veth pair with IPv4, which only nodes of the direct case use
 
+With ``bridged`` the direct path is as long as the other one: three more namespaces, each with a Linux bridge::
+
+    a -- p1 -- p2 -- p3 -- b      direct
+
 A node is started ``direct`` or not. Direct nodes meet over the cable, in a ROS domain of their own. The others have a
 domain for each end, so that nothing but the proxies joins them, and speak with their proxy inside their namespace.
 Everyone uses UDP over IPv4, because the shared memory of Fast DDS crosses the namespaces of one host (the discovery
@@ -41,16 +45,17 @@ from gdp.trust.right import Right
 from proxy.config import Encoding
 from proxy.ring.materials import Materials
 
-__all__ = ["BUFFER_BYTES", "LEFT", "READY_S", "RIGHT", "Carried", "Row"]
+__all__ = ["BUFFER_BYTES", "DIRECT_DOMAIN", "LEFT", "READY_S", "RIGHT", "Carried", "Row"]
 
 LEFT: Final = "a"
 RIGHT: Final = "b"
 READY_S: Final = 30.0
 _MIDDLE: Final = ("s1", "s2", "s3")
 _IFACE: Final = {LEFT: _MIDDLE[0], RIGHT: _MIDDLE[-1]}  # a device is called like the neighbour it leads to
-_CABLE: Final = {LEFT: (RIGHT, "10.98.0.1"), RIGHT: (LEFT, "10.98.0.2")}
+_BRIDGES: Final = ("p1", "p2", "p3")
+_ADDRESSES: Final = {LEFT: "10.98.0.1", RIGHT: "10.98.0.2"}
 _DOMAINS: Final = {LEFT: 141, RIGHT: 142}
-_DOMAIN_DIRECT: Final = 143
+DIRECT_DOMAIN: Final = 143
 _RIGHTS: Final = {"topic": (Right.PUBLISH, Right.READ), "service": (Right.SERVE, Right.CALL)}
 BUFFER_BYTES: Final = 4 << 20
 _PROFILE: Final = f"""<?xml version="1.0" encoding="UTF-8" ?>
@@ -64,6 +69,7 @@ _PROFILE: Final = f"""<?xml version="1.0" encoding="UTF-8" ?>
  </rtps></participant>
 </profiles></dds>
 """
+_BRIDGE: Final = "bridge"
 _TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK")
 
 
@@ -95,19 +101,23 @@ class Row:
         run: of which the namespaces are.
         carried: what the proxies carry.
         mtu: of every device, the cable included.
+        bridged: whether the direct path leads through three bridges instead of one cable.
 
     Raises:
         LocalError: the kernel refuses.
         FailedError: a process did not come up; also where ROS 2 is not installed.
     """
 
-    def __init__(self, run: Run, carried: Sequence[Carried], *, mtu: int) -> None:
+    def __init__(self, run: Run, carried: Sequence[Carried], *, mtu: int, bridged: bool = False) -> None:
         self._run = run
         self._undo = ExitStack()
-        self._topology = _topology(mtu)
+        direct = (LEFT, *(_BRIDGES if bridged else ()), RIGHT)
+        self._topology = _topology(mtu, direct)
         self._spaces = Namespaces(self._topology, run)
-        for node, (device, address) in _CABLE.items():
-            netns_files.inside(self._spaces.path(node), partial(_number, device, address))
+        for node in direct[1:-1]:
+            netns_files.inside(self._spaces.path(node), _bridge)
+        for node, device in ((LEFT, direct[1]), (RIGHT, direct[-2])):
+            netns_files.inside(self._spaces.path(node), partial(_number, device, _ADDRESSES[node]))
         self._files = run.directory / "keys"
         self._files.mkdir(mode=0o700)
         (self._files / "dds.xml").write_text(_PROFILE, encoding="utf-8")
@@ -140,8 +150,12 @@ class Row:
 
     def node(self, node: str, module: str, role: str, *, direct: bool, **settings: object) -> Started:
         """Start a ROS node at A or B: ``python -m module role settings``."""
-        domain = _DOMAIN_DIRECT if direct else _DOMAINS[node]
-        return self._start(node, role, ["-m", module, role, json.dumps(settings)], self._environment(domain))
+        return self.process(node, role, ["-m", module, role, json.dumps(settings)], direct=direct)
+
+    def process(self, node: str, what: str, arguments: Sequence[str], *, direct: bool) -> Started:
+        """Start a Python process that is a ROS node at A or B."""
+        domain = DIRECT_DOMAIN if direct else _DOMAINS[node]
+        return self._start(node, what, arguments, [*self._environment(domain), f"CYCLONEDDS_URI={_cyclone(node)}"])
 
     def proxies_cpu_s(self) -> float:
         """Return the processor time that both proxies have used, as proc(5) counts it in ``/proc/<pid>/stat``."""
@@ -185,11 +199,11 @@ class Row:
         return str(path)
 
 
-def _topology(mtu: int) -> Topology:
+def _topology(mtu: int, direct: Sequence[str]) -> Topology:
     nodes = (LEFT, *_MIDDLE, RIGHT)
     return Topology(
-        links=tuple(Link(a, b, mtu=mtu) for a, b in [*pairwise(nodes), (LEFT, RIGHT)]),
-        domains=(DomainPlan("row", nodes),),
+        links=tuple(Link(a, b, mtu=mtu) for a, b in [*pairwise(nodes), *pairwise(direct)]),
+        domains=(DomainPlan("row", (*nodes, *direct[1:-1])),),
         attachments=(
             Attachment("s2", "rib", "rib"),
             Attachment(LEFT, "proxy", "end"),
@@ -202,6 +216,26 @@ def _number(device: str, address: str) -> None:
     with IPRoute() as here:
         (index,) = here.link_lookup(ifname=device)
         here.addr("add", index=index, address=address, prefixlen=24)
+
+
+def _bridge() -> None:
+    """Join all links of this namespace by a bridge."""
+    with IPRoute() as here:
+        here.link("add", ifname=_BRIDGE, kind="bridge")
+        (bridge,) = here.link_lookup(ifname=_BRIDGE)
+        for link in here.get_links():
+            if link["index"] not in (1, bridge):  # 1 is the loopback device
+                here.link("set", index=link["index"], master=bridge)
+        here.link("set", index=bridge, state="up")
+
+
+def _cyclone(node: str) -> str:
+    """Return the configuration of Cyclone DDS for a direct node: interface, and socket buffers as the others have."""
+    return (
+        f'<CycloneDDS><Domain id="any"><General><Interfaces><NetworkInterface address="{_ADDRESSES[node]}"/>'
+        f'</Interfaces></General><Internal><SocketReceiveBufferSize max="{BUFFER_BYTES}B"/></Internal></Domain>'
+        "</CycloneDDS>"
+    )
 
 
 def _cpu_s(pid: int) -> float:

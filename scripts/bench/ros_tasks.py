@@ -22,9 +22,11 @@ from ros_end import End, Settings, reliable, run_role
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64MultiArray, MultiArrayLayout, UInt8MultiArray
 
+__all__ = ["TYPES", "Message", "message_of", "number_of", "set_number"]
+
 Message: TypeAlias = "CameraInfo | Float64MultiArray | Image | PoseStamped | UInt8MultiArray"
 
-_TYPES: Final = {
+TYPES: Final = {
     CAMERA: CameraInfo,
     IMAGE: Image,
     NUMBERS: Float64MultiArray,
@@ -72,9 +74,9 @@ class _Robot:
         self._messages = [message_of(part) for part in task.parts]
         self.bytes = sum(len(serialize_message(message)) for message in self._messages)
         self._publishers = [
-            end.node.create_publisher(_TYPES[part.type_name], prefix + part.topic, reliable()) for part in task.parts
+            end.node.create_publisher(TYPES[part.type_name], prefix + part.topic, reliable()) for part in task.parts
         ]
-        end.node.create_subscription(_TYPES[task.answer.type_name], prefix + task.answer.topic, self._take, reliable())
+        end.node.create_subscription(TYPES[task.answer.type_name], prefix + task.answer.topic, self._take, reliable())
         self._seconds = seconds
         self._number = 0
         self._asked_s = self._until_s = 0.0
@@ -121,7 +123,7 @@ def cloud(end: End, settings: Settings) -> None:
     """Answer until killed."""
     task, prefix = _task_of(settings), str(settings["prefix"])
     answer = message_of(task.answer)
-    publisher = end.node.create_publisher(_TYPES[task.answer.type_name], prefix + task.answer.topic, reliable())
+    publisher = end.node.create_publisher(TYPES[task.answer.type_name], prefix + task.answer.topic, reliable())
     latest = dict.fromkeys((part.topic for part in task.parts), -1)
 
     def take(topic: str, message: Message) -> None:
@@ -131,7 +133,7 @@ def cloud(end: End, settings: Settings) -> None:
             publisher.publish(answer)
 
     for part in task.parts:
-        kind = _TYPES[part.type_name]
+        kind = TYPES[part.type_name]
         end.node.create_subscription(kind, prefix + part.topic, partial(take, part.topic), reliable())
     say(event="ready")
     end.run()

@@ -8,10 +8,12 @@ so that the mean of its vertices is the origin of its poses, and COLLADA's up ax
 from __future__ import annotations
 
 import configparser
-from collections.abc import Callable
+import io
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import fcl
 import numpy as np
@@ -19,7 +21,7 @@ import trimesh
 from numpy.typing import NDArray
 from ompl import base, geometric, util
 
-__all__ = ["PROBLEMS", "Problem", "Way", "be_quiet", "planners"]
+__all__ = ["PROBLEMS", "Problem", "Solved", "Way", "be_quiet", "limits", "planners"]
 
 PROBLEMS: Final = {"Home": "Home", "Cubicles": "cubicles", "Twistycool": "Twistycool", "Easy": "Easy"}
 _AXES: Final = "xyz"
@@ -27,6 +29,18 @@ _AXES: Final = "xyz"
 Mesh: TypeAlias = "tuple[NDArray[np.float64], NDArray[np.int64]]"
 Place: TypeAlias = "tuple[float, ...]"
 Way: TypeAlias = "list[Place]"
+
+
+class Solved(NamedTuple):
+    """The outcome of one run.
+
+    Args:
+        way: places, each with a position and a quaternion (w last); None: not found in time.
+        checks: states whose validity was checked, a measure of the work that no other load of the machine changes.
+    """
+
+    way: Way | None
+    checks: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,20 +63,17 @@ class Problem:
             KeyError: no such problem, or a file without what it needs.
         """
         stem = PROBLEMS[name]
-        parser = configparser.ConfigParser(strict=False, allow_no_value=True)
-        with (folder / f"{stem}.cfg").open(encoding="utf-8") as file:
-            parser.read_file(file)
-        told = parser["problem"]
-        start, goal, low, high = (
-            tuple(float(told[f"{what}.{axis}"]) for axis in _AXES)
-            for what in ("start", "goal", "volume.min", "volume.max")
-        )
-        vertices, faces = _mesh(folder / f"{stem}_robot.dae")
-        robot = (vertices - vertices.mean(axis=0), faces)
-        return cls(robot, _mesh(folder / f"{stem}_env.dae"), start, goal, low, high)
+        meshes = ((folder / f"{stem}_{what}.dae").read_bytes() for what in ("robot", "env"))
+        return cls.of(*meshes, *limits(folder, name))
 
-    def solve(self, planner: str, patience_s: float, is_over: Callable[[], bool]) -> Way | None:
-        """Look for a way; return its places, each with a position and a quaternion (w last), or None.
+    @classmethod
+    def of(cls, robot: bytes, world: bytes, start: Place, goal: Place, low: Place, high: Place) -> Problem:
+        """Make a problem of two COLLADA files, the positions of start and goal, and the bounds of positions."""
+        vertices, faces = _mesh(robot)
+        return cls((vertices - vertices.mean(axis=0), faces), _mesh(world), start, goal, low, high)
+
+    def solve(self, planner: str, patience_s: float, is_over: Callable[[], bool]) -> Solved:
+        """Look for a way.
 
         Args:
             planner: its class in ``ompl.geometric``, such as ``RRTConnect``.
@@ -76,7 +87,8 @@ class Problem:
             bounds.setHigh(axis, self.high[axis])
         space.setBounds(bounds)
         setup = geometric.SimpleSetup(space)
-        setup.setStateValidityChecker(self._checker())
+        checks = count()
+        setup.setStateValidityChecker(self._checker(checks))
         ends = []
         for place in (self.start, self.goal):
             state = space.allocState()
@@ -89,15 +101,17 @@ class Problem:
         told = base.PlannerTerminationCondition(is_over)
         setup.solve(base.plannerOrTerminationCondition(timed, told))
         if not setup.haveExactSolutionPath():
-            return None
+            return Solved(None, next(checks))
         states = setup.getSolutionPath().getStates()
-        return [(each.getX(), each.getY(), each.getZ(), *_turn(each.rotation())) for each in states]
+        way = [(each.getX(), each.getY(), each.getZ(), *_turn(each.rotation())) for each in states]
+        return Solved(way, next(checks))
 
-    def _checker(self) -> Callable[[base.State], bool]:
+    def _checker(self, checks: Iterator[int]) -> Callable[[base.State], bool]:
         robot, world = (fcl.CollisionObject(_volume(mesh), fcl.Transform()) for mesh in (self.robot, self.world))
         request, low, high = fcl.CollisionRequest(), self.low, self.high
 
         def is_free(state: base.State) -> bool:
+            next(checks)
             at, turn = (state.getX(), state.getY(), state.getZ()), state.rotation()
             if not all(a <= x <= b for a, x, b in zip(low, at, high, strict=True)):
                 return False
@@ -105,6 +119,23 @@ class Problem:
             return not fcl.collide(robot, world, request, fcl.CollisionResult())
 
         return is_free
+
+
+def limits(folder: Path, name: str) -> tuple[Place, Place, Place, Place]:
+    """Return positions of start and goal, and the lowest and highest position, of a problem in ``PROBLEMS``.
+
+    Raises:
+        OSError: the file is missing.
+        KeyError: no such problem, or a file without what it needs.
+    """
+    parser = configparser.ConfigParser(strict=False, allow_no_value=True)
+    with (folder / f"{PROBLEMS[name]}.cfg").open(encoding="utf-8") as file:
+        parser.read_file(file)
+    told = parser["problem"]
+    start, goal, low, high = (
+        tuple(float(told[f"{what}.{axis}"]) for axis in _AXES) for what in ("start", "goal", "volume.min", "volume.max")
+    )
+    return start, goal, low, high
 
 
 def planners() -> list[str]:
@@ -131,7 +162,7 @@ def _volume(mesh: Mesh) -> fcl.BVHModel:
     return model
 
 
-def _mesh(path: Path) -> Mesh:
-    mesh: trimesh.Trimesh = trimesh.load_scene(path).to_mesh()
+def _mesh(collada: bytes) -> Mesh:
+    mesh: trimesh.Trimesh = trimesh.load_scene(io.BytesIO(collada), file_type="dae").to_mesh()
     x, y, z = np.asarray(mesh.vertices, dtype=np.float64).T
     return np.stack([x, z, -y], axis=1), np.asarray(mesh.faces, dtype=np.int64)

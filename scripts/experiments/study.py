@@ -42,6 +42,7 @@ __all__ = [
 
 _OUTPUT: Final = ROOT / "docs" / "experiments"
 _BEGIN_S: Final = 90.0
+_SILENT_S: Final = 20.0  # of a client between two samples
 _CONSOLE_COLUMNS: Final = 150
 _COLUMNS: Final = ("requests", "failed", "mean, ms", "p50, ms", "p99, ms", "worst, ms")
 
@@ -172,7 +173,7 @@ class Asking:
     def __iter__(self) -> Iterator[Sample]:
         """Yield each sample as it comes; raises FailedError if none comes in time."""
         self._client.read(_BEGIN_S)
-        while "sample" in (said := self._client.read(2 * self._series.patience_s)):
+        while "sample" in (said := self._client.read(max(2 * self._series.patience_s, _SILENT_S))):
             told = said["sample"]
             if isinstance(told, dict):
                 yield Sample(**told)

@@ -27,7 +27,17 @@ def test_a_region_without_prices_is_refused() -> None:
 
 def test_the_page_of_table_one_is_of_the_shipped_prices() -> None:
     shown = Path(table1.PAGES / "table1.md").read_text()
-    assert shown == table1.page("us-east-1", table1.bills("us-east-1"))
+    assert shown == table1.page("us-east-1", table1.bills("us-east-1"), table1.applications())
+
+
+def test_every_application_of_the_paper_has_its_three_prices_beside_ours() -> None:
+    needed = table1.applications()
+    assert [each.name for each in needed] == list(table1.APPLICATIONS)
+    for each in needed:
+        one, two, two_spot = each.usd_per_hour
+        assert one <= two - one
+        assert 0 < two_spot < two
+        assert {where.split()[1] for where in each.spot} == set(table1.REGIONS)
 
 
 @needs_traces

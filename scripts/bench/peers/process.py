@@ -59,6 +59,11 @@ class Started:
         """Return the process's id, the same in every namespace of the row."""
         return self._process.pid
 
+    @property
+    def code(self) -> int | None:
+        """Return its exit code; None while it runs."""
+        return self._process.poll()
+
     def __enter__(self) -> Started:
         return self
 
@@ -78,6 +83,16 @@ class Started:
         if not isinstance(said, dict):
             raise FailedError(f"{self._what} said {said!r}")
         return said
+
+    def has_line(self, patience_s: float) -> bool:
+        """Return whether a line waits to be read, or comes in time; raises as ``read`` where none can come."""
+        assert self._process.stdout is not None
+        if b"\n" not in self._unread and select.select([self._process.stdout], [], [], patience_s)[0]:
+            part = os.read(self._process.stdout.fileno(), 1 << 16)
+            if not part:
+                raise FailedError(f"{self._what} ended: {self._reason()}")
+            self._unread += part
+        return b"\n" in self._unread
 
     def read_line(self, patience_s: float) -> bytes:
         """Return the next line that it prints, whatever it is; raises as ``read``."""

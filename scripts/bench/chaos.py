@@ -1,0 +1,370 @@
+"""Faults of every kind in a network of real processes, drawn from a seed; afterwards everything must be well again.
+
+A random network of 12 to 20 switches, four domains, three tiers, several RIBs, two services with replicas, reliable
+and best-effort topics (``faults/network.py``) suffers overlapping faults (``faults/schedule.py``) for so long. What
+graph and policy leave connected (``faults/oracle.py``) must go on. Verdict:
+
+    after the last fault    every flow that must be connected delivers again within a second, and stays so
+    meanwhile               no silence above --limit-s where both ends were connected all the time
+    nothing                 reaches a wrong reader, or comes twice; nothing of the revoked member after three seconds
+    reliable flows          are complete from the first message that came, or the reader was told exactly what it lacks
+    requests                each has one answer, or one error
+
+    sudo .venv/bin/python scripts/bench/chaos.py --seed 7                    # one minute
+    sudo .venv/bin/python scripts/bench/chaos.py --seed 7 --seconds 300 --switches 20
+    sudo .venv/bin/python scripts/bench/chaos.py --hours 3                   # seed after seed
+    sudo .venv/bin/python scripts/bench/chaos.py --seed 7 --only cut --only roam
+
+A run that fails prints its seed, its faults, what broke, and the last lines of the logs; the seed draws the same again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import signal
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final
+
+from faults.accounts import Books, Silence, Timeline
+from faults.link_faults import FrameFaults
+from faults.network import VICTIM, random_network
+from faults.oracle import Oracle
+from faults.overlay import Overlay
+from faults.schedule import Fault, FaultKind, broken_by, make_schedule
+from peers.process import FailedError
+from report import percentile, progress
+from rich.console import Console
+from rich.table import Table
+
+from gdp.errors import GdpError
+from gdp.testbed.runs import Runs
+
+SECONDS: Final = 60.0
+AFTER_S: Final = 8.0  # that everything is watched after the last fault
+WELL_S: Final = 1.0  # after the last fault, all is well again
+LIMIT_S: Final = 5.0
+REVOKED_S: Final = 3.0
+SETTLE_S: Final = 60.0
+LOOK_S: Final = 0.1
+TOLD_S: Final = 0.25  # shorter silences are not worth telling
+CALL_S: Final = 5.0
+LOG_LINES: Final = 12
+FRAMES: Final = {
+    FaultKind.SILENT: FrameFaults(lost=1.0),
+    FaultKind.LOSS: FrameFaults(lost=0.05),
+    FaultKind.DOUBLED: FrameFaults(doubled=0.2),
+    FaultKind.REORDERED: FrameFaults(delayed=0.2, delay_s=0.02),
+}
+SHORT: Final = {kind.name.lower().replace("_", "-"): kind for kind in FaultKind}
+
+
+class Chaos:
+    """One run: a network, its faults, and the books.
+
+    Args:
+        overlay: of the plan, started.
+        faults: in the order of their starts.
+    """
+
+    def __init__(self, overlay: Overlay, faults: list[Fault]) -> None:
+        self._overlay, self._plan = overlay, overlay.plan
+        self._faults = faults
+        self._oracle = Oracle(self._plan)
+        self.books = Books(self._plan)
+        self._under_way: list[Fault] = []
+        self._ended_lives: set[tuple[str, int]] = set()
+        self.must = {pair: Timeline() for pair in self._oracle.pairs()}
+        self.moments: list[tuple[int, Fault, bool]] = []  # when, what, whether it began
+        self.begun_ns = 0
+        self.revoked_ns: int | None = None
+
+    def settle(self) -> None:
+        """Return when every flow is delivered and every service answers.
+
+        Raises:
+            FailedError: not in time.
+        """
+        end_s = time.monotonic() + SETTLE_S
+        while missing := self._unheard():
+            if time.monotonic() > end_s:
+                raise FailedError(f"before any fault, nothing came: {', '.join(missing)}")
+            self._watch(time.monotonic() + LOOK_S)
+
+    def run(self) -> None:
+        """Let the faults happen, each in its time, and watch for a while after the last."""
+        begun_s = time.monotonic()
+        self.begun_ns = time.monotonic_ns()
+        self._note()
+        for at_s, fault, begins in _moments(self._faults):
+            self._watch(begun_s + at_s)
+            progress(f"{at_s:7.2f} s  {'+' if begins else '-'} {fault.kind.value}: {', '.join(fault.targets)}")
+            if begins:
+                self._under_way.append(fault)
+                self._begin(fault)
+            else:
+                self._end(fault)
+                self._under_way.remove(fault)
+            self.moments.append((time.monotonic_ns(), fault, begins))
+            self._note()
+        self._watch(time.monotonic() + AFTER_S)
+
+    def verdict(self, limit_s: float) -> list[str]:
+        """Return what broke, in words."""
+        last_ns, end_ns = self.moments[-1][0] if self.moments else self.begun_ns, time.monotonic_ns()
+        found = [f"{who} ended by itself" for who in self._overlay.died()]
+        well_ns = last_ns + round(WELL_S * 1e9)
+        for silence in self._all_silences(last_ns, end_ns, WELL_S):
+            found.append(f"after the last fault: {self._words(silence)}")
+        found += [f"black hole: {self._words(each)}" for each in self._all_silences(self.begun_ns, last_ns, limit_s)]
+        found += sorted(set(self.books.wrong))
+        found += self.books.incomplete(self._is_last_life, end_ns - round(2e9))
+        over_ns = end_ns - round((CALL_S + 1) * 1e9)
+        found += self.books.miscalled(over_ns, lambda member, life: (member, life) in self._ended_lives)
+        if failed := self.books.failed_since(well_ns):
+            found.append(f"after the last fault: {failed} calls failed")
+        return [*found, *self._after_revocation()]
+
+    def silences(self) -> list[tuple[str, Silence]]:
+        """Return the silences of the run, each with the last thing that happened before it."""
+        found = []
+        for silence in self._all_silences(self.begun_ns, time.monotonic_ns(), TOLD_S):
+            before = [each for each in self.moments if each[0] <= silence.begin_ns + round(1e9)]
+            _, fault, begins = before[-1] if before else (0, None, True)
+            over = "" if begins else ", over"
+            found.append(("before any" if fault is None else fault.kind.value + over, silence))
+        return found
+
+    def _is_last_life(self, member: str, life: int) -> bool:
+        """Return whether what this life of a member says and hears goes on to the end of the run."""
+        is_revoked = member == VICTIM and self.revoked_ns is not None
+        return life == self._overlay.life(f"member {member}") and not is_revoked
+
+    def _unheard(self) -> list[str]:
+        silent = [
+            f"{self._plan.flows[channel].topic} at {reader}"
+            for channel, _, reader in self._oracle.pairs()
+            if not self.books.arrivals_ns[channel, reader]
+        ]
+        return silent if silent or self.books.answered or not self._plan.services else ["any answer"]
+
+    def _watch(self, until_s: float) -> None:
+        while True:
+            for member in self._plan.members:
+                for life, records in self._overlay.read(member):
+                    self.books.take(member, life, records)
+            if (left_s := until_s - time.monotonic()) <= 0:
+                return
+            time.sleep(min(LOOK_S, left_s))
+
+    def _note(self) -> None:
+        """Note what must be connected from now on."""
+        at = {mover: self._overlay.at(mover) for mover in self._plan.homes}
+        broken = broken_by(self._under_way, at)
+        if self.revoked_ns is not None:
+            broken.members.add(VICTIM)
+        for (_, publisher, reader), timeline in self.must.items():
+            connected = self._oracle.must_talk(publisher, reader, broken)
+            timeline.note(time.monotonic_ns(), connected=connected)
+
+    def _begin(self, fault: Fault) -> None:
+        overlay, kind, targets = self._overlay, fault.kind, fault.targets
+        if kind is FaultKind.CUT:
+            overlay.cut(*targets)
+        elif kind in FRAMES:
+            overlay.disturb(*targets, FRAMES[kind])
+        elif kind is FaultKind.PARTITION:
+            for link in targets[1:]:
+                overlay.cut(*link.split("-"))
+        elif kind in (FaultKind.KILL_SWITCH, FaultKind.KILL_RIB, FaultKind.KILL_MEMBER):
+            self._ended_lives.add((targets[0].removeprefix("member "), overlay.life(targets[0])))
+            overlay.kill(targets[0])
+        elif kind is FaultKind.FREEZE:
+            overlay.freeze(targets[0])
+        elif kind is FaultKind.CLOCK:
+            overlay.step_clock(targets[0], fault.amount)
+        elif kind is FaultKind.ROAM:
+            overlay.move(*targets)
+        elif kind is FaultKind.REVOKE:
+            overlay.revoke(targets[0])
+            self.revoked_ns = time.monotonic_ns()
+
+    def _end(self, fault: Fault) -> None:
+        overlay, kind, targets = self._overlay, fault.kind, fault.targets
+        if kind is FaultKind.CUT:
+            overlay.mend(*targets)
+        elif kind in FRAMES:
+            overlay.calm(*targets)
+        elif kind is FaultKind.PARTITION:
+            for link in targets[1:]:
+                overlay.mend(*link.split("-"))
+        elif kind in (FaultKind.KILL_SWITCH, FaultKind.KILL_RIB, FaultKind.KILL_MEMBER):
+            overlay.restart(targets[0])
+            self._await(targets[0])
+        elif kind is FaultKind.FREEZE:
+            overlay.thaw(targets[0])
+        elif kind is FaultKind.CLOCK:
+            overlay.step_clock(targets[0], 0.0)
+
+    def _await(self, who: str) -> None:
+        """Go on reading records while a restarted process comes up: it is part of the network when it says so."""
+        while not self._overlay.is_ready(who):
+            self._watch(time.monotonic() + LOOK_S)
+
+    def _all_silences(self, begin_ns: int, end_ns: int, above_s: float) -> list[Silence]:
+        return [
+            silence
+            for (channel, publisher, reader), must in self.must.items()
+            for silence in self.books.silences(channel, reader, begin_ns, end_ns, must, above_s)
+        ]
+
+    def _after_revocation(self) -> list[str]:
+        if self.revoked_ns is None:
+            return []
+        late_ns = self.revoked_ns + round(REVOKED_S * 1e9)
+        found = []
+        for channel, publisher, reader in self._oracle.pairs():
+            if VICTIM in (publisher, reader):
+                late = sum(at_ns > late_ns for at_ns in self.books.arrivals_ns[channel, reader])
+                if late:
+                    found.append(f"{late} messages from the revoked {publisher} to {reader}, {REVOKED_S:g} s after")
+        return found
+
+    def _words(self, silence: Silence) -> str:
+        topic = self._plan.flows[silence.channel].topic
+        at_s = (silence.begin_ns - self.begun_ns) / 1e9
+        return f"{topic} at {silence.reader}: {silence.seconds:.2f} s of silence from {at_s:.2f} s on"
+
+
+def _moments(faults: list[Fault]) -> Iterator[tuple[float, Fault, bool]]:
+    """Yield when each fault begins and ends, in the order of time."""
+    begins = [(fault.start_s, fault, True) for fault in faults]
+    ends = [(fault.end_s, fault, False) for fault in faults]
+    return iter(sorted([*begins, *ends], key=lambda each: (each[0], not each[2])))
+
+
+def run_seed(runs: Runs, seed: int, options: argparse.Namespace) -> list[str]:
+    """Run one seed; print its table; return what broke.
+
+    Raises:
+        FailedError: the network did not come up.
+        GdpError: the kernel refuses.
+    """
+    plan = random_network(seed, options.switches, rate=options.rate, one_rib=options.one_rib)
+    kinds = [SHORT[name] for name in options.only] if options.only else None
+    faults = make_schedule(plan, seed, options.seconds, pace_s=options.pace_s, kinds=kinds)
+    begun_s = time.monotonic()
+    with ExitStack() as undo:
+        run = runs.start()
+        undo.callback(run.end)
+        overlay = undo.enter_context(Overlay(run, plan, plane=options.plane, has_clocks=True))
+        overlay.start_all()
+        progress(f"seed {seed}: {len(plan.switches)} switches, {len(plan.ribs)} RIBs, {len(plan.members)} members up")
+        chaos = Chaos(overlay, faults)
+        chaos.settle()
+        progress(f"everything is delivered after {time.monotonic() - begun_s:.1f} s; {len(faults)} faults")
+        try:
+            chaos.run()
+            broke = chaos.verdict(options.limit_s)
+        except FailedError as error:
+            broke = [str(error)]
+        _show(seed, chaos)
+        if broke:
+            _explain(seed, faults, broke, overlay)
+            if options.logs is not None:
+                secret = shutil.ignore_patterns("domains", "nodes", "owner")
+                shutil.copytree(run.directory, options.logs / f"seed-{seed}", ignore=secret, dirs_exist_ok=True)
+    return broke
+
+
+def _show(seed: int, chaos: Chaos) -> None:
+    by: defaultdict[str, list[float]] = defaultdict(list)
+    for what, silence in chaos.silences():
+        by[what].append(silence.seconds)
+    counts: defaultdict[str, int] = defaultdict(int)
+    for _, fault, begins in chaos.moments:
+        counts[fault.kind.value + ("" if begins else ", over")] += 1
+    table = Table(title=f"seed {seed}: silences above {TOLD_S:g} s while connected, s", title_justify="left")
+    for heading in ("last event before", "events", "silences", "p50", "max"):
+        table.add_column(heading, justify="left" if heading == "last event before" else "right")
+    for what in sorted(counts | dict.fromkeys(by, 0)):
+        seconds = by.get(what, [])
+        if seconds or not what.endswith("over"):
+            figures = [f"{percentile(seconds, 0.5):.2f}", f"{max(seconds):.2f}"] if seconds else ["", ""]
+            table.add_row(what, str(counts[what]), str(len(seconds)), *figures)
+    calls, answered, failed = chaos.books.calls()
+    delivered = sum(len(each) for each in chaos.books.arrivals_ns.values())
+    told = sum(chaos.books.told.values())
+    console = Console(width=120)
+    console.print(table)
+    called = f"{calls} calls: {answered} answered, {failed} failed"
+    console.print(f"{delivered} messages delivered, {told} told lost; {called}")
+
+
+def _explain(seed: int, faults: list[Fault], broke: list[str], overlay: Overlay) -> None:
+    print(f"\nseed {seed} broke:", *(f"  {each}" for each in broke), sep="\n")
+    print("its faults:", *(f"  {each}" for each in faults), sep="\n")
+    touched = {target for fault in faults for target in fault.targets if " " in target}
+    for who in sorted(touched & set(overlay.everybody())):
+        tail = overlay.log_tail(who, LOG_LINES)
+        if tail:
+            print(f"{who}:", *(f"    {line}" for line in tail.splitlines()), sep="\n")
+
+
+def arguments() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, action="append", help="a run of this seed; may be repeated (default: 1)")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="of faults in each run (default: %(default)s)")
+    parser.add_argument("--hours", type=float, help="seed after seed, from the first on, for so long")
+    parser.add_argument("--switches", type=int, default=14, help="12 to 20 (default: %(default)s)")
+    parser.add_argument("--pace-s", type=float, default=2.0, help="mean time between faults (%(default)s)")
+    parser.add_argument(
+        "--rate", type=float, default=1.0, help="factor on all rates of messages (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--limit-s", type=float, default=LIMIT_S, help="longest silence meanwhile (default: %(default)s)"
+    )
+    parser.add_argument("--only", action="append", choices=list(SHORT), help="this kind of fault; may be repeated")
+    parser.add_argument("--one-rib", action="store_true", help="one RIB in each domain")
+    parser.add_argument("--plane", default="auto", help="as gdp-switch --data-plane (default: %(default)s)")
+    parser.add_argument("--logs", type=Path, help="a folder to copy the logs of a failed run to")
+    return parser
+
+
+def main() -> None:
+    """Run seeds; exit 1 when one broke."""
+    options = arguments().parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
+    runs = Runs()
+    runs.sweep()  # what a killed run left
+    broken: list[int] = []
+    for seed in _seeds(options.seed or [1], options.hours, time.monotonic):
+        try:
+            broke = run_seed(runs, seed, options)
+        except KeyboardInterrupt:
+            sys.exit(130)
+        except (GdpError, FailedError) as error:
+            print(f"seed {seed}: {error}")
+            broke = [str(error)]
+        broken += [seed] if broke else []
+    print(f"broken seeds: {broken}" if broken else "all is well")
+    sys.exit(bool(broken))
+
+
+def _seeds(first: list[int], hours: float | None, now_s: Callable[[], float]) -> Iterator[int]:
+    yield from first
+    end_s = now_s() + (hours or 0.0) * 3_600
+    seed = max(first)
+    while now_s() < end_s:
+        seed += 1
+        yield seed
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,195 @@
+"""What the records of a run come to: silences, what is missing, what came twice, what reached the wrong one.
+
+Sans-I/O; moments are monotonic nanoseconds, as the members wrote them down.
+
+A reader's life and a publisher's life make one account: numbers rise by one within it. From the first message that
+came on, each number is to come once, or its loss is to be told; what a killed publisher had not delivered nobody can
+tell.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+from faults.plan import Plan
+from faults.records import Kind, Record
+
+__all__ = ["Account", "Books", "Silence", "Timeline"]
+
+_SECOND_NS: Final = 1_000_000_000
+
+
+class Silence(NamedTuple):
+    """A time without a message at a reader, while it had to be reached."""
+
+    channel: int
+    reader: str
+    begin_ns: int
+    end_ns: int
+
+    @property
+    def seconds(self) -> float:
+        """Return its length."""
+        return (self.end_ns - self.begin_ns) / _SECOND_NS
+
+
+@dataclass(slots=True)
+class Account:
+    """What one life of a reader had of one life of a publisher; ``counts``: by number, how often it came, to 255."""
+
+    counts: bytearray = field(default_factory=bytearray)
+    first: int = 0
+    last: int = 0
+    doubled: int = 0
+
+    def add(self, number: int) -> None:
+        """Take a message."""
+        self.first = self.first or number
+        if number >= len(self.counts):
+            self.counts.extend(bytes(number + 1 - len(self.counts) + 4_096))
+        if self.counts[number]:
+            self.doubled += 1
+        self.counts[number] = min(self.counts[number] + 1, 255)
+        self.last = max(self.last, number)
+
+    def missing(self, until: int) -> int:
+        """Return how many numbers did not come, from the first that did up to one."""
+        if not self.first:
+            return 0
+        return max(until + 1 - self.first, 0) - sum(map(bool, self.counts[self.first : until + 1]))
+
+
+class Timeline:
+    """When something had to be connected: changes in the order of time."""
+
+    def __init__(self) -> None:
+        self._changes: list[tuple[int, bool]] = []
+
+    def note(self, at_ns: int, *, connected: bool) -> None:
+        """Note how it is from now on."""
+        if not self._changes or self._changes[-1][1] != connected:
+            self._changes.append((at_ns, connected))
+
+    def stretches(self, begin_ns: int, end_ns: int) -> Iterator[tuple[int, int]]:
+        """Yield the parts of a time in which it had to be connected throughout."""
+        marks = [*self._changes, (end_ns, False)]
+        for (from_ns, is_connected), (to_ns, _) in pairwise(marks):
+            if is_connected and max(from_ns, begin_ns) < min(to_ns, end_ns):
+                yield max(from_ns, begin_ns), min(to_ns, end_ns)
+
+
+class Books:
+    """The accounts of all readers, callers and publishers of a run.
+
+    Args:
+        plan: the network.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
+        # by channel, reader, the reader's life, the publisher's life
+        self.accounts: defaultdict[tuple[int, str, int, int], Account] = defaultdict(Account)
+        self.told: defaultdict[tuple[int, str, int], int] = defaultdict(int)  # by channel, reader, its life
+        self.published: defaultdict[tuple[int, int], list[int]] = defaultdict(list)  # channel, life -> moments
+        self.arrivals_ns: defaultdict[tuple[int, str], list[int]] = defaultdict(list)
+        self.wrong: list[str] = []
+        self._calls: dict[
+            tuple[int, str, int, int], list[int]
+        ] = {}  # channel, client, life, number -> [since, answers]
+        self.answered: list[tuple[int, int]] = []  # when asked, when answered
+        self.failed: list[tuple[int, int]] = []
+
+    def take(self, member: str, life: int, records: Iterator[Record]) -> None:
+        """Take what a life of a member wrote down."""
+        for each in records:
+            if each.kind == Kind.DELIVERED:
+                self.accounts[each.channel, member, life, each.life].add(each.number)
+                self.arrivals_ns[each.channel, member].append(each.at_ns)
+                expected = self._plan.members.index(self._publisher(each.channel))
+                if each.other != expected:
+                    self.wrong.append(f"{member} had a message of member {each.other} on channel {each.channel}")
+            elif each.kind == Kind.PUBLISHED:
+                self.published[each.channel, life].append(each.at_ns)
+            elif each.kind == Kind.LOST:
+                self.told[each.channel, member, life] += each.number
+            elif each.kind == Kind.WRONG:
+                self.wrong.append(f"{member} had, on channel {each.channel}, a message for channel {each.other}")
+            elif each.kind in (Kind.CALLED, Kind.ANSWERED, Kind.FAILED):
+                self._take_call(member, life, each)
+
+    def _take_call(self, member: str, life: int, each: Record) -> None:
+        key = each.channel, member, life, each.number
+        call = self._calls.setdefault(key, [each.at_ns, 0])
+        if each.kind != Kind.CALLED:
+            call[1] += 1
+            (self.answered if each.kind == Kind.ANSWERED else self.failed).append((call[0], each.at_ns))
+
+    def _publisher(self, channel: int) -> str:
+        return [*self._plan.flows, *self._plan.spare][channel].publisher
+
+    def silences(
+        self, channel: int, reader: str, begin_ns: int, end_ns: int, must: Timeline, above_s: float
+    ) -> Iterator[Silence]:
+        """Yield the longer silences of a reader while its publisher had to reach it."""
+        arrivals = [at_ns for at_ns in self.arrivals_ns[channel, reader] if begin_ns < at_ns < end_ns]
+        for from_ns, to_ns in pairwise((begin_ns, *arrivals, end_ns)):
+            if to_ns - from_ns > above_s * _SECOND_NS:
+                for part in must.stretches(from_ns, to_ns):
+                    if part[1] - part[0] > above_s * _SECOND_NS:
+                        yield Silence(channel, reader, *part)
+
+    def incomplete(self, is_last_life: Callable[[str, int], bool], until_ns: int) -> list[str]:
+        """Return what reliable flows lack that no reader was told, in words; and what came twice, of any flow.
+
+        Args:
+            is_last_life: whether a life of a member goes on to the end of the run.
+            until_ns: what was published later may still be under way.
+        """
+        found = []
+        of_reader: defaultdict[tuple[int, str, int], list[tuple[int, Account]]] = defaultdict(list)
+        for (channel, reader, life, source_life), account in sorted(self.accounts.items()):
+            of_reader[channel, reader, life].append((source_life, account))
+        for (channel, reader, life), accounts in of_reader.items():
+            flow = self._plan.flows[channel]
+            who = f"{flow.topic} at {reader} (life {life})"
+            if doubled := sum(account.doubled for _, account in accounts):
+                found.append(f"{who}: {doubled} messages came twice")
+            if not flow.reliable:
+                continue
+            least = most = 0
+            for at, (source_life, account) in enumerate(accounts):
+                sent = sum(at_ns <= until_ns for at_ns in self.published[channel, source_life])
+                is_last = is_last_life(flow.publisher, source_life) and is_last_life(reader, life)
+                head = account.first - 1 if at else 0  # a later life is missed from its beginning on
+                least += account.missing(sent if is_last else account.last)
+                most += account.missing(max(sent, account.last)) + head
+            told = self.told[channel, reader, life]
+            if not least <= told <= most:
+                lack = f"{least}" if least == most else f"{least} to {most}"
+                found.append(f"{who}: {lack} messages missing, {told} told")
+        return found
+
+    def miscalled(self, until_ns: int, is_over: Callable[[str, int], bool]) -> list[str]:
+        """Return the calls without an end, or with more than one.
+
+        Args:
+            until_ns: what was called later may still be under way.
+            is_over: whether a life of a member ended before its calls did.
+        """
+        found = []
+        for (channel, client, life, number), (since_ns, ends) in self._calls.items():
+            if ends > 1 or (not ends and since_ns < until_ns and not is_over(client, life)):
+                found.append(f"call {number} of {client} on channel {channel}: {ends} answers")
+        return found
+
+    def calls(self) -> tuple[int, int, int]:
+        """Return how many calls there were, how many were answered, how many failed."""
+        return len(self._calls), len(self.answered), len(self.failed)
+
+    def failed_since(self, at_ns: int) -> int:
+        """Return how many calls that began after a moment failed."""
+        return sum(since_ns >= at_ns for since_ns, _ in self.failed)

@@ -1,0 +1,59 @@
+"""The wall clock of a single process, stepped from outside.
+
+Place: I/O. The machine's clock is everybody's, and a time namespace shifts only the monotonic one. So a process that
+may be stepped is started through this module, which replaces ``time.time`` and ``time.time_ns`` before anything else is
+loaded; the offset is eight bytes of a file that the bench writes. Nothing of the product knows of it, and what asks the
+kernel past the module ``time`` is not stepped.
+
+    python -m faults.clock OFFSET_FILE gdp.cli.switch --config switch.yaml
+"""
+
+from __future__ import annotations
+
+import mmap
+import runpy
+import struct
+import sys
+import time
+from pathlib import Path
+from typing import Final
+
+__all__ = ["Clock", "follow"]
+
+_OFFSET: Final = struct.Struct("=q")  # nanoseconds
+
+
+class Clock:
+    """The offset of one process, as the bench sets it; it outlives the process.
+
+    Args:
+        path: a file to create.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        path.write_bytes(_OFFSET.pack(0))
+
+    def step(self, seconds: float) -> None:
+        """Let the clock be so far ahead of the machine's (behind, if negative) from now on."""
+        with self.path.open("r+b") as file:
+            file.write(_OFFSET.pack(round(seconds * 1e9)))
+
+
+def follow(path: Path) -> None:
+    """Let this process's wall clock be off by what the file says, whenever it is asked."""
+    with path.open("r+b") as file:
+        offset = mmap.mmap(file.fileno(), _OFFSET.size)
+    machine_ns = time.time_ns
+
+    def stepped_ns() -> int:
+        return machine_ns() + int(_OFFSET.unpack_from(offset)[0])
+
+    time.time_ns = stepped_ns
+    time.time = lambda: stepped_ns() / 1e9
+
+
+if __name__ == "__main__":
+    follow(Path(sys.argv[1]))
+    sys.argv = sys.argv[2:]
+    runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)

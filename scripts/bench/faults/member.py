@@ -1,0 +1,297 @@
+"""A member at the end of a network under test: publishes, reads, serves, calls, and writes it all down.
+
+Place: process of its own, started by ``faults.overlay`` with one argument of JSON. What arrived is appended to a file
+of records at once, so that nothing is lost when this process is killed. A message names its channel, its publisher and
+the publisher's life, so a message that reaches the wrong reader is seen as such.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+import struct
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from itertools import count
+from pathlib import Path
+from typing import Any, Final
+
+from peers.lines import say
+from priority_end import End
+
+from faults.records import Kind, RecordWriter
+from gdp.client.member import Message
+from gdp.client.publisher import Publisher
+from gdp.errors import LocalError
+from gdp.names import Name
+from gdp.nodes.allocator import settle_memory
+from gdp.service.dispatch import Ask, Dispatch, Failure
+
+__all__: list[str] = []
+
+_HEAD: Final = struct.Struct("!8sHHIQ")  # token of the channel, channel, publisher, life, number
+_REQUEST: Final = struct.Struct("!8sQ")  # token, number of the call
+_BEHIND_S: Final = 0.5  # what was not published for so long is not caught up with
+_LOOK_S: Final = 0.25  # between two looks at what was lost
+
+
+class Station(End):
+    """A member on its plane, with services."""
+
+    def serve(self, name: str) -> Name:
+        """Serve a name from now on; return it."""
+        self.member.serve(self._topics[name], b"bench")
+        return self._topics[name].name
+
+    def call(self, name: str) -> Publisher:
+        """Call a name from now on; return the stream that all its servers hear."""
+        return self.member.call(self._topics[name], b"bench")
+
+    def name_of(self, name: str) -> Name:
+        """Return what a topic or service is called in the overlay."""
+        return self._topics[name].name
+
+
+class Source:
+    """Publishes one topic at an even rate."""
+
+    def __init__(
+        self, station: Station, told: dict[str, Any], token: bytes, who: tuple[int, int], out: RecordWriter
+    ) -> None:
+        self._channel, (self._index, self._life) = told["channel"], who
+        self._publisher = station.advertise(told["name"], reliable=told["reliable"])
+        self._token, self._out = token, out
+        self._filler = bytes(max(told["size"] - _HEAD.size, 0))
+        self._every_s = 1.0 / told["hz"]
+        self.due_s = time.monotonic() + random.random() * self._every_s
+        self._number = 0
+        self._readers = -1
+
+    def go_on(self, now_s: float) -> None:
+        """Publish what is due."""
+        readers = self._publisher.readers
+        if readers != self._readers:
+            self._readers = readers
+            self._out.add(Kind.READERS, self._channel, self._life, 0, readers, time.monotonic_ns())
+        if now_s - self.due_s > _BEHIND_S:
+            self.due_s = now_s
+        while self.due_s <= now_s:
+            self._number += 1
+            head = _HEAD.pack(self._token, self._channel, self._index, self._life, self._number)
+            self._out.add(Kind.PUBLISHED, self._channel, self._life, self._index, self._number, time.monotonic_ns())
+            self._publisher.publish(head + self._filler)
+            self.due_s += self._every_s
+
+
+class Caller:
+    """Calls one service at an even rate: all replicas are asked, the first answer counts."""
+
+    def __init__(self, station: Station, told: dict[str, Any], token: bytes, life: int, out: RecordWriter) -> None:
+        self._station, self._token, self._out, self._life = station, token, out, life
+        self._channel, self._timeout_s = told["channel"], told["timeout_s"]
+        self._stream, self._name = station.call(told["name"]), station.name_of(told["name"])
+        self._dispatch: Dispatch[int] = Dispatch(start=random.getrandbits(62))
+        self._every_s = 1.0 / told["hz"]
+        self.due_s = time.monotonic() + random.random() * self._every_s
+        self._count = 0
+
+    def next_s(self) -> float:
+        """Return the monotonic second of what is due next."""
+        timer_s = self._dispatch.next_timeout()
+        return self.due_s if timer_s is None else min(self.due_s, timer_s)
+
+    def go_on(self, now_s: float) -> None:
+        """Learn of servers, call what is due, end what took too long."""
+        peers = set(self._station.member.peers(self._name)) or set(self._station.member.heard(self._name))
+        for server in set(self._dispatch.servers) - peers:
+            self._dispatch.gone(server, now_s, "gone")
+        for server in peers:
+            self._dispatch.came(server, now_s)
+        self._dispatch.timeout(now_s)
+        if now_s >= self.due_s:
+            self.due_s = max(self.due_s + self._every_s, now_s - _BEHIND_S)
+            self._begin(now_s)
+        self._send(now_s)
+
+    def take(self, message: Message, now_s: float) -> None:
+        """Take a server's answer."""
+        if not message.private:
+            return
+        token, number = _REQUEST.unpack_from(message.delivered.message)
+        if token != self._token:
+            self._note(Kind.WRONG, number)
+            return
+        self._dispatch.answered(number, Name(message.delivered.publisher), number, now_s)
+        self._send(now_s)
+
+    def _begin(self, now_s: float) -> None:
+        self._count += 1
+        call = self._count
+        self._note(Kind.CALLED, call)
+        try:
+            self._dispatch.begin(
+                now_s,
+                lambda number: _REQUEST.pack(self._token, number),
+                self._timeout_s,
+                lambda _: self._note(Kind.ANSWERED, call),
+                partial(self._failed, call),
+            )
+        except LocalError:  # no server is there: the caller hears so at once
+            self._note(Kind.FAILED, call)
+
+    def _failed(self, call: int, failure: Failure, reason: str) -> None:
+        del failure, reason
+        self._note(Kind.FAILED, call)
+
+    def _send(self, now_s: float) -> None:
+        for effect in self._dispatch.take():
+            if not isinstance(effect, Ask):
+                continue  # servers answer at once: there is nothing to stop
+            if effect.servers is None:
+                self._stream.publish(effect.request)
+            for server in effect.servers or ():
+                try:
+                    self._station.member.ask(self._name, server, effect.request)
+                except LocalError as error:
+                    self._dispatch.refused(effect.call, server, str(error), now_s)
+
+    def _note(self, kind: Kind, number: int) -> None:
+        self._out.add(kind, self._channel, self._life, 0, number, time.monotonic_ns())
+
+
+class Reading:
+    """What came on one topic."""
+
+    def __init__(self, channel: int, token: bytes, out: RecordWriter) -> None:
+        self._channel, self._token, self._out = channel, token, out
+        self._told = 0
+        self._look_at_s = 0.0
+
+    def look(self, station: Station, name: Name, now_s: float) -> None:
+        """Write down what the member says was lost, now and then."""
+        if now_s < self._look_at_s:
+            return
+        self._look_at_s = now_s + _LOOK_S
+        told = station.member.losses_of(name).total
+        if told > self._told:
+            self._out.add(Kind.LOST, self._channel, 0, 0, told - self._told, time.monotonic_ns())
+            self._told = told
+
+    def take(self, message: Message, now_s: float) -> None:
+        """Write a message down; one that is not of this channel is a wrong one."""
+        del now_s
+        token, channel, publisher, life, number = _HEAD.unpack_from(message.delivered.message)
+        at_ns = time.monotonic_ns()
+        if token != self._token or channel != self._channel:
+            self._out.add(Kind.WRONG, self._channel, 0, channel, number, at_ns)
+        else:
+            self._out.add(Kind.DELIVERED, self._channel, life, publisher, number, at_ns)
+
+
+class Serving:
+    """Answers each request with itself."""
+
+    def __init__(self, station: Station, name: Name, token: bytes) -> None:
+        self._station, self._name, self._token = station, name, token
+
+    def take(self, message: Message, now_s: float) -> None:
+        """Answer a client; one that has gone meanwhile gets nothing."""
+        del now_s
+        body = message.delivered.message
+        if body[: len(self._token)] == self._token:
+            try:
+                self._station.member.answer(self._name, Name(message.delivered.publisher), body)
+            except LocalError as error:
+                print(f"not answered: {error}", file=sys.stderr, flush=True)
+
+
+class Churning:
+    """Takes a topic up and leaves it, over and over."""
+
+    def __init__(self, station: Station, told: dict[str, Any], begin: Callable[[dict[str, Any]], None]) -> None:
+        self._station, self._told, self._begin = station, told, begin
+        self._name = station.name_of(told["name"])
+        self._every_s = 1.0 / told["hz"]
+        self.due_s = time.monotonic() + random.random() * self._every_s
+        self._is_taken_up = False
+
+    def go_on(self, now_s: float) -> None:
+        """Change what is due."""
+        if now_s < self.due_s:
+            return
+        self.due_s = max(self.due_s + self._every_s, now_s)
+        if not self._is_taken_up:
+            self._begin(self._told)
+        elif self._told["publishes"]:
+            self._station.member.withdraw(self._name)
+        else:
+            self._station.member.unsubscribe(self._name)
+        self._is_taken_up = not self._is_taken_up
+
+
+def main() -> None:
+    """Be a member until ended."""
+    told: dict[str, Any] = json.loads(sys.argv[1])
+    out, life = RecordWriter(Path(told["records"])), told["life"]
+    tokens = {int(channel): bytes.fromhex(token) for channel, token in told["tokens"].items()}
+    station = Station(Path(told["config"]), 0.0)
+    takers: dict[Name, Reading | Serving | Caller] = {}
+    for each in told["read"]:
+        takers[station.subscribe(each["name"])] = Reading(each["channel"], tokens[each["channel"]], out)
+    for each in told["serve"]:
+        name = station.serve(each["name"])
+        takers[name] = Serving(station, name, tokens[each["channel"]])
+    callers = [Caller(station, each, tokens[each["channel"]], life, out) for each in told["call"]]
+    for each, caller in zip(told["call"], callers, strict=True):
+        takers[station.name_of(each["name"])] = caller
+    who = told["index"], life
+    sources = [Source(station, each, tokens[each["channel"]], who, out) for each in told["publish"]]
+    spare, churned = iter(told["spare"]), count(1)
+
+    def begin_churn(each: dict[str, Any]) -> None:
+        if each["publishes"]:
+            head = _HEAD.pack(tokens[each["channel"]], each["channel"], who[0], life, next(churned))
+            station.advertise(each["name"], reliable=True).publish(head)
+        else:
+            takers[station.subscribe(each["name"])] = Reading(each["channel"], tokens[each["channel"]], out)
+
+    churn = [Churning(station, each, begin_churn) for each in told["churn"]]
+
+    def begin_spare(*_: object) -> None:
+        """Take up the next spare flow."""
+        each = next(spare)
+        token = tokens[each["channel"]]
+        if each["publishes"]:
+            sources.append(Source(station, each, token, who, out))
+        else:
+            takers[station.subscribe(each["name"])] = Reading(each["channel"], token, out)
+
+    signal.signal(signal.SIGUSR1, begin_spare)
+    settle_memory()
+    with station.runtime.signals():
+        say(event="ready")
+        while not station.runtime.is_stopped:
+            now_s = time.monotonic()
+            for source in sources:
+                source.go_on(now_s)
+            for each in (*callers, *churn):
+                each.go_on(now_s)
+            for name, taker in takers.items():
+                if isinstance(taker, Reading):
+                    taker.look(station, name, now_s)
+            station.member.flush(now_s)
+            out.flush()
+            due = [each.due_s for each in (*sources, *churn)] + [caller.next_s() for caller in callers]
+            station.runtime.step(min([*due, now_s + _LOOK_S]))
+            now_s = time.monotonic()
+            for message in station.member.take_messages():
+                takers[message.topic].take(message, now_s)
+        out.flush()
+        station.leave()
+
+
+if __name__ == "__main__":
+    main()

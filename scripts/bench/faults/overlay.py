@@ -1,0 +1,371 @@
+"""The real processes and links of a plan, and every fault that can be made there.
+
+Place: shell; namespaces and processes through ``gdp.testbed``, the commands that robots run, and ``faults.member`` at
+the ends. A process is called ``switch s1``, ``rib s1`` or ``member m1``. Each may be killed, restarted, frozen.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import struct
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import yaml
+from peers.process import Started
+from pyroute2 import IPRoute
+
+from faults.clock import Clock
+from faults.link_faults import FrameFaults, LinkFaults
+from faults.plan import Churn, Flow, Plan, Service
+from faults.records import Record, RecordReader
+from gdp.metadata import Metadata
+from gdp.stores.issue import delegate, install_delegation
+from gdp.stores.keyring import CARD, ROOT_CERTIFICATE, load_domain, load_identity
+from gdp.testbed import netns_files
+from gdp.testbed.namespaces import Namespaces
+from gdp.testbed.processes import Process, end_all
+from gdp.testbed.runs import Run
+from gdp.trust.revocation import Revocation
+from gdp.trust.right import Right
+from proxy.ring.materials import Materials
+
+__all__ = ["Overlay"]
+
+READY_S: Final = 60.0
+_OWNER: Final = "owner"
+
+
+class Overlay:
+    """The network of a plan; a context manager that takes everything down.
+
+    Args:
+        run: of which the namespaces and processes are.
+        plan: who there is.
+        plane: as ``gdp-switch --data-plane``.
+        has_clocks: processes may have their wall clock stepped.
+        churn_hz: how often members take up or leave what they churn, a second.
+        more: further keys of every switch's, RIB's file, by role.
+
+    Raises:
+        LocalError: the kernel refuses.
+        FailedError: a process did not come up.
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        plan: Plan,
+        *,
+        plane: str = "auto",
+        has_clocks: bool = False,
+        churn_hz: float = 10.0,
+        more: Mapping[str, Mapping[str, object]] | None = None,
+    ) -> None:
+        self.plan = plan
+        self.directory = run.directory
+        self._run = run
+        self._plane = plane
+        self._more = more or {}
+        self._churn_hz = churn_hz
+        self._at = {mover: plan.home(mover) for mover in (*plan.homes, *plan.members)}
+        self._lives: dict[str, int] = {}
+        self._processes: dict[str, Started] = {}
+        self._frozen: set[str] = set()
+        self._records: dict[tuple[str, int], RecordReader] = {}
+        self.spaces = Namespaces(plan.topology, run)
+        self._materials = Materials(plan.topology, run.directory, metrics=False)
+        self._clocks: dict[str, Clock] = {}
+        if has_clocks:
+            (run.directory / "clocks").mkdir()
+            self._clocks = {who: Clock(run.directory / "clocks" / who.replace(" ", "-")) for who in self.everybody()}
+        self._links = LinkFaults()
+        for member in plan.members:
+            self._admit(member)
+
+    def __enter__(self) -> Overlay:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._links.close()
+        for who in list(self._frozen):
+            self.thaw(who)
+        with ExitStack() as undo:
+            living = list[Process]()
+            for process in self._processes.values():
+                undo.enter_context(process)
+                with suppress(ProcessLookupError):  # it ended by itself
+                    living.append(Process.of(process.pid))
+            end_all(living)  # all at once, not one after the other
+
+    def everybody(self) -> list[str]:
+        """Return every process by name."""
+        return [
+            *(f"switch {node}" for node in self.plan.switches),
+            *(f"rib {node}" for node in self.plan.ribs),
+            *(f"member {node}" for node in self.plan.members),
+        ]
+
+    # processes
+
+    def start_all(self) -> None:
+        """Start switches, RIBs, members; return when each says that it is ready."""
+        for role in ("switch", "rib", "member"):
+            names = [who for who in self.everybody() if who.startswith(role)]
+            for who in names:
+                self.start(who)
+            for who in names:
+                self._processes[who].read(READY_S)
+
+    def start(self, who: str) -> None:
+        """Start a process, in a life of its own."""
+        role, _, node = who.partition(" ")
+        life = self._lives[who] = self._lives.get(who, 0) + 1
+        if role == "switch":
+            argv = ["gdp.cli.switch", "--json", "--data-plane", self._plane, "--config", str(self._switch_file(node))]
+        elif role == "rib":
+            argv = ["gdp.cli.rib", "--json", "--config", str(self._rib_file(node))]
+        else:
+            argv = ["faults.member", json.dumps(self._told(node, life))]
+        clock = self._clocks.get(who)
+        argv = ["-m", *argv] if clock is None else ["-m", "faults.clock", str(clock.path), *argv]
+        self._processes[who] = Started(self._run, f"{who} {life}", partial(self.spaces.command, node), argv)
+
+    def await_ready(self, who: str) -> None:
+        """Return when a process that was started says that it is ready.
+
+        Raises:
+            FailedError: it ended, or said nothing in time.
+        """
+        self._processes[who].read(READY_S)
+
+    def is_ready(self, who: str) -> bool:
+        """Return whether a process that was started is ready; waits a moment, raises as ``await_ready``."""
+        return self._processes[who].has_line(0.02)
+
+    def kill(self, who: str) -> None:
+        """Kill a process at once (SIGKILL)."""
+        self._frozen.discard(who)
+        process = self._processes.pop(who)
+        os.kill(process.pid, signal.SIGKILL)
+        process.__exit__(None, None, None)
+
+    def restart(self, who: str) -> None:
+        """Start a killed process again; not waited for."""
+        self.start(who)
+
+    def is_running(self, who: str) -> bool:
+        """Return whether a process was started and not killed, whatever became of it."""
+        return who in self._processes
+
+    def died(self) -> list[str]:
+        """Return the processes that ended by themselves."""
+        return [who for who, process in self._processes.items() if process.code is not None]
+
+    def life(self, who: str) -> int:
+        """Return how often a process was started."""
+        return self._lives[who]
+
+    def pid(self, who: str) -> int:
+        """Return the id of a running process."""
+        return self._processes[who].pid
+
+    def freeze(self, who: str) -> None:
+        """Give a process no more time."""
+        self._frozen.add(who)
+        os.kill(self._processes[who].pid, signal.SIGSTOP)
+
+    def thaw(self, who: str) -> None:
+        """Let a frozen process go on; harmless when it is none."""
+        if who in self._frozen and who in self._processes:
+            self._frozen.discard(who)
+            with suppress(ProcessLookupError):
+                os.kill(self._processes[who].pid, signal.SIGCONT)
+
+    def step_clock(self, who: str, seconds: float) -> None:
+        """Let a process's wall clock be so far off the machine's."""
+        self._clocks[who].step(seconds)
+
+    def read(self, member: str) -> Iterator[tuple[int, Iterator[Record]]]:
+        """Yield, by life, what a member wrote down since the last call."""
+        for life in range(1, self._lives.get(f"member {member}", 0) + 1):
+            if (member, life) not in self._records:
+                self._records[member, life] = RecordReader(self._record_file(member, life))
+            yield life, self._records[member, life].read()
+
+    def signal(self, who: str, number: signal.Signals) -> None:
+        """Send a signal: SIGHUP lets a switch read its revocations, SIGUSR1 a member begin its next spare flow."""
+        os.kill(self._processes[who].pid, number)
+
+    def log_tail(self, who: str, lines: int = 15) -> str:
+        """Return the end of a process's log, of its latest life."""
+        path = self.directory / f"{who} {self._lives.get(who, 0)}".replace(" ", "-")
+        with suppress(FileNotFoundError):
+            text = path.with_name(path.name + ".log").read_text(encoding="utf-8", errors="replace")
+            return "\n".join(text.splitlines()[-lines:])
+        return ""
+
+    # links
+
+    def cut(self, a: str, b: str) -> None:
+        """Take a link down; both ends lose their carrier."""
+        self.spaces.cut(a, b)
+
+    def revoke(self, member: str) -> None:
+        """Take a member's membership back: each switch is given the statement."""
+        label = self.plan.topology.domain_of(member).label
+        authority = load_domain(self.directory / "domains" / label)
+        identity = load_identity(self.directory / "nodes" / f"proxy-{member}", time.time())
+        held = identity.member
+        wire = Revocation.make(authority.key, authority.root.subject, held.fingerprint, held.not_after_unix_s)
+        (self.directory / "revocations" / f"{member}.revoke").write_bytes(wire)
+        for node in self.plan.switches:
+            if self.is_running(f"switch {node}"):
+                self.signal(f"switch {node}", signal.SIGHUP)
+
+    def mend(self, a: str, b: str) -> None:
+        """Bring a link back."""
+        self.spaces.mend(a, b)
+
+    def disturb(self, a: str, b: str, faults: FrameFaults) -> None:
+        """Let the frames of a link suffer, both ways."""
+        for own, other in ((a, b), (b, a)):
+            self._links.set(self.spaces.path(own), other, faults)
+
+    def calm(self, a: str, b: str) -> None:
+        """Let the frames of a link pass again."""
+        for own, other in ((a, b), (b, a)):
+            self._links.clear(self.spaces.path(own), other)
+
+    def received(self, node: str, neighbours: Sequence[str]) -> dict[str, int]:
+        """Return how many frames have come in at a node's devices towards these neighbours."""
+        return netns_files.inside(self.spaces.path(node), partial(_received, neighbours))
+
+    def at(self, mover: str) -> str:
+        """Return where a member is plugged in."""
+        return self._at[mover]
+
+    def move(self, mover: str, to: str) -> None:
+        """Pull the cable of a mover at its switch and put it in at another one: the mover keeps its device."""
+        there = os.open(self.spaces.path(to), os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            netns_files.inside(self.spaces.path(self._at[mover]), partial(_hand_over, mover, there))
+        finally:
+            os.close(there)
+        netns_files.inside(self.spaces.path(to), partial(_raise, mover))
+        self._at[mover] = to
+
+    # files
+
+    def _switch_file(self, node: str) -> Path:
+        path = self._materials.switch(node, "auto")
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        movers = {mover for mover, homes in self.plan.homes.items() if node in homes}
+        ports = [port for port in content["ports"] if port["iface"] not in movers]
+        content["ports"] = [*ports, *({"iface": mover, "optional": True} for mover in sorted(movers))]
+        revocations = self.directory / "revocations"
+        revocations.mkdir(exist_ok=True)
+        content["revocations"] = str(revocations)
+        return self._write(path, {**content, **self._more.get("switch", {})})
+
+    def _rib_file(self, node: str) -> Path:
+        at = next(at for at in self.plan.topology.attached("rib") if at.switch == node)
+        path = self._materials.rib(at)
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        domain = self.plan.topology.domain_of(node)
+        content["peers"] = [name for at, name in self._rib_names(domain.label) if at != node]
+        content["upper"] = [name for _, name in self._rib_names(domain.upper)]
+        return self._write(path, {**content, **self._more.get("rib", {})})
+
+    def _rib_names(self, label: str | None) -> list[tuple[str, str]]:
+        """Return the RIBs of a domain: switch, and name as text."""
+        switches = [at for at in self.plan.ribs if self.plan.topology.domain_of(at).label == label]
+        folders = [(at, self.directory / "nodes" / f"rib-{at}") for at in switches]
+        return [(at, load_identity(folder, time.time()).name.to_text()) for at, folder in folders]
+
+    def _write(self, path: Path, content: Mapping[str, object]) -> Path:
+        path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+        return path
+
+    def _told(self, member: str, life: int) -> dict[str, object]:
+        """Return what a member process is told: who it is, what it takes part in."""
+        parts = ("publish", "read", "serve", "call", "spare", "churn")
+        told: dict[str, list[dict[str, object]]] = {part: [] for part in parts}
+        for channel, what in self.plan.channels(member):
+            if isinstance(what, Service):
+                part = {"channel": channel, "name": what.name, "hz": what.hz, "timeout_s": what.timeout_s}
+                told["serve" if member in what.servers else "call"].append(part)
+            else:
+                told["publish" if member == what.publisher else "read"].append(_flow_part(channel, what))
+        for channel, flow in self.plan.spares(member):
+            told["spare"].append({**_flow_part(channel, flow), "publishes": member == flow.publisher})
+        for channel, churn in self.plan.churns(member):
+            part = {"channel": channel, "name": churn.topic, "hz": self._churn_hz, "publishes": churn.publishes}
+            told["churn"].append(part)
+        return {
+            "config": str(self.directory / f"end-{member}.yaml"),
+            "records": str(self._record_file(member, life)),
+            "index": self.plan.members.index(member),
+            "life": life,
+            "tokens": {channel: self._token(channel).hex() for channel, _ in self._parts(member)},
+            **told,
+        }
+
+    def _record_file(self, member: str, life: int) -> Path:
+        return self.directory / f"{member}-{life}.records"
+
+    def _parts(self, member: str) -> list[tuple[int, Flow | Service | Churn]]:
+        return [*self.plan.channels(member), *self.plan.spares(member), *self.plan.churns(member)]
+
+    def _token(self, channel: int) -> bytes:
+        """Return what every message of a channel begins with, and of no other."""
+        return struct.pack("!I", int(self._run.id, 16)) + struct.pack("!I", channel)
+
+    def _admit(self, member: str) -> None:
+        """Let a member do what it takes part in, and write its configuration."""
+        identity = self.directory / "nodes" / f"proxy-{member}"
+        owner = self.directory / _OWNER
+        for _, what in self._parts(member):
+            if isinstance(what, Service):
+                right = Right.SERVE if member in what.servers else Right.CALL
+                metadata = Metadata({"kind": "service", "name": what.name})
+            else:
+                publishes = what.publishes if isinstance(what, Churn) else member == what.publisher
+                right = Right.PUBLISH if publishes else Right.READ
+                metadata = Metadata({"kind": "topic", "name": what.topic})
+            install_delegation(identity, delegate(owner, identity / CARD, metadata, [right]))
+        own = self.plan.topology.domain_of(member).label
+        labels = [domain.label for domain in self.plan.topology.domains]
+        roots = {label: str(self.directory / "domains" / label / ROOT_CERTIFICATE) for label in labels}
+        content = {
+            "identity": str(identity),
+            "domain": {"root": roots.pop(own), "trusts": list(roots.values())},
+            "iface": self.plan.home(member),  # a device is called like the neighbour it first leads to
+        }
+        self._write(self.directory / f"end-{member}.yaml", content)
+
+
+def _flow_part(channel: int, flow: Flow) -> dict[str, object]:
+    return {"channel": channel, "name": flow.topic, "hz": flow.hz, "reliable": flow.reliable, "size": flow.size}
+
+
+def _hand_over(device: str, namespace: int) -> None:
+    with IPRoute() as here:
+        here.link("set", index=here.link_lookup(ifname=device)[0], net_ns_fd=namespace)
+
+
+def _received(devices: Sequence[str]) -> dict[str, int]:
+    with IPRoute() as here:
+        links = {link.get_attr("IFLA_IFNAME"): link.get_attr("IFLA_STATS64") for link in here.get_links()}
+    return {device: links[device]["rx_packets"] for device in devices}
+
+
+def _raise(device: str) -> None:
+    with IPRoute() as here:
+        here.link("set", index=here.link_lookup(ifname=device)[0], state="up")

@@ -1,0 +1,79 @@
+"""What a member writes down, and how it is read back: records of fixed size, appended to a file.
+
+Place: I/O; one file. What was written stays when the writer is killed, for it is the kernel's from then on.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterator
+from enum import IntEnum
+from pathlib import Path
+from typing import Final, NamedTuple
+
+__all__ = ["Kind", "Record", "RecordReader", "RecordWriter"]
+
+_FORM: Final = struct.Struct("=BBHIQQ")
+
+
+class Kind(IntEnum):
+    """What happened, and what ``other`` and ``number`` say of it."""
+
+    PUBLISHED = 1  # number: of the message
+    DELIVERED = 2  # other: the publisher; life: the publisher's
+    LOST = 3  # number: how many more messages the reader was told it missed
+    WRONG = 4  # other: the channel that the message was meant for
+    CALLED = 5  # number: of the request
+    ANSWERED = 6
+    FAILED = 7
+    READERS = 8  # number: how many readers the publisher counts now
+
+
+class Record(NamedTuple):
+    """One record; ``channel``: the index of a flow or service; ``at_ns``: monotonic."""
+
+    kind: int
+    channel: int
+    life: int
+    other: int
+    number: int
+    at_ns: int
+
+
+class RecordWriter:
+    """Appends records; ``flush`` hands them to the kernel."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
+        self._waiting: list[bytes] = []
+
+    def add(self, kind: Kind, channel: int, life: int, other: int, number: int, at_ns: int) -> None:
+        """Note one thing."""
+        self._waiting.append(_FORM.pack(kind, channel, life, other, number, at_ns))
+
+    def flush(self) -> None:
+        """Hand over what was noted."""
+        if self._waiting:
+            os.write(self._file, b"".join(self._waiting))
+            self._waiting.clear()
+
+
+class RecordReader:
+    """Reads a file that still grows."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._at = 0
+
+    def read(self) -> Iterator[Record]:
+        """Yield the records since the last call."""
+        if not self._path.exists():
+            return
+        with self._path.open("rb") as file:
+            file.seek(self._at)
+            data = file.read()
+        whole = len(data) - len(data) % _FORM.size
+        self._at += whole
+        for fields in _FORM.iter_unpack(data[:whole]):
+            yield Record(*fields)

@@ -1,0 +1,191 @@
+"""Which faults happen when: drawn from a seed, overlapping, and never parting what is to stay connected.
+
+Sans-I/O. Faults of the kinds in ``STRUCTURAL`` take a switch or a link away; one is drawn only if the rest stays whole
+with everything that is broken at that moment, by the oracle. A partition is the exception: it parts a domain on
+purpose, alone.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final
+
+from faults.network import VICTIM
+from faults.oracle import Broken, Oracle
+from faults.plan import Plan
+
+__all__ = ["STRUCTURAL", "Fault", "FaultKind", "broken_by", "make_schedule"]
+
+
+class FaultKind(Enum):
+    """What may happen."""
+
+    CUT = "link cut"
+    SILENT = "link silent"
+    LOSS = "5 % loss"
+    DOUBLED = "frames doubled"
+    REORDERED = "frames reordered"
+    KILL_SWITCH = "switch killed"
+    KILL_RIB = "RIB killed"
+    KILL_MEMBER = "member killed"
+    FREEZE = "process frozen"
+    CLOCK = "clock stepped"
+    REVOKE = "membership revoked"
+    PARTITION = "partition"
+    ROAM = "member moved"
+
+
+STRUCTURAL: Final = frozenset({FaultKind.CUT, FaultKind.SILENT, FaultKind.KILL_SWITCH})
+_WEIGHTS: Final = {
+    FaultKind.CUT: 4, FaultKind.SILENT: 3, FaultKind.LOSS: 3, FaultKind.DOUBLED: 2, FaultKind.REORDERED: 2,
+    FaultKind.KILL_SWITCH: 3, FaultKind.KILL_RIB: 3, FaultKind.KILL_MEMBER: 2, FaultKind.FREEZE: 3,
+    FaultKind.CLOCK: 2, FaultKind.PARTITION: 1, FaultKind.ROAM: 4,
+}  # fmt: skip
+_AT_ONCE: Final = 3
+_CLOCK_STEP_S: Final = 300.0
+_FIRST_S: Final = 1.0
+_TRIES: Final = 40
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One fault: ``targets`` are a process (``switch s1``), the two ends of a link, or a mover and where it goes.
+
+    Attributes:
+        start_s, end_s: from the start of the run; what has no end of its own ends where it starts.
+        amount: seconds of a clock step.
+    """
+
+    kind: FaultKind
+    targets: tuple[str, ...]
+    start_s: float
+    end_s: float
+    amount: float = 0.0
+
+    def __str__(self) -> str:
+        amount = f" {self.amount:+g} s" if self.amount else ""
+        return f"{self.start_s:7.2f}-{self.end_s:7.2f} s  {self.kind.value}{amount}: {', '.join(self.targets)}"
+
+
+def broken_by(faults: Sequence[Fault], at: dict[str, str]) -> Broken:
+    """Return what does not work while these faults are there."""
+    broken = Broken(at=dict(at))
+    for fault in faults:
+        if fault.kind in (FaultKind.CUT, FaultKind.SILENT):
+            broken.links.add(frozenset(fault.targets))
+        elif fault.kind is FaultKind.PARTITION:
+            broken.links |= {frozenset(each.split("-")) for each in fault.targets[1:]}
+        elif fault.kind is FaultKind.KILL_SWITCH:
+            broken.switches.add(fault.targets[0].split()[1])
+        elif fault.kind in (FaultKind.KILL_MEMBER, FaultKind.FREEZE):
+            role, _, node = fault.targets[0].partition(" ")
+            if role == "member":
+                broken.members.add(node)
+            elif role == "switch":
+                broken.switches.add(node)
+        elif fault.kind is FaultKind.REVOKE:
+            broken.members.add(fault.targets[0])
+    return broken
+
+
+def make_schedule(
+    plan: Plan, seed: int, duration_s: float, *, pace_s: float = 2.0, kinds: Sequence[FaultKind] | None = None
+) -> list[Fault]:
+    """Return the faults of a run, in the order of their starts.
+
+    Args:
+        duration_s: when the last fault has ended.
+        pace_s: mean time between two starts.
+        kinds: what may happen; None: everything.
+    """
+    return list(_draw(plan, random.Random(f"schedule {seed}"), duration_s, pace_s, set(kinds or FaultKind)))
+
+
+def _draw(
+    plan: Plan, chance: random.Random, duration_s: float, pace_s: float, kinds: set[FaultKind]
+) -> Iterator[Fault]:
+    oracle, under_way, at = Oracle(plan), list[Fault](), {mover: homes[0] for mover, homes in plan.homes.items()}
+    weights = {kind: weight for kind, weight in _WEIGHTS.items() if kind in kinds}
+    revoke_s = duration_s * 0.6 if FaultKind.REVOKE in kinds and VICTIM in plan.members else None
+    now_s = _FIRST_S
+    while weights:
+        now_s += min(chance.expovariate(1 / pace_s), 4 * pace_s)
+        if now_s >= duration_s:
+            break
+        under_way = [fault for fault in under_way if fault.end_s > now_s]
+        if revoke_s is not None and now_s >= revoke_s:
+            revoke_s = None
+            yield Fault(FaultKind.REVOKE, (VICTIM,), now_s, now_s)
+            continue
+        if len(under_way) >= _AT_ONCE:
+            continue
+        for _ in range(_TRIES):
+            kind = chance.choices(list(weights), list(weights.values()))[0]
+            fault = _one(kind, plan, oracle, chance, now_s, duration_s, at)
+            if fault is not None and _is_fit(fault, under_way, oracle, at):
+                under_way.append(fault)
+                if kind is FaultKind.ROAM:
+                    at[fault.targets[0]] = fault.targets[1]
+                yield fault
+                break
+
+
+def _one(
+    kind: FaultKind, plan: Plan, oracle: Oracle, chance: random.Random, now_s: float, duration_s: float,
+    at: dict[str, str],
+) -> Fault | None:  # fmt: skip
+    end_s = min(now_s + chance.uniform(0.5, 8.0), duration_s)
+    if kind in (FaultKind.CUT, FaultKind.SILENT, FaultKind.LOSS, FaultKind.DOUBLED, FaultKind.REORDERED):
+        return Fault(kind, tuple(sorted(chance.choice(oracle.links))), now_s, end_s)
+    if kind is FaultKind.KILL_SWITCH:
+        return Fault(kind, (f"switch {chance.choice(plan.switches)}",), now_s, end_s)
+    if kind is FaultKind.KILL_RIB:
+        return Fault(kind, (f"rib {chance.choice(plan.ribs)}",), now_s, end_s)
+    members = [member for member in plan.members if member != VICTIM]
+    if kind is FaultKind.KILL_MEMBER:
+        return Fault(kind, (f"member {chance.choice(members)}",), now_s, end_s)
+    if kind in (FaultKind.FREEZE, FaultKind.CLOCK):
+        role, nodes = chance.choice((("switch", plan.switches), ("rib", plan.ribs), ("member", members)))
+        who = f"{role} {chance.choice(nodes)}"
+        if kind is FaultKind.FREEZE:
+            return Fault(kind, (who,), now_s, min(now_s + chance.uniform(0.3, 3.0), duration_s))
+        return Fault(kind, (who,), now_s, end_s, chance.choice((-_CLOCK_STEP_S, _CLOCK_STEP_S)))
+    if kind is FaultKind.PARTITION:
+        domain = chance.choice(plan.topology.domains[1:])
+        own = set(domain.switches)
+        out = [link for link in oracle.links if len(link & own) == 1]
+        return Fault(kind, (domain.label, *sorted("-".join(sorted(link)) for link in out)), now_s, end_s)
+    mover = chance.choice(sorted(plan.homes))
+    there = chance.choice([home for home in plan.homes[mover] if home != at[mover]])
+    return Fault(FaultKind.ROAM, (mover, there), now_s, now_s)
+
+
+def _is_fit(fault: Fault, under_way: Sequence[Fault], oracle: Oracle, at: dict[str, str]) -> bool:
+    """Return whether a fault may come on top of those under way."""
+    busy = {target for each in under_way for target in _touched(each)}
+    if busy & _touched(fault):
+        return False
+    is_frozen_switch = fault.kind is FaultKind.FREEZE and fault.targets[0].startswith("switch")
+    if fault.kind is FaultKind.PARTITION:
+        return not any(each.kind in STRUCTURAL or each.kind is FaultKind.FREEZE for each in under_way)
+    if fault.kind in STRUCTURAL or is_frozen_switch:
+        if any(each.kind is FaultKind.PARTITION for each in under_way):
+            return False
+        return oracle.is_whole(broken_by([*under_way, fault], at))
+    if fault.kind is FaultKind.ROAM:
+        return fault.targets[1] not in broken_by(under_way, at).switches
+    return True
+
+
+def _touched(fault: Fault) -> set[str]:
+    """Return what no other fault may touch meanwhile: a process by name, a link by its ends."""
+    if fault.kind is FaultKind.PARTITION:
+        return set(fault.targets[1:])
+    if len(fault.targets) == 2 and fault.kind is not FaultKind.ROAM:
+        return {"-".join(fault.targets)}
+    if fault.kind is FaultKind.ROAM:
+        return {f"member {fault.targets[0]}"}
+    return set(fault.targets)

@@ -1,0 +1,50 @@
+"""Whether something grows: the slope of samples by least squares.
+
+Sans-I/O. A figure that is bounded rises while it warms up and is flat after that, so the samples of the warm-up are
+left out. A slope is told as growth over the rest of the run, beside the spread of the samples around their line.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+__all__ = ["Growth", "growth_of"]
+
+_WARM_UP: Final = 0.4  # of the samples
+
+
+@dataclass(frozen=True, slots=True)
+class Growth:
+    """What a figure did after the warm-up.
+
+    Attributes:
+        mean: of the samples.
+        rise: by how much the line rises from its first sample to its last; negative where it falls.
+        scatter: standard deviation of the samples from the line.
+    """
+
+    mean: float
+    rise: float
+    scatter: float
+
+    def is_flat(self, share: float, least: float) -> bool:
+        """Return whether the rise is below a share of the mean, or below ``least``, or drowns in the scatter."""
+        return self.rise <= max(share * abs(self.mean), least, 2 * self.scatter)
+
+
+def growth_of(samples: Sequence[float]) -> Growth:
+    """Return what the samples did after the warm-up; they were taken at even distances.
+
+    Raises:
+        ValueError: too few samples.
+    """
+    kept = samples[int(len(samples) * _WARM_UP) :]
+    if len(kept) < 3:
+        raise ValueError(f"{len(samples)} samples are too few")
+    places = range(len(kept))
+    slope, start = statistics.linear_regression(places, kept)
+    scatter = statistics.pstdev(value - (start + slope * at) for at, value in zip(places, kept, strict=True))
+    return Growth(statistics.fmean(kept), slope * (len(kept) - 1), scatter)

@@ -1,0 +1,246 @@
+"""Whether anything grows in nodes that live long: subscriptions and publishers that come and go.
+
+In memory (virtual time, one process): a reader subscribes and unsubscribes over and over; then publishers of names that
+were never heard of come, are read, and go. Samples: objects that Python's collector tracks, and resident memory.
+
+On real processes in namespaces: the same for a while, at an even rate. Samples of every switch, RIB and member: open
+descriptors, threads, bytes of BPF maps (which hold an entry only while it is there), resident memory.
+
+The samples after the warm-up must be flat (``faults/slope.py``). What went is remembered up to a bound (4,096 ended
+feeds, verified certificates), so objects are counted only where there are enough publishers to fill that first.
+
+    .venv/bin/python scripts/bench/soak.py --only memory                                    # a minute
+    .venv/bin/python scripts/bench/soak.py --only memory --cycles 1000000 --publishers 100000      # hours
+    sudo .venv/bin/python scripts/bench/soak.py --only real --seconds 3600
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import signal
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final
+
+from faults.overlay import Overlay
+from faults.plan import Churn, Flow, Plan, make_topology
+from faults.slope import Growth, growth_of
+from peers.process import FailedError
+from report import progress
+from rich.console import Console
+from rich.table import Table
+
+from gdp.errors import GdpError
+from gdp.testbed.runs import Runs
+from gdp.testbed.topology import chain
+from gdp.testbed.world import World
+from gdp.trust.right import Right
+
+CYCLES: Final = 3_000
+PUBLISHERS: Final = 600
+SECONDS: Final = 60.0
+SAMPLES: Final = 50
+BETWEEN_S: Final = 1.0
+CACHES: Final = 5_000  # publishers after which every bounded memory of those that went is full
+LEFT, RIGHT = "s1/left", "s3/right"
+PAGE_BYTES: Final = os.sysconf("SC_PAGE_SIZE")
+SHARE: Final = 0.02  # of the mean
+LEAST: Final = {"objects": 200.0, "memory, kB": 512.0, "descriptors": 0.0, "threads": 0.0, "map bytes": 1_024.0}
+
+Samples = dict[tuple[str, str], list[float]]  # (who, what) -> samples
+
+
+class Memory:
+    """Three switches, a RIB and two members on a network in memory."""
+
+    def __init__(self) -> None:
+        self._world = World(chain(3), seed=1, hello_s=20.0, dead_s=70.0)  # hellos cost most of the time otherwise
+        if not self._world.settle():
+            raise FailedError("the network in memory did not settle")
+        self._names = 0
+
+    def subscribe(self, cycles: int, samples: Samples) -> None:
+        """Subscribe and unsubscribe so often, with a message read each time."""
+        world, left, right = self._world, self._world.members[LEFT], self._world.members[RIGHT]
+        publisher = left.advertise(world.topic("/soak", left, [Right.PUBLISH]), b"soak", reliable=True)
+        topic = world.topic("/soak", right, [Right.READ])
+        world.network.touch(LEFT)
+
+        def once() -> None:
+            right.subscribe(topic)
+            world.network.touch(RIGHT)
+            self._until(lambda: publisher.readers == 1, "a reader")
+            publisher.publish(b"message")
+            left.flush(world.network.now.mono_s)
+            world.network.touch(LEFT)
+            self._until(lambda: bool(right.take_messages()), "a message")
+            right.unsubscribe(topic.name)
+            world.network.touch(RIGHT)
+            self._until(lambda: not publisher.readers, "the reader's end")
+
+        _repeat("subscribe, read, unsubscribe", once, cycles, samples)
+        left.withdraw(topic.name)
+        world.network.touch(LEFT)
+
+    def publish(self, publishers: int, samples: Samples) -> None:
+        """Let so many publishers come, each of a name of its own, be read once, and go."""
+        world, left, right = self._world, self._world.members[LEFT], self._world.members[RIGHT]
+
+        def once() -> None:
+            self._names += 1
+            name = f"/soak/{self._names}"
+            publisher = left.advertise(world.topic(name, left, [Right.PUBLISH]), b"soak", reliable=True)
+            topic = world.topic(name, right, [Right.READ])
+            right.subscribe(topic)
+            world.network.touch(LEFT)
+            world.network.touch(RIGHT)
+            self._until(lambda: publisher.readers == 1, "a reader")
+            publisher.publish(b"message")
+            left.flush(world.network.now.mono_s)
+            world.network.touch(LEFT)
+            self._until(lambda: bool(right.take_messages()), "a message")
+            left.withdraw(topic.name)
+            right.unsubscribe(topic.name)
+            world.network.touch(LEFT)
+            world.network.touch(RIGHT)
+            world.network.run(BETWEEN_S)  # so that the names of the warm-up run out within it
+
+        _repeat("publishers of new names", once, publishers, samples, is_filling=publishers < 2 * CACHES)
+
+    def _until(self, is_met: Callable[[], bool], what: str) -> None:
+        if not self._world.network.run(30.0, is_met):
+            raise FailedError(f"{what} did not come about within 30 s")
+
+
+def _repeat(label: str, once: Callable[[], None], times: int, samples: Samples, *, is_filling: bool = False) -> None:
+    """Do something so often, and take samples; where bounded memories still fill up, objects are not counted."""
+    begun_s = time.monotonic()
+    for at in range(times):
+        once()
+        if not (at + 1) % max(times // SAMPLES, 1):
+            gc.collect()
+            if not is_filling:
+                samples[label, "objects"].append(len(gc.get_objects()))
+            samples[label, "memory, kB"].append(_resident_bytes(os.getpid()) / 1_024)
+    progress(f"{label}: {times} in {time.monotonic() - begun_s:.0f} s")
+
+
+def soak_memory(options: argparse.Namespace, samples: Samples) -> None:
+    """Soak in memory.
+
+    Raises:
+        FailedError: something did not come about.
+    """
+    memory = Memory()
+    memory.subscribe(options.cycles, samples)
+    memory.publish(options.publishers, samples)
+
+
+def _plan() -> Plan:
+    topology, members = make_topology(
+        {"a": ("a1", "a2"), "b": ("b1",)}, {"b": "a"}, ("a1-a2", "a2-b1", "a1-b1"), ("a2", "b1"),
+        {"P": "a1", "R": "b1", "C": "b1", "D": "a2"},
+    )  # fmt: skip
+    churn = (Churn("/steady", "C"), Churn("/coming", "D", publishes=True), Churn("/coming", "R"))
+    return Plan(topology, members, flows=(Flow("/steady", "P", ("R",), hz=50.0),), churn=churn)
+
+
+def soak_real(options: argparse.Namespace, samples: Samples) -> None:
+    """Soak on real processes.
+
+    Raises:
+        FailedError: a process did not come up, or ended.
+        GdpError: the kernel refuses.
+    """
+    runs = Runs()
+    runs.sweep()  # what a killed run left
+    with ExitStack() as undo:
+        run = runs.start()
+        undo.callback(run.end)
+        overlay = undo.enter_context(Overlay(run, _plan(), plane=options.plane, churn_hz=options.hz))
+        overlay.start_all()
+        progress("real processes: up")
+        begun_s = time.monotonic()
+        for at in range(1, SAMPLES + 1):
+            time.sleep(max(begun_s + at * options.seconds / SAMPLES - time.monotonic(), 0.0))
+            for who in overlay.died():
+                raise FailedError(f"{who} ended by itself: {overlay.log_tail(who)}")
+            for who in overlay.everybody():
+                for what, value in _look(overlay.pid(who)):
+                    samples[who, what].append(value)
+        delivered = sum(1 for _, records in overlay.read("C") for _ in records)
+        if not delivered:
+            raise FailedError("the reader that comes and goes never had a message")
+        progress(f"real processes: {options.seconds:g} s, {delivered} messages to the reader that comes and goes")
+
+
+def _look(pid: int) -> Iterator[tuple[str, float]]:
+    folder = Path(f"/proc/{pid}")
+    yield "descriptors", float(len(list((folder / "fd").iterdir())))
+    yield "threads", float(len(list((folder / "task").iterdir())))
+    yield "memory, kB", _resident_bytes(pid) / 1_024
+    maps = list(_map_bytes(folder))
+    if maps:
+        yield "map bytes", float(sum(maps))
+
+
+def _resident_bytes(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) * PAGE_BYTES
+
+
+def _map_bytes(folder: Path) -> Iterator[int]:
+    """Yield what each BPF map of a process takes. Source: Linux, kernel/bpf/syscall.c, ``bpf_map_show_fdinfo``."""
+    for each in (folder / "fdinfo").iterdir():
+        facts = dict(line.split(":", 1) for line in each.read_text(encoding="ascii").splitlines() if ":" in line)
+        if "map_type" in facts:
+            yield int(facts["memlock"])
+
+
+def show(samples: Samples) -> bool:
+    """Print what every figure did; return whether all are flat."""
+    table = Table(title="After the warm-up", title_justify="left")
+    for heading in ("who", "figure", "mean", "rise", "scatter", "flat"):
+        table.add_column(heading, justify="left" if heading in ("who", "figure") else "right")
+    flat = True
+    for (who, what), values in samples.items():
+        growth: Growth = growth_of(values)
+        is_flat = growth.is_flat(SHARE, LEAST[what])
+        flat = flat and is_flat
+        figures = (f"{each:,.1f}" for each in (growth.mean, growth.rise, growth.scatter))
+        table.add_row(who, what, *figures, "yes" if is_flat else "NO")
+    Console(width=120).print(table)
+    return flat
+
+
+def main() -> None:
+    """Soak; exit 1 when something grows."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", choices=("memory", "real"), help="this part")
+    parser.add_argument("--cycles", type=int, default=CYCLES, help="subscriptions in memory (default: %(default)s)")
+    parser.add_argument("--publishers", type=int, default=PUBLISHERS, help="in memory (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="on real processes (default: %(default)s)")
+    parser.add_argument("--hz", type=float, default=10.0, help="changes a second there (default: %(default)s)")
+    parser.add_argument("--plane", default="auto", help="as gdp-switch --data-plane (default: %(default)s)")
+    options = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
+    samples: Samples = defaultdict(list)
+    try:
+        if options.only != "real":
+            soak_memory(options, samples)
+        if options.only != "memory":
+            soak_real(options, samples)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except (GdpError, FailedError) as error:
+        sys.exit(f"error: {error}")
+    sys.exit(not show(samples))
+
+
+if __name__ == "__main__":
+    main()

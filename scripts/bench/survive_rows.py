@@ -1,0 +1,217 @@
+"""The events of ``survive.py``: a small network for each, what fails in it, and how that is undone.
+
+Place: shell; through ``faults.overlay``. P publishes to R at an even rate; ``-`` is a link of cost 10, ``=`` one of
+12, so that traffic takes the upper way::
+
+    square      P - s1 - s2 - s4 - R            all of one domain; s1 has a loop-free alternate to s4 by s3 (RFC 5286),
+                     \\= s3 -/                    s2 has none: the way from its other neighbour leads back over s2
+    borders     P - a1 - a2 - b2 - b1 - R       two domains, two borders each
+                     \\= a3 - b3 =/
+    star        P - a1 - t1 - c1 - R            a domain each (a, b, t, c, d), RIBs in all of them; P and R may be moved
+                    b1 -/  \\- d1                to b1 and d1, or in the domain from a1 to a2 (which hangs at a1)
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from faults.link_faults import FrameFaults
+from faults.overlay import Overlay
+from faults.plan import Flow, Plan, make_topology
+
+from gdp.testbed.topology import Link
+
+__all__ = ["NEW_TOPICS", "ROWS", "Row"]
+
+TOPIC: Final = "/steady"
+NEW_TOPICS: Final = 40
+_DEARER: Final = 12
+_COUNT_S: Final = 0.1  # for which frames are counted, to see which way the flow takes
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One event.
+
+    Args:
+        what: in words.
+        target_s: most seconds of silence at the 99th percentile; None: only told.
+        plan: the network, for a rate of messages a second.
+        fail: makes the event happen; given the overlay and the number of the round, from 0.
+        undo: takes it back; None where the next event is as good from here.
+        new_name_s: most seconds until a name that is new then is read; None: not asked.
+        holds: the event lasts for the bench's ``--dead-s``.
+    """
+
+    what: str
+    target_s: float | None
+    plan: Callable[[float], Plan]
+    fail: Callable[[Overlay, int], None]
+    undo: Callable[[Overlay, int], None] | None = None
+    new_name_s: float | None = None
+    holds: bool = False
+
+
+def _flows(hz: float) -> tuple[Flow, ...]:
+    return (Flow(TOPIC, "P", ("R",), hz=hz),)
+
+
+def _square(hz: float, ribs: tuple[str, ...] = ("s3",), *, new_names: bool = False) -> Plan:
+    topology, members = make_topology(
+        {"home": ("s1", "s2", "s3", "s4")},
+        {},
+        ("s1-s2", "s2-s4", Link("s1", "s3", cost=_DEARER), "s3-s4"),
+        ribs,
+        {"P": "s1", "R": "s4"},
+    )
+    spare = tuple(Flow(f"/new/{n}", "P", ("R",), hz=50.0) for n in range(NEW_TOPICS)) if new_names else ()
+    return Plan(topology, members, flows=_flows(hz), spare=spare)
+
+
+def _borders(hz: float) -> Plan:
+    topology, members = make_topology(
+        {"a": ("a1", "a2", "a3"), "b": ("b1", "b2", "b3")},
+        {"b": "a"},
+        ("a1-a2", "a2-b2", "b2-b1", Link("a1", "a3", cost=_DEARER), "a3-b3", Link("b3", "b1", cost=_DEARER)),
+        ("a1", "b1"),
+        {"P": "a1", "R": "b1"},
+    )
+    return Plan(topology, members, flows=_flows(hz))
+
+
+def _star(hz: float, homes: Mapping[str, tuple[str, ...]]) -> Plan:
+    topology, members = make_topology(
+        {"t": ("t1",), "a": ("a1", "a2"), "b": ("b1",), "c": ("c1",), "d": ("d1",)},
+        {"a": "t", "b": "t", "c": "t", "d": "t"},
+        ("a1-t1", "a2-a1", "b1-t1", "c1-t1", "d1-t1"),
+        ("t1", "a1", "b1", "c1", "d1"),
+        {"P": "a1", "R": "c1"},
+    )
+    return Plan(topology, members, homes=homes, flows=_flows(hz))
+
+
+def _own_switch(hz: float) -> Plan:
+    topology, members = make_topology(
+        {"t": ("t1",), "a": ("a1", "robot"), "b": ("b1",), "c": ("c1",)},
+        {"a": "t", "b": "t", "c": "t"},
+        ("a1-t1", "robot-a1", "b1-t1", "c1-t1"),
+        ("t1", "a1", "b1", "c1"),
+        {"P": "robot", "R": "c1"},
+    )
+    return Plan(topology, members, homes={"robot": ("a1", "b1")}, flows=_flows(hz))
+
+
+def _move(*movers: str) -> Callable[[Overlay, int], None]:
+    def move(overlay: Overlay, at: int) -> None:
+        for mover in movers:
+            homes = overlay.plan.homes[mover]
+            overlay.move(mover, homes[(at + 1) % len(homes)])
+
+    return move
+
+
+class _OnPath:
+    """Faults at the switch, or the link to or from it, that the flow takes at that moment.
+
+    A link that came back may be left out of routes for seconds (damping), so the path is not always the cheaper one.
+    The busier of the last switch's two devices tells.
+
+    Args:
+        last: where both ways meet again.
+        ways: the switch before it, by which the flow comes, and what fails then.
+    """
+
+    def __init__(
+        self,
+        last: str,
+        ways: Mapping[str, str],
+        fail: Callable[[Overlay, str], None],
+        undo: Callable[[Overlay, str], None],
+    ) -> None:
+        self._last, self._ways, self._fail, self._undo = last, dict(ways), fail, undo
+        self._failed = ""
+
+    def fail(self, overlay: Overlay, _: int) -> None:
+        before = overlay.received(self._last, list(self._ways))
+        time.sleep(_COUNT_S)
+        after = overlay.received(self._last, list(self._ways))
+        self._failed = self._ways[max(self._ways, key=lambda way: after[way] - before[way])]
+        self._fail(overlay, self._failed)
+
+    def undo(self, overlay: Overlay, _: int) -> None:
+        self._undo(overlay, self._failed)
+
+    def both(self) -> dict[str, Callable[[Overlay, int], None]]:
+        """Return both as keys of a row."""
+        return {"fail": self.fail, "undo": self.undo}
+
+
+def _cut(**ways: str) -> dict[str, Callable[[Overlay, int], None]]:
+    return _OnPath(
+        "s4",
+        ways,
+        lambda overlay, link: overlay.cut(*link.split("-")),
+        lambda overlay, link: overlay.mend(*link.split("-")),
+    ).both()
+
+
+def _silence(**ways: str) -> dict[str, Callable[[Overlay, int], None]]:
+    return _OnPath(
+        "s4",
+        ways,
+        lambda overlay, link: overlay.disturb(*link.split("-"), FrameFaults(lost=1.0)),
+        lambda overlay, link: overlay.calm(*link.split("-")),
+    ).both()
+
+
+def _kill(last: str, **ways: str) -> dict[str, Callable[[Overlay, int], None]]:
+    return _OnPath(last, ways, lambda overlay, who: overlay.kill(who), _again).both()
+
+
+def _again(overlay: Overlay, *names: str) -> None:
+    for who in names:
+        overlay.restart(who)
+    for who in names:
+        overlay.await_ready(who)
+
+
+def _one_rib(overlay: Overlay, at: int) -> str:
+    return f"rib {overlay.plan.ribs[at % len(overlay.plan.ribs)]}"
+
+
+def _all_ribs(overlay: Overlay) -> list[str]:
+    return [f"rib {node}" for node in overlay.plan.ribs]
+
+
+def _kill_all_ribs(overlay: Overlay, _: int) -> None:
+    for who in _all_ribs(overlay):
+        overlay.kill(who)
+
+
+ROWS: Final[dict[str, Row]] = {
+    "nothing": Row("nothing happens", None, _square, lambda *_: None),
+    "roam-domain": Row("roaming, same domain", 0.3, lambda hz: _star(hz, {"P": ("a1", "a2")}), _move("P")),
+    "roam-other": Row("roaming, other domain", 0.5, lambda hz: _star(hz, {"P": ("a1", "b1")}), _move("P")),
+    "roam-switch": Row("roaming, own switch", 0.5, _own_switch, _move("robot")),
+    "roam-both": Row(
+        "roaming, both ends at once", 0.8, lambda hz: _star(hz, {"P": ("a1", "b1"), "R": ("c1", "d1")}), _move("P", "R")
+    ),
+    "cut-alternate": Row("link cut, carrier seen, with an alternate", 0.005, _square, **_cut(s2="s1-s2", s3="s1-s3")),
+    "cut": Row("link cut, carrier seen, without an alternate", 0.05, _square, **_cut(s2="s2-s4", s3="s3-s4")),
+    "silent": Row("link cut, silent", 0.25, _square, **_silence(s2="s1-s2", s3="s1-s3")),
+    "switch": Row("switch on the path killed", 0.3, _square, **_kill("s4", s2="switch s2", s3="switch s3")),
+    "border": Row("border killed", 0.5, _borders, **_kill("b1", b2="switch a2", b3="switch a3")),
+    "rib": Row(
+        "any one RIB of two killed", 0.0, lambda hz: _square(hz, ("s3", "s2"), new_names=True),
+        lambda overlay, at: overlay.kill(_one_rib(overlay, at)),
+        lambda overlay, at: _again(overlay, _one_rib(overlay, at)),
+        new_name_s=0.3,
+    ),
+    "ribs": Row(
+        "all RIBs dead", 0.0, lambda hz: _square(hz, ("s3", "s2")), _kill_all_ribs,
+        lambda overlay, _: _again(overlay, *_all_ribs(overlay)), holds=True,
+    ),
+}  # fmt: skip

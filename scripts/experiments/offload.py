@@ -1,0 +1,225 @@
+"""FogROS G, Table I and Figure 5: what a robot gains by computing elsewhere, and what the overlay adds to ROS 2.
+
+    sudo .venv/bin/python scripts/experiments/offload.py               # all; writes docs/experiments/offload.*
+    sudo .venv/bin/python scripts/experiments/offload.py --quick       # a few seconds: does it work?
+    sudo .venv/bin/python scripts/experiments/offload.py --task vSLAM --part network     # a piece; the rest is kept
+
+Robot and server are nodes of ROS 2. Between them are three machines, which are switches of the overlay or, for the
+unsecured ROS 2, Linux bridges (``scripts/bench/ros_row.py``). ``offload_tasks.py`` describes the tasks.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import statistics
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, field
+from typing import Annotated, Final, Literal, TypeAlias
+
+import typer
+from bench_path import ROOT
+from machine import machine_state
+from offload_page import page_of, save_picture
+from peers.process import FailedError, Started
+from report import progress
+from ros_row import DIRECT_DOMAIN, LEFT, READY_S, RIGHT, Carried, Row
+from study import JsonOption, OutOption, QuickOption, place_of
+
+from gdp.errors import LocalError
+from gdp.testbed.cgroups import Cgroup
+from gdp.testbed.runs import Run, Runs
+
+__all__: list[str] = []
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+OVERLAY: Final = "overlay"
+CONTENDERS: Final = {"ROS 2, Cyclone DDS": "cyclone", "ROS 2, Fast DDS": "fast", OVERLAY: "fast"}
+ROUNDS: Final = 3
+AT_ONCE: Final = 34  # requests a round that are answered without computing: the network alone
+COMPUTED: Final = {"vSLAM": 34, "grasp planning": 34, "motion planning": 1}  # requests a round that are computed
+ALONE: Final = {
+    "vSLAM": (100, 1),
+    "grasp planning": (25, 4),
+    "motion planning": (1, 6),
+}  # requests, robots side by side
+# The paper's time on the robot over its time on the server (total less network): how much slower the robot is.
+SLOWER: Final = {"vSLAM": 0.68 / 1.39, "motion planning": 161.8 / 4.292, "grasp planning": 14.0 / 0.535}
+MTU: Final = 1_500
+_QUICK: Final = "grasp planning"
+_END: Final = str(ROOT / "scripts" / "experiments" / "offload_end.py")
+_ANSWER_S: Final = 200.0
+_ROBOTS_READY_S: Final = 180.0
+_ALONE_S: Final = 1_100.0
+
+Part: TypeAlias = Literal["network", "alone", "both"]
+
+
+@dataclass(slots=True)
+class Measured:
+    """What one contender took, in seconds, a value a request. ``failed``: answers that were wrong."""
+
+    there_s: list[float] = field(default_factory=list)
+    back_s: list[float] = field(default_factory=list)
+    total_s: list[float] = field(default_factory=list)
+    computed_s: list[float] = field(default_factory=list)
+    rounds_there_s: list[float] = field(default_factory=list)  # the median of each round
+    failed: int = 0
+
+
+@app.command(
+    epilog="Example: sudo .venv/bin/python scripts/experiments/offload.py --task vSLAM --rounds 1 --out /tmp/g"
+)
+def main(
+    task: Annotated[list[str] | None, typer.Option(help="One of Table I; may be repeated. Default: all three.")] = None,
+    part: Annotated[
+        Part, typer.Option(help="What to measure: over the network, on the robot alone, or both.")
+    ] = "both",
+    rounds: Annotated[int, typer.Option(min=1, help="Contenders take turns, round by round.")] = ROUNDS,
+    quick: QuickOption = False,
+    as_json: JsonOption = False,
+    out: OutOption = None,
+) -> None:
+    """Compute three tasks on the robot, and on a server behind three switches."""
+    names = [_QUICK] if quick else task or list(COMPUTED)
+    if unknown := set(names) - set(COMPUTED):
+        raise typer.BadParameter(f"--task {', '.join(unknown)}: expected one of {', '.join(COMPUTED)}")
+    place = place_of(out, quick=quick)
+    kept = place / "offload.json" if place else None
+    tasks: dict[str, dict[str, object]] = {}
+    if kept is not None and kept.exists():
+        tasks = json.loads(kept.read_text(encoding="utf-8"))["tasks"]
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
+    try:
+        for name in names:
+            state = machine_state()
+            told = tasks.setdefault(name, {})
+            if part != "alone":
+                told["network"] = _network(name, 1 if quick else rounds, quick=quick) | {"machine": asdict(state)}
+            if part != "network":
+                told["alone"] = _alone(name, quick=quick) | {"machine": asdict(state)}
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except (LocalError, FailedError) as error:
+        sys.exit(f"error: {error}")
+    document = {"experiment": "offload", "slower": SLOWER, "tasks": tasks}
+    page = page_of(document)
+    print(json.dumps(document) if as_json else page)
+    if place is not None and kept is not None:
+        place.mkdir(parents=True, exist_ok=True)
+        kept.write_text(json.dumps(document, indent=None, separators=(",", ":")) + "\n", encoding="utf-8")
+        (place / "offload.md").write_text(page, encoding="utf-8")
+        save_picture(place / "offload.png", document)
+        progress(f"written: {place / 'offload'}.json, .md and .png")
+
+
+def _network(name: str, rounds: int, *, quick: bool) -> dict[str, object]:
+    """Let every contender carry a task, in turn, round by round."""
+    from offload_tasks import TASKS
+
+    shape = TASKS[name]()
+    prefix = f"/{name.replace(' ', '_').lower()}/"
+    carried = [Carried(prefix + topic, type_name, "cdr") for topic, type_name in shape.parts]
+    carried.append(Carried(prefix + shape.answer[0], shape.answer[1], "cdr", source=RIGHT))
+    at_once, computed = (3, 2) if quick else (AT_ONCE, COMPUTED[name])
+    found = {who: Measured() for who in CONTENDERS}
+    size = 0
+    with _run() as run, Row(run, carried, mtu=MTU, bridged=True) as row:
+        for at in range(1, rounds + 1):
+            for who, middleware in CONTENDERS.items():
+                progress(f"{name}, round {at} of {rounds}: {who}")
+                told = {"task": name, "prefix": prefix, "middleware": middleware, "domain": DIRECT_DOMAIN}
+                told |= {"at_once": at_once, "count": at_once + computed}
+                size = _trip(row, found[who], told, at_once, direct=who != OVERLAY)
+    return {
+        "request_bytes": size,
+        "rounds": rounds,
+        "answered_at_once": rounds * at_once,
+        "computed": rounds * computed,
+        "contenders": {who: {key: _short(value) for key, value in asdict(each).items()} for who, each in found.items()},
+    }
+
+
+def _trip(row: Row, found: Measured, told: Mapping[str, object], at_once: int, *, direct: bool) -> int:
+    """Let a robot and a server do one series; return the size of a request, in bytes."""
+    there_s = []
+    with row.process(RIGHT, "cloud", [_END, "cloud", json.dumps(told)], direct=direct) as cloud:
+        cloud.read(READY_S)
+        with row.process(LEFT, "robot", [_END, "robot", json.dumps(told)], direct=direct) as robot:
+            size = int(str(robot.read(READY_S)["request_bytes"]))
+            while "number" in (said := robot.read(_ANSWER_S)):
+                number, asked_s, answered_s = (
+                    int(str(said["number"])),
+                    _float(said, "asked_s"),
+                    _float(said, "answered_s"),
+                )
+                while (other := cloud.read(READY_S))["number"] != number:
+                    pass  # greetings
+                found.failed += not said["is_right"]
+                arrived_s, computed_s = _float(other, "arrived_s"), _float(other, "computed_s")
+                if number <= at_once:
+                    there_s.append(arrived_s - asked_s)
+                    found.back_s.append(answered_s - computed_s)
+                else:
+                    found.total_s.append(answered_s - asked_s)
+                    found.computed_s.append(computed_s - arrived_s)
+    found.there_s += there_s
+    found.rounds_there_s.append(statistics.median(there_s))
+    return size
+
+
+def _alone(name: str, *, quick: bool) -> dict[str, object]:
+    """Let robots compute by themselves, each in a control group that is as much slower than a core as the paper's."""
+    count, robots = (1, 1) if quick else ALONE[name]
+    cores = 1 / SLOWER[name] if SLOWER[name] > 1 and not quick else 1.0
+    times, failed = [], 0
+    with _run() as run, ExitStack() as stack:
+        started = []
+        for number in range(robots):
+            argv = [_END, "alone", json.dumps({"task": name, "count": count})]
+            started.append(stack.enter_context(Started(run, f"robot {number}", list, argv)))
+        for number, robot in enumerate(started):
+            robot.read(_ROBOTS_READY_S)
+            if cores < 1:
+                group = Cgroup(f"gdp-{run.id}-robot{number}")
+                stack.callback(group.remove)
+                group.make()
+                group.add(robot.pid)
+                group.limit_cpu(cores)
+        for robot in started:
+            os.kill(robot.pid, signal.SIGUSR1)
+        for robot in started:
+            for _ in range(count):
+                said = robot.read(_ALONE_S)
+                times.append(_float(said, "took_s"))
+                failed += not said["is_right"]
+            progress(f"{name}, on the robot: {len(times)} of {count * robots}")
+    return {"cores": cores, "took_s": _short(times), "failed": failed, "side_by_side": robots}
+
+
+@contextmanager
+def _run() -> Iterator[Run]:
+    """Have a run of the testbed for a while."""
+    runs = Runs()
+    runs.sweep()
+    run = runs.start()
+    try:
+        yield run
+    finally:
+        run.end()
+
+
+def _float(said: Mapping[str, object], key: str) -> float:
+    return float(str(said[key]))
+
+
+def _short(value: object) -> object:
+    return [round(each, 6) for each in value] if isinstance(value, list) else value
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,258 @@
+"""The three tasks of FogROS G's Table I: what a robot sends, what the server computes from it, and whether it is right.
+
+Reads recorded frames and meshes when a task is made; otherwise sans-I/O. The sizes of images and the types are those of
+the clients that the authors publish (``scripts/bench/fogros_tasks.py`` names the files); types of packages without a
+wheel are replaced by standard ones that carry the same numbers.
+
+    vSLAM             colour (rgb8) and depth (16UC1) of 640 x 480 -> pose          stand-in: odometry.py
+    motion planning   meshes of OMPL's Home and a request -> path                   OMPL's RRTConnect, FCL
+    grasp planning    depth (32FC1) and mask of 516 x 386, camera -> grasp          stand-in: grasp.py
+"""
+
+from __future__ import annotations
+
+import array
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Protocol
+
+import cv2
+import numpy as np
+from bench_path import ROOT
+from fogros_tasks import CAMERA, IMAGE, NUMBERS, OCTETS, POSE
+from geometry_msgs.msg import PoseStamped
+from ros_tasks import Message
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Float64MultiArray, UInt8MultiArray
+
+if TYPE_CHECKING:
+    from planning import Problem
+
+__all__ = ["DATA", "TASKS", "OffloadTask"]
+
+DATA: Final = ROOT.parent / "shared" / "data"
+_FRAMES: Final = (2, 3, 4, 5)  # the first of the five recorded frames is too far from the second to be matched well
+_NEAR_M: Final = 0.1
+_TURNED_RAD: Final = 0.1
+_CROP: Final = (slice(47, 433), slice(62, 578))  # 516 x 386, the size of Dex-Net's camera
+# An armchair, by frame: first and last row and column of a box around it, in the cropped image.
+_OBJECTS: Final = {3: (85, 235, 272, 374), 4: (77, 243, 212, 382), 5: (57, 263, 244, 418)}
+_THICK_M: Final = 0.4
+_PLANNER: Final = "RRTConnect"
+_PLANNING_LIMIT_S: Final = 1_000.0
+
+
+class OffloadTask(Protocol):
+    """A task.
+
+    Attributes:
+        parts: topic and type of each message that the robot sends.
+        answer: topic and type of the server's.
+    """
+
+    parts: Sequence[tuple[str, str]]
+    answer: tuple[str, str]
+
+    def warm_up(self) -> None:
+        """Load what the first computation would load."""
+        ...
+
+    def request(self, number: int) -> list[Message]:
+        """Return the messages of a request, in the order of ``parts``."""
+        ...
+
+    def compute(self, messages: Sequence[Message]) -> Message:
+        """Return the server's answer."""
+        ...
+
+    def is_right(self, number: int, answer: Message) -> bool:
+        """Return whether an answer to the request of that number is right."""
+        ...
+
+
+class Vslam:
+    """The camera's motion since the frame before. The camera goes through the recorded frames, back and forth."""
+
+    parts = (("color", IMAGE), ("depth", IMAGE))
+    answer = ("pose", POSE)
+
+    def __init__(self, data: Path = DATA) -> None:
+        from odometry import Features, transform_of
+
+        colors = {at: cv2.imread(str(data / "rgbd" / f"color_{at}.png"))[:, :, ::-1] for at in _FRAMES}
+        depths = {at: cv2.imread(str(data / "rgbd" / f"depth_{at}.pgm"), cv2.IMREAD_UNCHANGED) for at in _FRAMES}
+        poses = [line.split() for line in (data / "rgbd" / "pose.txt").read_text(encoding="ascii").splitlines()]
+        self._poses = {at: transform_of(tuple(map(float, poses[at - 1]))) for at in _FRAMES}
+        self._images = {at: [_image("rgb8", colors[at]), _image("16UC1", depths[at])] for at in _FRAMES}
+        self._before = Features.of(np.ascontiguousarray(colors[_FRAMES[0]]), depths[_FRAMES[0]])
+
+    def warm_up(self) -> None:
+        """Compute request 0."""
+        self.compute(self.request(0))
+
+    def request(self, number: int) -> list[Message]:
+        """Return colour and depth of a frame."""
+        return list(self._images[_frame(number)])
+
+    def compute(self, messages: Sequence[Message]) -> Message:
+        """Return the motion as a pose; without a header's ``stamp`` of 1 s it was not found."""
+        from odometry import Features, motion
+
+        color, depth = (_pixels(message) for message in messages)
+        after = Features.of(color, depth.reshape(color.shape[:2]))
+        found = motion(self._before, after)
+        self._before = after
+        answer = PoseStamped()
+        if found is not None:
+            answer.header.stamp.sec = 1
+            place, turn = answer.pose.position, answer.pose.orientation
+            place.x, place.y, place.z = (float(each) for each in found[:3, 3])
+            vector = cv2.Rodrigues(found[:3, :3])[0].ravel()
+            turn.x, turn.y, turn.z = (float(each) for each in vector)  # a rotation vector, in radians
+            turn.w = 0.0
+        return answer
+
+    def is_right(self, number: int, answer: Message) -> bool:
+        """Return whether the motion is within 0.1 m and 0.1 rad of the recorded one."""
+        if not isinstance(answer, PoseStamped) or answer.header.stamp.sec != 1:
+            return False
+        truth = np.linalg.inv(self._poses[_frame(number)]) @ self._poses[_frame(number - 1)]
+        place, turn = answer.pose.position, answer.pose.orientation
+        apart_m = float(np.linalg.norm(truth[:3, 3] - (place.x, place.y, place.z)))
+        rotation = cv2.Rodrigues(np.array([turn.x, turn.y, turn.z]))[0]
+        turned_rad = float(np.linalg.norm(cv2.Rodrigues(rotation.T @ truth[:3, :3])[0]))
+        return apart_m <= _NEAR_M and turned_rad <= _TURNED_RAD
+
+
+class MotionPlanning:
+    """A path of a rigid body through OMPL's Home. Every request carries both meshes."""
+
+    parts = (("environment_mesh", OCTETS), ("robot_mesh", OCTETS), ("motion_plan_request", NUMBERS))
+    answer = ("motion_plan", NUMBERS)
+
+    def __init__(self, data: Path = DATA) -> None:
+        from planning import be_quiet, limits
+
+        be_quiet()
+        folder = data / "planning"
+        self._limits = limits(folder, "Home")
+        meshes = ((folder / f"Home_{what}.dae").read_bytes() for what in ("env", "robot"))
+        octets = [UInt8MultiArray(data=array.array("B", mesh)) for mesh in meshes]
+        numbers = [number for place in self._limits for number in place]
+        self._messages = [*octets, Float64MultiArray(data=array.array("d", numbers))]
+
+    def warm_up(self) -> None:
+        """Read both meshes once; the planner itself has nothing to load."""
+        self._problem(self._messages)
+
+    def request(self, number: int) -> list[Message]:
+        """Return environment, robot, and start, goal and bounds."""
+        del number
+        return list(self._messages)
+
+    def compute(self, messages: Sequence[Message]) -> Message:
+        """Return the path, seven numbers a state; empty: none was found in time."""
+        way = self._problem(messages).solve(_PLANNER, _PLANNING_LIMIT_S, lambda: False).way or []
+        return Float64MultiArray(data=array.array("d", [number for place in way for number in place]))
+
+    def is_right(self, number: int, answer: Message) -> bool:
+        """Return whether the path begins at the start and ends at the goal."""
+        del number
+        if not isinstance(answer, Float64MultiArray) or len(answer.data) < 2 * 7:
+            return False
+        start, goal, _, _ = self._limits
+        return bool(np.allclose(answer.data[:3], start) and np.allclose(answer.data[-7:-4], goal))
+
+    @staticmethod
+    def _problem(messages: Sequence[Message]) -> Problem:
+        from planning import Problem
+
+        world, robot, asked = messages
+        start, goal, low, high = (tuple(asked.data[at : at + 3]) for at in (0, 3, 6, 9))
+        return Problem.of(bytes(robot.data), bytes(world.data), start, goal, low, high)
+
+
+class GraspPlanning:
+    """A grasp of an armchair, in three of the recorded frames in turn."""
+
+    parts = (("camera_info", CAMERA), ("image_raw", IMAGE), ("mask_raw", IMAGE))
+    answer = ("grasp", POSE)
+
+    def __init__(self, data: Path = DATA) -> None:
+        from odometry import CAMERA as MATRIX
+        from odometry import DEPTH_SCALE
+
+        self._masks = {}
+        self._messages = {}
+        info = CameraInfo(height=386, width=516, k=MATRIX.ravel().tolist())
+        for at, (top, bottom, left, right) in _OBJECTS.items():
+            image = cv2.imread(str(data / "rgbd" / f"depth_{at}.pgm"), cv2.IMREAD_UNCHANGED)
+            depth = (image[_CROP] / DEPTH_SCALE).astype(np.float32)
+            inside = np.zeros(depth.shape, dtype=bool)
+            inside[top:bottom, left:right] = True
+            distance_m = np.median(depth[inside & (depth > 0)])
+            mask = (inside & (np.abs(depth - distance_m) < _THICK_M)).astype(np.uint8) * 255
+            self._masks[at] = mask
+            self._messages[at] = [info, _image("32FC1", depth), _image("mono8", mask)]
+
+    def warm_up(self) -> None:
+        """Compute request 0."""
+        self.compute(self.request(0))
+
+    def request(self, number: int) -> list[Message]:
+        """Return camera, depth and mask."""
+        return list(self._messages[_object(number)])
+
+    def compute(self, messages: Sequence[Message]) -> Message:
+        """Return the grasp: middle (column, row, metres), and angle, width and quality as orientation x, y, z."""
+        from grasp import plan_grasp
+
+        info, depth, mask = messages
+        found = plan_grasp(_pixels(depth), _pixels(mask), float(info.k[0]), seed=1)
+        answer = PoseStamped()
+        if found is not None:
+            place, turn = answer.pose.position, answer.pose.orientation
+            place.x, place.y, place.z = found.column, found.row, found.depth_m
+            turn.x, turn.y, turn.z = found.angle_rad, found.width_m, found.quality
+        return answer
+
+    def is_right(self, number: int, answer: Message) -> bool:
+        """Return whether the middle of the grasp is on the object, and the gripper opens wide enough."""
+        from grasp import WIDEST_M
+
+        if not isinstance(answer, PoseStamped) or answer.pose.orientation.z <= 0:
+            return False
+        row, column = int(answer.pose.position.y), int(answer.pose.position.x)
+        return bool(self._masks[_object(number)][row, column]) and answer.pose.orientation.y <= WIDEST_M
+
+
+TASKS: Final[Mapping[str, Callable[[], OffloadTask]]] = {
+    "vSLAM": Vslam,
+    "motion planning": MotionPlanning,
+    "grasp planning": GraspPlanning,
+}
+
+_KINDS: Final = {"rgb8": (np.uint8, 3), "16UC1": (np.uint16, 1), "32FC1": (np.float32, 1), "mono8": (np.uint8, 1)}
+
+
+def _frame(number: int) -> int:
+    """Return which frame a request shows: 2 (request 0), 3, 4, 5, 4, 3, 2, ..."""
+    last = len(_FRAMES) - 1
+    at = number % (2 * last)
+    return _FRAMES[min(at, 2 * last - at)]
+
+
+def _object(number: int) -> int:
+    return list(_OBJECTS)[number % len(_OBJECTS)]
+
+
+def _image(encoding: str, pixels: np.ndarray) -> Image:
+    height, width = pixels.shape[:2]
+    raw = np.ascontiguousarray(pixels).tobytes()
+    return Image(height=height, width=width, encoding=encoding, step=len(raw) // height, data=array.array("B", raw))
+
+
+def _pixels(message: Message) -> np.ndarray:
+    kind, channels = _KINDS[message.encoding]
+    shape = (message.height, message.width, channels) if channels > 1 else (message.height, message.width)
+    return np.frombuffer(bytes(message.data), dtype=kind).reshape(shape)

@@ -1,0 +1,194 @@
+"""Availability, measured: machines that stop and come back at random, a service on one of them and on both.
+
+    sudo .venv/bin/python scripts/experiments/outages.py                # 4 minutes; writes docs/experiments/outages.*
+    sudo .venv/bin/python scripts/experiments/outages.py --quick        # a few seconds: does it work?
+
+FogROS2-FT reckons that two spot machines, each up for 15 h and down for 20 min, are down together less than 0.05 % of
+the time, because shares of independent machines multiply. Nobody can wait for that. Here the times are seconds, and the
+machines are down for a quarter of the time, so that both are down together often enough to be measured.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Final
+
+import typer
+from field import Field, Served, Work
+from machine import machine_state
+from pictures import Span, save_timeline
+from samples import Sample
+from series import Series
+from study import Asking, Finding, JsonOption, OutOption, QuickOption, Report, conclude, field_of, place_of
+
+from fog.plan.failure import chance_down, joint
+
+__all__ = ["Outage", "draw_outages", "share_unanswered"]
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+SECONDS: Final = 180.0
+QUICK_S: Final = 6.0
+UP_S: Final = 9.0
+DOWN_S: Final = 3.0
+_PAPER_UP_S: Final = 15 * 3_600.0
+_PAPER_DOWN_S: Final = 20 * 60.0
+_TYPE: Final = "nav_msgs/srv/GetPlan"
+_ONE, _TWO = "/serve/m1", "/serve"
+_MACHINES: Final = ("m1", "m2")
+_HZ: Final = 10.0  # of each service
+_PATIENCE_S: Final = 0.5
+_LANES: Final = 1_000
+_SEED: Final = 15
+_STEP_S: Final = 0.01
+_SETTING: Final = (
+    "A robot asks two services ten times a second each: one is on machine m1 alone, the other one on m1 and m2. Each"
+    " machine stops (SIGSTOP to its node and its proxy at once: whatever it is sent waits) and goes on, independently:"
+    f" the times up and down are exponential, with means of {UP_S:g} s and {DOWN_S:g} s, drawn before. The servers"
+    " answer"
+    f" at once. A request that has no answer after {_PATIENCE_S:g} s is unanswered.",
+    "*By the list*: the share of requests during whose whole patience all their machines are down, computed from the"
+    " times drawn, without any overlay. *By arithmetic*: the machines' shares of time down, multiplied.",
+)
+_NOTES: Final = (
+    "The paper's times (15 h up, 20 min down) would need months, so the shares here are larger ones. What is tested is"
+    " that shares multiply as the arithmetic says, and that the overlay adds little to it: a service is back as"
+    " soon as a"
+    " machine of it is.",
+    "The machines stop and do not die: a new machine needs time to start, which figure 9 shows. Outages of spot"
+    " machines"
+    " that come together are in availability.md.",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Outage:
+    """A time for which a machine is down, in seconds from the beginning."""
+
+    from_s: float
+    to_s: float
+
+
+class _Stopper:
+    """Stops machines and lets them go on, as drawn; driven by the samples as they come."""
+
+    def __init__(self, place: Field, drawn: Mapping[str, Sequence[Outage]]) -> None:
+        self._servers = place.servers
+        self._drawn = drawn
+        self._is_down = dict.fromkeys(drawn, False)
+        self.spans: list[Span] = []
+        self._down_from_s: dict[str, float] = {}
+
+    def see(self, since_s: float) -> None:
+        """Do what is due ``since_s`` seconds after the beginning."""
+        for label, outages in self._drawn.items():
+            wanted = any(each.from_s <= since_s < each.to_s for each in outages)
+            if wanted and not self._is_down[label]:
+                self._servers[label].freeze()
+                self._down_from_s[label] = since_s
+            elif self._is_down[label] and not wanted:
+                self._servers[label].thaw()
+                self.spans.append(Span(label, self._down_from_s[label], since_s))
+            self._is_down[label] = wanted
+
+    def end(self, since_s: float) -> None:
+        """Let every machine go on."""
+        for label, is_down in self._is_down.items():
+            if is_down:
+                self._servers[label].thaw()
+                self.spans.append(Span(label, self._down_from_s[label], since_s))
+
+
+@app.command(epilog="Example: sudo .venv/bin/python scripts/experiments/outages.py --seconds 60 --out /tmp/outages")
+def main(
+    seconds: Annotated[float, typer.Option(min=1.0, help="How long.")] = SECONDS,
+    quick: QuickOption = False,
+    as_json: JsonOption = False,
+    out: OutOption = None,
+) -> None:
+    """Ask a service on one machine and one on two, while machines stop and go on."""
+    state, place = machine_state(), place_of(out, quick=quick)
+    seconds = QUICK_S if quick else seconds
+    drawn = {each: draw_outages(random.Random(f"{_SEED} {each}"), seconds) for each in _MACHINES}
+    served = [Served(_TWO, _TYPE, _MACHINES), Served(_ONE, _TYPE, _MACHINES[:1])]
+    names = {each: " ".join(s.name for s in served if each in s.machines) for each in _MACHINES}
+    work = {each: Work("replay", {"services": names[each], "waits_s": {}}) for each in _MACHINES}
+    count = round(2 * _HZ * seconds)
+    series = Series("plan", (_ONE, _TWO), count, _MACHINES, _PATIENCE_S, lanes=_LANES, gap_s=1 / (2 * _HZ))
+    samples: list[Sample] = []
+    with field_of(served, work) as here, Asking(here, series) as asking:
+        stopper = _Stopper(here, drawn)
+        begun_s = time.monotonic()
+        for sample in asking:
+            begun_s = begun_s if samples else sample.begun_s
+            samples.append(sample)
+            stopper.see(time.monotonic() - begun_s)
+        stopper.end(time.monotonic() - begun_s)
+        plane = here.data_plane
+    groups = {what: [each for each in samples if each.service == name] for what, name in _CASES.items()}
+    measured = {label: [Outage(s.from_s, s.to_s) for s in stopper.spans if s.machine == label] for label in _MACHINES}
+    report = Report(
+        "outages",
+        "Availability, measured: machines that stop and go on",
+        "sudo .venv/bin/python scripts/experiments/outages.py",
+        _SETTING,
+        groups,
+        _findings(groups, measured, seconds),
+        _NOTES,
+        {"seconds": seconds, "outages": sum(map(len, measured.values())), "switches": plane},
+    )
+    if place is not None:
+        place.mkdir(parents=True, exist_ok=True)
+        save_timeline(place / "outages.png", report.title, groups["two machines"], stopper.spans, begun_s)
+    conclude(report, state, place, ["outages.png"], as_json=as_json)
+
+
+_CASES: Final = {"one machine": _ONE, "two machines": _TWO}
+
+
+def draw_outages(chance: random.Random, seconds: float) -> list[Outage]:
+    """Return when a machine is down within ``seconds``; times up and down are exponential."""
+    outages, now_s = [], 0.0
+    while (now_s := now_s + chance.expovariate(1 / UP_S)) < seconds:
+        outage = Outage(now_s, now_s + chance.expovariate(1 / DOWN_S))
+        outages.append(outage)
+        now_s = outage.to_s
+    return outages
+
+
+def share_unanswered(machines: Sequence[Sequence[Outage]], seconds: float, patience_s: float) -> float:
+    """Return the share of moments from which on all machines stay down for ``patience_s``."""
+    moments = [at * _STEP_S for at in range(round(seconds / _STEP_S))]
+    lost = sum(
+        all(any(each.from_s <= now_s and now_s + patience_s < each.to_s for each in outages) for outages in machines)
+        for now_s in moments
+    )
+    return lost / len(moments)
+
+
+def _findings(
+    groups: Mapping[str, Sequence[Sample]], down: Mapping[str, Sequence[Outage]], seconds: float
+) -> list[Finding]:
+    shares = [100 * sum(not each.is_right for each in samples) / len(samples) for samples in groups.values()]
+    lists = [list(down.values())[:1], list(down.values())]
+    listed = [100 * share_unanswered(each, seconds, _PATIENCE_S) for each in lists]
+    times = [sum(each.to_s - each.from_s for each in outages) / seconds for outages in down.values()]
+    paper = chance_down(_PAPER_UP_S, _PAPER_DOWN_S)
+    return [
+        Finding("one machine: requests unanswered, %", shares[0]),
+        Finding("one machine: by the list, %", listed[0]),
+        Finding("two machines: requests unanswered, %", shares[1]),
+        Finding("two machines: by the list, %", listed[1]),
+        Finding("two machines: by arithmetic, of the times down here, %", 100 * joint(times)),
+        Finding("one machine: by arithmetic, 15 h up and 20 min down, %", 100 * paper),
+        Finding(
+            "two machines: by arithmetic, 15 h up and 20 min down, %", 100 * joint([paper, paper]), 0.05, True, "< 0.05"
+        ),
+    ]
+
+
+if __name__ == "__main__":
+    app()

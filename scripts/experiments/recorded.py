@@ -1,0 +1,58 @@
+"""Waits of servers that compute nothing, drawn from recorded planning runs.
+
+Sans-I/O, but for reading the recording. Each run of ``RRTConnect`` is a pair. ``record.py`` writes the number of states
+that the run checked, which is proportional to its time on a machine that does nothing else, and its processor time.
+Where the number is 0 it was not counted: the second number is then the time on such a machine (the computed trials of
+figure 5).
+"""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Final
+
+__all__ = ["LIMIT_S", "RECORDED", "RECORDING", "Recorded", "draw", "load"]
+
+RECORDING: Final = Path(__file__).with_name("planning_runs.json")
+LIMIT_S: Final = 100.0  # the paper's timeout
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """How the runs of a problem are used.
+
+    Args:
+        mean_s: of the computed trials of figure 5 on a quiet machine; the recorded runs are scaled to it.
+        faster: times that the waits are shorter than the runs, so that a hundred trials take minutes.
+    """
+
+    mean_s: float
+    faster: float
+
+
+RECORDED: Final[Mapping[str, Recorded]] = {
+    "Home": Recorded(4.21, 20.0),
+    "Cubicles": Recorded(0.247, 1.0),
+    "Twistycool": Recorded(13.4, 40.0),
+}
+
+
+def load(path: Path = RECORDING) -> dict[str, list[float]]:
+    """Return the recorded runs by problem, in seconds, as on a quiet machine; at most ``LIMIT_S`` each."""
+    recording: dict[str, list[list[float]]] = json.loads(path.read_text(encoding="utf-8"))
+    found = {}
+    for name, runs in recording.items():
+        counted = [checks for checks, _ in runs if checks]
+        scale = RECORDED[name].mean_s / fmean(counted) if counted else 0.0
+        found[name] = [min(scale * checks if checks else seconds, LIMIT_S) for checks, seconds in runs]
+    return found
+
+
+def draw(runs: list[float], faster: float, count: int, chance: random.Random) -> list[float]:
+    """Return waits: runs drawn with replacement, and shortened."""
+    return [chance.choice(runs) / faster for _ in range(count)]

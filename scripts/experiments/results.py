@@ -1,0 +1,246 @@
+"""One table of what the papers measured: theirs, ours, trials, spread, conditions; from the experiments' JSON.
+
+Reads the JSON files of a folder; otherwise sans-I/O.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean, median
+from typing import Any, Final
+
+import numpy as np
+from offload_page import CYCLONE, OVERLAY, PAPER, PAPER_ADDED_S, added_s
+from samples import p99
+
+__all__ = ["Row", "machines_of", "page_of", "rows_of"]
+
+_RESAMPLES: Final = 2_000
+_SEED: Final = 1
+_CASES: Final = ("one server", "two replicas")
+# Group of JSON, without the case -> what it is called, mean gain and p99 gain of the paper, conditions.
+_GAINS: Final[Mapping[str, Mapping[str, tuple[str, str, str, str]]]] = {
+    "fig5": {
+        "Home, waits / 20": ("MPT Home", "up to 1.22", "1.42 to 5.53", "waits of recorded runs, times / 20"),
+        "Cubicles, waits": ("MPT Cubicles", "1.22 (1.16)", "5.53", "waits of recorded runs, unscaled"),
+        "Twistycool, waits / 40": ("MPT TwistyCool", "up to 1.22", "1.42", "waits of recorded runs, times / 40"),
+        "Home, computed": ("MPT Home", "up to 1.22", "1.42 to 5.53", "computed; both replicas on one machine"),
+        "Cubicles, computed": ("MPT Cubicles", "1.22 (1.16)", "5.53", "computed; both replicas on one machine"),
+        "Twistycool, computed": ("MPT TwistyCool", "up to 1.22", "1.42", "computed; both replicas on one machine"),
+    },
+    "fig6": {
+        "servers wait, nobody contends": ("SAM, no fault", "", "1.3", "waits; spread chosen to give 1.3"),
+        "servers wait, contended": ("SAM, second client", "1.31", "1.96", "waits; second client on and off"),
+        "servers compute, contended": ("SAM, second client", "1.31", "1.96", "computed; all on one machine"),
+    },
+    "fig7": {
+        "round trip +100 ms": ("YOLOv8, +100 ms", "2.1", "3.9", "round trip +100 ms; servers wait 40 ms"),
+        "each way +100 ms": ("YOLOv8, +100 ms", "2.1", "3.9", "each way +100 ms; servers wait 40 ms"),
+    },
+}
+_NUMBERS: Final = {"fig5": "FT Figure 5", "fig6": "FT Figure 6", "fig7": "FT Figure 7"}
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A figure of a paper beside ours, as text. ``spread``: of ours, with what it is."""
+
+    figure: str
+    what: str
+    paper: str
+    here: str
+    spread: str
+    trials: str
+    conditions: str
+
+
+def rows_of(folder: Path) -> list[Row]:
+    """Return the rows of those experiments whose JSON is in a folder."""
+    makers: dict[str, Callable[[Any], Iterator[Row]]] = {
+        "offload": _offload,
+        "table1": _prices,
+        **{name: lambda document, name=name: _gains(name, document) for name in _GAINS},  # type: ignore[misc]
+        "fig9": _kills,
+        "outages": _outages,
+    }
+    rows = []
+    for name, make in makers.items():
+        path = folder / f"{name}.json"
+        if path.exists():
+            rows += make(json.loads(path.read_text(encoding="utf-8")))
+    return rows
+
+
+def machines_of(folder: Path) -> list[str]:
+    """Return where each experiment ran, and how busy that machine was, from the JSON in a folder."""
+    found: dict[str, list[str]] = {}
+    for name in ("offload", *_GAINS, "fig9", "outages"):
+        path = folder / f"{name}.json"
+        if path.exists():
+            document = json.loads(path.read_text(encoding="utf-8"))
+            parts = [part for task in document.get("tasks", {}).values() for part in task.values()] or [document]
+            for state in (part["machine"] for part in parts if "machine" in part):
+                machine = f"Linux {state['kernel']}, {state['cores']} cores ({state['processor']})"
+                found.setdefault(machine, []).append(f"{name} {state['load_before']:.1f}")
+    return [f"{machine}; load before: {', '.join(loads)}." for machine, loads in found.items()]
+
+
+def page_of(rows: Sequence[Row], machines: Sequence[str]) -> str:
+    """Return the page, in Markdown."""
+    head = ("figure", "what", "paper", "here", "spread here", "trials here", "conditions here")
+    cells = [(r.figure, r.what, r.paper, r.here, r.spread, r.trials, r.conditions) for r in rows]
+    table = "\n".join("| " + " | ".join(line) + " |" for line in [head, ("---",) * len(head), *cells])
+    return "\n\n".join([
+        "# The papers' figures beside ours",
+        "G is FogROS G, FT is FogROS2-FT. One command measures everything and writes this page and"
+        " [results.json](results.json); `--collect` only writes the page again.",
+        "```bash\nsudo .venv/bin/python scripts/experiments/papers.py\n```",
+        table,
+        "Gains are the time of one server divided by that of two replicas. Their spread is the 95 % interval of a"
+        f" bootstrap ({_RESAMPLES:,} resamples). Each experiment's own page has all latencies and its conditions"
+        " ([index](README.md)).",
+        "What differs from the papers, in short:",
+        "\n".join(f"- {note}" for note in _NOTES),
+        "Measured on these machines. Load is that of other work; above the number of cores it takes time from what is"
+        " measured:",
+        "\n".join(f"- {machine}" for machine in machines),
+    ]) + "\n"  # fmt: skip
+
+
+_NOTES: Final = (
+    "One machine of two cores holds robot, switches and servers, as network namespaces. The papers had five NUCs"
+    " (G), and"
+    " AWS machines of 4 to 64 cores in two regions (FT). Absolute times are not comparable; ratios and added times"
+    " are.",
+    "No neural network runs here. Stand-ins: visual odometry for ORB-SLAM2, geometric ranking for Dex-Net's GQ-CNN,"
+    " classical segmentation and detection for SAM and YOLOv8. Their answers are checked against known truth. Motion"
+    " planning is OMPL with FCL on the papers' problems, on one thread, where the papers used MPT on many cores.",
+    "Servers that wait compute nothing, so two of them do not take each other's processor time. The number of trials is"
+    " then the paper's. Where servers compute there are fewer trials, and two replicas share the cores.",
+    "Long waits are divided by the number given; the network's time is not.",
+    "Prices are a list of 2024 with the spot advisor's average savings, not the day's prices.",
+)
+
+
+def _offload(document: Any) -> Iterator[Row]:
+    added = []
+    for name, paper in PAPER.items():
+        task = document["tasks"].get(name, {})
+        if "alone" in task:
+            times, cores = task["alone"]["took_s"], task["alone"]["cores"]
+            where = "one core" if cores == 1 else f"1/{1 / cores:.0f} of a core, the paper's ratio"
+            yield _seconds("G Table I", f"{name}: robot only", paper.alone_s, times, where)
+        if "network" not in task:
+            continue
+        network = task["network"]
+        for who, label, there_s, total_s in (
+            (CYCLONE, "ROS 2", paper.ros_network_s, paper.ros_total_s),
+            (OVERLAY, "overlay", paper.network_s, paper.total_s),
+        ):
+            found = network["contenders"][who]
+            hops = "three bridges, Cyclone DDS" if who == CYCLONE else "three switches"
+            yield _seconds("G Table I", f"{name}: {label}, network one way", there_s, found["there_s"], hops)
+            yield _seconds("G Table I", f"{name}: {label}, total", total_s, found["total_s"], f"{hops}; computed")
+        added.append((name, network, paper.network_s - paper.ros_network_s))
+    for name, network, paper_s in added:
+        middle, low, high = added_s(network, CYCLONE)
+        spread = f"{low:.4f} to {high:.4f} s, rounds"
+        trials = f"{network['rounds']} x {network['answered_at_once'] // network['rounds']}"
+        yield Row(
+            "G Figure 5",
+            f"{name}: added to Cyclone DDS",
+            f"{paper_s:.3f} s",
+            f"{middle:.4f} s",
+            spread,
+            trials,
+            "one way",
+        )
+    if added:
+        middle = fmean(added_s(network, CYCLONE)[0] for _, network, _ in added)
+        yield Row("G Figure 5", "added on average", f"{PAPER_ADDED_S} s", f"{middle:.4f} s", "", "", "one way")
+
+
+def _prices(document: Any) -> Iterator[Row]:
+    for each in document["applications"]:
+        paper, here = (" / ".join(f"{usd:.2f}" for usd in each[key]) for key in ("paper", "usd_per_hour"))
+        what = f"{each['name']}: one on-demand / two / two spot, USD an hour"
+        yield Row(
+            "FT Table I", what, paper, here, "", "", f"{each['on_demand'][0]}, {each['on_demand'][1]}; list of 2024"
+        )
+
+
+def _gains(name: str, document: Any) -> Iterator[Row]:
+    for group, (what, mean_gain, p99_gain, conditions) in _GAINS[name].items():
+        keys = [f"{group}, {case}" for case in _CASES]
+        if name == "fig7":
+            keys = [f"{case}, {group}" for case in _CASES]
+        if not all(key in document["groups"] for key in keys):
+            continue
+        one, two = ([sample[0] for sample in document["groups"][key]] for key in keys)
+        for label, paper, of in (("mean", mean_gain, fmean), ("p99", p99_gain, p99)):
+            low, high = _interval(one, two, of)
+            gain = f"{of(one) / of(two):.2f}"
+            yield Row(
+                _NUMBERS[name],
+                f"{what}: {label} gain",
+                paper,
+                gain,
+                f"{low:.2f} to {high:.2f}",
+                str(len(one)),
+                conditions,
+            )
+
+
+def _kills(document: Any) -> Iterator[Row]:
+    found = {each["what"]: each["got"] for each in document["findings"]}
+    samples = document["groups"]["all"]
+    times = [sample[0] for sample in samples]
+    conditions = (
+        f"{found['kills']:.0f} kills (SIGKILL), in turn; {document['settings']['requests a second']:g} requests/s"
+    )
+    unanswered = f"{found['failed requests']:.0f}"
+    spread = f"p50 {median(times):.1f} ms, p99 {p99(times):.1f} ms"
+    yield Row("FT Figure 9", "requests unanswered", "0", unanswered, spread, str(len(samples)), conditions)
+
+
+def _outages(document: Any) -> Iterator[Row]:
+    found = {each["what"]: each["got"] for each in document["findings"]}
+    arithmetic = found["two machines: by arithmetic, 15 h up and 20 min down, %"]
+    yield Row(
+        "FT availability", "two down together, 15 h and 20 min", "< 0.05 %", f"{arithmetic:.3f} %", "", "", "arithmetic"
+    )
+    for label in ("one machine", "two machines"):
+        listed = found[f"{label}: by the list, %"]
+        yield Row(
+            "FT availability",
+            f"{label}, 9 s up and 3 s down: requests unanswered",
+            "",
+            f"{found[f'{label}: requests unanswered, %']:.1f} %",
+            f"{listed:.1f} % by the times drawn",
+            str(len(document["groups"][label])),
+            "machines stop at random",
+        )
+
+
+def _seconds(figure: str, what: str, paper_s: float, times: Sequence[float], conditions: str) -> Row:
+    low, high = min(times), max(times)
+    spread = f"{_short(low)} to {_short(high)} s"
+    return Row(figure, what, f"{paper_s:g} s", f"{_short(median(times))} s", spread, str(len(times)), conditions)
+
+
+def _short(seconds: float) -> str:
+    return f"{seconds:.1f}" if seconds >= 10 else f"{seconds:.2f}" if seconds >= 1 else f"{seconds:.4f}"
+
+
+def _interval(
+    one: Sequence[float], two: Sequence[float], of: Callable[[Sequence[float]], float]
+) -> tuple[float, float]:
+    """Return the 95 % interval of the ratio of a figure of two samples, by resampling both."""
+    chance = np.random.default_rng(_SEED)
+    a, b = np.asarray(one), np.asarray(two)
+    ratios = [of(list(chance.choice(a, len(a)))) / of(list(chance.choice(b, len(b)))) for _ in range(_RESAMPLES)]
+    low, high = np.quantile(ratios, (0.025, 0.975))
+    return float(low), float(high)

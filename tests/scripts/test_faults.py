@@ -1,0 +1,198 @@
+"""What the chaos bench decides without processes: networks and faults from a seed, the oracle, the books."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from faults.accounts import Books, Timeline
+from faults.network import VICTIM, random_network
+from faults.oracle import Broken, Oracle
+from faults.plan import Churn, Flow, Plan, Service, make_topology
+from faults.records import Kind, Record, RecordReader, RecordWriter
+from faults.schedule import STRUCTURAL, Fault, FaultKind, broken_by, make_schedule
+from faults.slope import growth_of
+
+SEEDS = range(1, 9)
+SECOND_NS = 1_000_000_000
+
+
+def square(*flows: Flow, services: tuple[Service, ...] = (), homes: dict[str, tuple[str, ...]] | None = None) -> Plan:
+    """Return four switches in a square with P at s1 and R at s4."""
+    links = ("s1-s2", "s2-s4", "s1-s3", "s3-s4")
+    topology, members = make_topology({"a": ("s1", "s2", "s3", "s4")}, {}, links, ("s1",), {"P": "s1", "R": "s4"})
+    return Plan(topology, members, homes or {}, flows or (Flow("/t", "P", ("R",)),), services)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_seed_draws_the_same_network_and_the_same_faults_again(seed: int) -> None:
+    assert random_network(seed) == random_network(seed)
+    plan = random_network(seed)
+    assert make_schedule(plan, seed, 100) == make_schedule(plan, seed, 100)
+    assert make_schedule(plan, seed, 100) != make_schedule(plan, seed + 1, 100)
+
+
+@pytest.mark.parametrize("switches", [12, 16, 20])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_drawn_network_survives_any_single_failure(seed: int, switches: int) -> None:
+    plan = random_network(seed, switches)
+    assert len(plan.switches) == switches
+    assert len(plan.topology.domains) == 4
+    assert Oracle(plan).survives_any_single()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_faults_part_the_network_only_where_that_is_meant(seed: int) -> None:
+    plan = random_network(seed)
+    faults, oracle = make_schedule(plan, seed, 200), Oracle(plan)
+    assert {fault.kind for fault in faults} >= STRUCTURAL
+    for fault in faults:
+        under_way = [each for each in faults if each.start_s <= fault.start_s and each.end_s > fault.start_s]
+        is_parted = any(each.kind is FaultKind.PARTITION for each in under_way)
+        assert is_parted or oracle.is_whole(broken_by(under_way, {}))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_no_fault_outlasts_the_schedule_and_none_meets_another_at_the_same_target(seed: int) -> None:
+    faults = make_schedule(random_network(seed), seed, 120)
+    assert max(fault.end_s for fault in faults) <= 120
+    for kind in (FaultKind.KILL_SWITCH, FaultKind.CUT):
+        of_kind = [fault for fault in faults if fault.kind is kind]
+        for one, other in pairwise(of_kind):
+            assert one.targets != other.targets or one.end_s <= other.start_s
+
+
+def test_a_schedule_can_be_limited_to_some_kinds() -> None:
+    faults = make_schedule(random_network(1), 1, 100, kinds=[FaultKind.ROAM, FaultKind.CUT])
+    assert {fault.kind for fault in faults} == {FaultKind.ROAM, FaultKind.CUT}
+
+
+@pytest.mark.parametrize(
+    ("broken", "connected"),
+    [
+        (Broken(), True),
+        (Broken(links={frozenset(("s1", "s2"))}), True),
+        (Broken(switches={"s2"}), True),
+        (Broken(switches={"s2"}, links={frozenset(("s3", "s4"))}), False),
+        (Broken(switches={"s1"}), False),
+        (Broken(switches={"s1"}, at={"P": "s3"}), True),
+        (Broken(members={"R"}), False),
+        (Broken(links={frozenset(("s1", "s2")), frozenset(("s1", "s3"))}), False),
+    ],
+)
+def test_the_oracle_knows_what_the_graph_connects(broken: Broken, connected: bool) -> None:
+    assert Oracle(square()).must_talk("P", "R", broken) is connected
+
+
+def test_a_chain_does_not_survive_the_switch_in_its_middle() -> None:
+    topology, members = make_topology({"a": ("s1", "s2", "s3")}, {}, ("s1-s2", "s2-s3"), ("s1",), {})
+    assert not Oracle(Plan(topology, members)).survives_any_single()
+
+
+def test_frozen_processes_and_the_revoked_are_broken() -> None:
+    faults = [
+        Fault(FaultKind.FREEZE, ("member P",), 0, 1),
+        Fault(FaultKind.FREEZE, ("switch s2",), 0, 1),
+        Fault(FaultKind.FREEZE, ("rib s1",), 0, 1),
+        Fault(FaultKind.REVOKE, (VICTIM,), 0, 0),
+    ]
+    broken = broken_by(faults, {})
+    assert (broken.members, broken.switches) == ({"P", VICTIM}, {"s2"})
+
+
+def delivered(number: int, at_s: float = 0.0, life: int = 1, publisher: int = 0) -> Record:
+    return Record(Kind.DELIVERED, 0, life, publisher, number, round(at_s * SECOND_NS))
+
+
+def published(count: int) -> Iterator[Record]:
+    return (Record(Kind.PUBLISHED, 0, 1, 0, number, number) for number in range(1, count + 1))
+
+
+def books(*arrived: Record, sent: int = 0) -> Books:
+    found = Books(square())
+    found.take("P", 1, published(sent))
+    found.take("R", 1, iter(arrived))
+    return found
+
+
+def test_a_message_that_is_missing_and_was_not_told_is_found() -> None:
+    found = books(*(delivered(n) for n in (2, 3, 5)), sent=5).incomplete(lambda *_: True, SECOND_NS)
+    assert found == ["/t at R (life 1): 1 messages missing, 0 told"]
+
+
+def test_a_loss_that_was_told_exactly_is_none() -> None:
+    lost = Record(Kind.LOST, 0, 1, 0, 2, 0)
+    assert not books(*(delivered(n) for n in (1, 4)), lost, sent=4).incomplete(lambda *_: True, SECOND_NS)
+
+
+def test_more_told_than_missing_is_found() -> None:
+    lost = Record(Kind.LOST, 0, 1, 0, 2, 0)
+    assert books(delivered(1), delivered(2), lost, sent=2).incomplete(lambda *_: True, SECOND_NS)
+
+
+def test_the_end_of_a_flow_is_missed_only_where_nobody_was_killed() -> None:
+    cut_short = books(delivered(1), delivered(2), sent=9)
+    assert cut_short.incomplete(lambda *_: True, SECOND_NS)
+    assert not cut_short.incomplete(lambda *_: False, SECOND_NS)
+
+
+def test_a_message_that_came_twice_is_found() -> None:
+    assert "came twice" in books(delivered(1), delivered(1), sent=1).incomplete(lambda *_: True, SECOND_NS)[0]
+
+
+def test_a_message_of_another_publisher_is_a_wrong_one() -> None:
+    assert books(delivered(1, publisher=1)).wrong
+
+
+def test_a_silence_counts_only_while_both_ends_were_connected() -> None:
+    must = Timeline()
+    must.note(0, connected=True)
+    must.note(4 * SECOND_NS, connected=False)
+    must.note(7 * SECOND_NS, connected=True)
+    found = books(delivered(1, 1.0), delivered(2, 9.0))
+    silences = list(found.silences(0, "R", 0, 10 * SECOND_NS, must, 1.5))
+    assert [(each.begin_ns // SECOND_NS, each.end_ns // SECOND_NS) for each in silences] == [(1, 4), (7, 9)]
+
+
+def test_a_call_without_an_answer_or_with_two_is_found() -> None:
+    def of(*kinds: Kind) -> list[str]:
+        plan = square(services=(Service("/s", ("R",), ("P",)),))
+        found = Books(plan)
+        found.take("P", 1, (Record(kind, 1, 1, 0, 1, 0) for kind in kinds))
+        return found.miscalled(SECOND_NS, lambda *_: False)
+
+    assert not of(Kind.CALLED, Kind.ANSWERED)
+    assert not of(Kind.CALLED, Kind.FAILED)
+    assert of(Kind.CALLED)
+    assert of(Kind.CALLED, Kind.ANSWERED, Kind.ANSWERED)
+    assert of(Kind.CALLED, Kind.ANSWERED, Kind.FAILED)
+
+
+def test_what_rises_after_the_warm_up_is_not_flat() -> None:
+    rising = growth_of([float(n) for n in range(50)])
+    assert rising.rise == pytest.approx(29.0)
+    assert not rising.is_flat(0.02, 1.0)
+
+
+def test_what_rises_only_while_it_warms_up_is_flat() -> None:
+    assert growth_of([*(float(n) for n in range(20)), *([20.0, 20.5] * 15)]).is_flat(0.0, 0.0)
+
+
+def test_records_come_back_as_they_were_written_also_from_a_file_that_grows(tmp_path: Path) -> None:
+    writer, reader = RecordWriter(tmp_path / "records"), RecordReader(tmp_path / "records")
+    one, other = (Record(Kind.DELIVERED, 1, 2, 3, number, 5) for number in (4, 1 << 40))
+    writer.add(Kind(one.kind), *one[1:])
+    writer.flush()
+    assert list(reader.read()) == [one]
+    writer.add(Kind(other.kind), *other[1:])
+    writer.flush()
+    assert list(reader.read()) == [other]
+
+
+def test_what_churns_has_the_channel_of_its_flow_or_one_of_its_own() -> None:
+    plan = square()
+    churning = Plan(plan.topology, plan.members, flows=plan.flows, churn=(Churn("/t", "R"), Churn("/u", "P", True)))
+    assert [channel for channel, _ in churning.churns("R")] == [0]
+    assert [channel for channel, _ in churning.churns("P")] == [1]
