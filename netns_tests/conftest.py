@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 
 import pytest
 
 from gdp.errors import LocalError
 from gdp.ports.kernel.plane import KernelPlane
 from gdp.switch.table import Table
+from netns_tests import lifetimes
 from netns_tests.spaces import Space
 from tests.fixtures_forwarding import IN, IN_MAC, MTUS, NARROW, NARROW_MAC, PEER_MACS, WIDE, WIDE_MAC
 
 MakeKernel = Callable[..., KernelPlane]
 PORT_MACS = {IN: IN_MAC, WIDE: WIDE_MAC, NARROW: NARROW_MAC}
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
+    lifetimes.noted.clear()
+    yield
+    if complaint := lifetimes.too_short(lifetimes.noted, item.get_closest_marker("momentary")):
+        pytest.fail(complaint, pytrace=False)
 
 
 def _why_not() -> str:

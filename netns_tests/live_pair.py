@@ -36,6 +36,7 @@ from gdp.testbed.namespaces import Namespaces
 from gdp.testbed.runs import Run, Runs
 from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
 from gdp.trust.right import Right
+from netns_tests.lifetimes import LEASE_S, LEASES, Lifetime, noted
 from proxy.endpoints.endpoint import proxy_node_name
 from proxy.ring.plan import Credentials, rib_yaml, switch_yaml
 from tests.pages import ROOT
@@ -214,10 +215,10 @@ class Pair:
         make_owner(self.folder / "owner")
         for machine in _TOPOLOGY.nodes:
             credentials = self._credentials(Role.SWITCH, machine)
-            content = switch_yaml(_TOPOLOGY, machine, credentials, "auto", metrics=False)
+            content = switch_yaml(_TOPOLOGY, machine, credentials, "auto", metrics=False, lease_s=LEASE_S)
             self._start_node(machine, Role.SWITCH, content)
         (rib,) = _TOPOLOGY.attached("rib")
-        content = rib_yaml(rib, self._credentials(Role.RIB, rib.switch), None, metrics=False)
+        content = rib_yaml(rib, self._credentials(Role.RIB, rib.switch), None, metrics=False, lease_s=LEASE_S)
         self._start_node(rib.switch, Role.RIB, content)
 
     def proxy(self, label: str) -> Proxy:
@@ -238,6 +239,12 @@ class Pair:
                 return made
             self._nodes[graph] = made
         return self._nodes[graph]
+
+    def outlive(self) -> None:
+        """Return when what proxies have claimed by now has been renewed for three leases."""
+        began_s, lasts_s = time.monotonic(), (LEASES + 0.5) * LEASE_S
+        time.sleep(lasts_s)
+        noted.append(Lifetime("the pair", LEASE_S, time.monotonic() - began_s))
 
     def shape(self, rate: str) -> None:
         """Bound what machine "a" sends to "b", such as ``20mbit``; empty: as much as it can again."""
@@ -298,6 +305,7 @@ class Pair:
             **credentials.to_yaml(),
             "iface": f"to_{label}",
             "delegations": str(credentials.identity / DELEGATIONS),
+            "lease_s": LEASE_S,
             "ros": _GRAPHS[label],
             "metrics": {"port": port},
             **sides,

@@ -28,6 +28,7 @@ needs_ros2 = pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy is not
         pytest.param(["ros.py", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),
         pytest.param(["services.py", "--quick", "--no-save"], marks=needs_ros2),
         pytest.param(["fogros.py", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),
+        ["survive.py", "--only", "cut", "--rounds", "1", "--no-save"],
         ["serial.py", "--help"],
         ["claims.py", "--claims", "100"],
     ],

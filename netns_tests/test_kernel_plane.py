@@ -17,7 +17,7 @@ from gdp.ports.kernel.device import Refusals
 from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.kernel.shapes import BRANCHES_MAX
 from gdp.switch.forwarder import Forward, decide, rewrite
-from gdp.switch.table import Hop, Table
+from gdp.switch.table import Hops, Table
 from netns_tests.conftest import MakeKernel
 from netns_tests.spaces import Space
 from netns_tests.test_planes import PORT_MACS, far_end
@@ -55,7 +55,7 @@ def ends(make_kernel: MakeKernel) -> Iterator[dict[int, socket.socket]]:
         end.close()
 
 
-def filled(entries: dict[bytes, tuple[Hop, ...]] = ENTRIES) -> Table:
+def filled(entries: dict[bytes, Hops] = ENTRIES) -> Table:
     table = Table()
     table.install_many(entries.items(), float("inf"))
     return table
@@ -181,7 +181,7 @@ GROUPS = st.lists(st.sampled_from([TO_WIDE, TO_NARROW, TO_ABSENT]), min_size=2, 
 @settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(hops=GROUPS, size=st.sampled_from([0, 604, 605, 1404]), hops_left=st.sampled_from([2, 64, 255]))
 def test_generated_groups_copy_as_the_reference_says(
-    make_kernel: MakeKernel, ends: dict[int, socket.socket], hops: tuple[Hop, ...], size: int, hops_left: int
+    make_kernel: MakeKernel, ends: dict[int, socket.socket], hops: Hops, size: int, hops_left: int
 ) -> None:
     plane = make_kernel(filled({ONE: hops}))
     given = frame(ONE, bytes(size), hops_left=hops_left)

@@ -266,3 +266,10 @@ def test_what_comes_and_goes_leaves_memory_and_descriptors_where_they_were(a: Pe
     for (descriptors, memory_kib), (more_descriptors, more_kib) in zip(before, after, strict=True):
         assert abs(more_descriptors - descriptors) <= 4
         assert more_kib - memory_kib <= 4_096
+
+
+def test_what_crossed_still_does_when_three_leases_are_over(a: Peer, b: Peer, pair: Pair) -> None:
+    b.tell("read(String, '/churn_0')")
+    until(lambda: a.tell("say('/churn_0', 'now')") or b.tell("len(heard['/churn_0'])"), "/churn_0")
+    pair.outlive()
+    until(lambda: a.tell("say('/churn_0', 'later')") or b.tell("['later'] in heard['/churn_0']"), "three leases later")

@@ -220,3 +220,8 @@ def test_a_master_that_restarts(pair: Pair, a: Peer, b: Peer) -> None:
     late = node_of(pair, "one", "late")
     late.tell("listen(String, '/pulse')")
     until(lambda: a.tell("pulse.publish(String())") or late.tell("len(heard['/pulse'])"), "/pulse after the restart")
+
+
+def test_what_crossed_still_does_when_three_leases_are_over(pair: Pair, a: Peer, b: Peer) -> None:
+    pair.outlive()
+    flows(a, b)

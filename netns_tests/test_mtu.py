@@ -86,7 +86,7 @@ class Lab:
         self._add_switch("second", "a1", "e1", "b1")
         rib = self._identity(Role.RIB, "rib")
         self._run(
-            RibHost(rib, self._policy, Rib(rib, self._policy, MemoryStore(), RibSettings(None)), settings()), "b0"
+            RibHost(rib, self._policy, Rib(rib, self._policy, MemoryStore(), RibSettings()), settings()), "b0"
         )
         self._robot, robot = self._add_member("robot", "r0")
         self._server, server = self._add_member("server", "e0")

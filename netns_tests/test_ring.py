@@ -15,6 +15,7 @@ from typing import Final
 import pytest
 
 from gdp.testbed.runs import Runs
+from netns_tests.lifetimes import LEASE_S, Lifetime, noted
 from proxy.endpoints.bag import BagReader
 
 pytestmark = pytest.mark.netns
@@ -31,6 +32,8 @@ RECORDINGS: Final = (
     "aruco_compressed.bag",
 )
 PATIENCE_S: Final = 240
+LASTING: Final = ("--seconds", 7, "--lease", LEASE_S)  # past three leases
+FAST: Final = "sent as fast as it goes: what is compared is the content"
 WHERE: Final = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 
 
@@ -56,6 +59,9 @@ def crossed(folder: Path, *arguments: object) -> dict[str, object]:
     assert ended.returncode == 0, ended.stdout + ended.stderr
     result: dict[str, object] = json.loads((folder / "result.json").read_text())
     assert result["passed"] is True
+    settings = result["settings"]
+    assert isinstance(settings, dict)
+    noted.append(Lifetime("the ring", float(settings["lease_s"]), float(str(result["traffic_s"]))))
     return result
 
 
@@ -77,8 +83,8 @@ def longer(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_demo(tmp_path_factory.mktemp("longer"), 5)
 
 
-def test_a_recording_crosses_three_switches_in_between_at_its_own_pace(demo: Path, tmp_path: Path) -> None:
-    result = crossed(tmp_path, demo, "--out", tmp_path / "out")
+def test_a_recording_crosses_three_switches_in_between_at_an_even_pace(demo: Path, tmp_path: Path) -> None:
+    result = crossed(tmp_path, demo, *LASTING, "--out", tmp_path / "out")
     with BagReader(demo) as sent:
         assert {row["topic"] for row in topics(result)} == {channel.topic for channel in sent.channels}
         assert sum(int(str(row["messages"])) for row in topics(result)) == sent.count
@@ -87,6 +93,7 @@ def test_a_recording_crosses_three_switches_in_between_at_its_own_pace(demo: Pat
         assert received.count == sum(int(str(row["messages"])) for row in topics(result))
 
 
+@pytest.mark.momentary(FAST)
 @pytest.mark.parametrize("encoding", ["cbor", "cdr"])
 def test_every_encoding_crosses(demo: Path, tmp_path: Path, encoding: str) -> None:
     result = crossed(tmp_path, demo, "--rate", 0, "--encoding", encoding)
@@ -95,12 +102,14 @@ def test_every_encoding_crosses(demo: Path, tmp_path: Path, encoding: str) -> No
     assert settings["encoding"] == encoding
 
 
+@pytest.mark.momentary(FAST)
 def test_a_ros_1_recording_comes_out_as_a_ros_1_bag(tmp_path: Path) -> None:
     crossed(tmp_path, make_demo(tmp_path, 0.3, "--ros1"), "--rate", 0, "--out", tmp_path)
     with BagReader(tmp_path / "recording.bag") as received:
         assert {channel.ros for channel in received.channels} == {1}
 
 
+@pytest.mark.momentary(FAST)
 def test_larger_frames_carry_an_image_in_fewer_parts(demo: Path, tmp_path: Path) -> None:
     small, large = (crossed(tmp_path, demo, "--rate", 0, "--mtu", mtu) for mtu in (1_500, 9_000))
     parts = [max(int(str(row["parts"])) for row in topics(result)) for result in (small, large)]
@@ -108,15 +117,21 @@ def test_larger_frames_carry_an_image_in_fewer_parts(demo: Path, tmp_path: Path)
 
 
 def test_the_scapy_plane_carries_the_same(tmp_path: Path) -> None:
-    crossed(tmp_path, make_demo(tmp_path, 0.1), "--data-plane", "scapy")
+    crossed(tmp_path, make_demo(tmp_path, 0.1), *LASTING, "--data-plane", "scapy")
 
 
 def test_with_a_link_cut_in_the_middle_all_still_arrives_by_the_other_way(longer: Path, tmp_path: Path) -> None:
-    result = crossed(tmp_path, longer, "--cut", "nuc2-nuc3@2")
+    result = crossed(tmp_path, longer, *LASTING, "--cut", "nuc2-nuc3@2")
     (imu,) = (row for row in topics(result) if row["topic"] == "/imu")
     assert imu["hops_seen"] in ([5, 2], [2, 5])
 
 
+def test_what_fails_and_moves_one_after_the_other_costs_no_message(demo: Path, tmp_path: Path) -> None:
+    faults = ["--cut", "nuc1-nuc2@1-3", "--kill", "rib:school@2", "--roam", "robot:nuc2@4.5", "--kill", "switch:nuc1@5"]
+    crossed(tmp_path, demo, "--seconds", 12, "--lease", LEASE_S, *faults)
+
+
+@pytest.mark.momentary(FAST)
 def test_an_eavesdropper_in_the_middle_learns_no_topic_no_type_and_no_content(demo: Path, tmp_path: Path) -> None:
     crossed(tmp_path, demo, "--rate", 0, "--pcap", tmp_path / "seen.pcap")
     seen = (tmp_path / "seen.pcap").read_bytes()
@@ -132,6 +147,7 @@ def test_an_eavesdropper_in_the_middle_learns_no_topic_no_type_and_no_content(de
     assert [secret for secret in secrets | words | samples if secret in seen] == []
 
 
+@pytest.mark.momentary(FAST)
 @pytest.mark.parametrize("recording", RECORDINGS)
 def test_a_recording_of_a_real_robot_crosses(recording: str, tmp_path: Path) -> None:
     if not (SHARED / recording).exists():
@@ -139,6 +155,7 @@ def test_a_recording_of_a_real_robot_crosses(recording: str, tmp_path: Path) -> 
     crossed(tmp_path, SHARED / recording, "--rate", 0)
 
 
+@pytest.mark.momentary(FAST)
 @pytest.mark.parametrize("recording", ["ninety_four_types.mcap", "tilt_laser.bag"])
 def test_with_cdr_the_very_bytes_cross(recording: str, tmp_path: Path) -> None:
     if not (SHARED / recording).exists():
@@ -152,6 +169,8 @@ def test_with_cdr_the_very_bytes_cross(recording: str, tmp_path: Path) -> None:
         (["/nowhere/my.bag"], "no such recording: /nowhere/my.bag"),
         ([__file__], "cannot be read: neither a ROS 1 bag nor MCAP nor sqlite3"),
         (["--cut", "nuc1-nuc3@1"], "no link nuc1-nuc3"),
+        (["--kill", "switch:nuc1@1"], "with switch nuc1 dead, robot has no switch"),
+        (["--roam", "cat:nuc2@1"], "no proxy cat"),
         (["--encoding", "xml"], "--encoding is one of json, cbor, cdr, not 'xml'"),
         (["--mtu", "100"], "an MTU is 576 to 65521 bytes"),
     ],
@@ -192,6 +211,7 @@ def test_an_interrupted_run_leaves_nothing(longer: Path, number: signal.Signals,
     assert left_of(run) == []
 
 
+@pytest.mark.momentary(FAST)
 def test_what_a_killed_run_left_is_gone_with_the_next(longer: Path, demo: Path, tmp_path: Path) -> None:
     process, run = started(longer)
     with process:

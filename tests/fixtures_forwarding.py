@@ -20,6 +20,7 @@ PEER_MACS = {port: bytes([2, 0, 0, 0, port, 2]) for port in (IN, WIDE, NARROW)}
 
 SOURCE, OTHER_SOURCE = bytes([0x50]) * 32, bytes([0x51]) * 32
 ONE, BOTH, SPLIT, GONE, HALF, NOBODY, DEAD, ANYBODY = (bytes([0xD0 + n]) * 32 for n in range(8))
+RESCUED, READY, CUT_OFF, TREE = (bytes([0xE0 + n]) * 32 for n in range(4))
 NO_SOURCE = bytes(32)
 
 TO_WIDE = (WIDE, PEER_MACS[WIDE] + WIDE_MAC)
@@ -36,6 +37,10 @@ ENTRIES: dict[bytes, Hops] = {
     DEAD: (TO_ABSENT,),
     ANYBODY: (TO_WIDE,),
     ANYBODY + NO_SOURCE: (TO_NARROW,),
+    RESCUED: ((*TO_ABSENT, *TO_NARROW),),
+    READY: ((*TO_WIDE, *TO_NARROW),),
+    CUT_OFF: ((*TO_ABSENT, *TO_ABSENT),),
+    TREE: ((*TO_ABSENT, *TO_NARROW), (*TO_WIDE, *TO_ABSENT)),
 }
 
 
@@ -105,6 +110,13 @@ CASES = [
     _forwarded("an entry for no source", frame(ANYBODY, source=NO_SOURCE), NARROW),
     _forwarded("an entry for no source is for that alone", frame(ANYBODY), WIDE),
     _forwarded("urgent", frame(ONE, flags=Flag.LAST | Flag.URGENT), WIDE),
+    _forwarded("an alternate while the port is down", frame(RESCUED), NARROW),
+    _forwarded("no alternate while the port is up", frame(READY), WIDE),
+    _forwarded("the alternate of a branch", frame(TREE), WIDE, NARROW),
+    _forwarded("an alternate too narrow for a branch", frame(TREE, bytes(701 - 96)), WIDE, drops=(DropReason.TOO_BIG,)),
+    Case("an alternate that is too narrow", frame(RESCUED, bytes(701 - 96)), drops=(DropReason.TOO_BIG,)),
+    Case("an alternate that is down too", frame(CUT_OFF), drops=(DropReason.PORT_DOWN,)),
+    Case("an alternate goes round no more often", frame(RESCUED, hops_left=1), drops=(DropReason.HOPS_EXPIRED,)),
     Case("a miss", frame(NOBODY), handed_up=True),
     Case("a neighbour's word", frame(ONE, kind=Kind.HELLO), handed_up=True),
     Case("a neighbour's unknown word", frame(ONE, kind=0xFF, hops_left=0), handed_up=True),

@@ -51,7 +51,7 @@ APPS = {
 SHELLS = ("bash", "sh")
 MODELS: dict[str, type[Section]] = {"switch.yaml": SwitchConfig, "rib.yaml": RibConfig, "proxy.yaml": ProxyConfig}
 NODES = ("gdp-switch ", "gdp-rib ", "gdp-proxy ")
-UNITS = {"": 1, "s": 1, "KiB": 1 << 10, "MiB": 1 << 20}
+UNITS = {"": 1, "s": 1, "ms": 0.001, "KiB": 1 << 10, "MiB": 1 << 20}
 
 
 def _every_command() -> Iterator[Any]:
@@ -120,7 +120,9 @@ def test_source_files_that_a_page_names_exist() -> None:
 
 def _constant(dotted: str) -> float:
     room, _, name = dotted.rpartition(".")
-    return getattr(importlib.import_module(f"gdp.{room}") if room else limits, name)
+    if not room:
+        return getattr(limits, name)
+    return getattr(importlib.import_module(room if room.startswith("proxy.") else f"gdp.{room}"), name)
 
 
 def test_limits_that_a_page_states_are_the_limits() -> None:

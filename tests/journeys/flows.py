@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from math import ceil
 
 from gdp.client.feed import Delivered
 from gdp.client.member import Member, Topic
@@ -16,6 +17,8 @@ from gdp.testbed.world import World
 from gdp.trust.right import Right
 
 ROBOT, SERVER = "nuc1/robot", "nuc5/server"
+LEASE_S = 2.5  # of names; with it three leases outlast those of readers and of branches, too
+STEP_S = 0.25  # between messages of a flow that is to outlive leases
 
 
 @dataclass(slots=True)
@@ -74,6 +77,26 @@ class Flow:
         self.collect()
         return [each.hops for each in self.got[label]]
 
+    def outlive(self, *labels: str, nobody: bool = False, leases: float = 3.25) -> None:
+        """Publish at a steady rate until three leases are over; each of these readers, or all, gets all of it in order.
+
+        Other readers that were there get nothing of it; ``nobody``: none does.
+        """
+        self.collect()
+        world, expected = self.world, () if nobody else labels or tuple(self.got)
+        before = {label: len(got) for label, got in self.got.items()}
+        count = ceil(leases * world.lease_s / STEP_S)
+        sent = [b"outlives %d" % number for number in range(count)]
+        for number, message in enumerate(sent):
+            world.network.call(number * STEP_S, partial(self.publish, message))
+        world.network.run(count * STEP_S)
+        assert world.network.run(5, lambda: all(self.has(label, before[label] + count) for label in expected)), {
+            label: f"{len(self.got[label]) - before[label]} of {count}" for label in expected
+        }
+        for label, got in self.got.items():
+            later = [each.message for each in got[before[label] :]]
+            assert later == (sent if label in expected else []), f"what {label} got"
+
     def is_read_by(self, count: int) -> bool:
         """Return whether so many readers have introduced themselves."""
         return self.publisher.readers >= count
@@ -98,9 +121,11 @@ class Tap:
         return sum(1 for each in self.headers if each.kind == kind and destination in (None, each.destination))
 
 
-def ring(seed: int = 1, transits: Mapping[str, tuple[str, ...]] | None = None) -> World:
+def ring(
+    seed: int = 1, transits: Mapping[str, tuple[str, ...]] | None = None, *, lease_s: float = LEASE_S
+) -> World:
     """Return the ring of five, every member attached."""
-    world = World(ring5(), seed, transits=transits)
+    world = World(ring5(), seed, transits=transits, lease_s=lease_s)
     assert world.settle()
     return world
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
+from math import ceil
 
 from gdp.client.member import Member, Message
 from gdp.client.publisher import Publisher
 from gdp.names import Name
 from gdp.testbed.world import World
 from gdp.trust.right import Right
+from tests.journeys.flows import STEP_S
 
 SERVICE = "/add_two_ints"
 
@@ -69,6 +72,24 @@ class Party:
     def _flush(self) -> None:
         self.member.flush(self.world.network.now.mono_s)
         self.world.network.touch(self.label)
+
+
+def outlive(world: World, client: Party, *servers: Party, leases: float = 3.25) -> None:
+    """Ask at a steady rate until three leases are over; each server answers each request once, and in order."""
+    client.collect()
+    before, count = len(client.got), ceil(leases * world.lease_s / STEP_S)
+    for server in servers:
+        server.collect()  # what came before is not to be answered now
+        server.answers = True
+    asked = [b"outlives %d" % number for number in range(count)]
+    for number, request in enumerate(asked):
+        world.network.call(number * STEP_S, partial(client.publish, request))
+    work(world, *servers, client, until_s=count * STEP_S)
+    work(world, *servers, client, until_s=5.0, have=before + count * len(servers))
+    bodies = [each.delivered.message for each in client.got[before:]]
+    for server in servers:
+        tail = b" by " + server.label.encode()
+        assert [body for body in bodies if body.endswith(tail)] == [request + tail for request in asked]
 
 
 def meet(world: World, *parties: Party, within_s: float = 5.0) -> bool:

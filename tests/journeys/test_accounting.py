@@ -25,6 +25,8 @@ from gdp.testbed.topology import chain
 from gdp.testbed.world import World
 from tests.journeys.flows import Tap, advertise, flowing
 
+pytestmark = pytest.mark.momentary("the books close once the last frame has come to rest, before any lease ends")
+
 A, B = "s1/left", "s5/right"
 MIDDLE = frozenset(("s2", "s3"))
 SIZE = 1_000  # of a message: it fits one frame, so that frames are messages
@@ -83,11 +85,14 @@ def note_others(monkeypatch: pytest.MonkeyPatch) -> Counter[DropReason]:
     others: Counter[DropReason] = Counter()
     find, send = Unicast._find, Unicast.send
 
-    def noted_find(self: Unicast, destination: Name, source: Name, frame: bytes, now_s: float) -> None:
+    def noted_find(
+        self: Unicast, destination: Name, source: Name, frame: bytes, now_s: float, until_s: float | None = None
+    ) -> Name | None:
         before = self.drops.copy()
-        find(self, destination, source, frame, now_s)
+        waits_for = find(self, destination, source, frame, now_s, until_s)
         if frame[KIND_AT] != Kind.DATA:
             others.update(self.drops - before)
+        return waits_for
 
     def noted_send(self: Unicast, frames: list[bytes], destination: Name, source: Name, now_s: float) -> None:
         before = self.drops.copy()

@@ -36,6 +36,7 @@ def test_bursts_of_many_topics_arrive_once_and_in_order_under_few_seals() -> Non
     assert all(numbers == list(range(200)) for numbers in got.values())
     assert tap.count(Kind.DATA) < TOPICS * 200 / 5
     assert any(header.flags & Flag.BUNDLE for header in tap.headers if header.kind == Kind.DATA)
+    flows[0].outlive()
 
 
 def test_bundles_survive_loss_and_links_that_narrow() -> None:
@@ -57,6 +58,7 @@ def test_bundles_survive_loss_and_links_that_narrow() -> None:
     network.run(2)
     assert flow.numbers(SERVER) == list(range(10_000))
     assert flow.publisher.acknowledged == 10_000
+    flow.outlive()
 
 
 def test_a_step_asks_only_topics_that_have_something_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -72,6 +74,7 @@ def test_a_step_asks_only_topics_that_have_something_to_do(monkeypatch: pytest.M
     busy.stream(100, 0.01, 100)
     assert world.network.run(3, lambda: busy.has(SERVER, 100))
     assert asked == []
+    flow.outlive()
 
 
 def test_a_feed_that_was_closed_says_nothing_after_its_goodbye() -> None:
@@ -86,6 +89,7 @@ def test_a_feed_that_was_closed_says_nothing_after_its_goodbye() -> None:
     network.run(5)
     assert tap.count(Kind.REPORT) == 0
     assert [feed.next_timeout() for feed in feeds] == [float("inf")]
+    flow.outlive(nobody=True)
 
 
 def _noted(asked: list[Publisher], publisher: Publisher, *_: object) -> None:

@@ -45,6 +45,7 @@ def test_a_new_epoch_given_to_the_reader_first_costs_no_message() -> None:
     assert network.run(20, lambda: flow.has(SERVER, 200))
     assert flow.numbers(SERVER) == list(range(200))
     assert seen == {1, 2}
+    flow.outlive()
 
 
 @pytest.mark.parametrize(("published", "read"), [([1], [1, 2]), ([1, 2], [1, 2]), ([2], [1, 2]), ([1, 2], [2])])
@@ -59,6 +60,7 @@ def test_a_reader_finds_the_epoch_that_its_publisher_uses(published: list[int], 
     flow.world.network.run(1)
     flow.publish(b"hello")
     assert flow.world.network.run(2, lambda: flow.has(SERVER, 1))
+    flow.outlive()
 
 
 def test_a_reader_without_the_new_epoch_reads_no_more() -> None:
@@ -67,3 +69,4 @@ def test_a_reader_without_the_new_epoch_reads_no_more() -> None:
     flow.publish(b"under two")
     flow.world.network.run(5)
     assert not flow.has(SERVER, 1)
+    flow.outlive(nobody=True)

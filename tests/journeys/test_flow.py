@@ -9,7 +9,7 @@ from gdp.limits import DEAD_S, JOIN_LEASE_S
 from gdp.testbed.topology import ring5
 from gdp.testbed.world import World
 from gdp.trust.right import Right
-from tests.journeys.flows import ROBOT, SERVER, Tap, advertise, flowing, ring
+from tests.journeys.flows import LEASE_S, ROBOT, SERVER, Tap, advertise, flowing, ring
 
 LONG = frozenset(("nuc2", "nuc3"))
 
@@ -19,6 +19,7 @@ def test_a_message_takes_the_cheap_way_over_five_switches() -> None:
     flow.publish(b"hello")
     assert flow.world.network.run(1, lambda: flow.has(SERVER, 1))
     assert [(each.message, each.hops) for each in flow.got[SERVER]] == [(b"hello", 5)]
+    flow.outlive()
 
 
 def test_a_cut_in_mid_flow_turns_the_traffic_and_loses_nothing() -> None:
@@ -30,6 +31,7 @@ def test_a_cut_in_mid_flow_turns_the_traffic_and_loses_nothing() -> None:
     assert flow.numbers(SERVER) == list(range(100))
     hops = flow.hops(SERVER)
     assert (hops[0], hops[-1]) == (5, 2)
+    flow.outlive()
 
 
 def test_a_link_that_dies_without_a_word_is_noticed_by_its_silence() -> None:
@@ -38,6 +40,7 @@ def test_a_link_that_dies_without_a_word_is_noticed_by_its_silence() -> None:
     flow.world.network.call(1.0, lambda: setattr(flow.world.cables[LONG], "loss", 1.0))
     assert flow.world.network.run(10, lambda: flow.has(SERVER, 100))
     assert (flow.numbers(SERVER), flow.hops(SERVER)[-1]) == (list(range(100)), 2)
+    flow.outlive()
 
 
 def test_a_link_that_comes_back_is_used_again() -> None:
@@ -50,6 +53,7 @@ def test_a_link_that_comes_back_is_used_again() -> None:
     flow.publish(b"back")
     assert network.run(1, lambda: flow.has(SERVER, 1))
     assert flow.hops(SERVER) == [5]
+    flow.outlive()
 
 
 @pytest.mark.parametrize("name", ["nuc1", "nuc2", "nuc3", "nuc4", "nuc5"])
@@ -61,6 +65,7 @@ def test_a_switch_that_starts_anew_is_taken_back_and_nothing_is_lost(name: str) 
     network.call(2.5, lambda: (flow.world.restart_switch(name), None)[1])
     assert network.run(30, lambda: flow.has(SERVER, 200))
     assert flow.numbers(SERVER) == list(range(200))
+    flow.outlive()
 
 
 def test_a_switch_that_starts_anew_in_an_instant_is_noticed_by_its_session() -> None:
@@ -69,6 +74,7 @@ def test_a_switch_that_starts_anew_in_an_instant_is_noticed_by_its_session() -> 
     flow.world.network.call(1.0, lambda: (flow.world.restart_switch("nuc3"), None)[1])
     assert flow.world.network.run(10, lambda: flow.has(SERVER, 100))
     assert flow.numbers(SERVER) == list(range(100))
+    flow.outlive()
 
 
 @pytest.mark.parametrize("label", ["school", "backbone", "cloud"])
@@ -83,6 +89,7 @@ def test_a_rib_that_starts_anew_disturbs_no_flow_and_is_refilled(label: str) -> 
     assert world.ribs[label].rib.names == names > 0
     delays = {each.hops for each in flow.got[SERVER]}
     assert delays == {5}
+    flow.outlive()
 
 
 def test_a_late_joiner_of_a_latched_topic_gets_the_last_messages() -> None:
@@ -93,6 +100,7 @@ def test_a_late_joiner_of_a_latched_topic_gets_the_last_messages() -> None:
     flow.read_by(SERVER)
     assert flow.world.network.run(3, lambda: flow.has(SERVER, 3))
     assert [each.message for each in flow.got[SERVER]] == [b"2", b"3", b"4"]
+    flow.outlive()
 
 
 def test_two_publishers_of_one_topic_both_reach_its_reader() -> None:
@@ -107,6 +115,10 @@ def test_two_publishers_of_one_topic_both_reach_its_reader() -> None:
     second.publish(b"from the second")
     assert world.network.run(2, lambda: first.has(SERVER, 2))
     assert {each.message for each in first.got[SERVER]} == {b"from the robot", b"from the second"}
+    world.network.run(3.25 * world.lease_s)
+    first.publish(b"again")
+    second.publish(b"again")
+    assert world.network.run(1, lambda: second.has(SERVER, 4))
 
 
 def test_a_publisher_that_comes_after_its_reader_is_found() -> None:
@@ -116,6 +128,7 @@ def test_a_publisher_that_comes_after_its_reader_is_found() -> None:
     world.network.run(10)
     flow = advertise(world, "/late")
     assert world.network.run(3, lambda: flow.is_read_by(1))
+    flow.outlive()
 
 
 def test_two_readers_cost_a_shared_link_one_copy() -> None:
@@ -129,6 +142,7 @@ def test_two_readers_cost_a_shared_link_one_copy() -> None:
         flow.publish(b"x" * 100)
     assert world.network.run(2, lambda: flow.has(SERVER, 10) and flow.has("nuc4/second", 10))
     assert tap.count(Kind.DATA) == 10
+    flow.outlive()
 
 
 def test_a_tree_without_readers_is_taken_down() -> None:
@@ -139,6 +153,7 @@ def test_a_tree_without_readers_is_taken_down() -> None:
     world.network.touch(SERVER)
     world.network.run(JOIN_LEASE_S + 1)
     assert not any(switch.planter.trees.all() for switch in world.switches.values())
+    flow.outlive(nobody=True)
 
 
 def test_loss_on_every_link_costs_no_message() -> None:
@@ -149,6 +164,7 @@ def test_loss_on_every_link_costs_no_message() -> None:
     assert flow.world.network.run(30, lambda: flow.has(SERVER, 200))
     assert flow.numbers(SERVER) == list(range(200))
     assert flow.world.network.lost > 0
+    flow.outlive()
 
 
 def test_frames_that_overtake_each_other_arrive_in_order() -> None:
@@ -158,15 +174,20 @@ def test_frames_that_overtake_each_other_arrive_in_order() -> None:
     flow.stream(200, 0.005, size=5_000)
     assert flow.world.network.run(30, lambda: flow.has(SERVER, 200))
     assert flow.numbers(SERVER) == list(range(200))
+    flow.outlive()
 
 
 def test_the_network_settles_with_loss_from_the_beginning() -> None:
-    world = World(ring5())
+    world = World(ring5(), lease_s=LEASE_S)
     for cable in world.cables.values():
         cable.loss = 0.1
     assert world.settle(30)
+    world.network.run(3.25 * world.lease_s)
+    assert world.settle(1)
+    world.network.run(3.25 * world.lease_s)
 
 
+@pytest.mark.momentary("hellos have no lease of a name")
 def test_a_dead_neighbour_is_let_go_after_its_silence() -> None:
     world = ring()
     world.network.stop("nuc3")
@@ -183,6 +204,9 @@ def test_best_effort_over_loss_goes_on_without_what_is_lost() -> None:
     numbers = flow.numbers(SERVER)
     assert 100 < len(numbers) < 200
     assert numbers == sorted(set(numbers))
+    for cable in flow.world.cables.values():
+        cable.loss = 0.0
+    flow.outlive()
 
 
 def test_both_directions_flow_at_once() -> None:
@@ -192,3 +216,5 @@ def test_both_directions_flow_at_once() -> None:
     there.stream(50, 0.01)
     back.stream(50, 0.01)
     assert world.network.run(5, lambda: there.has(SERVER, 50) and back.has(ROBOT, 50))
+    there.outlive()
+    back.outlive()

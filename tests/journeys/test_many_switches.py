@@ -49,3 +49,4 @@ def test_two_hundred_switches_settle_and_deliver() -> None:
     flow.stream(20, 0.01)
     assert world.network.run(10, lambda: flow.has(label, 20) and flow.has("d4s24/proxy", 20))
     assert flow.numbers(label) == list(range(20))
+    flow.outlive()

@@ -12,7 +12,7 @@ from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
 from gdp.testbed.topology import Topology, chain, ring5
 from gdp.testbed.world import World
-from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, advertise, flowing, ring
+from tests.journeys.flows import LEASE_S, ROBOT, SERVER, Flow, Tap, advertise, flowing, ring
 
 MIDDLE = frozenset(("nuc2", "nuc3"))
 DETOUR = frozenset(("nuc5", "nuc1"))
@@ -42,7 +42,7 @@ def wide(topology: Topology, mtu: int = JUMBO, **links: int) -> World:
     """Return a network of wide links, but for those given as ``a_b=mtu``."""
     narrow = {frozenset(ends.split("_")): size for ends, size in links.items()}
     made = tuple(replace(link, mtu=narrow.get(link.ends(), mtu)) for link in topology.links)
-    world = World(replace(topology, links=made), lead_mtu=mtu)
+    world = World(replace(topology, links=made), lead_mtu=mtu, lease_s=LEASE_S)
     assert world.settle()
     return world
 
@@ -52,6 +52,7 @@ def test_frames_fill_links_of_any_size(mtu: int) -> None:
     flow = flowing(wide(ring5(), mtu))
     assert largest(flow) == mtu
     assert too_big(flow) == 0
+    flow.outlive()
 
 
 @pytest.mark.parametrize("mtu", [SMALL, 1_280, USUAL, JUMBO])
@@ -59,6 +60,7 @@ def test_one_narrow_link_in_the_middle_decides(mtu: int) -> None:
     flow = flowing(wide(ring5(), LARGEST, nuc2_nuc3=mtu))
     assert largest(flow) == mtu
     assert too_big(flow) == 0
+    flow.outlive()
 
 
 @pytest.mark.parametrize("ends", [MIDDLE, frozenset(("nuc1", "nuc2")), frozenset(("nuc4", "nuc5"))])
@@ -71,6 +73,7 @@ def test_a_link_that_changes_on_the_way_is_followed_by_the_next_message(ends: fr
         seen.append(largest(flow))
     assert seen == [1_200, 1_400, SMALL, USUAL, USUAL]
     assert too_big(flow) == 0
+    flow.outlive()
 
 
 @pytest.mark.parametrize("label", [ROBOT, SERVER])
@@ -82,6 +85,7 @@ def test_the_first_and_the_last_link_count_too(label: str) -> None:
         network.run(NEWS_S)
         seen.append(largest(flow))
     assert seen == [USUAL, JUMBO]
+    flow.outlive()
 
 
 def test_links_that_change_one_after_the_other_are_all_followed() -> None:
@@ -93,6 +97,7 @@ def test_links_that_change_one_after_the_other_are_all_followed() -> None:
         network.run(NEWS_S)
         seen.append(largest(flow))
     assert seen == [JUMBO, 1_000]
+    flow.outlive()
 
 
 def test_a_detour_over_a_narrower_link_is_known_with_its_first_join() -> None:
@@ -107,6 +112,7 @@ def test_a_detour_over_a_narrower_link_is_known_with_its_first_join() -> None:
     assert (before, over, largest(flow)) == (JUMBO, 1_200, JUMBO)
     assert {each.hops for each in flow.got[SERVER]} == {5, 2}
     assert too_big(flow) == 0
+    flow.outlive()
 
 
 def test_a_dearer_link_turns_the_tree_and_the_size_with_it() -> None:
@@ -123,6 +129,7 @@ def test_a_dearer_link_turns_the_tree_and_the_size_with_it() -> None:
     network.run(0.5)
     assert largest(flow) == USUAL
     assert too_big(flow) == 0
+    flow.outlive()
 
 
 def test_a_reader_behind_a_narrow_link_shrinks_all_frames_while_it_is_there() -> None:
@@ -141,6 +148,7 @@ def test_a_reader_behind_a_narrow_link_shrinks_all_frames_while_it_is_there() ->
     network.run(NEWS_S)
     assert (before, beside, largest(flow)) == (JUMBO, 1_000, JUMBO)
     assert too_big(flow) == 0
+    flow.outlive()
 
 
 def test_a_narrow_reader_whose_link_is_lost_no_longer_counts() -> None:
@@ -155,6 +163,7 @@ def test_a_narrow_reader_whose_link_is_lost_no_longer_counts() -> None:
     del flow.got["nuc3/narrow"]
     network.run(NEWS_S)
     assert largest(flow) == JUMBO
+    flow.outlive()
 
 
 def test_frames_too_large_for_a_link_that_shrank_under_them_are_counted() -> None:
@@ -165,6 +174,7 @@ def test_frames_too_large_for_a_link_that_shrank_under_them_are_counted() -> Non
     network.run(NEWS_S)
     parts = -(-(20_000 + 64) // (USUAL - 96 - 16))
     assert (too_big(flow), flow.numbers(SERVER)) == (parts - 1, [])  # the last part is a small one
+    flow.outlive()
 
 
 def test_a_stream_goes_on_while_links_shrink_and_grow_between_its_messages() -> None:
@@ -177,6 +187,7 @@ def test_a_stream_goes_on_while_links_shrink_and_grow_between_its_messages() -> 
     assert flow.numbers(SERVER) == list(range(60))
     assert [flow.got[SERVER][at].parts for at in (5, 15, 25, 35, 45)] == [3, 15, 35, 3, 18]
     assert too_big(flow) == 0
+    flow.outlive()
 
 
 @pytest.mark.parametrize("where", ["links", "leads"])
@@ -193,6 +204,7 @@ def test_of_news_that_overtake_each_other_the_newest_counts(where: str) -> None:
         network.run(NEWS_S)
         seen.append(largest(flow))
     assert seen == [JUMBO, 1_280, JUMBO, 800]
+    flow.outlive()
 
 
 # a link that shrinks under messages that are already sealed
@@ -206,6 +218,7 @@ def test_what_was_sealed_too_large_for_its_link_arrives_all_the_same() -> None:
     assert network.run(3, lambda: flow.has(SERVER, 20))  # sooner than a standing reader is let go
     assert flow.numbers(SERVER) == list(range(20))
     assert too_big(flow) > 0
+    flow.outlive()
 
 
 def test_of_two_readers_neither_gets_a_message_twice_that_had_to_be_split_anew() -> None:
@@ -219,6 +232,7 @@ def test_of_two_readers_neither_gets_a_message_twice_that_had_to_be_split_anew()
     world.network.run(3)
     assert flow.numbers(SERVER) == flow.numbers("nuc2/near") == list(range(20))
     assert too_big(flow) > 0
+    flow.outlive()
 
 
 def test_a_late_joiner_behind_a_narrow_link_gets_what_was_kept_for_it() -> None:
@@ -234,6 +248,7 @@ def test_a_late_joiner_behind_a_narrow_link_gets_what_was_kept_for_it() -> None:
     flow.read_by("nuc3/narrow")
     assert world.network.run(3, lambda: flow.has("nuc3/narrow", 3))
     assert (flow.numbers("nuc3/narrow"), flow.numbers(SERVER)) == ([2, 3, 4], [0, 1, 2, 3, 4])
+    flow.outlive()
 
 
 def test_links_that_shrink_again_and_again_under_a_flow_cost_nothing_but_time() -> None:
@@ -244,6 +259,7 @@ def test_links_that_shrink_again_and_again_under_a_flow_cost_nothing_but_time() 
         network.call(0.1003 + at * 0.1, partial(network.set_mtu, cable, mtu))
     assert network.run(10, lambda: flow.has(SERVER, 200))
     assert flow.numbers(SERVER) == list(range(200))
+    flow.outlive()
 
 
 def test_a_detour_over_a_narrower_link_loses_nothing_of_a_flow() -> None:
@@ -253,6 +269,7 @@ def test_a_detour_over_a_narrower_link_loses_nothing_of_a_flow() -> None:
     network.call(0.2, partial(network.set_link, cable, up=False))
     assert network.run(5, lambda: flow.has(SERVER, 100))
     assert flow.numbers(SERVER) == list(range(100))
+    flow.outlive()
 
 
 def test_reports_of_many_gaps_fit_the_smallest_link() -> None:
@@ -263,3 +280,4 @@ def test_reports_of_many_gaps_fit_the_smallest_link() -> None:
     network.call(0.05, partial(setattr, cable, "loss", 0.0))
     assert network.run(2, lambda: flow.has(SERVER, 3))
     assert too_big(flow) == 0
+    flow.outlive()

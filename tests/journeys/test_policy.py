@@ -26,6 +26,7 @@ def test_traffic_keeps_out_of_a_domain_that_the_reader_keeps_out_of() -> None:
     assert world.network.run(5, lambda: flow.has(SERVER, 20))
     assert set(flow.hops(SERVER)) == {2}
     assert [tap.count(Kind.DATA) for tap in taps] == [0, 0]
+    flow.outlive()
 
 
 def test_traffic_keeps_out_of_a_domain_that_the_publisher_keeps_out_of() -> None:
@@ -33,6 +34,7 @@ def test_traffic_keeps_out_of_a_domain_that_the_publisher_keeps_out_of() -> None
     flow.stream(20, 0.01)
     assert flow.world.network.run(5, lambda: flow.has(SERVER, 20))
     assert set(flow.hops(SERVER)) == {2}
+    flow.outlive()
 
 
 def test_reports_keep_to_the_allowed_way_too() -> None:
@@ -43,6 +45,7 @@ def test_reports_keep_to_the_allowed_way_too() -> None:
     flow.stream(20, 0.01)
     assert world.network.run(5, lambda: flow.has(SERVER, 20))
     assert tap.count(Kind.REPORT) == 0
+    flow.outlive()
 
 
 def test_nothing_passes_where_no_allowed_way_is_left() -> None:
@@ -55,6 +58,7 @@ def test_nothing_passes_where_no_allowed_way_is_left() -> None:
     flow.stream(20, 0.01)
     world.network.run(5)
     assert (flow.numbers(SERVER), tap.count(Kind.DATA)) == ([], 0)
+    flow.outlive(nobody=True)
 
 
 def test_the_allowed_way_is_taken_again_when_it_is_back() -> None:
@@ -66,8 +70,10 @@ def test_the_allowed_way_is_taken_again_when_it_is_back() -> None:
     world.network.call(3, lambda: world.network.set_link(world.cables[SHORT], up=True))
     assert world.network.run(10, lambda: flow.has(SERVER, 20))
     assert flow.numbers(SERVER) == list(range(20))
+    flow.outlive()
 
 
+@pytest.mark.momentary("hellos have no lease of a name")
 def test_a_border_of_an_untrusted_domain_is_no_neighbour() -> None:
     world = World(ring5(), trusts=WITHOUT_BACKBONE)
     world.network.run(3)
@@ -78,6 +84,7 @@ def test_a_border_of_an_untrusted_domain_is_no_neighbour() -> None:
     assert border.drops()[DropReason.WRONG_DOMAIN] > 0
 
 
+@pytest.mark.momentary("it is refused before anything is claimed")
 def test_a_member_without_a_delegation_to_read_cannot_even_ask() -> None:
     world = ring()
     server = world.members[SERVER]
@@ -99,6 +106,7 @@ def test_a_reader_whose_delegation_is_anothers_gets_nothing() -> None:
     flow.stream(20, 0.01)
     assert world.network.run(5, lambda: flow.has(SERVER, 20))
     assert (thief.take_messages(), tap.count(Kind.DATA), flow.publisher.readers) == ([], 0, 1)
+    flow.outlive()
 
 
 def test_a_local_topic_is_not_found_from_another_domain() -> None:
@@ -108,6 +116,7 @@ def test_a_local_topic_is_not_found_from_another_domain() -> None:
     world.network.run(5)
     assert flow.publisher.readers == 0
     assert not world.ribs["backbone"].rib._store.routes(flow.topic.name)
+    flow.outlive(nobody=True)
 
 
 def test_a_local_topic_is_found_within_its_domain() -> None:
@@ -117,6 +126,7 @@ def test_a_local_topic_is_found_within_its_domain() -> None:
     flow = advertise(world, is_global=False)
     flow.read_by("nuc2/near")
     assert world.network.run(5, lambda: flow.is_read_by(1))
+    flow.outlive()
 
 
 def test_no_frame_on_any_link_shows_a_topic_a_type_or_a_word_of_it() -> None:
@@ -130,3 +140,4 @@ def test_no_frame_on_any_link_shows_a_topic_a_type_or_a_word_of_it() -> None:
     assert len(seen) > 20
     for word in (b"camera", b"front", b"image", b"plaintext", b"described", bytes(range(32))):
         assert word not in wire
+    flow.outlive()

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import pytest
+
 from gdp.client.turns import BYTES_BESIDE_URGENT
 from gdp.frame.codec import decode
 from gdp.frame.kinds import Flag, Kind
 from tests.journeys.flows import ROBOT, SERVER, advertise, flowing, ring
 
 IMAGE = bytes(921_600)
+
+pytestmark = pytest.mark.momentary("the order of frames within one turn of the loop")
 
 
 def test_an_urgent_message_leaves_before_what_waits_of_others() -> None:

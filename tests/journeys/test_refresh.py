@@ -19,3 +19,4 @@ def test_every_way_is_found_anew_when_a_slice_is_one_way(monkeypatch: pytest.Mon
     assert world.network.run(10, lambda: flow.has(SERVER, 20))
     assert flow.numbers(SERVER) == list(range(20))
     assert not any(switch.unicast.is_refreshing for switch in world.switches.values())
+    flow.outlive()

@@ -10,21 +10,21 @@ from gdp.client.feed import FeedState
 from gdp.client.private import private_name
 from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import Kind
-from gdp.limits import CALL_LAG_S, CALL_QUIET_S, FLIGHT_START_BYTES
+from gdp.limits import CALL_LAG_S, CALL_QUIET_S, CLAIM_LEASE_S, FLIGHT_START_BYTES
 from gdp.names import Name
 from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology, chain
 from gdp.testbed.world import World
 from gdp.trust.right import Right
-from tests.journeys.flows import Tap
-from tests.journeys.services import Party, meet, work
+from tests.journeys.flows import LEASE_S, Tap
+from tests.journeys.services import Party, meet, outlive, work
 
 CLIENT = "s1/left"
 SERVERS = ("s3/a", "s3/b", "s3/c")
 
 
-def cluster(*labels: str) -> tuple[World, Party, list[Party]]:
+def cluster(*labels: str, lease_s: float = LEASE_S) -> tuple[World, Party, list[Party]]:
     """Return a client and servers at the other end of a chain, which answer nothing, and have met."""
-    world = World(chain(3))
+    world = World(chain(3), lease_s=lease_s)
     for label in labels:
         world.add_member(label, "s3")
     assert world.settle()
@@ -89,12 +89,13 @@ def test_a_request_to_one_server_reaches_that_one_alone_and_at_once() -> None:
     assert (Name(got.delivered.publisher), got.delivered.message) == (client.member.name, b"only you")
     world.network.run(1)
     assert (other.bodies(), tap.count(Kind.DATA)) == ([], 0)
+    outlive(world, client, one, other)
 
 
 @pytest.mark.parametrize("first", [Right.SERVE, Right.CALL])
 @pytest.mark.parametrize("lossy", [False, True])
 def test_a_request_to_a_server_that_has_just_become_a_peer_is_not_lost(first: Right, *, lossy: bool) -> None:
-    world = World(chain(3))
+    world = World(chain(3), lease_s=LEASE_S)
     assert world.settle()
     if lossy:
         for cable in world.cables.values():
@@ -107,6 +108,7 @@ def test_a_request_to_a_server_that_has_just_become_a_peer_is_not_lost(first: Ri
     ask(client, server, b"first")
     assert work(world, server, client, until_s=5 if lossy else 0.05, have=1)
     assert client.bodies() == [b"first by s3/right"]
+    outlive(world, client, server)
 
 
 def test_requests_to_one_server_are_complete_and_in_order_over_links_that_lose() -> None:
@@ -118,8 +120,10 @@ def test_requests_to_one_server_are_complete_and_in_order_over_links_that_lose()
         ask(client, one, message)
     assert work(world, one, until_s=20, have=100)
     assert one.bodies() == sent
+    outlive(world, client, one)
 
 
+@pytest.mark.momentary("it is refused at once")
 def test_who_is_not_heard_cannot_be_asked() -> None:
     world, client, (one, _) = cluster(*SERVERS[:2])
     with pytest.raises(LocalError, match="is not heard"):
@@ -152,6 +156,7 @@ def test_requests_to_a_former_life_of_a_server_do_not_reach_the_new_one() -> Non
     assert work(world, one, until_s=1, have=1)
     world.network.run(2)
     assert one.bodies() == [b"to the second life"]
+    outlive(world, client, one)
 
 
 def test_what_a_client_may_ask_before_it_has_said_what_its_requests_are_is_bounded() -> None:
@@ -171,8 +176,10 @@ def test_what_a_client_may_ask_before_it_has_said_what_its_requests_are_is_bound
     client.publish(b"?")
     assert work(world, one, until_s=5, have=messages + 1)
     assert [each.delivered.message[0] for each in one.got if each.private] == list(range(messages))
+    outlive(world, client, one)
 
 
+@pytest.mark.momentary("two names are compared, nothing is sent")
 def test_the_two_directions_of_two_nodes_are_two_streams() -> None:
     _, client, (one,) = cluster(SERVERS[0])
     (feed,) = client.member.feeds_of(client.service)
@@ -195,6 +202,7 @@ def test_a_frozen_or_dead_server_holds_up_no_other_and_is_no_peer_after_a_second
     for server in healthy:
         assert len(load.waits_s[server.label]) == 10_000
         assert load.worst_s(server.label) <= CALL_LAG_S
+    outlive(world, client, *healthy)
 
 
 def test_large_requests_wait_for_a_frozen_server_no_longer_than_its_lag() -> None:
@@ -205,6 +213,7 @@ def test_large_requests_wait_for_a_frozen_server_no_longer_than_its_lag() -> Non
     for label in SERVERS[:2]:
         assert len(load.waits_s[label]) == 1_000
         assert load.worst_s(label) <= CALL_LAG_S + 0.1
+    outlive(world, client, *servers[:2])
 
 
 def test_two_of_three_servers_may_freeze_at_once() -> None:
@@ -216,6 +225,7 @@ def test_two_of_three_servers_may_freeze_at_once() -> None:
     assert len(load.waits_s[SERVERS[0]]) == 3_000
     assert load.worst_s(SERVERS[0]) <= CALL_LAG_S
     assert client.member.peers(client.service) == [servers[0].member.name]
+    outlive(world, client, servers[0])
 
 
 def test_a_server_that_thaws_goes_on_with_what_is_new_and_holds_nobody_up() -> None:
@@ -231,16 +241,19 @@ def test_a_server_that_thaws_goes_on_with_what_is_new_and_holds_nobody_up() -> N
         assert load.worst_s(label) <= CALL_LAG_S
     after = [number for number in load.waits_s[frozen.label] if number >= 2_000]  # from a second and a half after it
     assert after == list(range(2_000, 2_500))
+    outlive(world, client, *servers)
 
 
 def test_a_silent_server_is_no_peer_though_nobody_asks_anything() -> None:
-    world, client, (_, silent) = cluster(*SERVERS[:2])
+    world, client, (heard, silent) = cluster(*SERVERS[:2])
     world.network.run(3)
     assert len(client.member.peers(client.service)) == 2
     world.network.stop(silent.label)
     assert world.network.run(CALL_QUIET_S + 0.3, lambda: len(client.member.peers(client.service)) == 1)
+    outlive(world, client, heard)
 
 
+@pytest.mark.momentary("it is about the first moment after a pause")
 def test_a_client_that_had_no_time_does_not_take_its_servers_for_silent() -> None:
     world, client, _ = cluster(*SERVERS[:2])
     world.network.freeze(client.label)
@@ -256,10 +269,11 @@ def test_the_only_server_keeps_its_requests_as_long_as_ever() -> None:
     load = Load(client, servers, size=100)
     load.run(5, per_s=100)
     assert len(load.waits_s[SERVERS[0]]) == 500
+    outlive(world, client, *servers)
 
 
 def test_a_server_that_starts_anew_is_a_peer_again_as_soon_as_it_is_there() -> None:
-    world, client, servers = cluster(*SERVERS)
+    world, client, servers = cluster(*SERVERS, lease_s=CLAIM_LEASE_S)
     load = Load(client, servers, size=100)
     again = servers[2]
     world.network.call(0.5, partial(world.network.stop, again.label))
@@ -270,6 +284,7 @@ def test_a_server_that_starts_anew_is_a_peer_again_as_soon_as_it_is_there() -> N
     client.publish(b"once more")
     assert work(world, again, until_s=0.1, have=1)
     assert again.bodies() == [b"once more"]
+    outlive(world, client, *servers)
 
 
 @pytest.mark.parametrize("replicas", [1, 2, 4])
@@ -284,7 +299,8 @@ def test_the_clients_link_carries_one_copy_of_a_request_whatever_the_number_of_s
                 Attachment("robot", "proxy", "proxy"),
                 *(Attachment(name, "proxy", "proxy") for name in names),
             ),
-        )
+        ),
+        lease_s=LEASE_S,
     )
     assert world.settle()
     servers = [Party(world, f"{name}/proxy", Right.SERVE, answers=False) for name in names]
@@ -299,6 +315,7 @@ def test_the_clients_link_carries_one_copy_of_a_request_whatever_the_number_of_s
     assert [len(server.bodies()) for server in servers] == [200] * replicas
     parts = 8  # of 10,000 bytes over 1,500
     assert [tap.count(Kind.DATA) for tap in (uplink, *branches)] == [200 * parts] * (1 + replicas)
+    outlive(world, client, *servers)
 
 
 @pytest.mark.parametrize("seed", [22, 28, 29, 34])
@@ -324,3 +341,5 @@ def test_a_new_server_is_a_peer_at_once_though_its_claims_and_questions_about_it
     world.add_member("m2/new", "m2")
     name = Party(world, "m2/new", Right.SERVE).member.name
     assert world.network.run(1.0, lambda: all(name in each.member.peers(each.service) for each in clients))
+    world.network.run(3.25 * world.lease_s)
+    assert all({name, old} <= set(each.member.peers(each.service)) for each in clients)

@@ -33,6 +33,7 @@ def test_a_publisher_whose_delegation_is_revoked_is_gone_from_every_tier() -> No
     assert {label: host.rib.names for label, host in world.ribs.items()} == {k: n - 1 for k, n in before.items()}
     assert not world.members[SERVER].feeds_of(flow.topic.name)
     assert not any(switch.planter.trees.all() for switch in world.switches.values())
+    flow.outlive(nobody=True)
 
 
 def test_what_a_revoked_publisher_still_sends_reaches_nobody() -> None:
@@ -42,6 +43,7 @@ def test_what_a_revoked_publisher_still_sends_reaches_nobody() -> None:
     flow.publish(b"too late")
     flow.world.network.run(1)
     assert not flow.has(SERVER, 1)
+    flow.outlive(nobody=True)
 
 
 def test_a_revoked_publisher_that_claims_again_is_refused() -> None:
@@ -51,6 +53,7 @@ def test_a_revoked_publisher_that_claims_again_is_refused() -> None:
     world.network.run(30)
     assert world.switches["nuc1"].drops()[DropReason.REVOKED] > 0
     assert not any(host.rib.names > 2 for host in world.ribs.values())
+    flow.outlive(nobody=True)
 
 
 def test_a_reader_whose_delegation_is_revoked_gets_no_frame_more() -> None:
@@ -65,6 +68,7 @@ def test_a_reader_whose_delegation_is_revoked_gets_no_frame_more() -> None:
     world.network.run(5)
     assert tap.count(Kind.DATA) == 0
     assert not flow.has(SERVER, 1)
+    flow.outlive(nobody=True)
 
 
 def test_another_reader_behind_the_same_link_reads_on_without_a_gap() -> None:
@@ -78,6 +82,7 @@ def test_another_reader_behind_the_same_link_reads_on_without_a_gap() -> None:
     assert world.network.run(10, lambda: flow.has("nuc4/other", 100))
     assert flow.numbers("nuc4/other") == list(range(100))
     assert len(flow.numbers(SERVER)) < 60
+    flow.outlive("nuc4/other")
 
 
 def test_a_revoked_member_is_cut_off_by_its_switch() -> None:
@@ -93,6 +98,7 @@ def test_a_revoked_member_is_cut_off_by_its_switch() -> None:
     world.network.run(1.5)  # a hello, and the silence that follows it
     assert world.ribs["backbone"].rib.names == 1
     assert flow.member.name not in {each.name for each in world.switches["nuc1"].greeter.all_up()}
+    flow.outlive(nobody=True)
 
 
 def test_a_switch_that_was_away_learns_what_was_revoked_meanwhile() -> None:
@@ -105,6 +111,7 @@ def test_a_switch_that_was_away_learns_what_was_revoked_meanwhile() -> None:
     world.network.run(5)
     assert world.switches["nuc1"].drops()[DropReason.REVOKED] > 0
     assert not world.switches["nuc1"].attached.get(flow.topic.name, flow.member.name)
+    flow.outlive(nobody=True)
 
 
 @pytest.mark.parametrize("revoked", [0, 1])
@@ -121,3 +128,4 @@ def test_the_whole_way_to_another_reader_stands_while_one_is_taken_back(revoked:
     world.network.touch("nuc5")
     way = [world.switches[node] for node in ("nuc1", "nuc2", "nuc3", "nuc4", "nuc5")]
     assert not world.network.run(3, lambda: not all(switch.planter.trees.all() for switch in way))
+    flow.outlive(readers[1 - revoked])

@@ -30,6 +30,7 @@ def test_a_publisher_that_moves_keeps_its_readers_and_loses_nothing(to: str) -> 
     flow.world.network.call(1.0, lambda: flow.world.roam(ROBOT, to))
     assert flow.world.network.run(20, lambda: flow.has(SERVER, 200))
     assert flow.numbers(SERVER) == list(range(200))
+    flow.outlive()
 
 
 @pytest.mark.parametrize("to", ["nuc2", "nuc3", "nuc5"])
@@ -41,6 +42,7 @@ def test_a_publisher_that_moved_is_known_there_in_every_tier(to: str) -> None:
     node = world.members[ROBOT].name
     for rib in world.ribs:
         assert place_in(world, rib, flow.topic.name, node) == to
+    flow.outlive()
 
 
 @pytest.mark.parametrize("to", ["nuc1", "nuc2", "nuc3", "nuc4"])
@@ -50,6 +52,7 @@ def test_a_reader_that_moves_reads_on_and_loses_nothing(to: str) -> None:
     flow.world.network.call(1.0, lambda: flow.world.roam(SERVER, to))
     assert flow.world.network.run(20, lambda: flow.has(SERVER, 200))
     assert flow.numbers(SERVER) == list(range(200))
+    flow.outlive()
 
 
 def test_moving_there_and_back_again_ends_where_it_began() -> None:
@@ -61,6 +64,7 @@ def test_moving_there_and_back_again_ends_where_it_began() -> None:
     assert network.run(30, lambda: flow.has(SERVER, 400))
     assert flow.numbers(SERVER) == list(range(400))
     assert flow.hops(SERVER)[-1] == 5
+    flow.outlive()
 
 
 def test_who_watches_is_told_within_the_blink_of_an_eye() -> None:
@@ -72,6 +76,7 @@ def test_who_watches_is_told_within_the_blink_of_an_eye() -> None:
     flow.publish(b"here I am")
     assert world.network.run(0.2, lambda: flow.has(SERVER, 1))
     assert flow.hops(SERVER) == [4]
+    flow.outlive()
 
 
 def test_the_old_branch_is_left_at_once() -> None:
@@ -86,6 +91,7 @@ def test_the_old_branch_is_left_at_once() -> None:
     assert flow.hops(SERVER) == [1]
     assert tap.count(Kind.DATA) == 0
     assert not world.switches["nuc3"].planter.trees.all()
+    flow.outlive()
 
 
 def test_a_new_life_of_a_publisher_is_read_anew() -> None:
@@ -99,6 +105,7 @@ def test_a_new_life_of_a_publisher_is_read_anew() -> None:
     second.publish(b"second life")
     assert world.network.run(5, lambda: second.has(SERVER, 2))
     assert [each.message for each in second.got[SERVER]] == [b"first life", b"second life"]
+    flow.outlive()
 
 
 def _again(flow: Flow) -> Flow:

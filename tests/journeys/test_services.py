@@ -11,12 +11,12 @@ from gdp.crypto.statements import parse
 from gdp.effects import Arrival
 from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import Kind
-from gdp.limits import READER_LEASE_S
+from gdp.limits import CLAIM_LEASE_S, READER_LEASE_S
 from gdp.testbed.world import World
 from gdp.trust.adcert import AdCert
 from gdp.trust.right import Right
 from tests.journeys.flows import ROBOT, SERVER, Tap, ring
-from tests.journeys.services import SERVICE, Party, meet, work
+from tests.journeys.services import SERVICE, Party, meet, outlive, work
 
 OTHER = "nuc4/other"
 
@@ -44,6 +44,7 @@ def test_a_call_is_answered_across_domains() -> None:
     assert (answer.topic, answer.private, answer.delivered.message) == (client.service, True, b"1+2 by nuc5/server")
     assert (answer.description, answer.delivered.hops) == (b"serve by nuc5/server", 5)
     assert [(each.private, each.description) for each in server.got] == [(False, b"call by nuc1/robot")]
+    outlive(world, client, server)
 
 
 @pytest.mark.parametrize("first", [Right.SERVE, Right.CALL])
@@ -56,6 +57,7 @@ def test_the_first_call_is_answered_as_soon_as_a_server_is_known(first: Right) -
     client.publish(b"first")
     assert work(world, server, client, until_s=0.1, have=1)
     assert client.stream.drops[DropReason.NO_READER] == 0
+    outlive(world, client, server)
 
 
 def test_two_servers_both_answer() -> None:
@@ -66,6 +68,7 @@ def test_two_servers_both_answer() -> None:
     client.publish(b"?")
     assert work(world, *servers, client, until_s=2, have=2)
     assert sorted(client.bodies()) == [b"? by nuc4/other", b"? by nuc5/server"]
+    outlive(world, client, *servers)
 
 
 def test_an_answer_goes_to_the_client_that_asked_alone() -> None:
@@ -78,6 +81,8 @@ def test_an_answer_goes_to_the_client_that_asked_alone() -> None:
     asks.publish(b"?")
     assert work(world, server, idle, asks, until_s=2, have=1)
     assert (idle.got, tap.count(Kind.DATA)) == ([], 0)
+    outlive(world, asks, server)
+    assert (idle.collect(), tap.count(Kind.DATA)) == ([], 0)
 
 
 def test_news_of_a_server_reaches_all_its_clients() -> None:
@@ -89,6 +94,7 @@ def test_news_of_a_server_reaches_all_its_clients() -> None:
     for client in clients:
         assert work(world, client, until_s=2, have=1)
         assert [(each.private, each.delivered.message) for each in client.got] == [(False, b"feedback")]
+    outlive(world, clients[0], server)
 
 
 def test_a_server_that_dies_is_no_peer_any_more_and_its_private_stream_ends() -> None:
@@ -97,6 +103,8 @@ def test_a_server_that_dies_is_no_peer_any_more_and_its_private_stream_ends() ->
     world.network.stop(SERVER)
     assert world.network.run(READER_LEASE_S + 2, lambda: not client.member.peers(client.service))
     assert world.network.run(40, lambda: not list(client.member.feeds()))
+    world.network.run(3.25 * world.lease_s)
+    assert list(client.member.feeds()) == []
 
 
 def test_a_server_that_withdraws_is_no_peer_at_once() -> None:
@@ -108,6 +116,8 @@ def test_a_server_that_withdraws_is_no_peer_at_once() -> None:
     assert client.member.peers(client.service) == []
     with pytest.raises(LocalError):
         server.member.answer(server.service, client.member.name, b"too late")
+    world.network.run(3.25 * world.lease_s)
+    assert client.member.peers(client.service) == []
 
 
 def test_answers_to_a_former_life_do_not_reach_the_new_one() -> None:
@@ -123,6 +133,7 @@ def test_answers_to_a_former_life_do_not_reach_the_new_one() -> None:
     server.answer(client.member.name, b"for the second life")
     assert work(world, client, until_s=2, have=1)
     assert client.bodies() == [b"for the second life"]
+    outlive(world, client, server)
 
 
 def test_a_server_that_starts_anew_answers_again() -> None:
@@ -137,6 +148,7 @@ def test_a_server_that_starts_anew_answers_again() -> None:
     client.publish(b"2")
     assert work(world, server, client, until_s=2, have=2)
     assert client.bodies() == [b"1 by nuc5/server", b"2 by nuc5/server"]
+    outlive(world, client, server)
 
 
 def test_a_lost_part_of_an_answer_is_repaired() -> None:
@@ -150,6 +162,7 @@ def test_a_lost_part_of_an_answer_is_repaired() -> None:
         server.answer(client.member.name, large)
     assert work(world, client, until_s=20, have=20)
     assert client.bodies() == [large] * 20
+    outlive(world, client, server)
 
 
 def test_a_lost_answer_alone_is_asked_for_and_repaired() -> None:
@@ -160,6 +173,7 @@ def test_a_lost_answer_alone_is_asked_for_and_repaired() -> None:
     world.network.run(0.5)
     world.leads[ROBOT].loss = 0.0
     assert work(world, client, until_s=2, have=1)
+    outlive(world, client, server)
 
 
 def test_replayed_answers_are_dropped() -> None:
@@ -178,8 +192,10 @@ def test_replayed_answers_are_dropped() -> None:
     client.member.receive([Arrival(neighbour.port, neighbour.mac, frame) for frame in frames], world.network.now)
     assert client.member.take_messages() == []
     assert client.member.drops()[DropReason.LATE] > dropped
+    outlive(world, client, server)
 
 
+@pytest.mark.momentary("it is refused before anything is claimed")
 def test_a_node_without_the_right_to_serve_or_call_does_neither() -> None:
     world = ring()
     member = world.members[ROBOT]
@@ -204,8 +220,10 @@ def test_who_may_only_call_is_heard_by_no_client_however_it_claims() -> None:
     world.network.run(2)
     assert liar.attachment.refusals[DropReason.NOT_DELEGATED] >= 1
     assert client.member.peers(client.service) == [server.member.name]
+    outlive(world, client, server)
 
 
+@pytest.mark.momentary("it is refused before anything is claimed")
 def test_a_node_serves_or_calls_a_name_not_both() -> None:
     world = ring()
     member = world.members[ROBOT]
@@ -227,9 +245,27 @@ def test_two_hundred_calls_at_once_are_all_answered_once() -> None:
     world.network.run(1)
     answered = sorted(client.bodies())
     assert answered == sorted([b"%d by nuc5/server" % number for number in range(200)] + [b"last by nuc5/server"])
+    outlive(world, client, server)
 
 
-def test_a_client_that_was_cut_off_goes_on_and_counts_what_it_lost() -> None:
+@pytest.mark.momentary("the lease of a reader ends, that of its claim does not")
+def test_a_client_that_was_cut_off_for_longer_than_its_lease_goes_on_and_loses_nothing() -> None:
+    world = ring(lease_s=CLAIM_LEASE_S)
+    server, client = pair(world)
+    server.answer(client.member.name, b"before")
+    assert work(world, client, until_s=2, have=1)
+    world.leads[ROBOT].loss = 1.0
+    server.answer(client.member.name, b"meanwhile")
+    world.network.run(READER_LEASE_S + 3)
+    world.leads[ROBOT].loss = 0.0
+    assert meet(world, server, client)
+    server.answer(client.member.name, b"after")
+    assert work(world, client, until_s=3, have=3)
+    assert client.bodies() == [b"before", b"meanwhile", b"after"]
+    assert sum(feed.lost for feed in client.member.feeds()) == 0
+
+
+def test_a_client_whose_claim_ended_meanwhile_goes_on_and_counts_what_it_lost() -> None:
     world = ring()
     server, client = pair(world)
     server.answer(client.member.name, b"before")
@@ -243,6 +279,7 @@ def test_a_client_that_was_cut_off_goes_on_and_counts_what_it_lost() -> None:
     assert work(world, client, until_s=3, have=2)
     assert client.bodies() == [b"before", b"after"]
     assert sum(feed.lost for feed in client.member.feeds()) == 1
+    outlive(world, client, server)
 
 
 def test_a_narrower_path_lets_answers_go_in_smaller_frames() -> None:
@@ -252,6 +289,7 @@ def test_a_narrower_path_lets_answers_go_in_smaller_frames() -> None:
     world.network.run(1)
     server.answer(client.member.name, bytes(5_000))
     assert work(world, client, until_s=2, have=1)
+    outlive(world, client, server)
 
 
 def test_a_private_stream_that_nobody_uses_is_forgotten_and_goes_on_above_its_numbers() -> None:
@@ -289,6 +327,7 @@ def test_withdrawn_and_served_again_goes_on_above_all_numbers_with_another_descr
     answers = [each.delivered.number for each in client.got if each.private]
     assert (news, answers) == ([1, 2], [1, 2])
     assert {each.description for each in client.got[2:]} == {b"another description"}
+    outlive(world, client, server)
 
 
 def test_a_change_of_secrets_reaches_private_streams() -> None:
@@ -299,6 +338,7 @@ def test_a_change_of_secrets_reaches_private_streams() -> None:
         party.member.renew(type(topic)(topic.delegation, {1: topic.secrets[1], 2: bytes(32)}))
     client.publish(b"?")
     assert work(world, server, client, until_s=2, have=1)
+    outlive(world, client, server)
 
 
 def test_calls_go_on_while_the_client_roams() -> None:
@@ -309,6 +349,7 @@ def test_calls_go_on_while_the_client_roams() -> None:
     world.network.call(1.55, lambda: world.roam(ROBOT, "nuc3"))
     assert work(world, server, client, until_s=20, have=40)
     assert len(client.bodies()) == 40
+    outlive(world, client, server)
 
 
 def test_a_client_whose_delegation_is_revoked_is_answered_no_more() -> None:
@@ -324,6 +365,8 @@ def test_a_client_whose_delegation_is_revoked_is_answered_no_more() -> None:
     assert world.network.run(1, lambda: not server.member.peers(server.service))
     with pytest.raises(LocalError, match="is not heard"):
         server.answer(client.member.name, b"?")
+    world.network.run(3.25 * world.lease_s)
+    assert server.member.peers(server.service) == []
 
 
 def test_calls_over_links_that_lose_and_reorder_are_all_answered_once() -> None:
@@ -336,3 +379,4 @@ def test_calls_over_links_that_lose_and_reorder_are_all_answered_once() -> None:
     assert work(world, server, client, until_s=30, have=100)
     world.network.run(1)
     assert sorted(client.bodies()) == sorted(b"%d by nuc5/server" % number for number in range(100))
+    outlive(world, client, server)

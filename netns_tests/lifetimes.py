@@ -1,0 +1,45 @@
+"""How long topologies of real processes carried traffic, compared with the leases of their names.
+
+A test that ends within the first lease shows nothing about renewal: what it saw may die a moment later.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+
+__all__ = ["LEASES", "LEASE_S", "Lifetime", "noted", "too_short"]
+
+LEASES = 3
+LEASE_S = 2.0  # what tests with real processes ask for, so that three leases are soon over
+
+
+@dataclass(frozen=True, slots=True)
+class Lifetime:
+    """One topology: the lease of its names, and for how many seconds it carried traffic."""
+
+    what: str
+    lease_s: float
+    lasted_s: float
+
+    @property
+    def short_s(self) -> float:
+        """Return how many seconds are missing to three leases."""
+        return LEASES * self.lease_s - self.lasted_s
+
+
+noted: list[Lifetime] = []  # of the test that runs
+
+
+def too_short(lifetimes: list[Lifetime], marker: pytest.Mark | None) -> str:
+    """Return why a test does not outlive its leases; empty: it does, or need not."""
+    if marker is not None:
+        reasons = [reason for reason in marker.args if isinstance(reason, str) and reason.strip()]
+        return "" if reasons else "momentary needs a reason: why does no lease matter here?"
+    return "".join(
+        f"{each.what} carried traffic for {each.lasted_s:.1f} s, {each.short_s:.1f} s less than {LEASES} leases: let it"
+        " last longer, make its leases shorter, or mark the test momentary and say why no lease matters. "
+        for each in lifetimes
+        if each.short_s > 0
+    )

@@ -1,0 +1,107 @@
+"""Real processes in namespaces come through faults of every kind; nothing grows where much comes and goes."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+from faults.link_faults import FrameFaults
+from faults.overlay import Overlay
+from faults.plan import Flow, Plan, make_topology
+from faults.records import Kind
+
+from gdp.testbed.processes import Process
+from gdp.testbed.runs import Runs
+from netns_tests.live_pair import until
+from tests.pages import ROOT
+
+pytestmark = pytest.mark.netns
+
+_START_S = 200.0
+
+
+def bench(name: str, *options: str, patience_s: float) -> subprocess.CompletedProcess[str]:
+    """Run a bench to its end."""
+    return subprocess.run(argv_of(name, options), capture_output=True, text=True, timeout=patience_s, check=False)
+
+
+def argv_of(name: str, options: Sequence[str]) -> list[str]:
+    """Return the command line of a bench."""
+    return [sys.executable, str(ROOT / "scripts" / "bench" / name), *options]
+
+
+def test_nothing_grows_in_memory_while_readers_and_publishers_come_and_go() -> None:
+    ran = bench("soak.py", "--only", "memory", "--cycles", "150", "--publishers", "60", patience_s=_START_S)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+
+
+def test_nothing_grows_in_real_processes_while_readers_and_publishers_come_and_go() -> None:
+    ran = bench("soak.py", "--only", "real", "--seconds", "15", patience_s=_START_S)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+
+
+def test_a_killed_run_is_taken_down_by_the_next() -> None:
+    def started() -> set[str]:
+        return {record.run for record in Runs().all()} - before
+
+    before = {record.run for record in Runs().all()}
+    process = subprocess.Popen(argv_of("chaos.py", ["--seconds", "60"]), stderr=subprocess.DEVNULL)
+    until(started, "a run that is recorded")
+    (run,) = started()
+    until(lambda: any(record.run == run and len(record.processes) > 20 for record in Runs().all()), "its processes")
+    (record,) = (record for record in Runs().all() if record.run == run)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    until(lambda: not any(each.alive for each in record.processes), "their end: they die with their parent")
+    assert run in Runs().sweep()
+    assert not any(Path(path).exists() for path in [*record.namespaces, *record.files])
+
+
+@pytest.fixture
+def overlay() -> Iterator[Overlay]:
+    """Two switches with a publisher and a reader, running."""
+    topology, members = make_topology({"a": ("s1", "s2")}, {}, ("s1-s2",), ("s1",), {"P": "s1", "R": "s2"})
+    plan = Plan(topology, members, flows=(Flow("/t", "P", ("R",), hz=100.0),))
+    run = Runs().start()
+    try:
+        with Overlay(run, plan, has_clocks=True) as made:
+            made.start_all()
+            yield made
+    finally:
+        run.end()
+
+
+def numbers(overlay: Overlay, member: str) -> list[int]:
+    """Return the numbers of what a member has published or had since last asked."""
+    kinds = (Kind.PUBLISHED, Kind.DELIVERED)
+    return [each.number for _, records in overlay.read(member) for each in records if each.kind in kinds]
+
+
+def test_frames_of_a_link_are_lost_doubled_and_delayed_as_told(overlay: Overlay) -> None:
+    until(lambda: numbers(overlay, "R"), "a message")
+    overlay.disturb("s1", "s2", FrameFaults(lost=1.0))
+    begun = max(numbers(overlay, "P"))
+    until(lambda: max(numbers(overlay, "P"), default=0) > begun + 50, "half a second of messages")
+    assert max(numbers(overlay, "R"), default=0) < begun + 20
+    for faults in (FrameFaults(doubled=1.0), FrameFaults(delayed=0.5)):
+        overlay.disturb("s1", "s2", faults)
+        until(lambda: numbers(overlay, "R"), "a message")
+    overlay.calm("s1", "s2")
+    until(lambda: numbers(overlay, "R"), "a message")
+
+
+def test_a_killed_process_is_started_again_and_a_frozen_one_goes_on(overlay: Overlay) -> None:
+    assert Process.of(overlay.pid("member P")).alive
+    overlay.kill("member P")
+    assert not overlay.is_running("member P")
+    overlay.restart("member P")
+    overlay.await_ready("member P")
+    assert overlay.life("member P") == 2
+    until(lambda: numbers(overlay, "R"), "a message of its new life")
+    overlay.freeze("member R")
+    overlay.thaw("member R")
+    until(lambda: numbers(overlay, "R"), "a message after the freeze")

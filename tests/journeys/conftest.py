@@ -1,0 +1,52 @@
+"""Every journey outlives the leases that it depends on: what holds only until the first of them ends is no promise.
+
+A test that built a world fails here unless one of its worlds ran for three leases after it had settled, or the test is
+marked ``momentary`` with the reason why no lease matters to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+
+import pytest
+
+from gdp.testbed.world import World
+
+LEASES = 3
+_WORLDS = pytest.StashKey[list[World]]()
+
+
+@pytest.fixture(autouse=True)
+def _worlds_are_known(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    worlds = request.node.stash[_WORLDS] = []
+    made = World.__post_init__
+
+    def note(world: World) -> None:
+        made(world)
+        worlds.append(world)
+
+    monkeypatch.setattr(World, "__post_init__", note)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
+    yield
+    complaint = too_short(item.stash.get(_WORLDS, []), item.get_closest_marker("momentary"))
+    if complaint:
+        pytest.fail(complaint, pytrace=False)
+
+
+def too_short(worlds: list[World], marker: pytest.Mark | None) -> str:
+    """Return why a test does not outlive its leases; empty: it does, or need not."""
+    if marker is not None:
+        reasons = [reason for reason in marker.args if isinstance(reason, str) and reason.strip()]
+        return "" if reasons else "momentary needs a reason: why does no lease matter here?"
+    if not worlds:
+        return ""
+    short_s = min(LEASES * world.lease_s - (world.network.now.mono_s - world.settled_s) for world in worlds)
+    if short_s <= 0:
+        return ""
+    return (
+        f"this journey ends {short_s:.1f} s of virtual time before {LEASES} leases are over: let it go on"
+        " (flow.outlive(), outlive(world, ...)), or mark it momentary and say why no lease matters"
+    )

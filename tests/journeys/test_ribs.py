@@ -1,0 +1,92 @@
+"""Several RIBs serve a domain: any of them may die, and no live name is lost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+from gdp.control.query import Query
+from gdp.limits import CLAIM_LEASE_S
+from gdp.testbed.topology import Attachment, ring5
+from gdp.testbed.world import World
+from tests.journeys.flows import ROBOT, SERVER, advertise, flowing
+
+LEASES_S = 3 * CLAIM_LEASE_S
+RIBS = ["school", "school#2", "backbone", "backbone#2", "cloud", "cloud#2"]
+
+
+def doubled() -> World:
+    """Return the ring with two RIBs in each domain."""
+    ring = ring5()
+    second = (Attachment("nuc1", "rib", "rib2"), Attachment("nuc3", "rib", "rib2"), Attachment("nuc5", "rib", "rib2"))
+    world = World(replace(ring, attachments=ring.attachments + second))
+    assert world.settle()
+    return world
+
+
+def agree(world: World, domain: str) -> bool:
+    one, two = (world.ribs[label].rib for label in (domain, f"{domain}#2"))
+    hashes = {digests.total for rib in (one, two) if (digests := rib._store.digests) is not None}
+    return len(hashes) == 1 and one.names > 0
+
+
+def test_what_one_rib_took_all_of_its_domain_hold() -> None:
+    world = flowing(doubled()).world
+    for domain in ("school", "backbone", "cloud"):
+        assert world.network.run(5, partial(agree, world, domain))
+    world.network.run(LEASES_S)
+    for domain in ("school", "backbone", "cloud"):
+        assert world.network.run(5, partial(agree, world, domain))
+
+
+def test_each_rib_dies_and_returns_in_turn_and_no_name_is_lost_or_unfindable() -> None:
+    flow = flowing(doubled())
+    world, network = flow.world, flow.world.network
+    number = int(LEASES_S)
+    flow.stream(number, 1.0, size=100)
+    for dead in RIBS:
+        world.kill_rib(dead)
+        network.run(0.1)  # before anybody can have noticed
+        late = advertise(world, f"/late/{dead}")
+        late.read_by(SERVER)
+        assert network.run(3, partial(late.is_read_by, 1))
+        network.run(LEASES_S / len(RIBS))
+        world.restart_rib(dead)
+        domain = dead.split("#")[0]
+        assert network.run(5, partial(agree, world, domain))
+        assert late.publisher.readers == 1
+    assert network.run(10, lambda: flow.has(SERVER, number))
+    assert flow.numbers(SERVER) == list(range(number))
+
+
+def test_two_ribs_that_were_parted_agree_again() -> None:
+    flow = flowing(doubled())
+    world, network = flow.world, flow.world.network
+    lead = world.leads[world.rib_node("school#2")]
+    network.set_link(lead, up=False)
+    gone = advertise(world, "/gone")
+    kept = advertise(world, "/kept")
+    network.run(LEASES_S)
+    gone.member.withdraw(gone.topic.name)
+    network.touch(ROBOT)
+    network.run(1)
+    assert not agree(world, "school")
+    network.set_link(lead, up=True)
+    assert network.run(5, partial(agree, world, "school"))
+    routes = world.ribs["school#2"].rib._store.routes
+    assert (len(routes(kept.topic.name)), len(routes(gone.topic.name))) == (1, 0)
+
+
+def test_a_watch_at_one_rib_hears_what_another_took() -> None:
+    world = doubled()
+    asked = world.ribs["school#2"].rib
+    watcher = next(iter(world.switches.values()))
+    flow = advertise(world, "/watched")
+    query = Query(flow.topic.name, 20.0)
+    identity = world.identities["nuc1"]
+    asked.receive(query.to_wire(identity.name, identity.key, identity.membership), watcher.name, world.network.now)
+    asked.take()
+    answers = asked.answers
+    assert world.network.run(1, lambda: asked.answers > answers)
+    world.network.run(LEASES_S)
+    assert asked._store.routes(flow.topic.name)

@@ -1,0 +1,169 @@
+"""What stays of a network goes on for longer than every lease: cuts, parted domains, dead RIBs, moves."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+
+from gdp.limits import CLAIM_LEASE_S
+from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
+from gdp.testbed.world import World
+from tests.journeys.flows import ROBOT, SERVER, Flow, flowing, ring
+
+LONG_S = 3 * CLAIM_LEASE_S + 8
+
+
+def complete(flow: Flow, label: str, count: int, within_s: float) -> None:
+    """Let time go on until so many messages have come to a reader: all of them, in order, once."""
+    flow.world.network.run(within_s, lambda: flow.has(label, count))
+    assert flow.numbers(label) == list(range(count))
+
+
+@pytest.mark.parametrize(
+    "cut", [("nuc1", "nuc2"), ("nuc2", "nuc3"), ("nuc3", "nuc4"), ("nuc4", "nuc5"), ("nuc5", "nuc1")]
+)
+def test_any_link_of_the_ring_may_fail_for_ever(cut: tuple[str, str]) -> None:
+    world = ring()
+    there, back = flowing(world), flowing(world, "/answers", SERVER, (ROBOT,))
+    count = int(LONG_S / 0.1)
+    there.stream(count, 0.1, size=100)
+    back.stream(count, 0.1, size=100)
+    world.network.call(5, lambda: world.network.set_link(world.cables[frozenset(cut)], up=False))
+    complete(there, SERVER, count, LONG_S + 10)
+    complete(back, ROBOT, count, 10)
+
+
+def three_sites(*, ribs: tuple[str, ...] = ("a", "b", "c", "top")) -> Topology:
+    """Return domains a, b and c around top, in two ways, each with two access switches and a border."""
+    nodes = {label: (f"{label}0", f"{label}1", f"{label}2") for label in ("a", "b", "c")}
+    links = [Link(n[0], each) for n in nodes.values() for each in n[1:]]
+    links += [Link(n[1], n[2]) for n in nodes.values()]
+    links += [Link(f"{label}0", "t1") for label in nodes] + [Link(f"{label}1", "t2", cost=30) for label in nodes]
+    links.append(Link("t1", "t2"))
+    return Topology(
+        tuple(links),
+        (*(DomainPlan(label, n, upper="top") for label, n in nodes.items()), DomainPlan("top", ("t1", "t2"))),
+        (
+            *(Attachment(f"{label}0" if label != "top" else "t1", "rib", "rib") for label in ribs),
+            Attachment("a1", "proxy", "robot"),
+            Attachment("c2", "proxy", "server"),
+        ),
+    )
+
+
+A, C = "a1/robot", "c2/server"
+
+
+def sites(**options: object) -> World:
+    """Return the sites, settled."""
+    world = World(three_sites(**options))  # type: ignore[arg-type]
+    assert world.settle()
+    return world
+
+
+MOVES = {
+    "within a domain": ["a2"],
+    "to another domain": ["b2"],
+    "to and fro": ["b2", "a1"] * 5,
+    "through all domains": ["b1", "top", "c1", "a2"],
+}
+
+
+@pytest.mark.parametrize("who", [A, C])
+@pytest.mark.parametrize("moves", MOVES.values(), ids=MOVES)
+def test_a_node_that_moves_keeps_every_flow(who: str, moves: list[str]) -> None:
+    world = sites()
+    there, back = flowing(world, source=A, readers=(C,)), flowing(world, "/answers", C, (A,))
+    count = int(LONG_S / 0.1)
+    there.stream(count, 0.1, size=100)
+    back.stream(count, 0.1, size=100)
+    for number, to in enumerate(moves):
+        world.network.call(3.0 + number, partial(world.roam, who, "t2" if to == "top" else to))
+    complete(there, C, count, LONG_S + 10)
+    complete(back, A, count, 10)
+
+
+def test_both_ends_may_move_at_once() -> None:
+    world = sites()
+    flow = flowing(world, source=A, readers=(C,))
+    count = int(LONG_S / 0.1)
+    flow.stream(count, 0.1, size=100)
+    world.network.call(3.0, lambda: world.roam(A, "b2"))
+    world.network.call(3.0, lambda: world.roam(C, "b1"))
+    complete(flow, C, count, LONG_S + 10)
+
+
+@pytest.mark.parametrize("to", ["a2", "b2"])
+@pytest.mark.parametrize("who", [A, C])
+def test_a_node_moves_while_all_ribs_are_dead(who: str, to: str) -> None:
+    world = sites()
+    there, back = flowing(world, source=A, readers=(C,)), flowing(world, "/answers", C, (A,))
+    count = int(LONG_S / 0.1)
+    there.stream(count, 0.1, size=100)
+    back.stream(count, 0.1, size=100)
+    world.network.call(2.0, lambda: [world.kill_rib(label) for label in world.ribs])
+    world.network.call(40.0, partial(world.roam, who, to))
+    complete(there, C, count, LONG_S + 10)
+    complete(back, A, count, 10)
+
+
+def test_established_flows_go_on_while_all_ribs_are_dead_for_ten_minutes() -> None:
+    world = sites()
+    flow = flowing(world, source=A, readers=(C,))
+    for label in world.ribs:
+        world.kill_rib(label)
+    flow.stream(600, 1.0, size=100)
+    complete(flow, C, 600, 620)
+
+
+def test_ribs_that_were_dead_for_long_come_back_without_a_flow_noticing() -> None:
+    world = sites()
+    flow = flowing(world, source=A, readers=(C,))
+    flow.stream(1_000, 0.1, size=100)
+    for label in world.ribs:
+        world.network.call(2.0, partial(world.kill_rib, label))
+        world.network.call(46.0, partial(world.restart_rib, label))
+    complete(flow, C, 1_000, 110)
+
+
+def test_a_transit_domain_needs_no_rib_of_its_own() -> None:
+    topology = Topology(
+        (Link("a1", "t1"), Link("t1", "t2"), Link("t2", "b1")),
+        (DomainPlan("a", ("a1",)), DomainPlan("t", ("t1", "t2")), DomainPlan("b", ("b1",), upper="a")),
+        (
+            Attachment("a1", "rib", "rib"),
+            Attachment("b1", "rib", "rib"),
+            Attachment("a1", "proxy", "robot"),
+            Attachment("b1", "proxy", "server"),
+        ),
+    )
+    world = World(topology)
+    assert world.settle()
+    world.network.run(9)
+    flow = flowing(world, source="a1/robot", readers=("b1/server",))
+    count = int(LONG_S / 0.1)
+    flow.stream(count, 0.1, size=100)
+    world.network.call(10.0, lambda: world.roam("a1/robot", "t2"))  # ... and is found in a domain without one
+    complete(flow, "b1/server", count, LONG_S + 10)
+
+
+def test_a_ring_survives_one_fault_after_the_other() -> None:
+    world = ring()
+    there, back = flowing(world), flowing(world, "/answers", SERVER, (ROBOT,))
+    count = int(LONG_S / 0.1)
+    there.stream(count, 0.1, size=100)
+    back.stream(count, 0.1, size=100)
+    at, network = world.network.call, world.network
+    one, two = world.cables[frozenset(("nuc1", "nuc2"))], world.cables[frozenset(("nuc4", "nuc5"))]
+    at(5, lambda: network.set_link(one, up=False))
+    at(15, lambda: network.set_link(one, up=True))
+    at(18, lambda: world.kill_rib("school"))
+    at(26, lambda: world.restart_rib("school"))
+    at(30, lambda: world.roam(ROBOT, "nuc2"))
+    at(36, lambda: network.set_link(two, up=False))
+    at(45, lambda: network.stop("nuc3"))
+    at(55, lambda: world.restart_switch("nuc3"))
+    at(60, lambda: world.roam(ROBOT, "nuc1"))
+    complete(there, SERVER, count, LONG_S + 10)
+    complete(back, ROBOT, count, 10)
