@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from math import ceil
+
+import pytest
+
 from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Kind
 from gdp.testbed.memory import Cable
 from gdp.testbed.topology import DomainPlan, Link, Topology
 from gdp.testbed.world import World
+from tests.journeys.flows import LEASE_S
 
 SQUARE = Topology(
     (Link("a", "b", 10), Link("a", "c", 10), Link("b", "d", 10), Link("c", "d", 15)),
@@ -18,9 +24,17 @@ DETECT_S = 0.21
 
 def square() -> World:
     """Return four switches in a ring, with their alternates."""
-    world = World(SQUARE)
+    world = World(SQUARE, lease_s=LEASE_S)
     world.network.run(3.0)
     return world
+
+
+def stays(world: World, holds: Callable[[], bool]) -> None:
+    """Check that something holds until three leases are over."""
+    for _ in range(ceil(3.25 * world.lease_s / 0.5)):
+        assert holds()
+        world.network.run(0.5)
+    assert holds()
 
 
 def cable(world: World, one: str, two: str) -> Cable:
@@ -31,6 +45,11 @@ def neighbours(world: World, switch: str) -> set[str]:
     """Return who is up at a switch."""
     label_of = {each.name: label for label, each in world.switches.items()}
     return {label_of[each.name] for each in world.switches[switch].greeter.all_up()}
+
+
+def is_whole(world: World) -> bool:
+    """Return whether every switch of the square has both its neighbours."""
+    return [neighbours(world, each) for each in "abcd"] == [{"b", "c"}, {"a", "d"}, {"a", "d"}, {"b", "c"}]
 
 
 def echo(world: World) -> bytes:
@@ -64,8 +83,7 @@ def test_a_silent_cut_is_noticed_by_both_ends_within_the_detection_time() -> Non
     world = square()
     cable(world, "a", "b").loss = 1.0
     world.network.run(DETECT_S + 0.02)
-    assert neighbours(world, "a") == {"c"}
-    assert neighbours(world, "b") == {"d"}
+    stays(world, lambda: (neighbours(world, "a"), neighbours(world, "b")) == ({"c"}, {"d"}))
 
 
 def test_a_link_that_loses_frames_one_way_is_given_up_by_both_ends() -> None:
@@ -81,8 +99,7 @@ def test_a_link_that_loses_frames_one_way_is_given_up_by_both_ends() -> None:
     world.network._send = lossy  # type: ignore[method-assign]
     assert a.is_alive
     world.network.run(DETECT_S + 0.05)
-    assert neighbours(world, "b") == {"d"}
-    assert neighbours(world, "a") == {"c"}
+    stays(world, lambda: (neighbours(world, "a"), neighbours(world, "b")) == ({"c"}, {"d"}))
 
 
 def test_five_percent_of_loss_lose_no_neighbour() -> None:
@@ -91,7 +108,7 @@ def test_five_percent_of_loss_lose_no_neighbour() -> None:
         each.loss = 0.05
     for _ in range(60):
         world.network.run(0.5)
-        assert [neighbours(world, each) for each in "abcd"] == [{"b", "c"}, {"a", "d"}, {"a", "d"}, {"b", "c"}]
+        assert is_whole(world)
 
 
 def test_a_frozen_switch_is_let_go_and_comes_back_cleanly() -> None:
@@ -101,9 +118,10 @@ def test_a_frozen_switch_is_let_go_and_comes_back_cleanly() -> None:
     assert neighbours(world, "a") == {"c"}
     world.network.thaw("b")
     world.network.run(2.0)
-    assert [neighbours(world, each) for each in "abcd"] == [{"b", "c"}, {"a", "d"}, {"a", "d"}, {"b", "c"}]
+    stays(world, lambda: is_whole(world))
 
 
+@pytest.mark.momentary("the one frame between the cut and its discovery is what this is about")
 def test_frames_take_the_alternate_before_the_switch_itself_knows_of_the_cut() -> None:
     world = square()
     by_b, by_c = passed(world, "a", "b"), passed(world, "a", "c")
@@ -134,3 +152,4 @@ def test_a_link_that_flaps_is_left_out_until_it_stays() -> None:
     way = a._paths.to_switch(b.name, a._identity.member.domain, allowed)
     assert way is not None
     assert way.first == b.name
+    stays(world, lambda: neighbours(world, "a") == {"b", "c"})

@@ -105,7 +105,7 @@ def test_a_new_life_of_a_publisher_is_read_anew() -> None:
     second.publish(b"second life")
     assert world.network.run(5, lambda: second.has(SERVER, 2))
     assert [each.message for each in second.got[SERVER]] == [b"first life", b"second life"]
-    flow.outlive()
+    second.outlive()
 
 
 def _again(flow: Flow) -> Flow:

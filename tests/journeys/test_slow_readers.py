@@ -160,7 +160,7 @@ def test_reliable_a_reader_that_lagged_holds_its_publisher_again_only_after_a_pe
     before = len(flow.numbers(NEAR))
     flow.stream(200, 0.001, size=50_000)
     assert world.network.run(2, lambda: flow.has(NEAR, before + 200))  # nobody waited for it
-    flow.outlive()
+    flow.outlive(NEAR)
 
 
 def test_a_reader_that_dies_holds_its_publisher_for_no_longer_than_its_lease() -> None:
@@ -171,7 +171,7 @@ def test_a_reader_that_dies_holds_its_publisher_for_no_longer_than_its_lease() -
     assert world.network.run(READER_LEASE_S + 1, lambda: flow.has(NEAR, 200))
     assert flow.numbers(NEAR) == list(range(200))
     assert flow.is_read_by(1)
-    flow.outlive()
+    flow.outlive(NEAR)
 
 
 def test_best_effort_of_what_nobody_takes_the_oldest_go_and_are_counted() -> None:

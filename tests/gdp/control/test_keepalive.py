@@ -257,8 +257,8 @@ def test_keepalives_do_not_keep_up_whose_membership_ran_out() -> None:
 
 def test_a_node_that_had_no_time_itself_calls_nobody_silent() -> None:
     pair = up(Pair())
-    pair.frozen.add("a")
-    pair.run(0.15)
+    pair.frozen |= {"a", "b"}
+    pair.run(1.0)
     pair.frozen.clear()
     pair.run(1.0)
     assert pair.gone_s == {}
