@@ -1,4 +1,4 @@
-"""Damping of links that flap: one that keeps going is said to be up again only after it has stayed.
+"""Damping of links that flap: one that keeps going serves, until it has stayed, only where there is no other.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: the penalty with a half-life of RFC 2439, section 2.3.
 A link that goes is followed at once, and one that comes back once or twice is used at once.
@@ -52,7 +52,7 @@ class Damping:
             del self._penalties[next(iter(self._penalties))]
 
     def suppresses(self, link: Link) -> bool:
-        """Return whether a link is to be left out of what the others are told."""
+        """Return whether a link is to be a last resort."""
         known = self._penalties.get(link)
         return known is not None and known.is_suppressed
 

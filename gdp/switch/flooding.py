@@ -31,6 +31,7 @@ __all__ = ["Flooding"]
 
 _STUB_S: Final = 2.0  # after a restart, until the trees and ways through here are set up
 _STUB_COST: Final = 1 << 20  # above every real way, so only what has no other way passes
+_FLAPPING_COST: Final = 1 << 19  # a link that flaps is better than none, and worse than any other
 _EARLY_S: Final = 10.0  # when a link state of an earlier life comes this soon, we have restarted
 _SYNC_S: Final = 0.5  # a neighbour is not sent everything more often than this
 _OUT_OF_STEP_S: Final = 0.2  # a flood under way makes digests differ for less long
@@ -140,9 +141,7 @@ class Flooding:
 
     def _originate(self, now_s: float) -> None:
         switches = [each for each in self._greeter.all_up() if each.role == Role.SWITCH]
-        steady = [each for each in switches if not self.damping.suppresses((each.port, each.name))]
-        up = steady or switches  # better a link that flaps than none
-        links = tuple(sorted(Adjacency(n.name, n.domain, self._cost(n), n.mtu) for n in up))
+        links = tuple(sorted(Adjacency(n.name, n.domain, self._cost(n), n.mtu) for n in switches))
         ribs = {AttachedRib(n.name, n.domain, n.nonce) for n in self._greeter.all_up() if n.role == Role.RIB}
         self._say(Scope.DOMAIN, links, (), tuple(sorted(ribs)), (), now_s)
         leaving = tuple(link for link in links if link.domain != self._domain)
@@ -195,4 +194,5 @@ class Flooding:
 
     def _cost(self, neighbour: Neighbour) -> int:
         cost = self._greeter.ports[neighbour.port].cost
-        return cost if self._stub_until_s is None else cost + _STUB_COST
+        cost += _STUB_COST if self._stub_until_s is not None else 0
+        return cost + (_FLAPPING_COST if self.damping.suppresses((neighbour.port, neighbour.name)) else 0)
