@@ -329,15 +329,18 @@ class Greeter:
 
     def next_timeout(self) -> float | None:
         """Return the monotonic second of the next hello or keepalive, or of the next neighbour's silence."""
-        times = [port.hello_at_s for port in self.ports.values() if port.is_up]
+        due_s = float("inf")
         for port in self.ports.values():
+            if port.is_up and port.hello_at_s < due_s:
+                due_s = port.hello_at_s
             for neighbour in port.neighbours.values():
-                times.append(self._gone_at_s(neighbour))
-                session = neighbour.keepalives
+                session, at_s = neighbour.keepalives, self._gone_at_s(neighbour)
                 if session is not None and port.is_up:
-                    times += [session.send_at_s, session.suspect_at_s(neighbour.heard_s)]
-        self._due_s = min(times, default=float("inf"))
-        return self._due_s if times else None
+                    at_s = min(at_s, session.send_at_s, session.suspect_at_s(neighbour.heard_s))
+                if at_s < due_s:
+                    due_s = at_s
+        self._due_s = due_s
+        return None if due_s == float("inf") else due_s
 
     def _gone_at_s(self, neighbour: Neighbour) -> float:
         """Return when a neighbour is gone if nothing comes of it; the node's own lateness is no silence of theirs."""

@@ -115,6 +115,7 @@ class Switch:
             self.relocations, self._outbox,
         )  # fmt: skip
         self._drops: Counter[DropReason] = Counter()
+        self._rest_due_s: float | None = None  # when something other than the greeter is due; None: to be looked up
 
     @property
     def name(self) -> Name:
@@ -138,6 +139,7 @@ class Switch:
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Instant) -> None:
         """Begin to use a port, or learn that the MTU or cost of one that is up has changed."""
+        self._rest_due_s = None
         changes = self.greeter.add_port(index, mac, mtu, cost, now.mono_s)
         for change in changes:
             self._neighbour_changed(change, now.mono_s)
@@ -146,19 +148,28 @@ class Switch:
 
     def port_changed(self, port: int, up: bool, now: Instant) -> None:
         """Learn that a port's link came or went."""
+        self._rest_due_s = None
         for change in self.greeter.port_changed(port, up, now.mono_s):
             self._neighbour_changed(change, now.mono_s)
         self._follow_links(now.mono_s)  # at once: these frames would be lost
 
     def receive(self, arrivals: Sequence[Arrival], now: Instant) -> None:
         """Take frames that the data plane handed up."""
+        has_others = False
         for arrival in arrivals:
             try:
-                self._take(arrival, decode(arrival.frame), now)
+                header = decode(arrival.frame)
+                if header.kind == Kind.KEEPALIVE:
+                    self._take_keepalive(arrival, header, now)
+                else:
+                    has_others = True
+                    self._take(arrival, header, now)
             except RemoteError as error:
                 self._drops[error.reason] += 1
-        self._presence.answer(now.mono_s)
-        self._plan_follow(now.mono_s)
+        if has_others:
+            self._rest_due_s = None
+            self._presence.answer(now.mono_s)
+            self._plan_follow(now.mono_s)
 
     def timeout(self, now: Instant) -> None:
         """Do what is due."""
@@ -168,6 +179,9 @@ class Switch:
             self._neighbour_changed(change, now_s)
         for hello in self.greeter.take(now_s):
             self._outbox.put(hello)
+        if not lost and self._rest_due_s is not None and now_s < self._rest_due_s:
+            return  # keepalives are most of what is due
+        self._rest_due_s = None
         self._flooding.timeout(now_s)
         if lost or (self._spf_delay.due_s is not None and self._spf_delay.due_s <= now_s):
             self._follow_links(now_s)
@@ -195,10 +209,16 @@ class Switch:
 
     def next_timeout(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
+        if self._rest_due_s is None:
+            self._rest_due_s = self._next_of_rest()
+        greeter_s = self.greeter.next_timeout()
+        return self._rest_due_s if greeter_s is None else min(greeter_s, self._rest_due_s)
+
+    def _next_of_rest(self) -> float:
+        """Return the monotonic second of the next timer that is not the greeter's."""
         times = [
             self._spf_delay.due_s,
             self._protect_at_s,
-            self.greeter.next_timeout(),
             self._flooding.next_timeout(),
             self.parked.next_expiry(),
             self.table.next_expiry(),
@@ -211,7 +231,7 @@ class Switch:
             times.append(self._followed_s)  # past: at once
         if self.inquirer.rib is None:
             times.append(self.attached.next_expiry())
-        return min((time for time in times if time is not None), default=None)
+        return min(time for time in times if time is not None)
 
     def take(self) -> list[Transmit]:
         """Return, once, what is to be sent."""
@@ -230,19 +250,20 @@ class Switch:
         Raises:
             StatementError: it does not hold.
         """
+        self._rest_due_s = None
         self._revoke(parse(wire), None, now)
 
     # -- frames
+
+    def _take_keepalive(self, arrival: Arrival, header: Header, now: Instant) -> None:
+        neighbour = self.greeter.receive_keepalive(arrival, header, now)
+        if neighbour.role is Role.SWITCH:
+            self._flooding.compare(neighbour, now.mono_s)
 
     def _take(self, arrival: Arrival, header: Header, now: Instant) -> None:
         if header.kind >= CONTROL_FROM:
             if header.kind not in _CONTROL:
                 raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
-            if header.kind == Kind.KEEPALIVE:
-                neighbour = self.greeter.receive_keepalive(arrival, header, now)
-                if neighbour.role is Role.SWITCH:
-                    self._flooding.compare(neighbour, now.mono_s)
-                return
             joiner = self._joiner
             if header.kind == Kind.HELLO:
                 joiner = self._hellos
