@@ -337,8 +337,7 @@ class Greeter:
                 session, at_s = neighbour.keepalives, self._gone_at_s(neighbour)
                 if session is not None and port.is_up:
                     at_s = min(at_s, session.send_at_s, session.suspect_at_s(neighbour.heard_s))
-                if at_s < due_s:
-                    due_s = at_s
+                due_s = min(due_s, at_s)
         self._due_s = due_s
         return None if due_s == float("inf") else due_s
 
