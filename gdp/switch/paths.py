@@ -58,7 +58,14 @@ class Paths:
         self.has_alternates = False
 
     def to_switch(self, switch: Name, domain: Name, allowed: frozenset[Name]) -> Way | None:
-        """Return the way to a switch of a domain; None when there is none through ``allowed`` domains."""
+        """Return the way to a switch of a domain; None when there is none through ``allowed`` domains.
+
+        A way within our own domain goes before every other (RFC 2328, 16.2): those outside know only how far our borders
+        are, and would send back what left in order to come in again elsewhere.
+        """
+        self._refresh()
+        if switch in self._members:
+            allowed = frozenset({self._domain})
         way = self._pick(self._to_all(allowed), switch, domain)
         if way is None or not self.has_alternates:
             return way
@@ -80,14 +87,19 @@ class Paths:
         for neighbour, edge in self._graph.adj[self._me].items():
             if neighbour == way.first or self._domains.get(neighbour) != self._domain:
                 continue
-            onwards = self.distance_from(neighbour, switch, domain, allowed)
-            back = self.distance_from(neighbour, self._me, self._domain, allowed)
+            onwards = self._distance(neighbour, switch, domain, allowed)
+            back = self._distance(neighbour, self._me, self._domain, allowed)
             if onwards is not None and back is not None and onwards < back + way.distance:
                 found.append((edge["weight"] + onwards, neighbour))
         return min(found, default=(0, None))[1]
 
     def distance_from(self, start: Name, switch: Name, domain: Name, allowed: frozenset[Name]) -> int | None:
         """Return how far a switch is from another one than this; None where there is no way."""
+        self._refresh()
+        within = switch in self._members and start in self._members
+        return self._distance(start, switch, domain, frozenset({self._domain}) if within else allowed)
+
+    def _distance(self, start: Name, switch: Name, domain: Name, allowed: frozenset[Name]) -> int | None:
         way = self._pick(self._to_all(allowed, start), switch, domain)
         return 0 if start == switch else None if way is None else way.distance
 
