@@ -116,8 +116,9 @@ def test_larger_frames_carry_an_image_in_fewer_parts(demo: Path, tmp_path: Path)
     assert parts[0] > 5 * parts[1]
 
 
+@pytest.mark.momentary("this plane forwards like the others, a hundred times slower; leases are no matter of a plane")
 def test_the_scapy_plane_carries_the_same(tmp_path: Path) -> None:
-    crossed(tmp_path, make_demo(tmp_path, 0.1), *LASTING, "--data-plane", "scapy")
+    crossed(tmp_path, make_demo(tmp_path, 0.1), "--data-plane", "scapy")
 
 
 def test_with_a_link_cut_in_the_middle_all_still_arrives_by_the_other_way(longer: Path, tmp_path: Path) -> None:

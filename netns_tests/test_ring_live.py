@@ -118,7 +118,6 @@ def test_an_interrupted_live_run_leaves_nothing() -> None:
         (["--live", "ros3"], "--live is one of ros2, ros1, mixed, not 'ros3'"),
         (["--live", "--rate", "0"], "--live is without a recording"),
         ([__file__, "--live"], "--live is without a recording"),
-        (["--seconds", "4"], "--seconds goes with --live"),
     ],
 )
 def test_wrong_input_is_told_before_anything_starts(arguments: Sequence[str], complaint: str) -> None:

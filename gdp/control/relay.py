@@ -1,6 +1,6 @@
 """A claim passed on: by the switch that its maker is attached to, or by a RIB to the tier above.
 
-Place: pure. The relay's signer says in which domain the claim's switch stands: its own.
+Place: pure. A switch speaks for claims of its own domain; a RIB says which domain a claim that it passes up is of.
 """
 
 from __future__ import annotations
@@ -22,17 +22,24 @@ class Relay:
 
     Args:
         statement: what is passed on, signed by its maker.
-        transit: domains through which the signer's domain lets its traffic pass.
+        transit: domains through which the domain of the claim's switch lets its traffic pass.
         membership: the signer's certificate, DER.
+        domain: where the claim's switch stands; None: in the signer's domain.
     """
 
     statement: bytes
     transit: tuple[Name, ...]
     membership: bytes
+    domain: Name | None = None
 
     def to_wire(self, signer: Name, key: SigningKey) -> bytes:
         """Return the signed statement."""
-        body = {"q": self.statement, "x": list(self.transit[:TRANSIT_MAX]), "c": self.membership}
+        body = {
+            "q": self.statement,
+            "x": list(self.transit[:TRANSIT_MAX]),
+            "d": self.domain or b"",
+            "c": self.membership,
+        }
         return sign(StatementType.RELAY, body, signer, key)
 
     @classmethod
@@ -42,4 +49,5 @@ class Relay:
         Raises:
             StatementError: MALFORMED.
         """
-        return cls(fields.bytes_("q"), tuple(fields.names("x", TRANSIT_MAX)), fields.bytes_("c"))
+        domain = fields.name("d") if fields.bytes_("d") else None
+        return cls(fields.bytes_("q"), tuple(fields.names("x", TRANSIT_MAX)), fields.bytes_("c"), domain)

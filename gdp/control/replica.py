@@ -29,7 +29,7 @@ FETCH_KEYS_MAX: Final = 64
 INVENTORY_MAX: Final = 128  # items of 73 bytes: 9.3 KiB
 ENTRIES_MAX: Final = 64
 _ROOM_BYTES: Final = CONTROL_MAX_BYTES - 4_096  # beside the entries: a membership, which has at most 4 KiB
-_ENTRY_COST_BYTES: Final = 140  # keys, names and heads of one entry beside its byte strings
+_ENTRY_COST_BYTES: Final = 180  # keys, names and heads of one entry beside its byte strings
 _KEY_BYTES: Final = 2 * NAME_BYTES
 
 Key = tuple[Name, Name]  # name, advertiser
@@ -146,6 +146,7 @@ class Entry:
         membership: of the maker of a withdrawal, whose claim need not be known; empty for a claim.
         sender: the switch or RIB that relayed it.
         domain: where the claim's switch stands.
+        via: the domain of ``sender``.
         transit: domains through which that domain lets its traffic pass.
         lease_s: what is left of the lease.
         is_from_above: learnt from the tier above.
@@ -155,6 +156,7 @@ class Entry:
     membership: bytes
     sender: Name
     domain: Name
+    via: Name
     transit: tuple[Name, ...]
     lease_s: float
     is_from_above: bool
@@ -166,6 +168,7 @@ class Entry:
             "m": self.membership,
             "w": self.sender,
             "d": self.domain,
+            "v": self.via,
             "x": list(self.transit[:TRANSIT_MAX]),
             "l": float(self.lease_s),
             "u": self.is_from_above,
@@ -183,6 +186,7 @@ class Entry:
             fields.bytes_("m"),
             fields.name("w"),
             fields.name("d"),
+            fields.name("v"),
             tuple(fields.names("x", TRANSIT_MAX)),
             fields.number("l", 0, LEASE_MAX_S),
             fields.flag("u"),

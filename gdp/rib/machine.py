@@ -245,6 +245,8 @@ class Rib:
             claim = self._verifier.verify_statement(passed_on, now.unix_s)
             if member.role is Role.SWITCH and claim.switch != member.name:
                 raise StatementError(DropReason.NOT_DELEGATED, "the RtCert names another switch than the relay")
+            if relay.domain is not None and not self._policy.trusts(relay.domain):
+                raise StatementError(DropReason.WRONG_DOMAIN, "a claim of a domain that is not trusted")
             if member.domain != self._policy.own and not claim.is_global:
                 raise StatementError(DropReason.WRONG_DOMAIN, "a local name of another domain")
             self._check_identity(claim, now.mono_s)
@@ -253,6 +255,8 @@ class Rib:
             self._refuse(passed_on, member, error, now.mono_s)
             raise
         route = self._route(claim, relay.transit, member, now)
+        if relay.domain is not None and member.role is Role.RIB:
+            route = replace(route, domain=relay.domain)
         self._store.put(route)
         self.accepted += 1
         self._judge(route.name, route.advertiser, None, route.sequence, member.name)
@@ -296,7 +300,7 @@ class Rib:
             raise StatementError(DropReason.LEASE_BOUNDS)
         known = self._store.get(claim.name, claim.node)
         if known is not None and claim.sequence <= known.sequence:
-            is_repeated = isinstance(known, Route) and (known.claim, known.domain) == (claim.wire, member.domain)
+            is_repeated = isinstance(known, Route) and (known.claim, known.via) == (claim.wire, member.domain)
             if not is_repeated:
                 raise StatementError(DropReason.STALE, str(known.sequence))
         is_new = known is None or known.sender != member.name
@@ -312,6 +316,7 @@ class Rib:
             sender=member.name,
             switch=claim.switch,
             domain=member.domain,
+            via=member.domain,
             transit=tuple(sorted(self._policy.transit)) if self._is_own_switch(member) else transit,
             sequence=claim.sequence,
             is_global=claim.is_global,
@@ -344,14 +349,14 @@ class Rib:
     def _pass_up(self, route: Route, statement: bytes, sequence: int, now_s: float) -> None:
         if self._upstream.rib is not None:
             key = (route.name, route.advertiser)
-            self._upstream.put(Passed(key, sequence, statement, route.transit, route.expires_s), now_s)
+            self._upstream.put(Passed(key, sequence, statement, route.domain, route.transit, route.expires_s), now_s)
             for passed in self._upstream.due(now_s):
                 self._send_up(passed)
 
     def _send_up(self, passed: Passed) -> None:
         upper = self._upstream.rib
         assert upper is not None
-        relay = Relay(passed.statement, passed.transit, self._identity.membership)
+        relay = Relay(passed.statement, passed.transit, self._identity.membership, passed.domain)
         self._letters.append(Letter(upper, Kind.RIB_REQUEST, relay.to_wire(self._identity.name, self._identity.key)))
 
     def _refuse(self, passed_on: Statement, member: Membership, error: StatementError, now_s: float) -> None:
@@ -408,7 +413,7 @@ class Rib:
         """
         if asker.domain == self._policy.own:
             return True
-        return route.is_global and not (asker.is_rib and asker.domain == route.domain)
+        return route.is_global and not (asker.is_rib and asker.domain in (route.domain, route.via))
 
     def _answer(self, route: Route, to: Asker, now_s: float) -> None:
         lease_s = min(max(route.expires_s - now_s, 0.0), _ADVISED_S)
@@ -452,7 +457,7 @@ class Rib:
     def _bringer(self, route: Route) -> dict[Asker, None]:
         """Return who relayed a route, unless that was the tier above."""
         is_rib = route.sender != route.switch
-        return {} if route.is_from_above else {Asker(route.sender, route.domain, is_rib): None}
+        return {} if route.is_from_above else {Asker(route.sender, route.via, is_rib): None}
 
     def _tell_gone(self, route: Route, now_s: float, by: Name | None = None) -> None:
         """Tell those who watch a name, hold a route of it or brought it that one is gone; ``by`` knows."""
@@ -539,8 +544,9 @@ class Rib:
         claim = self._verifier.verify(answer.claim, now.unix_s)
         if claim.name != answer.name or claim.node != answer.advertiser:
             raise StatementError(DropReason.WRONG_NAME, "an answer about something else than its claim")
-        if answer.domain == self._policy.own:
-            return  # our own, come back from above
+        is_from_below = isinstance(known, Route) and not known.is_from_above and known.claim == claim.wire
+        if answer.domain == self._policy.own or is_from_below:
+            return  # our own, or of a tier below, come back from above
         if isinstance(known, Route) and claim.sequence < known.sequence:
             raise StatementError(DropReason.STALE, "the tier above is behind")
         route = replace(
@@ -573,9 +579,13 @@ class Rib:
         known = self._store.get(*key)
         if isinstance(known, Route) and known.expires_s > now_s:
             lease_s = min(known.expires_s - now_s, LEASE_MAX_S)
-            return Entry(known.claim, b"", known.sender, known.domain, known.transit, lease_s, known.is_from_above)
+            return Entry(
+                known.claim, b"", known.sender, known.domain, known.via, known.transit, lease_s,
+                known.is_from_above,
+            )  # fmt: skip
         if isinstance(known, Withdrawn) and known.proof:
-            return Entry(known.proof, known.membership, known.sender, self._policy.own, (), 0.0, is_from_above=False)
+            own = self._policy.own
+            return Entry(known.proof, known.membership, known.sender, own, own, (), 0.0, is_from_above=False)
         return None
 
     def _take_peer_message(self, statement: Statement, now: Instant) -> None:
@@ -619,6 +629,7 @@ class Rib:
             sender=entry.sender,
             switch=claim.switch,
             domain=entry.domain,
+            via=entry.via,
             transit=entry.transit,
             sequence=claim.sequence,
             is_global=claim.is_global,

@@ -20,6 +20,7 @@ class Route:
         sender: the switch or RIB that relayed the claim, whose quota it counts against.
         switch: where the advertiser is attached, as its RtCert says.
         domain: where that switch stands.
+        via: the domain of ``sender``: another one where the claim came over several tiers.
         transit: domains through which that domain lets its traffic pass.
         claim: the signed bytes.
         is_from_above: learnt from the tier above, to be passed down only.
@@ -33,6 +34,7 @@ class Route:
     sender: Name
     switch: Name
     domain: Name
+    via: Name
     transit: tuple[Name, ...]
     sequence: int
     is_global: bool

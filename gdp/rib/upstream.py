@@ -32,6 +32,7 @@ class Passed:
     key: Key
     sequence: int
     statement: bytes
+    domain: Name
     transit: tuple[Name, ...]
     until_s: float
 

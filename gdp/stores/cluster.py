@@ -248,6 +248,7 @@ class ClusterStore:
             {
                 "w": route.sender,
                 "d": route.domain,
+                "v": route.via,
                 "x": list(route.transit),
                 "m": body.membership,
                 "r": body.rtcert,
@@ -301,6 +302,7 @@ class ClusterStore:
             sender=fields.name("w"),
             switch=claim.switch,
             domain=fields.name("d"),
+            via=fields.name("v"),
             transit=tuple(fields.names("x", 64)),
             sequence=claim.sequence,
             is_global=claim.is_global,

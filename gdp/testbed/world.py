@@ -46,6 +46,7 @@ class World:
         delay_s: of every link between switches.
         lease_s: of claims and watches.
         lead_mtu: of the links to members and RIBs, in bytes after the Ethernet header.
+        keepalive_ms: as in ``NodeSettings``; slower ones where no link fails save most of the time.
     """
 
     topology: Topology
@@ -55,6 +56,7 @@ class World:
     hello_s: float = HELLO_S
     dead_s: float = DEAD_S
     lease_s: float = CLAIM_LEASE_S
+    keepalive_ms: int | None = None
     trusts: dict[str, tuple[str, ...]] | None = None
     transits: Mapping[str, tuple[str, ...]] | None = None
     network: MemoryNetwork = field(init=False)
@@ -213,4 +215,5 @@ class World:
             self.hello_s,
             self.dead_s,
             self.lease_s,
+            self.keepalive_ms,
         )

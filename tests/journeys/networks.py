@@ -290,7 +290,7 @@ class Trial:
         for member in (first, last):
             switch = member.split("/", maxsplit=1)[0]
             domain = self.topology.domain_of(switch).label
-            asks.append((switch, places[domain] if domain in places else switch))
+            asks.append((switch, places.get(domain, switch)))
             if domain not in places:
                 asks += [(switch, place) for place in places.values()]
         if any(self._fate(*each) is not Fate.ALL for each in asks) or self.fate(first, last) is not Fate.ALL:

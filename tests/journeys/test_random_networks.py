@@ -5,11 +5,20 @@ from __future__ import annotations
 import os
 
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import HealthCheck, Phase, example, given, settings
 
-from tests.journeys.networks import Plan, Trial, plans, reproducible
+from tests.journeys.networks import Fault, Plan, Trial, plans, reproducible
 
 TRIALS = int(os.environ.get("GDP_RANDOM_NETWORKS", "12"))
+# The way within a domain was longer than one through its neighbour, which sent back what left.
+LOOPED_AT_A_BORDER = Plan(
+    (9, 6, 6, 4), (0, 1, 1), (), (), (2, 3, 0, 0), (3, 0), frozenset({2}), (Fault(False, 0, 2.0),), seed=1
+)
+# Two tiers up, a claim was taken for one of the tier between, through which its frames then might not pass.
+THREE_TIERS = Plan(
+    (1, 7, 3, 6, 2, 4), (0, 1, 1, 0, 0), (), ((9, 13, 20, 26), (31, 36, 31, 39)), (6, 4, 4, 4, 3, 8), (22, 28, 12),
+    frozenset({3}), (Fault(False, 141, 2.1),), seed=304,
+)  # fmt: skip
 IS_LONG = "GDP_RANDOM_NETWORKS" in os.environ
 
 
@@ -23,6 +32,8 @@ IS_LONG = "GDP_RANDOM_NETWORKS" in os.environ
     phases=(Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink) if IS_LONG else (Phase.explicit, Phase.generate),
 )
 @given(plans())
+@example(LOOPED_AT_A_BORDER)
+@example(THREE_TIERS)
 def test_all_arrives_that_graph_and_policy_allow(plan: Plan) -> None:
     with reproducible(plan.seed):
         Trial(plan).run()
