@@ -251,7 +251,8 @@ class Inquirer:
         known = self._places.get(place.name, place.advertiser)
         if known is not None and known.sequence > place.sequence:
             place = replace(known, expires_s=max(known.expires_s, place.expires_s))  # the teller lags behind
-        before = self._places.put(place, now_s, is_ours=is_ours)
+        has_left = is_ours and attachment is None
+        before = self._places.put(place, now_s, is_ours=is_ours, has_left=has_left)
         if before is None or (before.switch, before.domain) != (place.switch, place.domain):
             self._unicast.forget(place.name)
             self._unicast.forget(place.advertiser)

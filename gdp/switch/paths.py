@@ -60,7 +60,7 @@ class Paths:
     def to_switch(self, switch: Name, domain: Name, allowed: frozenset[Name]) -> Way | None:
         """Return the way to a switch of a domain; None when there is none through ``allowed`` domains.
 
-        A way within our own domain goes before every other (RFC 2328, 16.2): those outside know only how far our borders
+        A way within our own domain goes first (RFC 2328, 16.2): those outside know only how far our borders
         are, and would send back what left in order to come in again elsewhere.
         """
         self._refresh()

@@ -190,17 +190,19 @@ class Places:
         """Return a monotonic second that is no later than the next question, or None."""
         return self._ask_at_s if self._questions else None
 
-    def put(self, place: Place, now_s: float, *, is_ours: bool = False) -> Place | None:
+    def put(self, place: Place, now_s: float, *, is_ours: bool = False, has_left: bool = False) -> Place | None:
         """Note a place; return what was known of this advertiser before.
 
         Args:
             is_ours: it is attached here. The RIB echoes a claim to who brought it, which answers no question: only
                 what is told a second time does.
+            has_left: it was attached here and is no more. The RIB does not know that yet: where it went stays open.
         """
         self._nobody.pop(place.name, None)
         known = self._places.setdefault(place.name, {})
         before = known.get(place.advertiser)
-        if not is_ours or (before is not None and before.claim == place.claim):
+        is_repeated = before is not None and before.claim == place.claim
+        if not has_left and (not is_ours or is_repeated):
             self.answered(place.name, now_s)
         known[place.advertiser] = place
         self._names_of.setdefault(place.advertiser, set()).add(place.name)

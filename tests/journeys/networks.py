@@ -275,7 +275,7 @@ class Trial:
     def _check(self, flow: Flow, label: str, count: int) -> None:
         numbers = [int.from_bytes(each.message[:4], "big") for each in flow.got[label]]
         fate = self.fate(flow.source, label)
-        told = f"{flow.source} to {label}, {fate.value}: {len(numbers)} of {count}, from {numbers[:1]} to {numbers[-1:]}"
+        told = f"{flow.source} to {label}, {fate.value}: {len(numbers)} of {count}, the last of them {numbers[-1:]}"
         assert numbers == sorted(set(numbers)), f"doubled or out of order: {told}"
         if fate is Fate.ALL:
             assert numbers == list(range(count)), told

@@ -6,10 +6,11 @@ from functools import partial
 
 import pytest
 
+from gdp.frame.kinds import Kind
 from gdp.limits import CLAIM_LEASE_S
 from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
 from gdp.testbed.world import World
-from tests.journeys.flows import ROBOT, SERVER, Flow, flowing, ring
+from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 
 LONG_S = 3 * CLAIM_LEASE_S + 8
 LEASE_S = 6.0  # of names, where the real one would only cost time: that of readers is as long
@@ -178,3 +179,15 @@ def test_a_ring_survives_one_fault_after_the_other() -> None:
     at(60, lambda: world.roam(ROBOT, "nuc1"))
     complete(there, SERVER, count, LONG_S + 10)
     complete(back, ROBOT, count, 10)
+
+
+def test_a_node_that_died_is_sought_a_few_times_a_second() -> None:
+    world = ring(lease_s=LEASE_S)
+    flow = flowing(world)
+    flow.publish(b"a reader has to confirm it")
+    world.network.run(1.0)
+    tap = Tap("nuc1", "nuc2")
+    world.network.taps.append(tap)
+    world.network.stop(ROBOT)
+    world.network.run(SHORT_S)
+    assert 0 < tap.count(Kind.RIB_REQUEST) < 10 * SHORT_S
