@@ -69,6 +69,10 @@ class ClusterLink:
         """Return a client of each primary."""
         return [self._client(at) for at in dict.fromkeys(self._primaries.values())]
 
+    def primary_of(self, name: Name) -> Address:
+        """Return host and port of the primary that holds a name."""
+        return self._primaries[tag_of(name)]
+
     def execute(self, commands: Sequence[tuple[bytes, Command]]) -> list[object]:
         """Send commands, each with the hash tag of its keys, in one batch for each primary.
 

@@ -15,7 +15,7 @@ from gdp.errors import DropReason
 from gdp.nodes.config import ClusterConfig
 from gdp.rib.machine import Rib
 from gdp.rib.store import MemoryStore
-from gdp.stores.cluster_link import ClusterLink, tag_of
+from gdp.stores.cluster_link import ClusterLink
 from gdp.stores.snapshot import Snapshot
 from tests.gdp.stores.sites import (
     ClusterPair,
@@ -116,7 +116,7 @@ def test_names_outlive_a_primary(servers: Path) -> None:
     name = pair.site.subject("/a").name
     pair.give(pair.one, pair.site.relay("/a", 1))
     link = ClusterLink(config.address())
-    primary = link._primaries[tag_of(name)]
+    primary = link.primary_of(name)
     kill_server(servers.parent, primary[1])
     pair.stores[1]._cache.clear()
     deadline_s = time.monotonic() + 60
