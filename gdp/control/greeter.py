@@ -161,6 +161,7 @@ class Greeter:
         self._timings: dict[int, Timing] = {}
         self._incarnation = incarnation
         self._due_s = float("inf")  # when the next call was asked for
+        self._next_s: float | None = None  # no timer is due before; None: to be looked up
         self._lateness_s = 0.0  # how long, in all, this node was called later than it had asked to be
         self._slowness = Slowness()
         self._digest_for = digest_for
@@ -169,12 +170,14 @@ class Greeter:
     def set_timing(self, index: int, timing: Timing) -> None:
         """Want other keepalives on one port, from its next session on."""
         self._timings[index] = timing
+        self._next_s = None
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now_s: float) -> list[Change]:
         """Begin to greet on a port, or learn that the MTU or cost of one that is up has changed.
 
         Returns the neighbours to which the link has changed, and those that another address of ours takes away.
         """
+        self._next_s = None
         port, own_mtu = self.ports.get(index), max(mtu, MTU_MIN_BYTES)
         if port is None or not port.is_up or port.mac != mac:
             lost = [] if port is None else self._lose(port, list(port.neighbours.values()), NeighbourEvent.LINK_LOST)
@@ -206,6 +209,7 @@ class Greeter:
             StatementError: it does not hold; nothing has changed.
         """
         hello = Hello.from_fields(statement.expect(StatementType.HELLO))
+        self._next_s = None
         port = self.ports.get(arrival.port)
         if port is None or not port.is_up:
             return None
@@ -269,11 +273,14 @@ class Greeter:
             self._policy.check_member(known.member, now.unix_s)
             known.checked_s = now.mono_s
         known.digest = known.keepalives.open(header, arrival.frame, now.mono_s)
+        if known.keepalives.is_final_due:
+            self._next_s = None  # anything else only puts timers off
         self._alive(known, now.mono_s - arrival.waited_s)
         return known
 
     def port_changed(self, index: int, up: bool, now_s: float) -> list[Change]:
         """Learn that a link came or went; return the neighbours that this took away."""
+        self._next_s = None
         port = self.ports.get(index)
         if port is None or port.is_up == up:
             return []
@@ -291,7 +298,7 @@ class Greeter:
         if now_s > self._due_s + _LATE_S:
             self._lateness_s += now_s - self._due_s
             self._slowness.late(now_s - self._due_s, now_s)
-        self._due_s = float("inf")
+        self._due_s, self._next_s = float("inf"), None
         changes: list[Change] = []
         for port in self.ports.values():
             silent = [n for n in port.neighbours.values() if now_s >= self._gone_at_s(n)]
@@ -302,6 +309,7 @@ class Greeter:
 
     def take(self, now_s: float) -> list[Transmit]:
         """Return the hellos and keepalives that are due."""
+        self._next_s = None
         out: list[Transmit] = []
         for port in self.ports.values():
             if not port.is_up:
@@ -328,7 +336,13 @@ class Greeter:
         return out
 
     def next_timeout(self) -> float | None:
-        """Return the monotonic second of the next hello or keepalive, or of the next neighbour's silence."""
+        """Return a monotonic second that is no later than the next hello, keepalive or silence of a neighbour."""
+        if self._next_s is None:
+            self._next_s = self._look_ahead()
+        self._due_s = self._next_s
+        return None if self._due_s == float("inf") else self._due_s
+
+    def _look_ahead(self) -> float:
         due_s = float("inf")
         for port in self.ports.values():
             if port.is_up and port.hello_at_s < due_s:
@@ -338,8 +352,7 @@ class Greeter:
                 if session is not None and port.is_up:
                     at_s = min(at_s, session.send_at_s, session.suspect_at_s(neighbour.heard_s))
                 due_s = min(due_s, at_s)
-        self._due_s = due_s
-        return None if due_s == float("inf") else due_s
+        return due_s
 
     def _gone_at_s(self, neighbour: Neighbour) -> float:
         """Return when a neighbour is gone if nothing comes of it; the node's own lateness is no silence of theirs."""

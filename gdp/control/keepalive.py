@@ -51,6 +51,9 @@ class KeepaliveFlag(IntFlag):
     HEARD = 4  # the sender hears the receiver's keepalives
 
 
+_POLL, _FINAL, _HEARD = (int(each) for each in (KeepaliveFlag.POLL, KeepaliveFlag.FINAL, KeepaliveFlag.HEARD))
+
+
 def seal_keepalive(key: bytes, header: Header, flags: int, multiplier: int, digest: bytes) -> bytes:
     """Return a frame."""
     tagged = encode(header) + bytes((flags, multiplier)) + digest
@@ -167,11 +170,7 @@ class KeepaliveSession:
         Args:
             source: our name and incarnation.
         """
-        flags = KeepaliveFlag.POLL if poll else KeepaliveFlag.NONE
-        if self.is_final_due:
-            flags |= KeepaliveFlag.FINAL
-        if self.is_heard:
-            flags |= KeepaliveFlag.HEARD
+        flags = _POLL * poll | _FINAL * self.is_final_due | _HEARD * self.is_heard
         self.is_final_due = False
         length = _FRAME_BYTES - HEADER_BYTES
         name, incarnation = source
@@ -192,8 +191,8 @@ class KeepaliveSession:
         flags, multiplier, digest = open_keepalive(self.in_key, frame)
         self.detect_s = self.in_interval_s * max(multiplier, 1)
         self.received, self.is_heard = header.number, True
-        self.hears_us = bool(flags & KeepaliveFlag.HEARD)
-        if flags & KeepaliveFlag.POLL:
+        self.hears_us = bool(flags & _HEARD)
+        if flags & _POLL:
             self.is_final_due, self.send_at_s = True, now_s
         return digest
 
