@@ -5,15 +5,17 @@ Place: pure. A switch speaks for claims of its own domain; a RIB says which doma
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from gdp.control.query import TRANSIT_MAX
 from gdp.crypto.fields import Fields
+from gdp.crypto.identity import Identity
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import StatementType, sign
 from gdp.names import Name
 
-__all__ = ["Relay"]
+__all__ = ["Relay", "relayed"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,3 +53,8 @@ class Relay:
         """
         domain = fields.name("d") if fields.bytes_("d") else None
         return cls(fields.bytes_("q"), tuple(fields.names("x", TRANSIT_MAX)), fields.bytes_("c"), domain)
+
+
+def relayed(statement: bytes, switch: Identity, transit: Iterable[Name]) -> bytes:
+    """Return a claim or withdrawal of a node attached to a switch, relayed by that; ``transit``: of its domain."""
+    return Relay(statement, tuple(sorted(transit)), switch.membership).to_wire(switch.name, switch.key)

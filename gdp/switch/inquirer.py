@@ -14,7 +14,7 @@ from typing import Final
 
 from gdp.control.presence import Presence
 from gdp.control.query import Answer, Query
-from gdp.control.relay import Relay
+from gdp.control.relay import relayed
 from gdp.control.verdict import Verdict
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.identity import Identity
@@ -142,8 +142,7 @@ class Inquirer:
 
     def relay(self, statement: bytes, now_s: float) -> None:
         """Pass an attached node's claim or withdrawal on to the RIB."""
-        relay = Relay(statement, tuple(sorted(self._policy.transit)), self._identity.membership)
-        self._to_rib(relay.to_wire(self._identity.name, self._identity.key), now_s)
+        self._to_rib(relayed(statement, self._identity, self._policy.transit), now_s)
 
     def _to_rib(self, statement: bytes, now_s: float) -> None:
         if self.rib is None:
@@ -282,8 +281,7 @@ class Inquirer:
         """Return statements that prove where a node, or who advertises a name, is; at most ``KNOWN_MAX``."""
         attachment = self._attached.at(name)
         if attachment is not None:
-            relay = Relay(attachment.claim.wire, tuple(sorted(self._policy.transit)), self._identity.membership)
-            return [relay.to_wire(self._identity.name, self._identity.key)]
+            return [relayed(attachment.claim.wire, self._identity, self._policy.transit)]
         node = self._places.of_node(name, now_s)
         places = self._places.of(name, now_s) + ([] if node is None else [node])
         return [self._as_answer(place, now_s) for place in places[:KNOWN_MAX]]

@@ -24,7 +24,7 @@ from typing import Final
 
 from gdp.control.neighbour import Neighbour
 from gdp.control.query import Query
-from gdp.control.relay import Relay
+from gdp.control.relay import relayed
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.frame.kinds import Kind
@@ -87,8 +87,7 @@ class Relocations:
         """Tell the former switch of a node that claims a name here."""
         if claim.previous in (ZERO, self._identity.name):
             return
-        relay = Relay(claim.wire, tuple(sorted(self._policy.transit)), self._identity.membership)
-        statement = relay.to_wire(self._identity.name, self._identity.key)
+        statement = relayed(claim.wire, self._identity, self._policy.transit)
         _remember(self._notices, (claim.name, claim.node), _Notice(claim.previous, statement, claim.sequence, now_s))
         _remember(self._former, claim.previous, now_s + _FORMER_S)
         self.timeout(now_s)
