@@ -52,6 +52,7 @@ CONTROL_JOIN_SOURCE_BYTES: Final = 64 << 10
 CONTROL_PATIENCE_S: Final = 2.0
 CBOR_DEPTH_MAX: Final = 16
 CHAIN_MAX: Final = 4  # delegations between an owner's key and a node
+CLOCK_EARLY_S: Final = 3_600.0  # so long before it begins a certificate is believed
 CLOCK_SKEW_S: Final = 120.0
 
 # Leases

@@ -1,6 +1,8 @@
 """From when until when: the one test of time for certificates and delegations.
 
-Place: pure. Clocks of honest machines differ; ``CLOCK_SKEW_S`` is forgiven at both ends.
+Place: pure. Clocks of honest machines differ. What ended is believed for ``CLOCK_SKEW_S`` more. What begins later is
+believed ``CLOCK_EARLY_S`` before: the beginning keeps nobody out who has the certificate, and a machine whose clock was
+set back must not lose the certificates of the last hour.
 """
 
 from __future__ import annotations
@@ -9,7 +11,7 @@ from dataclasses import dataclass
 
 from gdp.crypto.fields import Fields
 from gdp.errors import DropReason, LocalError, StatementError
-from gdp.limits import CLOCK_SKEW_S
+from gdp.limits import CLOCK_EARLY_S, CLOCK_SKEW_S
 
 __all__ = ["Validity"]
 
@@ -46,12 +48,12 @@ class Validity:
         return {"from": self.not_before_unix_s, "until": self.not_after_unix_s}
 
     def check(self, unix_s: float, what: str) -> None:
-        """Return if ``unix_s`` lies within, give or take the skew of clocks.
+        """Return if ``unix_s`` lies within, give or take what clocks differ.
 
         Raises:
             StatementError: EXPIRED, or not valid yet; ``what`` names it for people.
         """
         if unix_s > self.not_after_unix_s + CLOCK_SKEW_S:
             raise StatementError(DropReason.EXPIRED, what)
-        if unix_s < self.not_before_unix_s - CLOCK_SKEW_S:
+        if unix_s < self.not_before_unix_s - CLOCK_EARLY_S:
             raise StatementError(DropReason.EXPIRED, f"{what}: not valid yet")

@@ -9,6 +9,7 @@ tell.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -17,9 +18,11 @@ from typing import Final, NamedTuple
 
 from faults.plan import Plan
 from faults.records import Kind, Record
+from gdp.message.loss import LossReason
 
 __all__ = ["Account", "Books", "Silence", "Timeline"]
 
+UNCONFIRMED_S: Final = 2.0  # what came so shortly before a reader's death its publisher may take for lost
 _SECOND_NS: Final = 1_000_000_000
 
 
@@ -94,6 +97,7 @@ class Books:
         # by channel, reader, the reader's life, the publisher's life
         self.accounts: defaultdict[tuple[int, str, int, int], Account] = defaultdict(Account)
         self.told: defaultdict[tuple[int, str, int], int] = defaultdict(int)  # by channel, reader, its life
+        self.told_between: defaultdict[tuple[int, str, int], int] = defaultdict(int)  # the same, of before that life
         self.published: defaultdict[tuple[int, int], list[int]] = defaultdict(list)  # channel, life -> moments
         self.arrivals_ns: defaultdict[tuple[int, str], list[int]] = defaultdict(list)
         self.wrong: list[str] = []
@@ -115,7 +119,9 @@ class Books:
             elif each.kind == Kind.PUBLISHED:
                 self.published[each.channel, life].append(each.at_ns)
             elif each.kind == Kind.LOST:
-                self.told[each.channel, member, life] += each.number
+                is_between = each.other == LossReason.READER_RESTARTED
+                told = self.told_between if is_between else self.told
+                told[each.channel, member, life] += each.number
             elif each.kind == Kind.WRONG:
                 self.wrong.append(f"{member} had, on channel {each.channel}, a message for channel {each.other}")
             elif each.kind in (Kind.CALLED, Kind.ANSWERED, Kind.FAILED):
@@ -167,11 +173,25 @@ class Books:
                 head = account.first - 1 if at else 0  # a later life is missed from its beginning on
                 least += account.missing(sent if is_last else account.last)
                 most += account.missing(max(sent, account.last)) + head
+            between = self.told_between[channel, reader, life]
+            gap = sum(self._gap(channel, reader, life, source_life) for source_life, _ in accounts)
+            if between and not gap <= between <= gap + math.ceil(flow.hz * UNCONFIRMED_S):
+                found.append(f"{who}: {gap} messages missing since its former life, {between} told")
             told = self.told[channel, reader, life]
             if not least <= told <= most:
                 lack = f"{least}" if least == most else f"{least} to {most}"
                 found.append(f"{who}: {lack} messages missing, {told} told")
         return found
+
+    def _gap(self, channel: int, reader: str, life: int, source_life: int) -> int:
+        """Return how many messages came to neither this life of a reader nor to an earlier one, in between."""
+        before = [
+            account.last
+            for (of, who, earlier, source), account in self.accounts.items()
+            if (of, who, source) == (channel, reader, source_life) and earlier < life
+        ]
+        account = self.accounts[channel, reader, life, source_life]
+        return max(account.first - 1 - max(before), 0) if before else 0
 
     def miscalled(self, until_ns: int, is_over: Callable[[str, int], bool]) -> list[str]:
         """Return the calls without an end, or with more than one.

@@ -13,6 +13,7 @@ import signal
 import struct
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from itertools import count
@@ -26,6 +27,7 @@ from faults.records import Kind, RecordWriter
 from gdp.client.member import Message
 from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
+from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.nodes.allocator import settle_memory
 from gdp.service.dispatch import Ask, Dispatch, Failure
@@ -167,7 +169,7 @@ class Reading:
 
     def __init__(self, channel: int, token: bytes, out: RecordWriter) -> None:
         self._channel, self._token, self._out = channel, token, out
-        self._told = 0
+        self._told = Counter[LossReason]()
         self._look_at_s = 0.0
 
     def look(self, station: Station, name: Name, now_s: float) -> None:
@@ -175,10 +177,10 @@ class Reading:
         if now_s < self._look_at_s:
             return
         self._look_at_s = now_s + _LOOK_S
-        told = station.member.losses_of(name).total
-        if told > self._told:
-            self._out.add(Kind.LOST, self._channel, 0, 0, told - self._told, time.monotonic_ns())
-            self._told = told
+        told = Counter(station.member.losses_of(name).counts)
+        for reason, number in (told - self._told).items():
+            self._out.add(Kind.LOST, self._channel, 0, reason, number, time.monotonic_ns())
+        self._told = told
 
     def take(self, message: Message, now_s: float) -> None:
         """Write a message down; one that is not of this channel is a wrong one."""

@@ -22,7 +22,7 @@ class Kind(IntEnum):
 
     PUBLISHED = 1  # number: of the message
     DELIVERED = 2  # other: the publisher; life: the publisher's
-    LOST = 3  # number: how many more messages the reader was told it missed
+    LOST = 3  # number: how many more messages the reader was told it missed; other: the reason, a ``LossReason``
     WRONG = 4  # other: the channel that the message was meant for
     CALLED = 5  # number: of the request
     ANSWERED = 6

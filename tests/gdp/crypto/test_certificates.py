@@ -74,7 +74,7 @@ def test_a_domain_of_another_label_does_not_vouch_for_it() -> None:
     assert reason(MEMBER.wire, other.root) is DropReason.WRONG_DOMAIN
 
 
-@pytest.mark.parametrize("unix_s", [NOW - 1_000, NOW + 31 * 86_400])
+@pytest.mark.parametrize("unix_s", [NOW - 4_000, NOW + 31 * 86_400])
 def test_outside_its_validity_it_does_not_hold(unix_s: int) -> None:
     assert reason(MEMBER.wire, unix_s=unix_s) is DropReason.EXPIRED
 
