@@ -106,6 +106,7 @@ cluster-port $bus
 cluster-node-timeout 500
 cluster-require-full-coverage no
 cluster-replica-validity-factor 0
+repl-diskless-sync-delay 0
 appendonly yes
 save ""
 dir $dir/$at
@@ -145,6 +146,7 @@ await() {
     fail "$what did not happen within 30 s"
 }
 answers() { [[ "$(ask "$1" ping)" == PONG ]]; }
+is_replicated() { ask "$1" info replication | grep -q '^master_link_status:up\|^slave0:.*state=online'; }
 is_whole() { ask "$1" cluster info | grep -q '^cluster_state:ok' && [[ $(ask "$1" cluster nodes | wc -l) -eq $nodes ]]; }
 
 for each in "${addresses[@]}"; do await "an answer of $each" answers "$each"; done
@@ -152,6 +154,7 @@ if [[ ! -f "$dir/store.yaml" ]]; then
     ask "${addresses[0]}" --cluster create "${addresses[@]}" --cluster-replicas 1 --cluster-yes >"$dir/create.log"
 fi
 for each in "${addresses[@]}"; do await "a whole cluster at $each" is_whole "$each"; done
+for each in "${addresses[@]}"; do await "a replica that has everything, at $each" is_replicated "$each"; done
 {
     echo "store:"
     echo "  cluster:"

@@ -148,10 +148,10 @@ class ClusterStore:
         writes, self._writes = self._writes, []
         if not writes:
             return []
-        replies = self._link.execute([(write.tag, write.command) for write in writes])
+        replies = self._link.execute([(write.tag, write.command) for write in writes], writes=True)
         again = [at for at, reply in enumerate(replies) if _code(reply) == _NO_CONTEXT]
         with_context = [(writes[at].tag, _with_context(writes[at])) for at in again]
-        for at, reply in zip(again, self._link.execute(with_context), strict=True):
+        for at, reply in zip(again, self._link.execute(with_context, writes=True), strict=True):
             replies[at] = reply
         refused = []
         for write, reply in zip(writes, replies, strict=True):

@@ -29,6 +29,8 @@ _ALPHABET: Final = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456
 CHANNELS: Final = tuple(b"{%c}" % char for char in _ALPHABET)  # hash tags: names share 64 slots, and one channel each
 _TIMEOUT_S: Final = 0.5  # a primary that does not answer for so long has failed
 _REFRESH_S: Final = 0.1  # between two readings of the map of slots while something fails
+_REPLICA_MS: Final = 100  # a replica confirms within about a millisecond
+_ALONE_S: Final = 1.0
 _PING_S: Final = 1.0  # between two signs of life on a connection that only listens
 _MOVED: Final = ("MOVED", "ASK", "CLUSTERDOWN", "READONLY", "LOADING", "TRYAGAIN", "NOREPLICAS", "MASTERDOWN")
 
@@ -55,7 +57,9 @@ class ClusterLink:
         self._listening: dict[Address, PubSub] = {}
         self._readable = select.epoll()
         self._pinged_s = 0.0
+        self._alone_until_s: dict[Address, float] = {}
         self.failures = 0
+        self.unreplicated = 0
         try:
             self._refresh()
         except StoreError as error:
@@ -73,12 +77,17 @@ class ClusterLink:
         """Return host and port of the primary that holds a name."""
         return self._primaries[tag_of(name)]
 
-    def execute(self, commands: Sequence[tuple[bytes, Command]]) -> list[object]:
+    def execute(self, commands: Sequence[tuple[bytes, Command]], *, writes: bool = False) -> list[object]:
         """Send commands, each with the hash tag of its keys, in one batch for each primary.
+
+        Args:
+            writes: wait until a replica of each primary has what they wrote, so that it outlives the primary. Where no
+                replica says so in time the primary has it alone; ``unreplicated`` counts that.
 
         Returns the replies in order; in the place of one that did not come stands a ``StoreError``.
         """
         replies: list[object] = [StoreError("not sent")] * len(commands)
+        batch = self._batch_of_writes if writes else self._batch
         for _attempt in range(2):
             open_ = [index for index, reply in enumerate(replies) if isinstance(reply, StoreError)]
             if not open_:
@@ -89,7 +98,7 @@ class ClusterLink:
             for index in open_:
                 by_primary[self._primaries[commands[index][0]]].append(index)
             for at, indices in by_primary.items():
-                for index, reply in zip(indices, self._batch(at, [commands[i][1] for i in indices]), strict=True):
+                for index, reply in zip(indices, batch(at, [commands[i][1] for i in indices]), strict=True):
                     replies[index] = reply
         return replies
 
@@ -156,6 +165,16 @@ class ClusterLink:
             self.failures += 1
             return [StoreError(str(error))] * len(commands)
         return [_translated(reply) for reply in replies]
+
+    def _batch_of_writes(self, at: Address, commands: list[Command]) -> list[object]:
+        if time.monotonic() < self._alone_until_s.get(at, 0.0):
+            self.unreplicated += len(commands)
+            return self._batch(at, commands)
+        *replies, replicas = self._batch(at, [*commands, (b"WAIT", 1, _REPLICA_MS)])
+        if replicas == 0:
+            self._alone_until_s[at] = time.monotonic() + _ALONE_S  # nobody waits for a replica that is away
+            self.unreplicated += len(commands)
+        return replies
 
     def _client(self, at: Address) -> Redis:
         client = self._clients.get(at)
