@@ -159,6 +159,7 @@ def measure(runs: Runs, row: Row, rounds: int, options: argparse.Namespace) -> M
         flow = Flowing(overlay)
         if not flow.await_steady(time.monotonic_ns()):
             raise FailedError(f"{row.what}: no steady flow before any event")
+        _watch(flow, options.settle_s)  # paths wait longer in a network that has just begun (RFC 8405)
         for at in range(rounds):
             _once(overlay, flow, row, at, found, options)
         flow.look()
