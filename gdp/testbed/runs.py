@@ -12,6 +12,7 @@ import os
 import secrets
 import shutil
 import tempfile
+import time
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -26,6 +27,8 @@ __all__ = ["Record", "Run", "Runs", "in_first_user_namespace", "outer_uid"]
 log = logging.getLogger(__name__)
 
 _ID_BYTES: Final = 3
+_FRESH: Final = ".new"  # of a record that is being written
+_WRITTEN_S: Final = 60.0  # ... which takes no longer than this
 _ALL_IDS: Final = 4_294_967_295  # length of the first user namespace's map; user_namespaces(7)
 
 
@@ -137,7 +140,7 @@ class Run:
         _take_down(self._record, self._path)
 
     def _save(self) -> None:
-        fresh = self._path.with_suffix(".new")
+        fresh = self._path.with_suffix(_FRESH)
         descriptor = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
         with os.fdopen(descriptor, "w", encoding="utf-8") as file:
             file.write(self._record.to_text())
@@ -185,11 +188,19 @@ class Runs:
 
     def sweep(self) -> list[str]:
         """Take down every run that nobody answers for; return their ids."""
+        self._remove_unfinished()
         return [record.run for record, path in self._records() if record.dead and _take_down(record, path)]
 
     def take_down(self) -> list[str]:
         """Take down every run that was kept, and every dead one; return their ids. Runs under way are left alone."""
         return [r.run for r, path in self._records() if (r.kept or r.dead) and _take_down(r, path)]
+
+    def _remove_unfinished(self) -> None:
+        """Remove what a process that was killed had begun to write, before it had made anything."""
+        for path in self._directory.glob(f"*{_FRESH}"):
+            with suppress(FileNotFoundError):  # it was renamed, or another start was quicker
+                if time.time() - path.stat().st_mtime > _WRITTEN_S and not path.with_suffix(".json").exists():
+                    path.unlink()
 
     def _records(self) -> list[tuple[Record, Path]]:
         found = []
@@ -229,5 +240,6 @@ def _take_down(record: Record, path: Path) -> bool:
                 shutil.rmtree(target)
         else:
             target.unlink(missing_ok=True)
+    path.with_suffix(_FRESH).unlink(missing_ok=True)
     path.unlink(missing_ok=True)
     return True

@@ -102,6 +102,20 @@ def test_a_record_that_cannot_be_read_is_left_alone(runs: Runs, tmp_path: Path) 
     assert strange.exists()
 
 
+def test_a_record_whose_writer_was_killed_is_swept(runs: Runs, tmp_path: Path) -> None:
+    run = runs.start()
+    of_a_run, of_none, young = (tmp_path / "runs" / f"{name}.new" for name in (run.id, "abc", "def"))
+    for each in (of_a_run, of_none, young):
+        each.touch()
+    for each in (of_a_run, of_none):
+        os.utime(each, (1.0, 1.0))
+    assert runs.sweep() == []
+    assert [each.exists() for each in (of_a_run, of_none, young)] == [True, False, True]
+    rewrite(run, tmp_path, orphan)
+    assert runs.sweep() == [run.id]
+    assert [each.exists() for each in (of_a_run, young)] == [False, True]
+
+
 def test_records_that_others_could_have_written_are_refused(tmp_path: Path) -> None:
     (tmp_path / "open").mkdir()
     os.chmod(tmp_path / "open", 0o777)
