@@ -88,7 +88,7 @@ def test_a_rule_may_say_otherwise_than_the_publisher(sites: Sites) -> None:
     sites.world.leads[SERVER].loss = 0.3
     sites.every(0.01, 50, lambda number: talker.publish(string(str(number))))
     sites.run(5)
-    assert 10 < len(ear.heard) < 50
+    assert 0 < len(ear.heard) < 50  # none of what was lost is repaired
 
 
 def test_a_latched_message_reaches_who_joins_later_on_the_far_side(sites: Sites) -> None:
