@@ -171,10 +171,6 @@ class Rib:
                 self.refusals[error.reason] += 1
         return self.names - before
 
-    def entry_of(self, key: Key, now_s: float) -> Entry | None:
-        """Return what is kept of an advertiser of a name, for a peer or a snapshot, or None."""
-        return self._entry_of(key, now_s)
-
     def revoke(self, wire: bytes, now: Instant) -> None:
         """Take a certificate back: what rests on it is gone, and whoever watched is told.
 
@@ -310,21 +306,13 @@ class Rib:
 
     def _route(self, claim: Claim, transit: tuple[Name, ...], member: Membership, now: Instant) -> Route:
         left_s = max(claim.valid_until_unix_s - now.unix_s, 1.0)
-        return Route(
-            name=claim.name,
-            advertiser=claim.node,
+        return Route.of(
+            claim,
             sender=member.name,
-            switch=claim.switch,
             domain=member.domain,
             via=member.domain,
             transit=tuple(sorted(self._policy.transit)) if self._is_own_switch(member) else transit,
-            sequence=claim.sequence,
-            is_global=claim.is_global,
-            claim=claim.wire,
-            is_from_above=False,
             expires_s=now.mono_s + min(claim.lease_s, left_s),
-            valid_until_unix_s=claim.valid_until_unix_s,
-            fingerprints=claim.fingerprints,
         )
 
     def _take_withdrawal(self, withdrawal: Statement, member: Membership, now: Instant) -> None:
@@ -565,7 +553,7 @@ class Rib:
     def _replication_over(self, digests: DigestTree | None) -> Replication | None:
         if digests is None:
             return None
-        return Replication(self._identity, digests, self._settings.peers, self._entry_of, self._rank_of)
+        return Replication(self._identity, digests, self._settings.peers, self.entry_of, self._rank_of)
 
     def _replicate(self, name: Name, advertiser: Name) -> None:
         if self._replication is not None:
@@ -575,7 +563,8 @@ class Rib:
         known = self._store.get(*key)
         return None if known is None else _rank(known)
 
-    def _entry_of(self, key: Key, now_s: float) -> Entry | None:
+    def entry_of(self, key: Key, now_s: float) -> Entry | None:
+        """Return what is kept of an advertiser of a name, for a peer or a snapshot, or None."""
         known = self._store.get(*key)
         if isinstance(known, Route) and known.expires_s > now_s:
             lease_s = min(known.expires_s - now_s, LEASE_MAX_S)
@@ -623,21 +612,14 @@ class Rib:
             return  # nothing here that it corrects
         if known is None and self._store.count_of(entry.sender) >= self._settings.names_per_sender:
             raise StatementError(DropReason.QUOTA, "names of one sender")
-        route = Route(
-            name=claim.name,
-            advertiser=claim.node,
+        route = Route.of(
+            claim,
             sender=entry.sender,
-            switch=claim.switch,
             domain=entry.domain,
             via=entry.via,
             transit=entry.transit,
-            sequence=claim.sequence,
-            is_global=claim.is_global,
-            claim=claim.wire,
-            is_from_above=entry.is_from_above,
             expires_s=now.mono_s + lease_s,
-            valid_until_unix_s=claim.valid_until_unix_s,
-            fingerprints=claim.fingerprints,
+            is_from_above=entry.is_from_above,
         )
         self._store.put(route)
         self._tell(route, known, now.mono_s, self._above.answered(route.name, now.mono_s))

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gdp.names import Name
+from gdp.trust.claim import Claim
 
 __all__ = ["Route", "Withdrawn"]
 
@@ -43,6 +44,36 @@ class Route:
     expires_s: float
     valid_until_unix_s: int
     fingerprints: frozenset[bytes]
+
+    @classmethod
+    def of(
+        cls,
+        claim: Claim,
+        *,
+        sender: Name,
+        domain: Name,
+        via: Name,
+        transit: tuple[Name, ...],
+        expires_s: float,
+        is_from_above: bool = False,
+    ) -> Route:
+        """Return what is kept of a verified claim."""
+        return cls(
+            name=claim.name,
+            advertiser=claim.node,
+            sender=sender,
+            switch=claim.switch,
+            domain=domain,
+            via=via,
+            transit=transit,
+            sequence=claim.sequence,
+            is_global=claim.is_global,
+            claim=claim.wire,
+            is_from_above=is_from_above,
+            expires_s=expires_s,
+            valid_until_unix_s=claim.valid_until_unix_s,
+            fingerprints=claim.fingerprints,
+        )
 
     @property
     def place(self) -> tuple[Name, Name]:

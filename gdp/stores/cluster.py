@@ -296,21 +296,13 @@ class ClusterStore:
         claim = self._verifier.verify(claim_wire, self._now.unix_s)
         if claim.name != name:
             raise StatementError(DropReason.WRONG_NAME, "a record of the store under another name")
-        return Route(
-            name=name,
-            advertiser=claim.node,
+        return Route.of(
+            claim,
             sender=fields.name("w"),
-            switch=claim.switch,
             domain=fields.name("d"),
             via=fields.name("v"),
             transit=tuple(fields.names("x", 64)),
-            sequence=claim.sequence,
-            is_global=claim.is_global,
-            claim=claim_wire,
-            is_from_above=False,
             expires_s=self._now.mono_s + min(end_unix_s - self._now.unix_s, claim.lease_s),
-            valid_until_unix_s=claim.valid_until_unix_s,
-            fingerprints=claim.fingerprints,
         )
 
     def _context(self, tag: bytes, context_id: bytes) -> bytes:

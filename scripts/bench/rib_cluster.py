@@ -120,12 +120,8 @@ class Field:
 
     def route(self, claim: Claim, now: Instant) -> Route:
         domain = self.authority.root.domain
-        return Route(
-            name=claim.name, advertiser=claim.node, sender=self.switch.name, switch=claim.switch, domain=domain,
-            via=domain, transit=(), sequence=claim.sequence, is_global=claim.is_global, claim=claim.wire,
-            is_from_above=False, expires_s=now.mono_s + LEASE_S, valid_until_unix_s=claim.valid_until_unix_s,
-            fingerprints=claim.fingerprints,
-        )  # fmt: skip
+        expires_s = now.mono_s + LEASE_S
+        return Route.of(claim, sender=self.switch.name, domain=domain, via=domain, transit=(), expires_s=expires_s)
 
 
 def now() -> Instant:
