@@ -13,7 +13,7 @@ from gdp.crypto.fields import Fields
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import StatementType, sign
 from gdp.limits import FRAME_MAX_BYTES, LEASE_MAX_S
-from gdp.names import Name
+from gdp.names import ZERO, Name
 
 __all__ = ["Join"]
 
@@ -32,6 +32,8 @@ class Join:
         session: nonce of the receiver's port, as its hellos say it.
         sequence: rises with every join and leave of the sender, over its restarts too.
         version: sequence number of the publisher's claim that ``switch`` was read from; the newest decides.
+        backup_for: the switch below that has the tree another way, and wants copies only while that way is broken;
+            ``ZERO`` in an ordinary join. Source: the secondary join of RFC 7431.
     """
 
     topic: Name
@@ -45,6 +47,7 @@ class Join:
     session: bytes
     sequence: int
     version: int = 0
+    backup_for: Name = ZERO
 
     def to_wire(self, signer: Name, key: SigningKey) -> bytes:
         """Return the signed statement."""
@@ -60,6 +63,7 @@ class Join:
             "i": self.session,
             "s": self.sequence,
             "v": self.version,
+            "b": self.backup_for,
         }
         return sign(StatementType.JOIN, body, signer, key)
 
@@ -82,4 +86,5 @@ class Join:
             fields.bytes_("i", NONCE_BYTES),
             fields.uint("s"),
             fields.uint("v"),
+            fields.name("b"),
         )

@@ -362,7 +362,7 @@ class Switch:
         elif before is NeighbourState.UP:
             if neighbour.role is Role.SWITCH:
                 self._flooding.damping.went((neighbour.port, neighbour.name), now_s)
-            self.planter.neighbour_lost((neighbour.port, neighbour.mac))
+            self.planter.neighbour_lost((neighbour.port, neighbour.mac), now_s)
             for attachment in self.attached.of(neighbour.name):
                 if attachment.port == neighbour.port:
                     self.relocations.departed(attachment.claim, now_s)

@@ -11,6 +11,10 @@ reader came or left, or a link got narrower or wider.
 Make before break: where the one above changes because a better way has come up, the former one is left only after
 ``_OVERLAP_S``; readers drop what comes twice. Where the publisher has moved it is left at once, for the former one may
 now have to take its messages from here.
+
+A tree that has settled asks its loop-free alternate for a backup branch (``backups.py``). Where both ways part, the
+data plane takes it as soon as the port of the protected branch is down; the branch itself is lost a moment later, and
+the backup then counts as one for ``_ACTIVE_S``, in which the switch below joins anew.
 """
 
 from __future__ import annotations
@@ -26,8 +30,9 @@ from gdp.crypto.identity import Identity
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
 from gdp.limits import JOIN_LEASE_S, JOIN_REFRESH_S
-from gdp.names import Name
+from gdp.names import ZERO, Name
 from gdp.switch.attached import Attached
+from gdp.switch.backups import Backups
 from gdp.switch.outbox import Outbox
 from gdp.switch.paths import Paths
 from gdp.switch.places import Place
@@ -41,6 +46,7 @@ __all__ = ["Planter"]
 
 _JOIN_AGAIN_S: Final = (0.1, 0.3)  # a new join is said again after so long, then every JOIN_REFRESH_S
 _OVERLAP_S: Final = 0.3  # the former one above is left so long after the new one was asked
+_ACTIVE_S: Final = 1.0  # for which a backup takes the place of a branch that was lost
 
 
 @dataclass(slots=True)
@@ -75,6 +81,7 @@ class Planter:
         self._paths = paths
         self._attached = attached
         self._outbox = outbox
+        self._backups = Backups(identity.name, policy.own, paths, outbox)
         self._readers: dict[Name, dict[At, _Reader]] = {}
         self.trees = Trees()
         self.drops: Counter[DropReason] = Counter()
@@ -174,11 +181,13 @@ class Planter:
             return False
         if self._policy.own not in join.allowed or neighbour.domain not in join.allowed:
             raise StatementError(DropReason.WRONG_DOMAIN, "a tree that must not pass here")
+        if join.backup_for != ZERO and neighbour.domain != self._policy.own:
+            raise StatementError(DropReason.WRONG_DOMAIN, "a backup for another domain")
         tree = self._tree(join.topic, join.publisher, join.allowed)
         before = tree.branches.get(at)
         if before is not None and join.sequence < before.sequence:
             return False  # a newer one overtook it
-        if tree.former is not None and tree.former[0] == at:
+        if tree.former is not None and tree.former[0] == at and join.backup_for == ZERO:
             self._leave_former(tree)  # it takes the messages from here now
         is_behind = join.version < tree.version
         is_same_place = (tree.switch, tree.domain) == (join.switch, join.domain) or is_behind
@@ -187,13 +196,16 @@ class Planter:
             tree.allowed = join.allowed
         branch = Branch(now_s + min(join.lease_s, JOIN_LEASE_S), join.mtu, join.evidence, join.mtu, join.sequence)
         branch.fit(self._outbox.mtu_of(neighbour.port))
+        if join.backup_for != ZERO:
+            branch.backup_for = join.backup_for
+            branch.active_until_s = None if before is None else before.active_until_s
         tree.branches[at] = branch
         self._plant(tree)
         if not self._follow(tree, now_s):
-            if before is None or not is_same_place or tree.is_doubted:
+            if (before is None and branch.is_active) or not is_same_place or tree.is_doubted:
                 self._ask_above(tree, now_s)
             else:
-                self._resize(tree)
+                self._restate(tree)
         return is_behind and tree.switch != join.switch
 
     def neighbour_up(self, at: At, now_s: float) -> None:
@@ -202,11 +214,14 @@ class Planter:
             if tree.above == at:
                 self._ask_above(tree, now_s)
 
-    def neighbour_lost(self, at: At) -> None:
-        """Cut every branch to a neighbour that is gone."""
+    def neighbour_lost(self, at: At, now_s: float) -> None:
+        """Cut every branch to a neighbour that is gone; what backups they have take their place."""
         for topic in [topic for topic, readers in self._readers.items() if at in readers]:
             self.remove_reader(topic, at)
         for tree in self.trees.all():
+            backup = tree.protection.get(at)
+            if backup is not None:
+                tree.branches[backup].active_until_s = now_s + _ACTIVE_S
             self._cut(tree, at)
 
     def link_resized(self, port: int) -> None:
@@ -215,7 +230,7 @@ class Planter:
             for (its, _), branch in tree.branches.items():
                 if its == port:
                     branch.fit(self._outbox.mtu_of(port))
-            self._resize(tree)
+            self._restate(tree)
 
     def claims(self) -> list[tuple[Name, At, Claim]]:
         """Return the claims of all readers attached here, with their topic and place."""
@@ -239,7 +254,8 @@ class Planter:
     def reroute(self, now_s: float) -> None:
         """Ask anew where the way to a publisher has changed."""
         for tree in self.trees.all():
-            self._follow(tree, now_s)
+            if not self._follow(tree, now_s) and self._backups.protection(tree) != tree.protection:
+                self._plant(tree)
 
     def timeout(self, now_s: float) -> list[Name]:
         """Prune, renew upwards; return the topics that lost their last reader here."""
@@ -250,6 +266,9 @@ class Planter:
                     orphaned.append(topic)
         for tree in self.trees.prune(now_s):
             self._after_cut(tree)
+        for tree in self.trees.deactivate(now_s):
+            self._plant(tree)
+            self._restate(tree)
         for tree in self.trees.all():
             if tree.renew_at_s <= now_s:
                 self._ask_above(tree, now_s)
@@ -271,6 +290,7 @@ class Planter:
         return tree
 
     def _plant(self, tree: Tree) -> None:
+        tree.protection = self._backups.protection(tree)
         if not self._table.install(tree.key, tree.hops(self._outbox.mac_of()), tree.expires_s()):
             self.drops[DropReason.QUOTA] += 1
 
@@ -281,10 +301,11 @@ class Planter:
     def _after_cut(self, tree: Tree) -> None:
         if tree.branches:
             self._plant(tree)
-            self._resize(tree)
+            self._restate(tree)
             return
         self._table.remove(tree.key)
         self._leave_former(tree)
+        self._leave_backup(tree)
         self._leave(tree)
         self.trees.remove(tree)
 
@@ -312,31 +333,58 @@ class Planter:
             self._part_from_above(tree, now_s, keep=above is not None)
             if above is not None:
                 tree.above, tree.above_name = above[:2], above[2]
+                if tree.backup is not None and tree.backup[0] == tree.above:
+                    tree.backup = None  # an ordinary join takes its place
             self._plant(tree)
         if above is None or not tree.is_wanted_below:
             return
-        if tree.joins < len(_JOIN_AGAIN_S):
+        has_settled = tree.joins >= len(_JOIN_AGAIN_S)
+        if not has_settled:
             tree.renew_at_s = now_s + _JOIN_AGAIN_S[tree.joins]
             tree.joins += 1
         tree.asked_mtu = min(tree.mtu, self._outbox.mtu_of(above[0]))
         self._show(tree)
+        if has_settled and self._paths.has_alternates:
+            self._ask_for_backup(tree)
 
-    def _resize(self, tree: Tree) -> None:
-        """Say at once, to the one above, that what fits its tree has changed."""
+    def _restate(self, tree: Tree) -> None:
+        """Say at once, to the one above, that what fits this tree, or whether anybody wants copies, has changed."""
         if tree.above is None:
             return
         mtu = min(tree.mtu, self._outbox.mtu_of(tree.above[0]))
-        if mtu != tree.asked_mtu:
+        if mtu != tree.asked_mtu or tree.backup_for != tree.asked_backup_for:
             tree.asked_mtu = mtu
             self._show(tree)
+
+    def _ask_for_backup(self, tree: Tree) -> None:
+        """Ask, or leave, the one above that could take the place of the best one."""
+        other = self._backups.above(tree)
+        if other != tree.backup:
+            self._leave_backup(tree)
+        tree.backup = other
+        if other is not None:
+            (port, _), _ = other
+            mtu = min(tree.mtu, self._outbox.mtu_of(port))
+            self._say(tree, *other, mtu, JOIN_LEASE_S, tree.evidence, backup_for=self._identity.name)
+
+    def _leave_backup(self, tree: Tree) -> None:
+        if tree.backup is not None:
+            (at, name), tree.backup = tree.backup, None
+            if at != tree.above:
+                self._say(tree, at, name, 1, 0.0, b"")
 
     def _show(self, tree: Tree) -> None:
         """Join the one above, with the evidence of a reader below."""
         evidence = tree.evidence
         tree.is_doubted = tree.is_doubted and evidence == tree.shown
         tree.shown = evidence
-        if tree.above is not None and tree.above_name is not None:
-            self._say(tree, tree.above, tree.above_name, tree.asked_mtu, JOIN_LEASE_S, evidence)
+        tree.asked_backup_for = tree.backup_for
+        if tree.above is None or tree.above_name is None:
+            return
+        backup_for = tree.backup_for or ZERO
+        if backup_for != ZERO and self._paths.domain_of(tree.above_name) != self._policy.own:
+            return  # what a domain does to survive is its own matter
+        self._say(tree, tree.above, tree.above_name, tree.asked_mtu, JOIN_LEASE_S, evidence, backup_for=backup_for)
 
     def _place_at(self, tree: Tree, switch: Name, domain: Name, version: int) -> None:
         """Take in where a tree's publisher is; where that is news, the one above is left before another is asked."""
@@ -377,7 +425,9 @@ class Planter:
             self._say(tree, tree.above, tree.above_name, 1, 0.0, b"")
         tree.above = tree.above_name = None
 
-    def _say(self, tree: Tree, above: At, name: Name, mtu: int, lease_s: float, evidence: bytes) -> None:
+    def _say(
+        self, tree: Tree, above: At, name: Name, mtu: int, lease_s: float, evidence: bytes, *, backup_for: Name = ZERO
+    ) -> None:
         """Send a join, or with no lease a leave, to one above."""
         session = self._outbox.session_of(above[0], name)
         if session is None:
@@ -395,6 +445,7 @@ class Planter:
             session,
             self._sequence,
             tree.version,
+            backup_for,
         )
         kind = Kind.JOIN if lease_s else Kind.LEAVE
         self._outbox.say_at(*above, kind, join.to_wire(self._identity.name, self._identity.key))

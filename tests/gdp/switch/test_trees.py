@@ -55,3 +55,54 @@ def test_a_branch_is_as_narrow_as_its_link_or_the_way_behind_it() -> None:
         branch.fit(link_mtu)
         seen.append(branch.mtu)
     assert seen == [1_400, 1_000, 1_400]
+
+
+OTHER = (2, b"\x02other")
+MACS = {0: b"\x02own00", 1: b"\x02own01", 2: b"\x02own02"}
+
+
+def with_backup() -> Tree:
+    """Return a tree with a backup that protects the branch FAR."""
+    made = tree()
+    made.branches[OTHER] = Branch(20.0, 900, b"its claim", backup_for=name("below"))
+    made.protection = {FAR: OTHER}
+    return made
+
+
+def test_a_backup_is_the_alternate_of_the_branch_that_it_protects() -> None:
+    assert with_backup().hops(MACS) == (
+        (0, NEAR[1] + MACS[0]),
+        (1, FAR[1] + MACS[1], 2, OTHER[1] + MACS[2]),
+    )
+
+
+def test_a_backup_on_a_port_that_is_down_or_leads_back_up_is_no_alternate() -> None:
+    plain = ((0, NEAR[1] + MACS[0]), (1, FAR[1] + MACS[1]))
+    made = with_backup()
+    assert made.hops({port: mac for port, mac in MACS.items() if port != 2}) == plain
+    made.above = OTHER
+    assert made.hops(MACS) == plain
+
+
+def test_a_backup_counts_neither_for_the_mtu_nor_for_the_evidence_until_it_is_needed() -> None:
+    made = with_backup()
+    assert (made.mtu, made.evidence, made.backup_for) == (1_400, b"far claim", None)
+    made.branches[OTHER].active_until_s = 3.0
+    assert (made.mtu, made.evidence, made.backup_for) == (900, b"its claim", None)
+
+
+def test_a_tree_of_backups_alone_asks_for_a_backup_and_passes_on_what_comes() -> None:
+    made = with_backup()
+    del made.branches[FAR], made.branches[NEAR]
+    assert (made.backup_for, made.is_backup, made.mtu) == (name("below"), True, 900)
+    assert made.hops(MACS) == ((2, OTHER[1] + MACS[2]),)
+
+
+def test_a_backup_rests_again_when_its_time_is_over() -> None:
+    trees, made = Trees(), with_backup()
+    trees.put(made)
+    made.branches[OTHER].active_until_s = 3.0
+    assert trees.next_event() == 3.0
+    assert trees.deactivate(2.9) == []
+    assert trees.deactivate(3.0) == [made]
+    assert (made.branches[OTHER].is_active, trees.next_event()) == (False, 5.0)
