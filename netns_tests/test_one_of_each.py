@@ -20,6 +20,7 @@ pytestmark = pytest.mark.netns
 _PATIENCE_S = 60.0
 _MACS = bytes.fromhex("020000000001"), bytes.fromhex("020000000002")
 _PROXY = "identity: proxy\ndomain: {root: proxy/root.crt}\ndelegations: proxy/delegations\niface: proxy0\n"
+_OTHER_HOST = ("unshare", "--mount", "sh", "-c", 'mount -t tmpfs -o mode=700 locks /run/gdp-locks && exec "$@"', "sh")
 _PROGRAMS = {"switch": "gdp.cli.switch", "rib": "gdp.cli.rib", "proxy": "proxy.cli"}
 
 
@@ -74,9 +75,9 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
     Path("robot/proxy.yaml").write_text(_PROXY)
     nodes: list[Node] = []
 
-    def begin(host: str, what: str, *options: str) -> Node:
+    def begin(host: str, what: str, *options: str, on_another_host: bool = False) -> Node:
         argv = [sys.executable, "-m", _PROGRAMS[what], "--config", f"{host}/{what}.yaml", *options]
-        nodes.append(Node(argv))
+        nodes.append(Node([*(_OTHER_HOST if on_another_host else ()), *argv]))
         return nodes[-1]
 
     yield begin
@@ -121,6 +122,25 @@ def test_the_same_identity_is_refused_in_another_network_namespace_and_from_a_co
         second = start("copy", "switch")
     second.says("error: this switch already runs, pid")
     assert second.process.wait(_PATIENCE_S) == 2
+
+
+def test_of_two_switches_with_one_identity_on_two_hosts_the_older_one_stays_and_both_say_so(
+    space: Space, start: Start
+) -> None:
+    space.veth("eth0", "far0", *_MACS)
+    space.veth("eth1", "far1", bytes.fromhex("020000000003"), bytes.fromhex("020000000004"))
+    subprocess.run(["cp", "-rp", "robot", "copy"], check=True)
+    head = Path("robot/switch.yaml").read_text().split("ports:")[0]
+    for host, ports in (("robot", "eth0"), ("copy", "eth1"), ("server", "far0}, {iface: far1")):
+        Path(host, "switch.yaml").write_text(f"{head}ports: [{{iface: {ports}}}]\n")
+    start("server", "switch").says(" is up")
+    first = start("robot", "switch")
+    first.says("neighbour up port=eth0")
+    second = start("copy", "switch", on_another_host=True)
+    second.says("waiting: another node with this identity")
+    first.says("another node with this identity is alive")
+    first.end(signal.SIGKILL)
+    second.says("neighbour up port=eth1")
 
 
 def test_a_second_proxy_is_refused_and_a_killed_one_can_be_started_at_once(space: Space, start: Start) -> None:

@@ -102,7 +102,7 @@ class ProxyNode:
             calls=self.traffic.calls,
             latency=lambda: self.traffic.latency,
             waiting=self.node_log.metrics,
-            clashes=lambda: member.attachment.clashes,
+            clashes=lambda: member.attachment.clashes + member.attachment.greeter.clashes,
         )
 
 

@@ -88,6 +88,7 @@ class Attachment:
             dead_s=settings.dead_s,
             timing=settings.timing,
             incarnation=settings.incarnation,
+            life=settings.life,
         )
         self._claims: dict[tuple[Name, Right], Claimed] = {}
         self._switch: Neighbour | None = None

@@ -19,10 +19,11 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gdp.control.frames import ControlSplitter
-from gdp.control.hello import DIGEST_BYTES, NO_KEEPALIVES, NONCE_BYTES, Hello, Timing
+from gdp.control.hello import DIGEST_BYTES, LIFE_BYTES, NO_KEEPALIVES, NONCE_BYTES, Hello, Timing
 from gdp.control.join import Join
 from gdp.control.keepalive import KeepaliveSession, Slowness
 from gdp.control.neighbour import TRANSITIONS, Neighbour, NeighbourEvent, NeighbourState
+from gdp.control.rivals import Rivals
 from gdp.control.strangers import Strangers
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
 from gdp.crypto.identity import Identity
@@ -47,6 +48,8 @@ _EAGER_HELLOS: Final = 4  # after a change, so that a lost one delays nobody
 _HELLOS_MISSED: Final = 5  # idle hello intervals after which keepalives alone keep nobody up
 _RECHECK_S: Final = 1.0  # a membership may be revoked or run out while keepalives come
 _LATE_S: Final = 0.02  # called later than this, a node had no time of its own
+_CLASH_S: Final = 2.0  # for so long another node must have our identity
+_CLASH_PAUSE_S: Final = 10.0  # above the time between two idle hellos
 _TOGETHER: Final = 0.125  # of an interval: keepalives due within it leave at once
 
 # A neighbour after the change, and its state before; the same state where only the link to it changed, MTU or cost.
@@ -135,7 +138,14 @@ class Greeter:
     Args:
         random_bytes: source of nonces and of session keys.
         timing: what this node wants of keepalives, where ``set_timing`` says nothing else of a port.
+        life: mark of this node's life, ``LIFE_BYTES``.
         digest_for: what to say of our link state to the far end of a port.
+        life_elsewhere: the mark of a node with a name that is known to be alive, but at none of our ports; or None.
+
+    Attributes:
+        rivals: nodes that share an identity with another one, at our ports.
+        clashes: how often we heard of another node with our own identity.
+        clash_told_by: the neighbour that said so last.
     """
 
     def __init__(
@@ -149,7 +159,9 @@ class Greeter:
         dead_s: float = DEAD_S,
         timing: Timing = NO_KEEPALIVES,
         incarnation: int = 0,
+        life: bytes = bytes(LIFE_BYTES),
         digest_for: Callable[[LinkPort], bytes] = lambda _: bytes(DIGEST_BYTES),
+        life_elsewhere: Callable[[Name], bytes | None] = lambda _: None,
     ) -> None:
         self._identity = identity
         self._policy = policy
@@ -165,6 +177,12 @@ class Greeter:
         self._lateness_s = 0.0  # how long, in all, this node was called later than it had asked to be
         self._slowness = Slowness()
         self._digest_for = digest_for
+        self._life = life
+        self._life_elsewhere = life_elsewhere
+        self.rivals = Rivals()
+        self.clashes = 0
+        self.clash_told_by: Name | None = None
+        self._clash_since_s = self._clash_s = float("-inf")
         self.ports: dict[int, LinkPort] = {}
 
     def set_timing(self, index: int, timing: Timing) -> None:
@@ -226,6 +244,7 @@ class Greeter:
         if hello.sequence <= port.last_of(member.name, hello.nonce):
             raise StatementError(DropReason.REPLAYED, "hello")
         statement.verify(member.key)
+        self._refuse_rival(port, hello, member.name, arrival.mac, now.mono_s)
         if known is None:
             if len(port.neighbours) >= NEIGHBOURS_PER_PORT:
                 raise StatementError(DropReason.QUOTA, "neighbours on one port")
@@ -247,7 +266,8 @@ class Greeter:
         is_resized = known.mtu != mtu
         known.mac, known.mtu, known.nonce, known.candidate = arrival.mac, mtu, hello.nonce, b""
         known.sequence, known.digest, known.greeted_s = hello.sequence, hello.digest, now.mono_s
-        known.member, known.checked_s = member, now.mono_s
+        known.member, known.checked_s, known.life = member, now.mono_s, hello.life
+        self._note_clash(port, known, hello, now.mono_s)
         self._alive(known, now.mono_s)
         if is_two_way and known.keepalives is None:
             self._begin_keepalives(port, known, hello, now.mono_s)
@@ -257,6 +277,71 @@ class Greeter:
         if change is None and is_resized and known.state is NeighbourState.UP:
             return known, known.state
         return change
+
+    def _refuse_rival(self, port: LinkPort, hello: Hello, name: Name, mac: bytes, now_s: float) -> None:
+        """Take a hello's word only if no older node with its identity is alive; a younger one is let go.
+
+        Raises:
+            StatementError: IN_USE.
+        """
+        others = [
+            other
+            for each in self.ports.values()
+            if (other := each.neighbours.get(name)) is not None
+            and other.life != hello.life
+            and now_s < self._gone_at_s(other)
+        ]
+        if any((other.port, other.mac) == (port.index, mac) for other in others):
+            return  # it was restarted there
+        elsewhere = self._life_elsewhere(name)
+        has_older = any(other.life < hello.life for other in others)
+        if not others and (elsewhere is None or hello.life <= elsewhere):
+            return
+        for other in others:
+            if self.rivals.tell(other.port, other.nonce, name, now_s):
+                self.ports[other.port].hurry(now_s)
+            if not has_older:
+                self.let_go(other, now_s)
+        if not has_older and (elsewhere is None or hello.life <= elsewhere):
+            return
+        self.rivals.refuse(name, now_s)
+        if self.rivals.tell(port.index, hello.nonce, name, now_s):
+            port.hurry(now_s)
+        raise StatementError(DropReason.IN_USE, "an older node with this identity is alive")
+
+    def let_go(self, neighbour: Neighbour, now_s: float) -> None:
+        """Have ``expire`` let a neighbour go, for an older node with its identity is alive."""
+        self._next_s = None
+        self.rivals.refuse(neighbour.name, now_s)
+        self.rivals.tell(neighbour.port, neighbour.nonce, neighbour.name, now_s)
+        neighbour.heard_s = float("-inf")
+
+    def tell_rivals(self, name: Name, now_s: float) -> None:
+        """Tell a neighbour, where it is one, that another node has its identity."""
+        for port in self.ports.values():
+            held = port.neighbours.get(name)
+            if held is not None and self.rivals.tell(port.index, held.nonce, name, now_s):
+                self._next_s = None
+                port.hurry(now_s)
+
+    def note_clash(self, told_by: Name, now_s: float, *, is_proven: bool = False) -> None:
+        """Note that another node has our own identity.
+
+        Args:
+            is_proven: it counts at once; else when it lasts, for an earlier life of ours may linger.
+        """
+        if now_s > self._clash_s + _CLASH_PAUSE_S:
+            self._clash_since_s = now_s
+        self._clash_s = now_s
+        if is_proven or now_s >= self._clash_since_s + _CLASH_S:
+            self.clashes += 1
+            self.clash_told_by = told_by
+
+    def _note_clash(self, port: LinkPort, neighbour: Neighbour, hello: Hello, now_s: float) -> None:
+        """Note what a neighbour's hello says of our identity."""
+        neighbour.refuses_us = port.nonce in hello.rivals and port.nonce not in hello.heard
+        if port.nonce in hello.rivals:
+            self.note_clash(neighbour.name, now_s)
 
     def receive_keepalive(self, arrival: Arrival, header: Header, now: Instant) -> Neighbour:
         """Take a keepalive; return the neighbour that it is of.
@@ -387,7 +472,7 @@ class Greeter:
         identity, timing = self._identity, self._timings.get(port.index, self._timing)
         hello = Hello(
             port.nonce, port.sequence, heard, port.own_mtu, self._digest_for(port), identity.membership,
-            timing, port.exchange_key.public,
+            timing, port.exchange_key.public, self._life, self.rivals.on(port.index, now_s),
         )  # fmt: skip
         return self._splitter.split(Kind.HELLO, hello.to_wire(identity.name, identity.key), port.hello_mtu)
 

@@ -16,10 +16,20 @@ from gdp.errors import DropReason, StatementError
 from gdp.limits import FRAME_MAX_BYTES
 from gdp.names import Name
 
-__all__ = ["DIGEST_BYTES", "INTERVAL_MAX_MS", "MULTIPLIER_MAX", "NONCE_BYTES", "NO_KEEPALIVES", "Hello", "Timing"]
+__all__ = [
+    "DIGEST_BYTES",
+    "INTERVAL_MAX_MS",
+    "LIFE_BYTES",
+    "MULTIPLIER_MAX",
+    "NONCE_BYTES",
+    "NO_KEEPALIVES",
+    "Hello",
+    "Timing",
+]
 
 NONCE_BYTES: Final = 8
 DIGEST_BYTES: Final = 8
+LIFE_BYTES: Final = 16  # first sequence number (wall-clock milliseconds of the start), incarnation; big-endian
 HEARD_MAX: Final = 32
 INTERVAL_MAX_MS: Final = 60_000
 MULTIPLIER_MAX: Final = 255
@@ -59,6 +69,8 @@ class Hello:
         membership: the sender's certificate, DER.
         timing: what the sender wants of keepalives.
         exchange_key: X25519, for the key of keepalives; empty where the sender wants none.
+        life: mark of the sender's life, ``LIFE_BYTES``.
+        rivals: nonces of those at this port whose identity another node has, too; refused are those not in ``heard``.
     """
 
     nonce: bytes
@@ -69,6 +81,8 @@ class Hello:
     membership: bytes
     timing: Timing = NO_KEEPALIVES
     exchange_key: bytes = b""
+    life: bytes = bytes(LIFE_BYTES)
+    rivals: tuple[bytes, ...] = ()
 
     def to_wire(self, signer: Name, key: SigningKey) -> bytes:
         """Return the signed statement."""
@@ -81,6 +95,8 @@ class Hello:
             "c": self.membership,
             "k": list(self.timing),
             "x": self.exchange_key,
+            "b": self.life,
+            "u": list(self.rivals[:HEARD_MAX]),
         }
         return sign(StatementType.HELLO, body, signer, key)
 
@@ -100,6 +116,8 @@ class Hello:
             fields.bytes_("c"),
             _timing(fields),
             fields.bytes_("x", EXCHANGE_KEY_BYTES) if fields.get("x") != b"" else b"",
+            fields.bytes_("b", LIFE_BYTES),
+            tuple(fields.byte_strings("u", HEARD_MAX, NONCE_BYTES)),
         )
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final, NamedTuple
 
-from gdp.control.hello import NONCE_BYTES
+from gdp.control.hello import LIFE_BYTES, NONCE_BYTES
 from gdp.crypto.fields import Fields
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import StatementType, sign
@@ -51,11 +51,13 @@ class AttachedRib(NamedTuple):
     Args:
         domain: the RIB's own, which may differ from the switch's.
         session: nonce of its present session with its switch; a restarted or moved RIB has another one.
+        life: mark of its life (``LIFE_BYTES``), which tells two nodes with one identity apart.
     """
 
     name: Name
     domain: Name
     session: bytes
+    life: bytes = bytes(LIFE_BYTES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +72,8 @@ class LinkState:
     inside: tuple[Adjacency, ...]  # BORDER only
     ribs: tuple[AttachedRib, ...]  # attached here (DOMAIN), or reachable within this domain (BORDER)
     members: tuple[Name, ...] = ()  # BORDER only: switches of the domain that are reachable within it from here
+    life: bytes = bytes(LIFE_BYTES)  # mark of the origin's life
+    refused: tuple[Name, ...] = ()  # identities refused at this switch, for an older node has them
 
     def to_wire(self, key: SigningKey, membership: bytes) -> bytes:
         """Return the signed statement."""
@@ -80,6 +84,8 @@ class LinkState:
             "i": [list(each) for each in self.inside[:LINKS_MAX]],
             "r": [list(each) for each in self.ribs[:RIBS_MAX]],
             "m": list(self.members[:MEMBERS_MAX]),
+            "b": self.life,
+            "u": list(self.refused[:RIBS_MAX]),
             "c": membership,
         }
         return sign(StatementType.LINK_STATE, body, self.origin, key)
@@ -103,6 +109,8 @@ class LinkState:
             _adjacencies(fields, "i"),
             _ribs(fields),
             tuple(fields.names("m", MEMBERS_MAX)),
+            fields.bytes_("b", LIFE_BYTES),
+            tuple(fields.names("u", RIBS_MAX)),
         )
 
 
@@ -110,10 +118,10 @@ def _ribs(fields: Fields) -> tuple[AttachedRib, ...]:
     found = []
     for each in fields.list_("r", RIBS_MAX):
         match each:
-            case [bytes(name), bytes(domain), bytes(session)] if (
-                len(name) == len(domain) == 32 and len(session) == NONCE_BYTES
+            case [bytes(name), bytes(domain), bytes(session), bytes(life)] if (
+                len(name) == len(domain) == 32 and len(session) == NONCE_BYTES and len(life) == LIFE_BYTES
             ):
-                found.append(AttachedRib(Name(name), Name(domain), session))
+                found.append(AttachedRib(Name(name), Name(domain), session, life))
             case _:
                 raise StatementError(DropReason.MALFORMED, "RIB")
     return tuple(found)

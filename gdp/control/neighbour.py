@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
+from gdp.control.hello import LIFE_BYTES
 from gdp.control.keepalive import KeepaliveSession
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.keys import PublicKey
@@ -78,3 +79,5 @@ class Neighbour:
     greeted_s: float = 0.0  # when its last hello came
     keepalives: KeepaliveSession | None = None  # while it is up and both ends want them
     lateness_s: float = 0.0  # of this node, in all, when the neighbour was last heard
+    life: bytes = bytes(LIFE_BYTES)
+    refuses_us: bool = False  # its last hello said that an older node has our identity

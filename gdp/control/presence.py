@@ -7,7 +7,8 @@ own name in a new incarnation, from another switch, asks the older one's switch:
     newer node --claim--> its switch --relay--> RIB --presence question--> older node's switch --the same--> older node
                                      <-IN_USE--     <--presence answer--   (heard since: there; lost: gone)
 
-The newer one asks again until the older one is gone.
+The newer one asks again until the older one is gone. Where the older one is of another domain, only the tier above
+knows of it: what that has refused is passed up again and again, and not believed here until it is taken there.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ __all__ = ["IdentityChecks", "Presence"]
 
 NO_ANSWER_S: Final = 1.5  # above the time after which a switch gives up a silent neighbour
 _BELIEVED_S: Final = 0.5  # an answer "is there" stands for so long before the switch is asked again
+_REFUSED_ABOVE_S: Final = 10.0  # a refusal from above stands for so long; a refused node asks more often
 _CHECKS_MAX: Final = 1_024
 
 
@@ -85,6 +87,7 @@ class IdentityChecks:
 
     def __init__(self) -> None:
         self._checks: dict[Name, _Check] = {}
+        self._refused_above: dict[Name, tuple[int, float]] = {}  # incarnation, and until when
         self.clashes = 0
 
     def is_free(self, node: Name, incarnation: int, switch: Name, now_s: float) -> bool:
@@ -110,6 +113,22 @@ class IdentityChecks:
             del self._checks[next(iter(self._checks))]
         self._checks[node] = _Check(incarnation, switch, now_s)
         return True
+
+    def refused_above(self, node: Name, incarnation: int, now_s: float) -> None:
+        """Note that the tier above knows of an older node with this identity."""
+        self._refused_above.pop(node, None)
+        if len(self._refused_above) >= _CHECKS_MAX:
+            del self._refused_above[next(iter(self._refused_above))]
+        self._refused_above[node] = incarnation, now_s + _REFUSED_ABOVE_S
+
+    def taken_above(self, node: Name) -> None:
+        """Note that the tier above takes a node's claim."""
+        self._refused_above.pop(node, None)
+
+    def is_refused_above(self, node: Name, incarnation: int, now_s: float) -> bool:
+        """Return whether a node has to be taken by the tier above first."""
+        refused, until_s = self._refused_above.get(node, (incarnation, now_s))
+        return refused == incarnation and now_s < until_s
 
     def answered(self, presence: Presence, switch: Name, now_s: float) -> None:
         """Take a verified answer of a switch; one to no open question is ignored."""

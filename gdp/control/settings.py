@@ -39,6 +39,11 @@ class NodeSettings:
     detect_multiplier: int = DETECT_MULTIPLIER
 
     @property
+    def life(self) -> bytes:
+        """Return the mark of this life, ``LIFE_BYTES``: of two, that of the older one is less."""
+        return self.first_sequence.to_bytes(8, "big") + self.incarnation.to_bytes(8, "big")
+
+    @property
     def timing(self) -> Timing:
         """Return what this node wants of keepalives."""
         every_ms = round(KEEPALIVE_MS * self.dead_s / DEAD_S) if self.keepalive_ms is None else self.keepalive_ms

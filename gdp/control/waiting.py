@@ -73,7 +73,9 @@ def port_waits(port: LinkPort, wanted: Collection[Role]) -> Iterator[Wait]:
     if any(each.state is NeighbourState.UP and each.role in wanted for each in neighbours):
         return
     deaf = next((each for each in neighbours if each.state is not NeighbourState.UP and each.role in wanted), None)
-    if deaf is not None:
+    if any(each.refuses_us for each in neighbours):
+        yield Wait(WaitReason.IN_USE, port.index)
+    elif deaf is not None:
         yield Wait(WaitReason.ONE_WAY, port.index, name=deaf.name)
     elif neighbours:
         yield Wait(WaitReason.NO_SWITCH, port.index)

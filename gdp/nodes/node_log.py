@@ -62,6 +62,7 @@ class NodeLog:
         self._known_rib: Name | None = None
         self._rival = rival
         self._known_rival: Name | None = None
+        self._known_clash: Name | None = None
         self._local_name = local_name
         self._on_wait = on_wait
         self._neighbours: set[tuple[int, Name]] = set()
@@ -76,6 +77,10 @@ class NodeLog:
         if (rival := self._rival()) is not None and rival != self._known_rival:
             self._known_rival = rival
             log.error("another node with this identity asked for its place at switch %s and was refused", rival.short)
+        told_by = self._greeter.clash_told_by
+        if told_by is not None and told_by != self._known_clash:
+            self._known_clash = told_by
+            log.error("another node with this identity is alive, says switch %s; the older one stays", told_by.short)
         for wait in self._wait_log.update(self._waits(now.mono_s), now.mono_s):
             text = self._text(wait)
             log.log(logging.ERROR if wait.reason is WaitReason.IN_USE else logging.WARNING, "waiting: %s", text)

@@ -103,5 +103,5 @@ def _sources(host: RibHost, plane: Plane, node_log: NodeLog) -> Sources:
         },
         rib_refusals=lambda: {reason.label: count for reason, count in list(rib.refusals.items())},
         waiting=node_log.metrics,
-        clashes=lambda: rib.identities.clashes,
+        clashes=lambda: rib.identities.clashes + host.attachment.greeter.clashes,
     )

@@ -93,6 +93,7 @@ def run_switch(
             on_wait=on_wait,
         )
         runtime.every(LOOK_S, node_log.look)
+        runtime.every(LOOK_S, lambda _: _end_if_displaced(switch))
         stack.enter_context(runtime.signals(lambda: _revoke(switch, config.revocations)))
         _revoke(switch, config.revocations)
         if config.metrics is not None:
@@ -117,6 +118,12 @@ def _revoke(switch: Switch, directory: Path | None) -> None:
             log.error("revocation not taken file=%s reason=%s", path, error)
 
 
+def _end_if_displaced(switch: Switch) -> None:
+    """Raise a ``LocalError`` where an older switch with this identity is alive."""
+    if switch.is_displaced:
+        raise LocalError("an older switch with this identity is alive; this one ends: give it keys of its own")
+
+
 def _widest(ifaces: Sequence[str]) -> int:
     """Return the largest MTU of these devices; what is not there, opening the port will tell."""
     with contextlib.closing(LinkWatch()) as links:
@@ -138,4 +145,5 @@ def _sources(switch: Switch, chosen: Chosen, node_log: NodeLog) -> Sources:
         entries=chosen.entry_counts,
         parked_frames=lambda: len(switch.parked),
         waiting=node_log.metrics,
+        clashes=lambda: switch.greeter.clashes,
     )

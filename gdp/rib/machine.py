@@ -246,6 +246,12 @@ class Rib:
             if member.domain != self._policy.own and not claim.is_global:
                 raise StatementError(DropReason.WRONG_DOMAIN, "a local name of another domain")
             self._check_identity(claim, now.mono_s)
+            if claim.right is Right.ATTACH and self.identities.is_refused_above(
+                claim.node, claim.incarnation, now.mono_s
+            ):
+                route = self._route(claim, relay.transit, member, now)
+                self._pass_up(route, relay.statement, route.sequence, now.mono_s)
+                raise StatementError(DropReason.IN_USE, "another node with this identity, says the tier above")
             known = self._check_news(claim, member)
         except StatementError as error:
             self._refuse(passed_on, member, error, now.mono_s)
@@ -503,10 +509,19 @@ class Rib:
     def _take_verdict_from_above(self, statement: Statement, now: Instant) -> None:
         self._upper_member(statement, now)
         verdict = Verdict.from_fields(statement.fields)
+        key = verdict.name, verdict.advertiser
         if verdict.refused in (None, DropReason.STALE):
-            self._upstream.settle((verdict.name, verdict.advertiser), verdict.sequence)
-        else:
-            self._upstream.refused((verdict.name, verdict.advertiser))
+            self._upstream.settle(key, verdict.sequence)
+            self.identities.taken_above(verdict.name)
+            return
+        self._upstream.refused(key)
+        known = self._store.get(*key)
+        if verdict.refused is DropReason.IN_USE and isinstance(known, Route) and not known.is_from_above:
+            incarnation = ClaimBody.from_statement(parse(known.claim)).incarnation
+            self.identities.refused_above(verdict.name, incarnation, now.mono_s)
+            self._store.withdraw(*key)
+            self._tell_gone(known, now.mono_s)
+            self._judge(*key, DropReason.IN_USE, known.sequence, known.sender)
 
     def _take_answer_from_above(self, statement: Statement, now: Instant) -> None:
         fields = statement.fields

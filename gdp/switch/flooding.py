@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Final
 
 from gdp.control.greeter import Greeter, LinkPort
-from gdp.control.hello import DIGEST_BYTES
+from gdp.control.hello import DIGEST_BYTES, LIFE_BYTES
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
 from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
@@ -29,6 +29,8 @@ from gdp.trust.domain import Policy
 
 __all__ = ["Flooding"]
 
+_NEVER: Final = 1 << 64
+_LIVES_MAX: Final = 64
 _STUB_S: Final = 2.0  # after a restart, until the trees and ways through here are set up
 _STUB_COST: Final = 1 << 20  # above every real way, so only what has no other way passes
 _FLAPPING_COST: Final = 1 << 19  # a link that flaps is better than none, and worse than any other
@@ -45,16 +47,30 @@ class Flooding:
     Args:
         send: sends a link state to a neighbour.
         first_sequence: above every sequence number of an earlier life; wall-clock milliseconds do.
+        life: mark of this life, ``LIFE_BYTES``.
+
+    Attributes:
+        is_displaced: an older switch with our identity is alive. Then we say nothing any more.
     """
 
     def __init__(
-        self, identity: Identity, policy: Policy, greeter: Greeter, send: SendStatement, first_sequence: int
+        self,
+        identity: Identity,
+        policy: Policy,
+        greeter: Greeter,
+        send: SendStatement,
+        first_sequence: int,
+        life: bytes = bytes(LIFE_BYTES),
     ) -> None:
         self._identity = identity
         self._policy = policy
         self._greeter = greeter
         self._send = send
         self._sequence = self._first_sequence = first_sequence
+        self._life = life
+        self._outdone: dict[bytes, int] = {}  # other lives of ours that were heard, and what was said above them
+        self.is_displaced = False
+        self._rivals_seen = 0
         self._begun_s: float | None = None
         self._stub_until_s: float | None = None
         self._was_stub = False
@@ -97,6 +113,11 @@ class Flooding:
             return False
         self._flood(state.scope, statement.wire, but=neighbour)
         return True
+
+    def tell_of_rivals(self, now_s: float) -> None:
+        """Say anew which identities are refused here, if that changed; cheap when it did not."""
+        if self._rivals_seen != self._greeter.rivals.changes:
+            self._originate(now_s)
 
     def neighbour_changed(self, now_s: float) -> None:
         """Say anew what our links are, if that changed."""
@@ -142,8 +163,12 @@ class Flooding:
     def _originate(self, now_s: float) -> None:
         switches = [each for each in self._greeter.all_up() if each.role == Role.SWITCH]
         links = tuple(sorted(Adjacency(n.name, n.domain, self._cost(n), n.mtu) for n in switches))
-        ribs = {AttachedRib(n.name, n.domain, n.nonce) for n in self._greeter.all_up() if n.role == Role.RIB}
-        self._say(Scope.DOMAIN, links, (), tuple(sorted(ribs)), (), now_s)
+        if self.is_displaced:
+            return
+        self._rivals_seen = self._greeter.rivals.changes
+        ribs = {AttachedRib(n.name, n.domain, n.nonce, n.life) for n in self._greeter.all_up() if n.role == Role.RIB}
+        refused = tuple(self._greeter.rivals.refused(now_s))
+        self._say(Scope.DOMAIN, links, (), tuple(sorted(ribs)), (), refused, now_s)
         leaving = tuple(link for link in links if link.domain != self._domain)
         if leaving or Scope.BORDER in self._said or self.link_states.sequence_of(self._identity.name, Scope.BORDER):
             inside = tuple(
@@ -152,7 +177,7 @@ class Flooding:
                 if border != self._identity.name
             )
             members = tuple(sorted(self.paths.members()))
-            self._say(Scope.BORDER, leaving, inside, tuple(sorted(self.paths.ribs_inside())), members, now_s)
+            self._say(Scope.BORDER, leaving, inside, tuple(sorted(self.paths.ribs_inside())), members, refused, now_s)
 
     def _say(
         self,
@@ -161,21 +186,30 @@ class Flooding:
         inside: tuple[Adjacency, ...],
         ribs: tuple[AttachedRib, ...],
         members: tuple[Name, ...],
+        refused: tuple[Name, ...],
         now_s: float,
     ) -> None:
-        said = (links, inside, ribs, members)
+        said = (links, inside, ribs, members, refused)
         if self._said.get(scope) == said:
             return
         self._said[scope] = said
         self._sequence += 1
-        state = LinkState(self._identity.name, self._domain, scope, self._sequence, links, inside, ribs, members)
+        state = LinkState(
+            self._identity.name, self._domain, scope, self._sequence, links, inside, ribs, members, self._life, refused
+        )
         wire = state.to_wire(self._identity.key, self._identity.membership)
         self.link_states.put(state, wire, now_s)
         self._refresh_at_s = now_s + LINK_STATE_REFRESH_S
         self._flood(scope, wire)
 
     def _outdo(self, state: LinkState, now_s: float) -> None:
-        """Answer a link state of an earlier life of ours that others still hold."""
+        """Answer a link state of ours that we did not send: others still hold it, or another node has our identity.
+
+        What is left of an earlier life does not answer. So whoever goes above what was said in answer is alive.
+        """
+        if state.life != self._life and state.sequence > self._outdone.get(state.life, _NEVER):
+            self._greeter.note_clash(self._identity.name, now_s, is_proven=True)
+            self.is_displaced = self.is_displaced or state.life < self._life
         is_early = self._begun_s is not None and now_s - self._begun_s < _EARLY_S
         if is_early and not self._was_stub and state.sequence <= self._first_sequence:
             self._was_stub, self._stub_until_s = True, now_s + _STUB_S
@@ -184,6 +218,8 @@ class Flooding:
             self._sequence = state.sequence
             self._said.clear()
             self._originate(now_s)
+            if state.life != self._life and len(self._outdone) < _LIVES_MAX:
+                self._outdone.setdefault(state.life, self._sequence)
 
     def _flood(self, scope: Scope, wire: bytes, but: Neighbour | None = None) -> None:
         for neighbour in self._greeter.all_up():

@@ -157,13 +157,19 @@ class Inquirer:
         self._unicast.send(frames, self.rib, self._identity.name, now_s)
 
     def receive(self, statement: Statement, now: Instant) -> None:
-        """Take a RIB's answer or verdict, or what a node's former switch knows.
+        """Take a RIB's answer, verdict or question, or what a node's former switch knows.
+
+        Whether a node is there any RIB of a trusted domain may ask: a tier above may know of another one.
 
         Raises:
             StatementError: it does not hold, or is from nobody who was asked.
         """
         fields = statement.fields
         member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
+        if statement.type is StatementType.PRESENCE and member.role is Role.RIB and member.name == statement.signer:
+            statement.verify(member.key)
+            self._presence.ask(Presence.from_fields(fields), member.name, statement.wire, now.mono_s)
+            return
         if member.name != statement.signer or not self._was_asked(member, now.mono_s):
             raise StatementError(DropReason.WRONG_DOMAIN, "an answer from nobody who was asked")
         statement.verify(member.key)
@@ -173,9 +179,6 @@ class Inquirer:
         self._rib_answered(member.name, now.mono_s)
         if statement.type is StatementType.VERDICT:
             self._take_verdict(statement)
-            return
-        if statement.type is StatementType.PRESENCE:
-            self._presence.ask(Presence.from_fields(fields), member.name, statement.wire, now.mono_s)
             return
         statement.expect(StatementType.ANSWER)
         answer = Answer.from_fields(fields)

@@ -31,7 +31,7 @@ class LinkStates:
     """The link-state database of one switch.
 
     Attributes:
-        version: rises with every change that may move a path.
+        version: rises with every change that may move a path, or of whose identity is whose.
     """
 
     def __init__(self, domain: Name) -> None:
@@ -110,4 +110,4 @@ class LinkStates:
 
 
 def _ways(state: LinkState) -> tuple[object, ...]:
-    return state.links, state.inside, state.ribs, state.members
+    return state.links, state.inside, state.ribs, state.members, state.life, state.refused

@@ -52,6 +52,7 @@ from gdp.trust.verifier import ClaimVerifier
 __all__ = ["Switch"]
 
 _PROTECT_S: Final = 0.1  # from new paths to their alternates, which nobody waits for
+_RIVALS_S: Final = 1.0  # between two looks at identities that are refused elsewhere
 _CONTROL = frozenset(kind.value for kind in Kind if kind >= CONTROL_FROM)
 
 
@@ -78,10 +79,14 @@ class Switch:
             dead_s=settings.dead_s,
             timing=settings.timing,
             incarnation=settings.incarnation,
+            life=settings.life,
             digest_for=self._digest_for,
+            life_elsewhere=self._life_elsewhere,
         )
         self._outbox = Outbox(self.greeter, self._splitter)
-        self._flooding = Flooding(identity, policy, self.greeter, self._send_link_state, settings.first_sequence)
+        self._flooding = Flooding(
+            identity, policy, self.greeter, self._send_link_state, settings.first_sequence, settings.life
+        )
         self._paths = self._flooding.paths
         self._verifier = ClaimVerifier(policy)
         self._incarnation = settings.incarnation
@@ -104,7 +109,7 @@ class Switch:
         self._seen_version = -1
         self._spf_delay = SpfDelay()
         self._protect_at_s: float | None = None  # when alternates are computed
-        self._followed_s = float("-inf")
+        self._followed_s = self._rivals_sought_s = float("-inf")
         self._presence = PresenceAnswers(identity, self.greeter, self.attached, self.unicast, self._outbox)
         self.inquirer = Inquirer(
             identity, policy, self._paths, self.attached, self.places, self.parked, self.planter, self.unicast,
@@ -126,6 +131,11 @@ class Switch:
     def rib(self) -> Name | None:
         """Return the RIB that is asked, or None while none is known."""
         return self.inquirer.rib
+
+    @property
+    def is_displaced(self) -> bool:
+        """Return whether an older switch with this identity is alive, so that this one has to end."""
+        return self._flooding.is_displaced
 
     @property
     def link_states(self) -> int:
@@ -169,6 +179,7 @@ class Switch:
         if has_others:
             self._rest_due_s = None
             self._presence.answer(now.mono_s)
+            self._flooding.tell_of_rivals(now.mono_s)
             self._plan_follow(now.mono_s)
 
     def timeout(self, now: Instant) -> None:
@@ -193,6 +204,8 @@ class Switch:
             self.unicast.refresh(now_s)
         if self.unicast.is_refreshing:
             self.unicast.refresh_more(now_s)
+        if now_s >= self._rivals_sought_s + _RIVALS_S:
+            self._look_for_rivals(now_s)
         self._joiner.expire(now_s)
         self._hellos.expire(now_s)
         self.parked.expire(now_s)
@@ -229,13 +242,15 @@ class Switch:
         ]
         if self.unicast.is_refreshing:
             times.append(self._followed_s)  # past: at once
+        if self._paths.refused_elsewhere():
+            times.append(self._rivals_sought_s + _RIVALS_S)
         if self.inquirer.rib is None:
             times.append(self.attached.next_expiry())
         return min(time for time in times if time is not None)
 
     def take(self) -> list[Transmit]:
-        """Return, once, what is to be sent."""
-        return self._outbox.take()
+        """Return, once, what is to be sent: nothing from a switch whose identity an older one has."""
+        return [] if self.is_displaced else self._outbox.take()
 
     def _revoke(self, statement: Statement, neighbour: Neighbour | None, now: Instant) -> None:
         for topic in self._revoker.take(statement, neighbour, now):
@@ -390,6 +405,23 @@ class Switch:
         self.unicast.refresh(now_s)
         self.planter.reroute(now_s)
         self.inquirer.links_changed(now_s)
+        self._look_for_rivals(now_s)
+
+    def _life_elsewhere(self, name: Name) -> bytes | None:
+        role = Role.SWITCH if self._paths.is_switch(name) else Role.RIB
+        return self._paths.life_of(name, role)
+
+    def _look_for_rivals(self, now_s: float) -> None:
+        """Let RIBs go that an older node with their identity outlives elsewhere; tell those that younger ones copy."""
+        self._rivals_sought_s = now_s
+        for neighbour in self.greeter.all_up():
+            elsewhere = self._life_elsewhere(neighbour.name) if neighbour.role is Role.RIB else None
+            if elsewhere is not None and elsewhere < neighbour.life:
+                self.greeter.let_go(neighbour, now_s)
+        for name in self._paths.refused_elsewhere():
+            self.greeter.tell_rivals(name, now_s)
+            if name == self.name:
+                self.greeter.note_clash(name, now_s)
 
     def _send_link_state(self, neighbour: Neighbour, wire: bytes) -> None:
         self._outbox.say(neighbour, Kind.LINK_STATE, wire)

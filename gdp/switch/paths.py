@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
 from gdp.control.link_state import MEMBERS_MAX, Adjacency, AttachedRib, LinkState, Scope
+from gdp.crypto.certificates import Role
 from gdp.names import Name
 from gdp.switch.link_states import LinkStates
 
@@ -53,6 +54,8 @@ class Paths:
         self._beyond: dict[Name, list[Name]] = {}  # by domain: borders that are reached over links between domains
         self._open_borders: dict[Name, list[Name]] = {}  # by domain: borders that could not list all their switches
         self._ribs: dict[Name, dict[Name, AttachedRib]] = {}  # RIB to the switches where it is attached or reached
+        self._lives: dict[Name, bytes] = {}  # of every switch whose link state is known
+        self._refused: frozenset[Name] = frozenset()
         self._ways: dict[tuple[Name, frozenset[Name]], dict[Name, Way]] = {}
         self._alternates: dict[tuple[Name, frozenset[Name]], Name | None] = {}
         self.has_alternates = False
@@ -128,6 +131,22 @@ class Paths:
         found = ((self.to_switch(host, self._domains[host], allowed | {self._domains[host]}), host) for host in hosts)
         reachable = [(way, host) for way, host in found if way is not None]
         return min(reachable, key=lambda each: each[0].distance, default=(None, None))
+
+    def life_of(self, name: Name, role: Role) -> bytes | None:
+        """Return the mark of the oldest life in which a switch or a RIB is reached over other switches, or None."""
+        self._refresh()
+        if role is Role.RIB:
+            hosts = {host: rib.life for host, rib in self._ribs.get(name, {}).items() if host != self._me}
+        else:
+            hosts = {} if (life := self._lives.get(name)) is None else {name: life}
+        everywhere = frozenset(self._domains.values())
+        lives = [life for host, life in hosts.items() if host in self._to_all(everywhere)]
+        return min(lives, default=None)
+
+    def refused_elsewhere(self) -> frozenset[Name]:
+        """Return the identities that other switches refuse at present, for an older node has them."""
+        self._refresh()
+        return self._refused
 
     def is_switch(self, name: Name) -> bool:
         """Return whether a link state names this switch."""
@@ -209,6 +228,9 @@ class Paths:
         self._domains = {member: state.domain for state in beyond for member in state.members}
         self._domains |= {state.origin: state.domain for state in [*home, *beyond]}
         self._borders_of, self._open_borders, self._beyond, self._ribs = {}, {}, {}, {}
+        others = [state for state in [*inside, *beyond] if state.origin != self._me]
+        self._lives = {state.origin: state.life for state in others}
+        self._refused = frozenset(name for state in others for name in state.refused)
         for state in beyond:
             self._beyond.setdefault(state.domain, []).append(state.origin)
             for member in state.members:

@@ -12,6 +12,7 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Final
 
+from gdp.crypto.certificates import Role
 from gdp.errors import DropReason
 from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_AT, SOURCE_AT, Header
 from gdp.names import Name
@@ -181,7 +182,7 @@ class Unicast:
             self._install(destination, b"", self._outbox.hop_at(at.port, at.mac), source, at.expires_s)
             return None
         neighbour = self._outbox.neighbour(destination)
-        if neighbour is not None:
+        if neighbour is not None and neighbour.role is not Role.PROXY:  # a proxy is where its claim was taken
             self._install(destination, b"", self._outbox.hop(neighbour), source, now_s + NODE_LEASE_S)
             return None
         if self._paths.is_switch(destination):

@@ -1,0 +1,75 @@
+"""Two nodes with one identity (copied keys, a cloned disk), as a neighbour of both sees them.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds). A node says in its hellos when its life began. Of two lives
+of one identity that are alive at once, the older one keeps its place; hellos of the other one are refused. Both are
+told: for ``_TOLD_S`` after the last refusal hellos name the sessions of both (``Hello.rivals``). Whoever finds its own
+session there, but not among those that are heard, is the refused one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, TypeVar
+
+from gdp.names import Name
+
+__all__ = ["Rivals"]
+
+_TOLD_S: Final = 3.0
+_K = TypeVar("_K")
+_V = TypeVar("_V")
+_RIVALS_MAX: Final = 64  # sessions, and identities; the one named first makes room
+
+
+@dataclass(slots=True)
+class _Session:
+    name: Name
+    until_s: float
+
+
+class Rivals:
+    """The sessions at this node's ports whose identity another node has, too.
+
+    Attributes:
+        refusals: hellos that were refused because an older node has their identity.
+        changes: how often an identity was refused anew.
+    """
+
+    def __init__(self) -> None:
+        self._sessions: dict[tuple[int, bytes], _Session] = {}
+        self._refused: dict[Name, float] = {}
+        self.refusals = 0
+        self.changes = 0
+
+    def refuse(self, name: Name, now_s: float) -> None:
+        """Note that a hello was refused."""
+        self.refusals += 1
+        self.changes += self._refused.get(name, now_s) <= now_s
+        _put(self._refused, name, now_s + _TOLD_S)
+
+    def tell(self, port: int, nonce: bytes, name: Name, now_s: float) -> bool:
+        """See that a session hears of its rival; return whether it has not yet."""
+        known = self._sessions.get((port, nonce))
+        _put(self._sessions, (port, nonce), _Session(name, now_s + _TOLD_S))
+        return known is None or known.until_s <= now_s
+
+    def on(self, port: int, now_s: float) -> tuple[bytes, ...]:
+        """Return the sessions at a port that have rivals."""
+        if not self._sessions:
+            return ()
+        self._sessions = {key: each for key, each in self._sessions.items() if each.until_s > now_s}
+        return tuple(nonce for its, nonce in self._sessions if its == port)
+
+    def refused(self, now_s: float) -> list[Name]:
+        """Return the identities of which a hello was refused lately."""
+        if not self._refused:
+            return []
+        self._refused = {name: until_s for name, until_s in self._refused.items() if until_s > now_s}
+        return sorted(self._refused)
+
+
+def _put(held: dict[_K, _V], key: _K, value: _V) -> None:
+    held.pop(key, None)
+    if len(held) >= _RIVALS_MAX:
+        del held[next(iter(held))]
+    held[key] = value
