@@ -29,8 +29,8 @@ from gdp.trust.domain import Policy
 
 __all__ = ["Flooding"]
 
-_NEVER: Final = 1 << 64
 _LIVES_MAX: Final = 64
+_ANSWERS: Final = 5  # of another life of ours to what we say; a few old link states may be left of a dead one
 _STUB_S: Final = 2.0  # after a restart, until the trees and ways through here are set up
 _STUB_COST: Final = 1 << 20  # above every real way, so only what has no other way passes
 _FLAPPING_COST: Final = 1 << 19  # a link that flaps is better than none, and worse than any other
@@ -68,7 +68,7 @@ class Flooding:
         self._send = send
         self._sequence = self._first_sequence = first_sequence
         self._life = life
-        self._outdone: dict[bytes, int] = {}  # other lives of ours that were heard, and what was said above them
+        self._answers: dict[tuple[bytes, Scope], int] = {}  # by life: how often it went above what we said
         self.is_displaced = False
         self._rivals_seen = 0
         self._begun_s: float | None = None
@@ -205,11 +205,15 @@ class Flooding:
     def _outdo(self, state: LinkState, now_s: float) -> None:
         """Answer a link state of ours that we did not send: others still hold it, or another node has our identity.
 
-        What is left of an earlier life does not answer. So whoever goes above what was said in answer is alive.
+        What is left of an earlier life does not answer. So who goes above what we say, again and again, is alive.
         """
-        if state.life != self._life and state.sequence > self._outdone.get(state.life, _NEVER):
-            self._greeter.note_clash(self._identity.name, now_s, is_proven=True)
-            self.is_displaced = self.is_displaced or state.life < self._life
+        key = state.life, state.scope
+        if state.life != self._life and state.sequence > self._sequence:
+            if key in self._answers or len(self._answers) < _LIVES_MAX:
+                self._answers[key] = self._answers.get(key, 0) + 1
+            if self._answers.get(key, 0) > _ANSWERS:
+                self._greeter.note_clash(self._identity.name, now_s, is_proven=True)
+                self.is_displaced = self.is_displaced or state.life < self._life
         is_early = self._begun_s is not None and now_s - self._begun_s < _EARLY_S
         if is_early and not self._was_stub and state.sequence <= self._first_sequence:
             self._was_stub, self._stub_until_s = True, now_s + _STUB_S
@@ -218,8 +222,6 @@ class Flooding:
             self._sequence = state.sequence
             self._said.clear()
             self._originate(now_s)
-            if state.life != self._life and len(self._outdone) < _LIVES_MAX:
-                self._outdone.setdefault(state.life, self._sequence)
 
     def _flood(self, scope: Scope, wire: bytes, but: Neighbour | None = None) -> None:
         for neighbour in self._greeter.all_up():
