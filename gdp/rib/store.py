@@ -139,6 +139,8 @@ class MemoryStore:
             withdrawn = self._withdrawn.get((name, advertiser))
             if withdrawn is not None and withdrawn.valid_until_unix_s <= unix_s:
                 self._forget_withdrawn(name, advertiser)
+                if self.changes is not None:
+                    self.changes.add((name, advertiser))
         return gone
 
     def next_expiry(self) -> float | None:

@@ -20,7 +20,6 @@ from gdp.control.replica import Entry, Key
 from gdp.crypto import cbor, cbor_writer
 from gdp.crypto.fields import Fields
 from gdp.errors import RemoteError
-from gdp.limits import LEASE_MAX_S
 
 __all__ = ["SLICE", "Snapshot"]
 
@@ -136,7 +135,7 @@ def _write(database: sqlite3.Connection, changes: Sequence[Change], unix_s: floa
         (
             _key(key),
             cbor_writer.encode(entry.to_fields()),
-            unix_s + (LEASE_MAX_S if entry.membership else entry.lease_s),
+            entry.until_unix_s or unix_s + entry.lease_s,
         )
         for key, entry in changes
         if entry is not None

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
+import sqlite3
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,6 +21,7 @@ from gdp.rib.store import MemoryStore
 from gdp.stores.cluster_link import ClusterLink
 from gdp.stores.snapshot import Snapshot
 from tests.gdp.stores.sites import (
+    EVIDENCE_S,
     ClusterPair,
     MemoryPair,
     Pair,
@@ -95,6 +99,51 @@ class TestEveryStore:
             rib.timeout(pair.site.now(5.1))
             pair.take(rib)
         assert [each.is_nobody for each in answers(pair.give(pair.two, pair.site.query("/a"), 5.1))] == [True]
+
+
+def test_peers_forget_a_withdrawal_when_the_claim_can_be_proven_no_more() -> None:
+    pair = MemoryPair(Site())
+    pair.sync()
+    pair.give(pair.one, pair.site.relay("/a", 1))
+    pair.give(pair.one, pair.site.withdrawal("/a", 2))
+    pair.sync()
+    held = [rib._store.count_of(pair.site.switch.name) for rib in (pair.one, pair.two)]
+    for later_s in range(EVIDENCE_S + 1, EVIDENCE_S + 5):
+        pair.sync(later_s)  # neither learns it again from the other
+    left = [rib._store.count_of(pair.site.switch.name) for rib in (pair.one, pair.two)]
+    assert (held, left) == ([1, 1], [0, 0])
+
+
+def test_a_peer_forgets_no_withdrawal_sooner_than_what_it_knows_of_the_claim_says() -> None:
+    pair = MemoryPair(Site())
+    pair.sync()
+    pair.give(pair.one, pair.site.relay("/a", 1))
+    pair.sync()
+    key = (pair.site.subject("/a").name, pair.site.robot.name)
+    pair.give(pair.one, pair.site.withdrawal("/a", 2))
+    entry = pair.one.entry_of(key, pair.site.now().mono_s)
+    assert entry is not None
+    pair.two.load([replace(entry, until_unix_s=int(pair.site.unix_s) + 10)], pair.site.now())
+    pair.two.timeout(pair.site.now(11.0))
+    assert [each.refused for each in verdicts(pair.give(pair.two, pair.site.relay("/a", 1), 11.0))] == [
+        DropReason.STALE
+    ]
+
+
+def test_a_snapshot_keeps_no_withdrawal_for_longer_than_the_rib(tmp_path: Path) -> None:
+    path = tmp_path / "rib.sqlite"
+    pair = SnapshotPair(Site(), path)
+    for number in range(3):
+        pair.give(pair.one, pair.site.relay(f"/{number}", 1))
+        pair.give(pair.one, pair.site.withdrawal(f"/{number}", 2))
+    pair.sync()
+    rows = []
+    for later_s in (0.0, EVIDENCE_S + 1.0):
+        pair.one.timeout(pair.site.now(later_s))
+        pair.sync(later_s)
+        with contextlib.closing(sqlite3.connect(path)) as database:
+            rows.append(database.execute("SELECT count(*) FROM entries").fetchone()[0])
+    assert rows == [3, 0]
 
 
 def test_of_two_writes_at_once_the_newer_wins_and_the_other_is_not_confirmed(servers: Path) -> None:
