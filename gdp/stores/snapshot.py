@@ -1,7 +1,8 @@
 """What a RIB with its store in memory held, on disk: read at the start, kept up to date in the background.
 
-Layer: I/O. SQLite, written by one thread in slices; a full disk or a broken file is reported, and the RIB goes on
-without. Entries prove themselves, so what is read is verified like what a peer sends.
+Layer: I/O. SQLite in WAL mode, written by one thread in slices, each of which is one transaction. A full disk or a
+broken file is reported once, and the RIB goes on without. A slice that cannot be written is tried again, so that no
+withdrawal is missing from the file. Entries prove themselves: what is read is verified like what a peer sends.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ __all__ = ["SLICE", "Snapshot"]
 log = logging.getLogger(__name__)
 
 SLICE: Final = 512  # entries at once
+RETRY_S: Final = 0.5  # between two tries of a slice that cannot be written
 _SLICES_WAITING_MAX: Final = 4
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS entries (key BLOB PRIMARY KEY, entry BLOB NOT NULL, end_unix_s REAL NOT NULL) WITHOUT ROWID
@@ -47,6 +49,8 @@ class Snapshot:
         self.failures = 0
         self.unreadable = 0
         self._has_failed = False
+        self._is_outdated = False  # the file holds what this RIB does not know
+        self._is_closing = threading.Event()
         self._thread = threading.Thread(target=self._work, name="snapshot", daemon=True)
 
     def load(self, unix_s: float) -> Iterator[list[Entry]]:
@@ -57,7 +61,9 @@ class Snapshot:
                 while slice_ := rows.fetchmany(SLICE):
                     yield [entry for row in slice_ if (entry := self._read(row[0], row[1] - unix_s)) is not None]
         except sqlite3.OperationalError as error:
-            self._report(error)
+            self.failures += 1
+            self._is_outdated = True
+            log.warning("snapshot not read path=%s reason=%s; the RIB starts without it", self._path, error)
         except sqlite3.DatabaseError as error:
             self._put_aside(error)
 
@@ -75,7 +81,8 @@ class Snapshot:
         self._slices.put_nowait((changes, unix_s))
 
     def close(self) -> None:
-        """Write what waits, and end."""
+        """Write what waits, each slice tried once, and end."""
+        self._is_closing.set()
         if self._thread.is_alive():
             self._slices.put(None)
             self._thread.join()
@@ -92,24 +99,45 @@ class Snapshot:
     def _work(self) -> None:
         database: sqlite3.Connection | None = None
         while (item := self._slices.get()) is not None:
-            try:
-                database = database or _opened(self._path)
-                with database:
-                    _write(database, *item)
-                if self._has_failed:
-                    log.info("snapshot written again path=%s", self._path)
-                self._has_failed = False
-            except sqlite3.Error as error:
-                self._report(error)
+            changes, unix_s = item
+            while True:
+                try:
+                    database = database or self._opened_to_write(unix_s)
+                    with database:
+                        _write(database, changes, unix_s)
+                except sqlite3.Error as error:
+                    self._write_failed(error)
+                    if self._is_closing.wait(RETRY_S):
+                        break
+                else:
+                    self._written()
+                    break
         if database is not None:
             database.close()
 
-    def _report(self, error: sqlite3.Error) -> None:
-        """Count each failure, report the first of a row: the RIB goes on without."""
+    def _opened_to_write(self, unix_s: float) -> sqlite3.Connection:
+        """Return the database without rows that no RIB would load."""
+        database = _opened(self._path)
+        try:
+            with database:
+                database.execute("DELETE FROM entries WHERE ? OR end_unix_s <= ?", (self._is_outdated, unix_s))
+        except sqlite3.Error:
+            database.close()
+            raise
+        self._is_outdated = False
+        return database
+
+    def _write_failed(self, error: sqlite3.Error) -> None:
+        """Count each failure, report the first of a row."""
         self.failures += 1
         if not self._has_failed:
-            log.warning("snapshot failed path=%s reason=%s; the RIB goes on without it", self._path, error)
+            log.warning("snapshot not written path=%s reason=%s; the RIB goes on without it", self._path, error)
         self._has_failed = True
+
+    def _written(self) -> None:
+        if self._has_failed:
+            log.info("snapshot written again path=%s", self._path)
+        self._has_failed = False
 
     def _put_aside(self, error: sqlite3.DatabaseError) -> None:
         self.failures += 1
@@ -122,10 +150,20 @@ class Snapshot:
 
 
 def _opened(path: Path) -> sqlite3.Connection:
+    """Return the database, its lock held: SQLite then needs no further file to read what a killed RIB left.
+
+    Raises:
+        sqlite3.Error: it cannot be opened, or is new and the disk is full.
+    """
     database = sqlite3.connect(path, timeout=1.0)
-    database.execute("PRAGMA journal_mode=WAL")
-    database.execute("PRAGMA synchronous=NORMAL")
-    database.execute(_SCHEMA)
+    try:
+        database.execute("PRAGMA locking_mode=EXCLUSIVE")  # before WAL, or a file of shared memory is made
+        database.execute("PRAGMA journal_mode=WAL")
+        database.execute("PRAGMA synchronous=NORMAL")
+        database.execute(_SCHEMA)
+    except sqlite3.Error:
+        database.close()
+        raise
     return database
 
 
