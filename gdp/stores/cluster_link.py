@@ -34,7 +34,7 @@ _ALONE_S: Final = 1.0
 _PING_S: Final = 1.0  # between two signs of life on a connection that only listens
 _MOVED: Final = ("MOVED", "ASK", "CLUSTERDOWN", "READONLY", "LOADING", "TRYAGAIN", "NOREPLICAS", "MASTERDOWN")
 
-Command = tuple[bytes | int, ...]  # the second item of which decides: a key
+Command = tuple[bytes | str | int, ...]  # the second item of which decides: a key
 
 
 def tag_of(name: Name) -> bytes:
@@ -76,6 +76,13 @@ class ClusterLink:
     def primary_of(self, name: Name) -> Address:
         """Return host and port of the primary that holds a name."""
         return self._primaries[tag_of(name)]
+
+    def ask_primaries(self, command: Command) -> list[object]:
+        """Send a command to each primary; where one did not answer, or is none any more, stands a ``StoreError``."""
+        replies = [reply for at in dict.fromkeys(self._primaries.values()) for reply in self._batch(at, [command])]
+        if any(isinstance(reply, StoreError) for reply in replies):
+            self._try_refresh()
+        return replies
 
     def execute(self, commands: Sequence[tuple[bytes, Command]], *, writes: bool = False) -> list[object]:
         """Send commands, each with the hash tag of its keys, in one batch for each primary.

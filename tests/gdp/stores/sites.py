@@ -198,10 +198,24 @@ def cluster(folder: Path) -> Iterator[Path]:
 
 def kill_server(folder: Path, port: int) -> None:
     """Kill the server that listens on a port."""
+    os.kill(_pid_of_server(folder, port), signal.SIGKILL)
+
+
+@contextmanager
+def frozen_server(folder: Path, port: int) -> Iterator[None]:
+    """Give the server that listens on a port no time meanwhile."""
+    pid = _pid_of_server(folder, port)
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+
+def _pid_of_server(folder: Path, port: int) -> int:
     for conf in folder.glob("*/server.conf"):
         if f"tls-port {port}\n" in conf.read_text():
-            os.kill(int((conf.parent / "server.pid").read_text()), signal.SIGKILL)
-            return
+            return int((conf.parent / "server.pid").read_text())
     raise AssertionError(f"no server on port {port}")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import select
 import shutil
 import sqlite3
 import time
@@ -15,9 +16,11 @@ import pytest
 import yaml
 
 from gdp.control.replica import Entry, Key
+from gdp.effects import Instant
 from gdp.errors import DropReason
 from gdp.nodes.config import ClusterConfig
-from gdp.rib.machine import Rib
+from gdp.nodes.rib_cluster import ClusterUpkeep
+from gdp.rib.machine import Rib, RibSettings
 from gdp.rib.store import MemoryStore
 from gdp.stores.cluster_link import ClusterLink
 from gdp.stores.snapshot import Snapshot
@@ -30,6 +33,7 @@ from tests.gdp.stores.sites import (
     SnapshotPair,
     answers,
     cluster,
+    frozen_server,
     kill_server,
     verdicts,
 )
@@ -156,6 +160,26 @@ def test_of_two_writes_at_once_the_newer_wins_and_the_other_is_not_confirmed(ser
     (verdict,) = verdicts(pair.give(pair.two, pair.site.relay("/a", 8)))
     assert (verdict.refused, verdict.sequence) == (DropReason.STALE, 9)
     pair.close()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore:unclosed:ResourceWarning")
+def test_a_rib_starts_while_a_primary_is_frozen_and_brings_it_the_functions_later(servers: Path) -> None:
+    site, config = Site(), config_of(servers)
+    link = ClusterLink(config.address())
+    victim = link.primary_of(site.subject("/a").name)
+    link.close()
+    with frozen_server(servers.parent, victim[1]):
+        upkeep = ClusterUpkeep(config.address(), site.policy(), allow_unowned=False)
+        was_complete = upkeep.is_complete
+    at = site.now()
+    upkeep.begin(Rib(site.ribs[0], site.policy(), upkeep.store, RibSettings()), at)
+    deadline_s = time.monotonic() + 60
+    while not upkeep.is_complete and time.monotonic() < deadline_s:
+        at = Instant(at.mono_s + 1.0, at.unix_s + 1.0)
+        upkeep.work(at)
+        select.select([], [], [], 0.05)  # the servers agree in their own time who is a primary
+    assert (was_complete, upkeep.is_complete) == (False, True)
+    upkeep.close()
 
 
 # redis-py leaves the socket of a TLS handshake that broke off to the garbage collector.
