@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import multiprocessing
+import os
 import select
 import shutil
+import signal
 import sqlite3
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import count
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
@@ -18,12 +23,13 @@ import yaml
 from gdp.control.replica import Entry, Key
 from gdp.effects import Instant
 from gdp.errors import DropReason
+from gdp.names import Name
 from gdp.nodes.config import ClusterConfig
 from gdp.nodes.rib_cluster import ClusterUpkeep
 from gdp.rib.machine import Rib, RibSettings
 from gdp.rib.store import MemoryStore
 from gdp.stores.cluster_link import ClusterLink
-from gdp.stores.snapshot import Snapshot
+from gdp.stores.snapshot import SLICE, Snapshot
 from tests.gdp.stores.sites import (
     EVIDENCE_S,
     ClusterPair,
@@ -265,6 +271,39 @@ def test_a_file_that_could_not_be_read_at_the_start_is_replaced_and_not_added_to
         snapshot.close()
     (read,) = Snapshot(path).load(pair.site.unix_s)
     assert [entry.statement for entry in read] == [changes_of(pair, ["/b"], pair.one)[0][1].statement]
+
+
+def write_generations(path: Path, said: Connection) -> None:
+    snapshot = Snapshot(path)
+    list(snapshot.load(0.0))
+    snapshot.start()
+    for generation in count(1):
+        said.send(generation)
+        while not snapshot.is_ready:
+            time.sleep(0.001)
+        snapshot.write(slice_of(generation), 0.0)
+
+
+def slice_of(generation: int) -> list[tuple[Key, Entry | None]]:
+    name = Name(bytes(32))
+    entry = Entry(generation.to_bytes(8, "big") * 64, b"", name, name, name, (), 60.0, is_from_above=False)
+    return [((Name(at.to_bytes(32, "big")), name), entry) for at in range(SLICE)]
+
+
+@pytest.mark.parametrize("generations", [10, 25, 50])
+def test_of_a_killed_writer_a_slice_is_read_whole_or_not_at_all(tmp_path: Path, generations: int) -> None:
+    path = tmp_path / "rib.sqlite"
+    heard, said = multiprocessing.Pipe()
+    writer = multiprocessing.get_context("spawn").Process(target=write_generations, args=(path, said))
+    writer.start()
+    while heard.recv() < generations:
+        pass
+    assert writer.pid is not None
+    os.kill(writer.pid, signal.SIGKILL)
+    writer.join()
+    (read,) = Snapshot(path).load(0.0)
+    assert len(read) == SLICE
+    assert len({entry.statement for entry in read}) == 1
 
 
 def test_an_altered_entry_of_a_snapshot_is_not_believed(tmp_path: Path) -> None:
