@@ -136,6 +136,11 @@ class Chaos:
             found.append(f"after the last fault: {failed} calls failed")
         return [*found, *self._after_revocation(), *self._of_snapshots()]
 
+    def noticed(self) -> int:
+        """Return how often a RIB said that its snapshot is not written."""
+        logs = (log for node in self._plan.ribs for _, log in self._overlay.logs(f"rib {node}"))
+        return sum(log.count(NOT_WRITTEN) for log in logs)
+
     def silences(self) -> list[tuple[str, Silence]]:
         """Return the silences of the run, each with the last thing that happened before it."""
         found = []
@@ -268,15 +273,13 @@ class Chaos:
         if self._overlay.disk is None:
             return []
         found = [f"{name}: a snapshot that its RIB could not make sense of" for name in self._overlay.disk.broken()]
-        noticed = 0
         for node in self._plan.ribs:
             who = f"rib {node}"
             for life, log in self._overlay.logs(who):
                 if self._overlay.keeps_snapshot(node):
                     is_alive = life == self._overlay.life(who) and self._overlay.is_running(who)
                     found += snapshot_faults(f"{who} (life {life})", log, is_alive=is_alive)
-                    noticed += log.count(NOT_WRITTEN)
-        if not noticed and any(fault.kind is FaultKind.DISK_FULL for fault in self._faults):
+        if not self.noticed() and any(fault.kind is FaultKind.DISK_FULL for fault in self._faults):
             found.append("no RIB noticed that the disk was full")
         return found
 
@@ -369,6 +372,7 @@ def _show(seed: int, chaos: Chaos) -> None:
     console.print(table)
     called = f"{calls} calls: {answered} answered, {failed} failed"
     console.print(f"{delivered} messages delivered, {told} told lost; {called}")
+    console.print(f"{chaos.noticed()} times a RIB said that its snapshot is not written")
 
 
 def _explain(seed: int, faults: list[Fault], broke: list[str], overlay: Overlay) -> None:
