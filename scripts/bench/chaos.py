@@ -29,7 +29,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Final
 
@@ -61,6 +61,7 @@ TOLD_S: Final = 0.25  # shorter silences are not worth telling
 CALL_S: Final = 5.0
 LOG_LINES: Final = 12
 _CLUSTER_EVERY: Final = 3  # seeds
+_PRESSURE: Final = Path("/proc/pressure/cpu")
 FRAMES: Final = {
     FaultKind.SILENT: FrameFaults(lost=1.0),
     FaultKind.LOSS: FrameFaults(lost=0.05),
@@ -88,6 +89,8 @@ class Chaos:
         self.must = {pair: Timeline() for pair in self._oracle.pairs()}
         self.moments: list[tuple[int, Fault, bool]] = []  # when, what, whether it began
         self.begun_ns = 0
+        self.late_s = 0.0  # that faults and restarts took longer than drawn, in all
+        self.waited_share = 0.0  # of the run, in which a process was ready and had no processor
         self.revoked_ns: int | None = None
 
     def settle(self) -> None:
@@ -103,12 +106,17 @@ class Chaos:
             self._watch(time.monotonic() + LOOK_S)
 
     def run(self) -> None:
-        """Let the faults happen, each in its time, and watch for a while after the last."""
-        begun_s = time.monotonic()
+        """Let the faults happen, each in its time, and watch for a while after the last.
+
+        What is late makes everything after it late, so that faults are as far apart as they were drawn.
+        """
+        begun_s, waited_s = time.monotonic(), _waited_s()
         self.begun_ns = time.monotonic_ns()
         self._note()
         for at_s, fault, begins in _moments(self._faults):
-            self._watch(begun_s + at_s)
+            due_s = begun_s + at_s + self.late_s
+            self.late_s += max(time.monotonic() - due_s, 0.0)
+            self._watch(due_s)
             progress(f"{at_s:7.2f} s  {'+' if begins else '-'} {fault.kind.value}: {', '.join(fault.targets)}")
             if begins:
                 self._under_way.append(fault)
@@ -119,6 +127,7 @@ class Chaos:
             self.moments.append((time.monotonic_ns(), fault, begins))
             self._note()
         self._watch(time.monotonic() + AFTER_S)
+        self.waited_share = (_waited_s() - waited_s) / (time.monotonic() - begun_s)
 
     def verdict(self, limit_s: float) -> list[str]:
         """Return what broke, in words."""
@@ -210,7 +219,7 @@ class Chaos:
                 overlay.kill(rib)
                 overlay.restart(rib)
                 self._await(rib)
-        elif overlay.store is not None:
+        elif overlay.store is not None and targets[0] == STORE:
             self._begin_in_store(overlay.store, fault)
 
     def _begin_in_store(self, store: StoreCluster, fault: Fault) -> None:
@@ -334,6 +343,17 @@ def run_seed(runs: Runs, seed: int, options: argparse.Namespace) -> list[str]:
     return broke
 
 
+def _waited_s() -> float:
+    """Return for how long, since boot, some process of the machine had to wait for a processor; 0 if that is not known.
+
+    Source: Linux, Documentation/accounting/psi.rst.
+    """
+    with suppress(OSError):
+        some = _PRESSURE.read_text(encoding="ascii").splitlines()[0]
+        return int(some.rpartition("total=")[2]) / 1e6
+    return 0.0
+
+
 def _in_store(plan: Plan, seed: int, *, is_wanted: bool | None) -> list[str]:
     """Return the switches whose RIBs share a cluster: those of the top domain, or none.
 
@@ -372,6 +392,8 @@ def _show(seed: int, chaos: Chaos) -> None:
     console.print(table)
     called = f"{calls} calls: {answered} answered, {failed} failed"
     console.print(f"{delivered} messages delivered, {told} told lost; {called}")
+    waited = f"{chaos.waited_share:.0%} of the time some process on this machine waited for a processor"
+    console.print(f"the schedule was {chaos.late_s:.1f} s late in the end; {waited}")
     console.print(f"{chaos.noticed()} times a RIB said that its snapshot is not written")
 
 

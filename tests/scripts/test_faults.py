@@ -16,6 +16,8 @@ from faults.records import Kind, Record, RecordReader, RecordWriter
 from faults.schedule import STRUCTURAL, Fault, FaultKind, broken_by, make_schedule
 from faults.slope import growth_of
 
+from gdp.message.loss import LossReason
+
 SEEDS = range(1, 9)
 SECOND_NS = 1_000_000_000
 
@@ -165,6 +167,18 @@ def test_a_message_that_is_missing_and_was_not_told_is_found() -> None:
 def test_a_loss_that_was_told_exactly_is_none() -> None:
     lost = Record(Kind.LOST, 0, 1, 0, 2, 0)
     assert not books(*(delivered(n) for n in (1, 4)), lost, sent=4).incomplete(lambda *_: True, SECOND_NS)
+
+
+def test_what_a_publisher_said_before_it_died_between_two_lives_of_a_reader_may_be_told() -> None:
+    found = books(delivered(1), delivered(2))
+    found.take("P", 1, (Record(Kind.PUBLISHED, 0, 1, 0, number, number) for number in range(1, 100)))
+    found.take("P", 2, (Record(Kind.PUBLISHED, 0, 2, 0, number, number) for number in range(1, 6)))
+    between = Record(Kind.LOST, 0, 2, LossReason.READER_RESTARTED, 97, 0)
+    head = Record(Kind.LOST, 0, 2, LossReason.PUBLISHER_RESTARTED, 3, 0)
+    found.take("R", 2, iter((between, delivered(4, life=2), delivered(5, life=2), head)))
+    assert not found.incomplete(lambda _, life: life == 2, SECOND_NS)
+    found.take("R", 2, iter((Record(Kind.LOST, 0, 2, LossReason.READER_RESTARTED, 41, 0),)))
+    assert found.incomplete(lambda _, life: life == 2, SECOND_NS)
 
 
 def test_more_told_than_missing_is_found() -> None:
