@@ -15,7 +15,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from gdp.control.replica import Entry, Key
 from gdp.crypto import cbor, cbor_writer
@@ -36,6 +36,12 @@ CREATE TABLE IF NOT EXISTS entries (key BLOB PRIMARY KEY, entry BLOB NOT NULL, e
 Change = tuple[Key, Entry | None]  # None: it is gone
 
 
+class _Slice(NamedTuple):
+    generation: int
+    changes: Sequence[Change]
+    unix_s: float  # when the changes were looked up
+
+
 class Snapshot:
     """One file.
 
@@ -45,11 +51,12 @@ class Snapshot:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._slices: queue.Queue[tuple[Sequence[Change], float] | None] = queue.Queue(_SLICES_WAITING_MAX)
+        self._slices: queue.Queue[_Slice | None] = queue.Queue(_SLICES_WAITING_MAX)
         self.failures = 0
         self.unreadable = 0
         self._has_failed = False
-        self._is_outdated = False  # the file holds what this RIB does not know
+        self._generation = 0  # of the slices that count
+        self._generation_in_file = 0  # another one is deleted before a slice is written
         self._is_closing = threading.Event()
         self._thread = threading.Thread(target=self._work, name="snapshot", daemon=True)
 
@@ -62,7 +69,7 @@ class Snapshot:
                     yield [entry for row in slice_ if (entry := self._read(row[0], row[1] - unix_s)) is not None]
         except sqlite3.OperationalError as error:
             self.failures += 1
-            self._is_outdated = True
+            self.begin_again()  # the file may hold what this RIB will never hear of
             log.warning("snapshot not read path=%s reason=%s; the RIB starts without it", self._path, error)
         except sqlite3.DatabaseError as error:
             self._put_aside(error)
@@ -78,7 +85,11 @@ class Snapshot:
 
     def write(self, changes: Sequence[Change], unix_s: float) -> None:
         """Have changes written; the caller has asked ``is_ready``."""
-        self._slices.put_nowait((changes, unix_s))
+        self._slices.put_nowait(_Slice(self._generation, changes, unix_s))
+
+    def begin_again(self) -> None:
+        """Forget slices that are not written yet; the next one that is given replaces all that is in the file."""
+        self._generation += 1
 
     def close(self) -> None:
         """Write what waits, each slice tried once, and end."""
@@ -99,33 +110,25 @@ class Snapshot:
     def _work(self) -> None:
         database: sqlite3.Connection | None = None
         while (item := self._slices.get()) is not None:
-            changes, unix_s = item
-            while True:
+            while item.generation == self._generation:
                 try:
-                    database = database or self._opened_to_write(unix_s)
+                    is_first, database = database is None, database or _opened(self._path)
                     with database:
-                        _write(database, changes, unix_s)
+                        if item.generation != self._generation_in_file:
+                            database.execute("DELETE FROM entries")
+                        elif is_first:
+                            database.execute("DELETE FROM entries WHERE end_unix_s <= ?", (item.unix_s,))
+                        _write(database, item.changes, item.unix_s)
                 except sqlite3.Error as error:
                     self._write_failed(error)
                     if self._is_closing.wait(RETRY_S):
                         break
                 else:
+                    self._generation_in_file = item.generation
                     self._written()
                     break
         if database is not None:
             database.close()
-
-    def _opened_to_write(self, unix_s: float) -> sqlite3.Connection:
-        """Return the database without rows that no RIB would load."""
-        database = _opened(self._path)
-        try:
-            with database:
-                database.execute("DELETE FROM entries WHERE ? OR end_unix_s <= ?", (self._is_outdated, unix_s))
-        except sqlite3.Error:
-            database.close()
-            raise
-        self._is_outdated = False
-        return database
 
     def _write_failed(self, error: sqlite3.Error) -> None:
         """Count each failure, report the first of a row."""

@@ -19,17 +19,21 @@ from pathlib import Path
 
 import pytest
 import yaml
+from redis._parsers.base import BaseParser
 
 from gdp.control.replica import Entry, Key
+from gdp.crypto.validity import Validity
 from gdp.effects import Instant
-from gdp.errors import DropReason
+from gdp.errors import DropReason, StoreError
 from gdp.names import Name
 from gdp.nodes.config import ClusterConfig
 from gdp.nodes.rib_cluster import ClusterUpkeep
+from gdp.nodes.rib_upkeep import MemoryUpkeep
 from gdp.rib.machine import Rib, RibSettings
 from gdp.rib.store import MemoryStore
-from gdp.stores.cluster_link import ClusterLink
+from gdp.stores.cluster_link import ClusterLink, _translated
 from gdp.stores.snapshot import SLICE, Snapshot
+from gdp.trust.rtcert import RtCert
 from tests.gdp.stores.sites import (
     EVIDENCE_S,
     ClusterPair,
@@ -188,6 +192,14 @@ def test_a_rib_starts_while_a_primary_is_frozen_and_brings_it_the_functions_late
     upkeep.close()
 
 
+@pytest.mark.parametrize(
+    "word",
+    ["MOVED 1 10.0.0.1:7000", "ASK 1 10.0.0.1:7000", "CLUSTERDOWN a", "READONLY a", "LOADING a", "TRYAGAIN a"],
+)
+def test_a_server_that_is_not_the_primary_now_is_no_fault_of_the_rib(word: str) -> None:
+    assert isinstance(_translated(BaseParser.parse_error(word)), StoreError)
+
+
 # redis-py leaves the socket of a TLS handshake that broke off to the garbage collector.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore:unclosed:ResourceWarning")
 def test_names_outlive_a_primary(servers: Path) -> None:
@@ -253,6 +265,38 @@ def test_what_could_not_be_written_is_written_when_the_disk_has_space_again(
     read = [entry for entries in Snapshot(folder / "rib.sqlite").load(pair.site.unix_s) for entry in entries]
     assert len(read) == 1
     assert caplog.text.count("snapshot not written") == 1
+
+
+def test_what_waits_for_a_full_disk_is_bounded_by_what_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gdp.stores.snapshot.RETRY_S", 0.001)
+    monkeypatch.setattr("gdp.nodes.rib_upkeep.CHANGES_MAX", 4)
+    site, folder = Site(), tmp_path / "disk"
+    upkeep = MemoryUpkeep(folder / "rib.sqlite")
+    rib = Rib(site.ribs[0], site.policy(), upkeep.store, RibSettings())
+    upkeep.begin(rib, site.now())
+    waiting = upkeep._memory.changes
+    assert waiting is not None
+    for number in range(100):
+        begin = site.now(100.0 * number)
+        site.rtcert = RtCert.make(site.robot, site.switch.name, Validity.lasting(begin.unix_s, 50))
+        rib.receive(site.relay(f"/{number}", 1, lease_s=5.0), site.switch.name, begin)
+        for later_s in (10.0, 60.0):  # the lease ends, then what is remembered of it
+            rib.timeout(site.now(100.0 * number + later_s))
+        upkeep.work(site.now(100.0 * number + 60.0))
+        waiting = upkeep._memory.changes
+        assert waiting is not None
+        assert len(waiting) <= 2 * len(set(upkeep._memory.known())) + 5
+    folder.mkdir()
+    end = site.now(10_000.0)
+    site.rtcert = RtCert.make(site.robot, site.switch.name, Validity.lasting(end.unix_s, 50))
+    rib.receive(site.relay("/last", 1), site.switch.name, end)
+    while waiting := upkeep._memory.changes:
+        upkeep.work(end)
+    upkeep.close()
+    (read,) = Snapshot(folder / "rib.sqlite").load(end.unix_s)
+    assert len(read) == 1
 
 
 def test_a_file_that_could_not_be_read_at_the_start_is_replaced_and_not_added_to(tmp_path: Path) -> None:
