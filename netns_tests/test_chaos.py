@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -9,11 +10,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
+from faults.disk import NOT_WRITTEN, snapshot_faults
 from faults.link_faults import FrameFaults
 from faults.overlay import Overlay
 from faults.plan import Flow, Plan, make_topology
 from faults.records import Kind
+from faults.store import has_server
 
+from gdp.testbed.netns_files import processes_inside
 from gdp.testbed.processes import Process
 from gdp.testbed.runs import Runs
 from netns_tests.live_pair import until
@@ -59,6 +63,61 @@ def test_a_killed_run_is_taken_down_by_the_next() -> None:
     until(lambda: not any(each.alive for each in record.processes), "their end: they die with their parent")
     assert run in Runs().sweep()
     assert not any(Path(path).exists() for path in [*record.namespaces, *record.files])
+
+
+@pytest.mark.skipif(not has_server(), reason="neither redis-server nor valkey-server is installed")
+def test_the_disk_and_the_servers_of_a_killed_run_are_gone_after_the_next_sweep() -> None:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT), str(ROOT / "scripts" / "bench")))}
+    argv = [sys.executable, "-m", "netns_tests.store_child"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(argv, stdin=pipe, stdout=pipe, text=True, cwd=ROOT, env=environment) as child:
+        assert child.stdout is not None
+        run = child.stdout.readline().strip()
+        child.send_signal(signal.SIGKILL)
+    (record,) = (record for record in Runs().all() if record.run == run)
+    spaces, folder = [Path(path) for path in record.namespaces], Path(record.files[0])
+    servers = processes_inside(spaces)
+    assert len(servers) == 6
+    assert (folder / "disk").is_mount()
+    record.processes.clear()  # as if it had been killed before it could note the servers
+    (Path("/run/gdp") / f"{run}.json").write_text(record.to_text())
+    assert run in Runs().sweep()
+    assert not any(server.alive for server in servers)
+    assert not any(path.exists() for path in [*spaces, folder])
+
+
+def rib_log(overlay: Overlay) -> str:
+    return list(overlay.logs("rib s1"))[-1][1]
+
+
+def test_a_rib_comes_through_a_full_disk_and_starts_on_one() -> None:
+    topology, members = make_topology({"a": ("s1", "s2")}, {}, ("s1-s2",), ("s1",), {"P": "s1", "R": "s2"})
+    plan = Plan(topology, members, flows=(Flow("/t", "P", ("R",), hz=100.0),))
+    run = Runs().start()
+    try:
+        with Overlay(run, plan, has_disk=True, more={"rib": {"lease_s": 2.0}}) as overlay:
+            assert overlay.disk is not None
+            overlay.start_all()
+            until(lambda: numbers(overlay, "R"), "a message")
+            overlay.disk.fill()
+            until(lambda: NOT_WRITTEN in rib_log(overlay), "a word about the full disk")
+            overlay.kill("rib s1")
+            overlay.restart("rib s1")
+            overlay.await_ready("rib s1")
+            assert "snapshot read live=0" not in rib_log(overlay)
+            assert "snapshot read live=" in rib_log(overlay)
+            until(lambda: NOT_WRITTEN in rib_log(overlay), "a word about the full disk, after the restart")
+            overlay.disk.free()
+            until(lambda: "snapshot written again" in rib_log(overlay), "a word that it is written again")
+            faults = [
+                fault
+                for life, log in overlay.logs("rib s1")
+                for fault in snapshot_faults(f"life {life}", log, is_alive=life == 2)
+            ]
+            assert (faults, overlay.disk.broken()) == ([], [])
+    finally:
+        run.end()
+    assert not run.directory.exists()
 
 
 @pytest.fixture

@@ -150,6 +150,7 @@ class Entry:
         transit: domains through which that domain lets its traffic pass.
         lease_s: what is left of the lease.
         is_from_above: learnt from the tier above.
+        until_unix_s: when a withdrawal may be forgotten: the claim can be proven no more; 0 for a claim.
     """
 
     statement: bytes
@@ -160,6 +161,7 @@ class Entry:
     transit: tuple[Name, ...]
     lease_s: float
     is_from_above: bool
+    until_unix_s: int = 0
 
     def to_fields(self) -> dict[str, object]:
         """Return the entry as a map."""
@@ -172,6 +174,7 @@ class Entry:
             "x": list(self.transit[:TRANSIT_MAX]),
             "l": float(self.lease_s),
             "u": self.is_from_above,
+            "t": self.until_unix_s,
         }
 
     @classmethod
@@ -190,6 +193,7 @@ class Entry:
             tuple(fields.names("x", TRANSIT_MAX)),
             fields.number("l", 0, LEASE_MAX_S),
             fields.flag("u"),
+            fields.uint("t"),
         )
 
     @property

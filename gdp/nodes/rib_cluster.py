@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from gdp.effects import Instant
+from gdp.errors import LocalError
 from gdp.ports.plane import HasFileno
 from gdp.rib.machine import Rib
 from gdp.rib.store import Store
@@ -24,10 +25,14 @@ __all__ = ["ClusterUpkeep"]
 log = logging.getLogger(__name__)
 
 KEEP_ALIVE_S: Final = 0.25
+LOAD_S: Final = 1.0  # between two tries to bring functions to a primary
 
 
 class ClusterUpkeep:
     """A connection to the cluster and the store over it.
+
+    Attributes:
+        is_complete: each primary has the RIB's functions, as far as is known.
 
     Raises:
         LocalError: the cluster cannot be reached, or does not take the RIB's functions.
@@ -35,7 +40,10 @@ class ClusterUpkeep:
 
     def __init__(self, address: ClusterAddress, policy: Policy, *, allow_unowned: bool) -> None:
         self._link = ClusterLink(address)
-        load_functions(self._link)
+        self.is_complete = load_functions(self._link)
+        self._load_at_s = float("-inf")
+        if not self.is_complete:
+            log.warning("cluster incomplete; the RIB starts without the primaries that do not answer")
         self._cluster = ClusterStore(self._link, ClaimVerifier(policy, allow_unowned=allow_unowned))
         self._rib: Rib | None = None
         self._failures = 0
@@ -62,11 +70,24 @@ class ClusterUpkeep:
     def work(self, now: Instant) -> None:
         """Tell of what other RIBs changed; look after the connections."""
         self._link.keep_alive(now.mono_s)
+        if not self.is_complete and now.mono_s >= self._load_at_s:
+            self._complete(now.mono_s)
         if self._rib is not None:
             self._rib.changed(self._cluster.changed(), now)
         if self._link.failures != self._failures:
             log.warning("cluster failures=%d; requests are refused where no primary answers", self._link.failures)
             self._failures = self._link.failures
+
+    def _complete(self, now_s: float) -> None:
+        """Bring the functions to the primaries that did not answer at the start."""
+        self._load_at_s = now_s + LOAD_S
+        try:
+            self.is_complete = load_functions(self._link)
+        except LocalError as error:
+            log.warning("%s", error)
+            return
+        if self.is_complete:
+            log.info("cluster complete")
 
     def close(self) -> None:
         """Close the connections."""

@@ -22,6 +22,7 @@ __all__ = ["MemoryUpkeep", "Upkeep"]
 log = logging.getLogger(__name__)
 
 SNAPSHOT_S: Final = 0.1  # between two slices
+CHANGES_MAX: Final = 65_536  # that wait for a disk with space, or twice what is kept
 
 
 class Upkeep(Protocol):
@@ -85,7 +86,12 @@ class MemoryUpkeep:
     def work(self, now: Instant) -> None:
         """Hand one slice of changes to the snapshot, if it is not behind."""
         changes, snapshot, rib = self._memory.changes, self._snapshot, self._rib
-        if changes is None or snapshot is None or rib is None or not changes or not snapshot.is_ready:
+        if changes is None or snapshot is None or rib is None or not changes:
+            return
+        if not snapshot.is_ready:
+            if len(changes) > CHANGES_MAX and len(changes) > 2 * sum(1 for _ in self._memory.known()):
+                snapshot.begin_again()  # most of the changes are of names that are gone
+                self._memory.changes = set(self._memory.known())
             return
         keys = list(islice(changes, SLICE))
         changes.difference_update(keys)

@@ -589,7 +589,10 @@ class Rib:
             )  # fmt: skip
         if isinstance(known, Withdrawn) and known.proof:
             own = self._policy.own
-            return Entry(known.proof, known.membership, known.sender, own, own, (), 0.0, is_from_above=False)
+            return Entry(
+                known.proof, known.membership, known.sender, own, own, (), 0.0,
+                is_from_above=False, until_unix_s=known.valid_until_unix_s,
+            )  # fmt: skip
         return None
 
     def _take_peer_message(self, statement: Statement, now: Instant) -> None:
@@ -654,9 +657,14 @@ class Rib:
             return
         member = self._sender(entry.membership, withdrawal, now)
         withdrawal.verify(member.key)
+        until_unix_s = min(entry.until_unix_s, member.not_after_unix_s)
+        if known is not None:  # a peer cannot have us forget sooner what we know
+            until_unix_s = max(until_unix_s, known.valid_until_unix_s)
+        if until_unix_s <= now.unix_s:
+            return  # forgotten here already
         if known is None and self._store.count_of(entry.sender) >= self._settings.names_per_sender:
             raise StatementError(DropReason.QUOTA, "names of one sender")
-        gone = Withdrawn(entry.sender, sequence, member.not_after_unix_s, withdrawal.wire, entry.membership)
+        gone = Withdrawn(entry.sender, sequence, until_unix_s, withdrawal.wire, entry.membership)
         route = self._store.withdraw(name, withdrawal.signer, gone)
         if route is not None:
             self._tell_gone(route, now.mono_s, by=entry.sender)

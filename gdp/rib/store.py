@@ -7,7 +7,7 @@ Place: pure; the interface, and the embedded store, which is memory. Leases, oth
 from __future__ import annotations
 
 import heapq
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from typing import Protocol
 
 from gdp.control.replica import Key
@@ -79,6 +79,11 @@ class MemoryStore:
     def __len__(self) -> int:
         return self._size
 
+    def known(self) -> Iterator[Key]:
+        """Yield the name and advertiser of each route and of each withdrawal that is not forgotten."""
+        yield from ((name, advertiser) for name, routes in self._routes.items() for advertiser in routes)
+        yield from self._withdrawn
+
     def prefetch(self, names: Collection[Name], now: Instant) -> None:
         """Do nothing: all of it is in memory."""
 
@@ -139,6 +144,8 @@ class MemoryStore:
             withdrawn = self._withdrawn.get((name, advertiser))
             if withdrawn is not None and withdrawn.valid_until_unix_s <= unix_s:
                 self._forget_withdrawn(name, advertiser)
+                if self.changes is not None:
+                    self.changes.add((name, advertiser))
         return gone
 
     def next_expiry(self) -> float | None:

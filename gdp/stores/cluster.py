@@ -18,8 +18,6 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Final
 
-from redis.exceptions import RedisError
-
 from gdp.control.replica import Key
 from gdp.crypto import cbor, cbor_writer
 from gdp.crypto.fields import Fields
@@ -43,18 +41,21 @@ _SEQUENCE_MAX: Final = (1 << 64) - 1
 _KEPT, _NEWER, _NO_CONTEXT = 1, 0, 2
 
 
-def load_functions(link: ClusterLink) -> None:
+def load_functions(link: ClusterLink) -> bool:
     """Bring the functions to every primary; they replicate from there.
+
+    Returns:
+        Whether each primary has them; one that does not answer is to be asked again.
 
     Raises:
         LocalError: a server refuses them.
     """
     code = FUNCTIONS.read_text()
-    for client in link.primaries():
-        try:
-            client.execute_command("FUNCTION LOAD", "REPLACE", code)
-        except RedisError as error:
-            raise LocalError(f"the cluster does not take the RIB's functions: {error}") from error
+    replies = link.ask_primaries((b"FUNCTION LOAD", b"REPLACE", code))
+    for reply in replies:
+        if isinstance(reply, LocalError):
+            raise LocalError(f"the cluster does not take the RIB's functions: {reply}") from reply
+    return not any(isinstance(reply, StoreError) for reply in replies)
 
 
 @dataclass(slots=True)

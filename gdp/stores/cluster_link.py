@@ -16,7 +16,16 @@ from redis import Redis
 from redis.backoff import NoBackoff
 from redis.client import PubSub
 from redis.crc import key_slot
-from redis.exceptions import RedisError, ResponseError
+from redis.exceptions import (
+    AskError,
+    ClusterDownError,
+    MasterDownError,
+    MovedError,
+    ReadOnlyError,
+    RedisError,
+    ResponseError,
+    TryAgainError,
+)
 from redis.retry import Retry
 
 from gdp.errors import LocalError, StoreError
@@ -32,9 +41,10 @@ _REFRESH_S: Final = 0.1  # between two readings of the map of slots while someth
 _REPLICA_MS: Final = 100  # a replica confirms within about a millisecond
 _ALONE_S: Final = 1.0
 _PING_S: Final = 1.0  # between two signs of life on a connection that only listens
-_MOVED: Final = ("MOVED", "ASK", "CLUSTERDOWN", "READONLY", "LOADING", "TRYAGAIN", "NOREPLICAS", "MASTERDOWN")
+_ELSEWHERE: Final = (AskError, ClusterDownError, MasterDownError, MovedError, ReadOnlyError, TryAgainError)
+_NO_REPLICAS: Final = "NOREPLICAS"
 
-Command = tuple[bytes | int, ...]  # the second item of which decides: a key
+Command = tuple[bytes | str | int, ...]  # the second item of which decides: a key
 
 
 def tag_of(name: Name) -> bytes:
@@ -76,6 +86,13 @@ class ClusterLink:
     def primary_of(self, name: Name) -> Address:
         """Return host and port of the primary that holds a name."""
         return self._primaries[tag_of(name)]
+
+    def ask_primaries(self, command: Command) -> list[object]:
+        """Send a command to each primary; where one did not answer, or is none any more, stands a ``StoreError``."""
+        replies = [reply for at in dict.fromkeys(self._primaries.values()) for reply in self._batch(at, [command])]
+        if any(isinstance(reply, StoreError) for reply in replies):
+            self._try_refresh()
+        return replies
 
     def execute(self, commands: Sequence[tuple[bytes, Command]], *, writes: bool = False) -> list[object]:
         """Send commands, each with the hash tag of its keys, in one batch for each primary.
@@ -248,7 +265,11 @@ def _primaries(shards: Sequence[Sequence[object]]) -> Iterator[tuple[bytes, Addr
 
 
 def _translated(reply: object) -> object:
-    """Return a reply; one that means "not here, not now" as a ``StoreError``."""
-    if isinstance(reply, ResponseError) and not str(reply).startswith(_MOVED):
+    """Return a reply; one that means "not here, not now" as a ``StoreError``.
+
+    The library gives most of these a class, and takes the server's word for it out of the text.
+    """
+    is_temporary = isinstance(reply, _ELSEWHERE) or str(reply).startswith(_NO_REPLICAS)
+    if isinstance(reply, ResponseError) and not is_temporary:
         return LocalError(str(reply))
     return StoreError(str(reply)) if isinstance(reply, RedisError) else reply

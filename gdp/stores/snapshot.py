@@ -1,7 +1,8 @@
 """What a RIB with its store in memory held, on disk: read at the start, kept up to date in the background.
 
-Layer: I/O. SQLite, written by one thread in slices; a full disk or a broken file is reported, and the RIB goes on
-without. Entries prove themselves, so what is read is verified like what a peer sends.
+Layer: I/O. SQLite in WAL mode, written by one thread in slices, each of which is one transaction. A full disk or a
+broken file is reported once, and the RIB goes on without. A slice that cannot be written is tried again, so that no
+withdrawal is missing from the file. Entries prove themselves: what is read is verified like what a peer sends.
 """
 
 from __future__ import annotations
@@ -14,25 +15,31 @@ import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from gdp.control.replica import Entry, Key
 from gdp.crypto import cbor, cbor_writer
 from gdp.crypto.fields import Fields
 from gdp.errors import RemoteError
-from gdp.limits import LEASE_MAX_S
 
 __all__ = ["SLICE", "Snapshot"]
 
 log = logging.getLogger(__name__)
 
 SLICE: Final = 512  # entries at once
+RETRY_S: Final = 0.5  # between two tries of a slice that cannot be written
 _SLICES_WAITING_MAX: Final = 4
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS entries (key BLOB PRIMARY KEY, entry BLOB NOT NULL, end_unix_s REAL NOT NULL) WITHOUT ROWID
 """
 
 Change = tuple[Key, Entry | None]  # None: it is gone
+
+
+class _Slice(NamedTuple):
+    generation: int
+    changes: Sequence[Change]
+    unix_s: float  # when the changes were looked up
 
 
 class Snapshot:
@@ -44,10 +51,13 @@ class Snapshot:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._slices: queue.Queue[tuple[Sequence[Change], float] | None] = queue.Queue(_SLICES_WAITING_MAX)
+        self._slices: queue.Queue[_Slice | None] = queue.Queue(_SLICES_WAITING_MAX)
         self.failures = 0
         self.unreadable = 0
         self._has_failed = False
+        self._generation = 0  # of the slices that count
+        self._generation_in_file = 0  # another one is deleted before a slice is written
+        self._is_closing = threading.Event()
         self._thread = threading.Thread(target=self._work, name="snapshot", daemon=True)
 
     def load(self, unix_s: float) -> Iterator[list[Entry]]:
@@ -58,7 +68,9 @@ class Snapshot:
                 while slice_ := rows.fetchmany(SLICE):
                     yield [entry for row in slice_ if (entry := self._read(row[0], row[1] - unix_s)) is not None]
         except sqlite3.OperationalError as error:
-            self._report(error)
+            self.failures += 1
+            self.begin_again()  # the file may hold what this RIB will never hear of
+            log.warning("snapshot not read path=%s reason=%s; the RIB starts without it", self._path, error)
         except sqlite3.DatabaseError as error:
             self._put_aside(error)
 
@@ -73,10 +85,15 @@ class Snapshot:
 
     def write(self, changes: Sequence[Change], unix_s: float) -> None:
         """Have changes written; the caller has asked ``is_ready``."""
-        self._slices.put_nowait((changes, unix_s))
+        self._slices.put_nowait(_Slice(self._generation, changes, unix_s))
+
+    def begin_again(self) -> None:
+        """Forget slices that are not written yet; the next one that is given replaces all that is in the file."""
+        self._generation += 1
 
     def close(self) -> None:
-        """Write what waits, and end."""
+        """Write what waits, each slice tried once, and end."""
+        self._is_closing.set()
         if self._thread.is_alive():
             self._slices.put(None)
             self._thread.join()
@@ -93,24 +110,37 @@ class Snapshot:
     def _work(self) -> None:
         database: sqlite3.Connection | None = None
         while (item := self._slices.get()) is not None:
-            try:
-                database = database or _opened(self._path)
-                with database:
-                    _write(database, *item)
-                if self._has_failed:
-                    log.info("snapshot written again path=%s", self._path)
-                self._has_failed = False
-            except sqlite3.Error as error:
-                self._report(error)
+            while item.generation == self._generation:
+                try:
+                    is_first, database = database is None, database or _opened(self._path)
+                    with database:
+                        if item.generation != self._generation_in_file:
+                            database.execute("DELETE FROM entries")
+                        elif is_first:
+                            database.execute("DELETE FROM entries WHERE end_unix_s <= ?", (item.unix_s,))
+                        _write(database, item.changes, item.unix_s)
+                except sqlite3.Error as error:
+                    self._write_failed(error)
+                    if self._is_closing.wait(RETRY_S):
+                        break
+                else:
+                    self._generation_in_file = item.generation
+                    self._written()
+                    break
         if database is not None:
             database.close()
 
-    def _report(self, error: sqlite3.Error) -> None:
-        """Count each failure, report the first of a row: the RIB goes on without."""
+    def _write_failed(self, error: sqlite3.Error) -> None:
+        """Count each failure, report the first of a row."""
         self.failures += 1
         if not self._has_failed:
-            log.warning("snapshot failed path=%s reason=%s; the RIB goes on without it", self._path, error)
+            log.warning("snapshot not written path=%s reason=%s; the RIB goes on without it", self._path, error)
         self._has_failed = True
+
+    def _written(self) -> None:
+        if self._has_failed:
+            log.info("snapshot written again path=%s", self._path)
+        self._has_failed = False
 
     def _put_aside(self, error: sqlite3.DatabaseError) -> None:
         self.failures += 1
@@ -123,10 +153,20 @@ class Snapshot:
 
 
 def _opened(path: Path) -> sqlite3.Connection:
+    """Return the database, its lock held: SQLite then needs no further file to read what a killed RIB left.
+
+    Raises:
+        sqlite3.Error: it cannot be opened, or is new and the disk is full.
+    """
     database = sqlite3.connect(path, timeout=1.0)
-    database.execute("PRAGMA journal_mode=WAL")
-    database.execute("PRAGMA synchronous=NORMAL")
-    database.execute(_SCHEMA)
+    try:
+        database.execute("PRAGMA locking_mode=EXCLUSIVE")  # before WAL, or a file of shared memory is made
+        database.execute("PRAGMA journal_mode=WAL")
+        database.execute("PRAGMA synchronous=NORMAL")
+        database.execute(_SCHEMA)
+    except sqlite3.Error:
+        database.close()
+        raise
     return database
 
 
@@ -136,7 +176,7 @@ def _write(database: sqlite3.Connection, changes: Sequence[Change], unix_s: floa
         (
             _key(key),
             cbor_writer.encode(entry.to_fields()),
-            unix_s + (LEASE_MAX_S if entry.membership else entry.lease_s),
+            entry.until_unix_s or unix_s + entry.lease_s,
         )
         for key, entry in changes
         if entry is not None

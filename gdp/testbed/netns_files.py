@@ -8,20 +8,20 @@ closed, so it lies in the run's own directory and ``nsenter --net=FILE`` enters 
 
 from __future__ import annotations
 
-import ctypes
-import errno
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, TypeVar
 
 from gdp.errors import LocalError
+from gdp.testbed.mounts import unmount
+from gdp.testbed.processes import Process
 
-__all__ = ["IP_NETNS_DIRECTORY", "create", "inside", "release"]
+__all__ = ["IP_NETNS_DIRECTORY", "create", "inside", "processes_inside", "release"]
 
 IP_NETNS_DIRECTORY: Final = Path("/run/netns")
-_MNT_DETACH: Final = 2
 
 T = TypeVar("T")
 
@@ -70,22 +70,33 @@ def inside(path: Path, work: Callable[[], T]) -> T:
     return results[0]
 
 
+def processes_inside(paths: Collection[Path]) -> list[Process]:
+    """Return the processes in these namespaces that we may look at; a file that holds none counts for nothing."""
+    held = {where for path in paths if (where := _identity(path)) is not None}
+    found = []
+    for folder in Path("/proc").iterdir() if held else ():
+        if folder.name.isdecimal() and _identity(folder / "ns" / "net") in held:
+            with suppress(ProcessLookupError):
+                found.append(Process.of(int(folder.name)))
+    return found
+
+
 def release(path: Path) -> None:
     """Unbind the namespace and delete its file; the kernel frees it with its last process. Fine if it is gone already.
 
     Raises:
         LocalError: the kernel refuses.
     """
-    _unmount(path)
+    unmount(path)
     if path.parent != IP_NETNS_DIRECTORY:
-        _unmount(path.parent)  # which ``create`` has bound onto itself, as ip-netns(8) does with its own folder
+        unmount(path.parent)  # which ``create`` has bound onto itself, as ip-netns(8) does with its own folder
     path.unlink(missing_ok=True)
 
 
-def _unmount(path: Path) -> None:
-    """Unmount what lies on ``path``; fine if nothing does, since mounts go with their mount namespace."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.umount2(os.fsencode(path), _MNT_DETACH) != 0:
-        reason = ctypes.get_errno()
-        if reason not in (errno.EINVAL, errno.ENOENT):
-            raise LocalError(f"{path} cannot be unmounted: {os.strerror(reason)}")
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Return what tells namespaces apart; None where there is none, or we may not look."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino

@@ -56,8 +56,13 @@ def _started(pid: int) -> int | None:
     return None if fields[0] in ("Z", "X") else int(fields[19])
 
 
-def end_all(processes: Iterable[Process], patience_s: float = 3.0) -> None:
-    """End the groups of these processes: SIGTERM, and after ``patience_s`` SIGKILL. Those gone already are fine."""
+def end_all(processes: Iterable[Process], patience_s: float = 3.0, *, are_leaders: bool = True) -> None:
+    """End the groups of these processes: SIGTERM, and after ``patience_s`` SIGKILL. Those gone already are fine.
+
+    Args:
+        are_leaders: of groups; otherwise each is ended alone.
+    """
+    signal_to = os.killpg if are_leaders else os.kill
     waiting: dict[int, Process] = {}
     try:
         for process in processes:
@@ -65,11 +70,11 @@ def end_all(processes: Iterable[Process], patience_s: float = 3.0) -> None:
                 descriptor = os.pidfd_open(process.pid)
                 waiting[descriptor] = process
                 if process.alive:
-                    os.killpg(process.pid, signal.SIGTERM)
+                    signal_to(process.pid, signal.SIGTERM)
         for process in _still_running(waiting, patience_s):
             with suppress(ProcessLookupError):
                 if process.alive:
-                    os.killpg(process.pid, signal.SIGKILL)
+                    signal_to(process.pid, signal.SIGKILL)
         _still_running(waiting, patience_s)
     finally:
         for descriptor in waiting:

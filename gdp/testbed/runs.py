@@ -20,6 +20,7 @@ from typing import Final
 
 from gdp.errors import LocalError
 from gdp.testbed.cgroups import Cgroup
+from gdp.testbed.mounts import unmount
 from gdp.testbed.processes import Process, boot_id, end_all
 
 __all__ = ["Record", "Run", "Runs", "in_first_user_namespace", "outer_uid"]
@@ -59,6 +60,7 @@ class Record:
     namespaces: list[str] = field(default_factory=list)  # paths of files that hold a network namespace
     files: list[str] = field(default_factory=list)  # files and directories to delete
     cgroups: list[str] = field(default_factory=list)  # names
+    mounts: list[str] = field(default_factory=list)  # paths that a file system is mounted on
 
     @classmethod
     def from_text(cls, text: str) -> Record:
@@ -122,6 +124,11 @@ class Run:
     def plan_cgroup(self, name: str) -> None:
         """Note a control group that is about to be made."""
         self._record.cgroups.append(name)
+        self._save()
+
+    def plan_mount(self, path: Path) -> None:
+        """Note a path that a file system is about to be mounted on."""
+        self._record.mounts.append(str(path))
         self._save()
 
     def note_process(self, pid: int) -> None:
@@ -225,14 +232,19 @@ def _default_directory() -> Path:
 
 def _take_down(record: Record, path: Path) -> bool:
     """Undo what the record names; what is gone already is fine."""
-    from gdp.testbed.netns_files import release  # pyroute2 takes 0.2 s to load, and most records need none of it
+    # pyroute2 takes 0.2 s to load, and most records need none of it
+    from gdp.testbed.netns_files import processes_inside, release
 
     if record.boot == boot_id():
         end_all(record.processes)
+        spaces = [Path(namespace) for namespace in record.namespaces]
+        end_all(processes_inside(spaces), are_leaders=False)  # daemons that nobody could note in time
         for group in record.cgroups:
             Cgroup(group).remove()
-        for namespace in record.namespaces:
-            release(Path(namespace))
+        for space in spaces:
+            release(space)
+        for mount in record.mounts:
+            unmount(Path(mount))
     for name in record.files:
         target = Path(name)
         if target.is_dir() and not target.is_symlink():

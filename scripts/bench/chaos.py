@@ -9,11 +9,13 @@ graph and policy leave connected (``faults/oracle.py``) must go on. Verdict:
     nothing                 reaches a wrong reader, or comes twice; nothing of the revoked member after three seconds
     reliable flows          are complete from the first message that came, or the reader was told exactly what it lacks
     requests                each has one answer, or one error
+    snapshots               a RIB says once that its disk is full, and when it writes again; it starts all the same
 
     sudo .venv/bin/python scripts/bench/chaos.py --seed 7                    # one minute
     sudo .venv/bin/python scripts/bench/chaos.py --seed 7 --seconds 300 --switches 20
     sudo .venv/bin/python scripts/bench/chaos.py --hours 3                   # seed after seed
     sudo .venv/bin/python scripts/bench/chaos.py --seed 7 --only cut --only roam
+    sudo .venv/bin/python scripts/bench/chaos.py --seed 7 --cluster          # RIBs share a Valkey or Redis Cluster
 
 A run that fails prints its seed, its faults, what broke, and the last lines of the logs; the seed draws the same again.
 """
@@ -27,16 +29,19 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Final
 
 from faults.accounts import Books, Silence, Timeline
+from faults.disk import NOT_WRITTEN, snapshot_faults
 from faults.link_faults import FrameFaults
 from faults.network import VICTIM, random_network
 from faults.oracle import Oracle
 from faults.overlay import Overlay
-from faults.schedule import Fault, FaultKind, broken_by, make_schedule
+from faults.plan import Plan
+from faults.schedule import STORE, Fault, FaultKind, broken_by, make_schedule
+from faults.store import StoreCluster, has_server
 from peers.process import FailedError
 from report import percentile, progress
 from rich.console import Console
@@ -55,6 +60,8 @@ LOOK_S: Final = 0.1
 TOLD_S: Final = 0.25  # shorter silences are not worth telling
 CALL_S: Final = 5.0
 LOG_LINES: Final = 12
+_CLUSTER_EVERY: Final = 3  # seeds
+_PRESSURE: Final = Path("/proc/pressure/cpu")
 FRAMES: Final = {
     FaultKind.SILENT: FrameFaults(lost=1.0),
     FaultKind.LOSS: FrameFaults(lost=0.05),
@@ -82,6 +89,8 @@ class Chaos:
         self.must = {pair: Timeline() for pair in self._oracle.pairs()}
         self.moments: list[tuple[int, Fault, bool]] = []  # when, what, whether it began
         self.begun_ns = 0
+        self.late_s = 0.0  # that faults and restarts took longer than drawn, in all
+        self.waited_share = 0.0  # of the run, in which a process was ready and had no processor
         self.revoked_ns: int | None = None
 
     def settle(self) -> None:
@@ -97,12 +106,17 @@ class Chaos:
             self._watch(time.monotonic() + LOOK_S)
 
     def run(self) -> None:
-        """Let the faults happen, each in its time, and watch for a while after the last."""
-        begun_s = time.monotonic()
+        """Let the faults happen, each in its time, and watch for a while after the last.
+
+        What is late makes everything after it late, so that faults are as far apart as they were drawn.
+        """
+        begun_s, waited_s = time.monotonic(), _waited_s()
         self.begun_ns = time.monotonic_ns()
         self._note()
         for at_s, fault, begins in _moments(self._faults):
-            self._watch(begun_s + at_s)
+            due_s = begun_s + at_s + self.late_s
+            self.late_s += max(time.monotonic() - due_s, 0.0)
+            self._watch(due_s)
             progress(f"{at_s:7.2f} s  {'+' if begins else '-'} {fault.kind.value}: {', '.join(fault.targets)}")
             if begins:
                 self._under_way.append(fault)
@@ -113,6 +127,7 @@ class Chaos:
             self.moments.append((time.monotonic_ns(), fault, begins))
             self._note()
         self._watch(time.monotonic() + AFTER_S)
+        self.waited_share = (_waited_s() - waited_s) / (time.monotonic() - begun_s)
 
     def verdict(self, limit_s: float) -> list[str]:
         """Return what broke, in words."""
@@ -128,7 +143,12 @@ class Chaos:
         found += self.books.miscalled(over_ns, lambda member, life: (member, life) in self._ended_lives)
         if failed := self.books.failed_since(well_ns):
             found.append(f"after the last fault: {failed} calls failed")
-        return [*found, *self._after_revocation()]
+        return [*found, *self._after_revocation(), *self._of_snapshots()]
+
+    def noticed(self) -> int:
+        """Return how often a RIB said that its snapshot is not written."""
+        logs = (log for node in self._plan.ribs for _, log in self._overlay.logs(f"rib {node}"))
+        return sum(log.count(NOT_WRITTEN) for log in logs)
 
     def silences(self) -> list[tuple[str, Silence]]:
         """Return the silences of the run, each with the last thing that happened before it."""
@@ -193,6 +213,22 @@ class Chaos:
         elif kind is FaultKind.REVOKE:
             overlay.revoke(targets[0])
             self.revoked_ns = time.monotonic_ns()
+        elif kind is FaultKind.DISK_FULL and overlay.disk is not None:
+            overlay.disk.fill()
+            for rib in targets[1:]:
+                overlay.kill(rib)
+                overlay.restart(rib)
+                self._await(rib)
+        elif overlay.store is not None and targets[0] == STORE:
+            self._begin_in_store(overlay.store, fault)
+
+    def _begin_in_store(self, store: StoreCluster, fault: Fault) -> None:
+        choice = round(fault.amount)
+        if fault.kind is FaultKind.FREEZE_PRIMARY:
+            progress(f"           {store.freeze(str(fault), choice=choice)}")
+        else:
+            is_primary = fault.kind is FaultKind.KILL_PRIMARY
+            progress(f"           {store.kill(str(fault), is_primary=is_primary, choice=choice)}")
 
     def _end(self, fault: Fault) -> None:
         overlay, kind, targets = self._overlay, fault.kind, fault.targets
@@ -210,6 +246,12 @@ class Chaos:
             overlay.thaw(targets[0])
         elif kind is FaultKind.CLOCK:
             overlay.step_clock(targets[0], 0.0)
+        elif kind is FaultKind.DISK_FULL and overlay.disk is not None:
+            overlay.disk.free()
+        elif kind is FaultKind.FREEZE_PRIMARY and overlay.store is not None:
+            overlay.store.thaw(str(fault))
+        elif overlay.store is not None and targets[0] == STORE:
+            overlay.store.restart(str(fault))
 
     def _await(self, who: str) -> None:
         """Go on reading records while a restarted process comes up: it is part of the network when it says so."""
@@ -235,6 +277,21 @@ class Chaos:
                     found.append(f"{late} messages from the revoked {publisher} to {reader}, {REVOKED_S:g} s after")
         return found
 
+    def _of_snapshots(self) -> list[str]:
+        """Return what RIBs did wrong about their snapshots."""
+        if self._overlay.disk is None:
+            return []
+        found = [f"{name}: a snapshot that its RIB could not make sense of" for name in self._overlay.disk.broken()]
+        for node in self._plan.ribs:
+            who = f"rib {node}"
+            for life, log in self._overlay.logs(who):
+                if self._overlay.keeps_snapshot(node):
+                    is_alive = life == self._overlay.life(who) and self._overlay.is_running(who)
+                    found += snapshot_faults(f"{who} (life {life})", log, is_alive=is_alive)
+        if not self.noticed() and any(fault.kind is FaultKind.DISK_FULL for fault in self._faults):
+            found.append("no RIB noticed that the disk was full")
+        return found
+
     def _words(self, silence: Silence) -> str:
         topic = self._plan.flows[silence.channel].topic
         at_s = (silence.begin_ns - self.begun_ns) / 1e9
@@ -257,12 +314,16 @@ def run_seed(runs: Runs, seed: int, options: argparse.Namespace) -> list[str]:
     """
     plan = random_network(seed, options.switches, rate=options.rate, one_rib=options.one_rib)
     kinds = [SHORT[name] for name in options.only] if options.only else None
-    faults = make_schedule(plan, seed, options.seconds, pace_s=options.pace_s, kinds=kinds)
+    in_store = _in_store(plan, seed, is_wanted=options.cluster)
+    faults = make_schedule(
+        plan, seed, options.seconds, pace_s=options.pace_s, kinds=kinds, has_store=bool(in_store)
+    )
     begun_s = time.monotonic()
     with ExitStack() as undo:
         run = runs.start()
         undo.callback(run.end)
-        overlay = undo.enter_context(Overlay(run, plan, plane=options.plane, has_clocks=True))
+        made = Overlay(run, plan, plane=options.plane, has_clocks=True, has_disk=True, in_store=in_store)
+        overlay = undo.enter_context(made)
         overlay.start_all()
         progress(f"seed {seed}: {len(plan.switches)} switches, {len(plan.ribs)} RIBs, {len(plan.members)} members up")
         chaos = Chaos(overlay, faults)
@@ -280,6 +341,33 @@ def run_seed(runs: Runs, seed: int, options: argparse.Namespace) -> list[str]:
                 secret = shutil.ignore_patterns("domains", "nodes", "owner")
                 shutil.copytree(run.directory, options.logs / f"seed-{seed}", ignore=secret, dirs_exist_ok=True)
     return broke
+
+
+def _waited_s() -> float:
+    """Return for how long, since boot, some process of the machine had to wait for a processor; 0 if that is not known.
+
+    Source: Linux, Documentation/accounting/psi.rst.
+    """
+    with suppress(OSError):
+        some = _PRESSURE.read_text(encoding="ascii").splitlines()[0]
+        return int(some.rpartition("total=")[2]) / 1e6
+    return 0.0
+
+
+def _in_store(plan: Plan, seed: int, *, is_wanted: bool | None) -> list[str]:
+    """Return the switches whose RIBs share a cluster: those of the top domain, or none.
+
+    Args:
+        is_wanted: None: for every third seed, where a server is installed.
+
+    Raises:
+        FailedError: it is wanted, and no server is installed.
+    """
+    if is_wanted and not has_server():
+        raise FailedError("neither valkey-server nor redis-server is installed")
+    if not (has_server() and seed % _CLUSTER_EVERY == 0 if is_wanted is None else is_wanted):
+        return []
+    return [node for node in plan.ribs if plan.topology.domain_of(node).upper is None]
 
 
 def _show(seed: int, chaos: Chaos) -> None:
@@ -304,6 +392,9 @@ def _show(seed: int, chaos: Chaos) -> None:
     console.print(table)
     called = f"{calls} calls: {answered} answered, {failed} failed"
     console.print(f"{delivered} messages delivered, {told} told lost; {called}")
+    waited = f"{chaos.waited_share:.0%} of the time some process on this machine waited for a processor"
+    console.print(f"the schedule was {chaos.late_s:.1f} s late in the end; {waited}")
+    console.print(f"{chaos.noticed()} times a RIB said that its snapshot is not written")
 
 
 def _explain(seed: int, faults: list[Fault], broke: list[str], overlay: Overlay) -> None:
@@ -331,6 +422,11 @@ def arguments() -> argparse.ArgumentParser:
         "--limit-s", type=float, default=LIMIT_S, help="longest silence meanwhile (default: %(default)s)"
     )
     parser.add_argument("--only", action="append", choices=list(SHORT), help="this kind of fault; may be repeated")
+    parser.add_argument(
+        "--cluster",
+        action=argparse.BooleanOptionalAction,
+        help="RIBs of the top domain share a Valkey or Redis Cluster (default: for every third seed, if installed)",
+    )
     parser.add_argument("--one-rib", action="store_true", help="one RIB in each domain")
     parser.add_argument("--plane", default="auto", help="as gdp-switch --data-plane (default: %(default)s)")
     parser.add_argument("--logs", type=Path, help="a folder to copy the logs of a failed run to")

@@ -8,12 +8,15 @@ from pathlib import Path
 
 import pytest
 from faults.accounts import Books, Timeline
+from faults.disk import snapshot_faults
 from faults.network import VICTIM, random_network
 from faults.oracle import Broken, Oracle
 from faults.plan import Churn, Flow, Plan, Service, make_topology
 from faults.records import Kind, Record, RecordReader, RecordWriter
 from faults.schedule import STRUCTURAL, Fault, FaultKind, broken_by, make_schedule
 from faults.slope import growth_of
+
+from gdp.message.loss import LossReason
 
 SEEDS = range(1, 9)
 SECOND_NS = 1_000_000_000
@@ -67,6 +70,45 @@ def test_no_fault_outlasts_the_schedule_and_none_meets_another_at_the_same_targe
 def test_a_schedule_can_be_limited_to_some_kinds() -> None:
     faults = make_schedule(random_network(1), 1, 100, kinds=[FaultKind.ROAM, FaultKind.CUT])
     assert {fault.kind for fault in faults} == {FaultKind.ROAM, FaultKind.CUT}
+
+
+_OF_STORE = {FaultKind.KILL_PRIMARY, FaultKind.KILL_REPLICA, FaultKind.FREEZE_PRIMARY}
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_servers_of_a_store_fail_one_at_a_time_and_long_enough_to_be_replaced(seed: int) -> None:
+    plan = random_network(seed)
+    assert not _OF_STORE & {fault.kind for fault in make_schedule(plan, seed, 300)}
+    faults = [each for each in make_schedule(plan, seed, 300, has_store=True) if each.kind in _OF_STORE]
+    assert {fault.kind for fault in faults} == _OF_STORE
+    assert all(fault.end_s - fault.start_s >= 3.0 for fault in faults)
+    assert all(one.end_s <= other.start_s for one, other in pairwise(faults))
+
+
+def test_a_disk_is_full_once_at_a_time_and_a_rib_may_restart_meanwhile() -> None:
+    faults = make_schedule(random_network(1), 1, 200, kinds=[FaultKind.DISK_FULL])
+    assert {len(fault.targets) for fault in faults} == {1, 2}
+    assert all(one.end_s <= other.start_s for one, other in pairwise(faults))
+
+
+_START = "snapshot read live=3 unreadable=0 refused=0\nrib up name=a\n"
+_FULL, _AGAIN = "snapshot not written path=a reason=full\n", "snapshot written again path=a\n"
+
+
+@pytest.mark.parametrize(
+    ("log", "faults"),
+    [
+        (_START, 0),
+        (_START + _FULL + _AGAIN + _FULL + _AGAIN, 0),
+        (_START + _FULL, 1),
+        (_START + _FULL + _FULL + _AGAIN, 1),
+        ("snapshot not read path=a reason=full\nsnapshot read live=0 unreadable=0 refused=0\nrib up name=a\n", 0),
+        ("rib up name=a\n", 1),
+        (_START.replace("unreadable=0", "unreadable=1"), 1),
+    ],
+)
+def test_a_rib_says_once_that_its_snapshot_is_not_written_and_when_it_is_again(log: str, faults: int) -> None:
+    assert len(list(snapshot_faults("rib s1", log, is_alive=True))) == faults
 
 
 @pytest.mark.parametrize(
@@ -125,6 +167,18 @@ def test_a_message_that_is_missing_and_was_not_told_is_found() -> None:
 def test_a_loss_that_was_told_exactly_is_none() -> None:
     lost = Record(Kind.LOST, 0, 1, 0, 2, 0)
     assert not books(*(delivered(n) for n in (1, 4)), lost, sent=4).incomplete(lambda *_: True, SECOND_NS)
+
+
+def test_what_a_publisher_said_before_it_died_between_two_lives_of_a_reader_may_be_told() -> None:
+    found = books(delivered(1), delivered(2))
+    found.take("P", 1, (Record(Kind.PUBLISHED, 0, 1, 0, number, number) for number in range(1, 100)))
+    found.take("P", 2, (Record(Kind.PUBLISHED, 0, 2, 0, number, number) for number in range(1, 6)))
+    between = Record(Kind.LOST, 0, 2, LossReason.READER_RESTARTED, 97, 0)
+    head = Record(Kind.LOST, 0, 2, LossReason.PUBLISHER_RESTARTED, 3, 0)
+    found.take("R", 2, iter((between, delivered(4, life=2), delivered(5, life=2), head)))
+    assert not found.incomplete(lambda _, life: life == 2, SECOND_NS)
+    found.take("R", 2, iter((Record(Kind.LOST, 0, 2, LossReason.READER_RESTARTED, 41, 0),)))
+    assert found.incomplete(lambda _, life: life == 2, SECOND_NS)
 
 
 def test_more_told_than_missing_is_found() -> None:

@@ -3,6 +3,6 @@
 Sans-I/O: ``plan`` (who there is), ``network`` (a random one), ``schedule`` (what fails when), ``oracle`` (what must
 stay connected), ``accounts`` (what the records come to), ``slope`` (what grows).
 
-I/O: ``overlay`` (processes and links), ``link_faults`` (frames), ``clock`` (wall clocks), ``member`` (the process at
-the ends), ``records`` (what it writes down).
+I/O: ``overlay`` (processes and links), ``link_faults`` (frames), ``clock`` (wall clocks), ``disk``, ``store``
+(servers that RIBs share), ``member`` (the process at the ends), ``records`` (what it writes down).
 """

@@ -170,12 +170,15 @@ class Books:
             for at, (source_life, account) in enumerate(accounts):
                 sent = sum(at_ns <= until_ns for at_ns in self.published[channel, source_life])
                 is_last = is_last_life(flow.publisher, source_life) and is_last_life(reader, life)
-                head = account.first - 1 if at else 0  # a later life is missed from its beginning on
+                # a later life is missed from its beginning on, also if only a reader's former life knew an earlier one
+                is_later = at or self._known_before(channel, reader, life, source_life)
+                head = account.first - 1 if is_later else 0
                 least += account.missing(sent if is_last else account.last)
                 most += account.missing(max(sent, account.last)) + head
             between = self.told_between[channel, reader, life]
             gap = sum(self._gap(channel, reader, life, source_life) for source_life, _ in accounts)
-            if between and not gap <= between <= gap + math.ceil(flow.hz * UNCONFIRMED_S):
+            tail = self._tail(channel, reader, life)
+            if between and not gap <= between <= gap + tail + math.ceil(flow.hz * UNCONFIRMED_S):
                 found.append(f"{who}: {gap} messages missing since its former life, {between} told")
             told = self.told[channel, reader, life]
             if not least <= told <= most:
@@ -192,6 +195,21 @@ class Books:
         ]
         account = self.accounts[channel, reader, life, source_life]
         return max(account.first - 1 - max(before), 0) if before else 0
+
+    def _known_before(self, channel: int, reader: str, life: int, source_life: int) -> dict[int, int]:
+        """Return the last number by earlier lives of a publisher that earlier lives of a reader had messages of."""
+        known: dict[int, int] = {}
+        for (of, who, earlier, source), account in self.accounts.items():
+            if (of, who) == (channel, reader) and earlier < life and source < source_life:
+                known[source] = max(known.get(source, 0), account.last)
+        return known
+
+    def _tail(self, channel: int, reader: str, life: int) -> int:
+        """Return what lives of a publisher said after a reader's former lives had last heard them, and died."""
+        own = {source for of, who, its, source in self.accounts if (of, who, its) == (channel, reader, life)}
+        known = self._known_before(channel, reader, life, max(own))
+        lost = (len(self.published[channel, source]) - last for source, last in known.items() if source not in own)
+        return sum(max(each, 0) for each in lost)
 
     def miscalled(self, until_ns: int, is_over: Callable[[str, int], bool]) -> list[str]:
         """Return the calls without an end, or with more than one.

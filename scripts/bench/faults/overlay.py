@@ -22,9 +22,11 @@ from peers.process import Started
 from pyroute2 import IPRoute
 
 from faults.clock import Clock
+from faults.disk import Disk
 from faults.link_faults import FrameFaults, LinkFaults
 from faults.plan import Churn, Flow, Plan, Service
 from faults.records import Record, RecordReader
+from faults.store import StoreCluster
 from gdp.metadata import Metadata
 from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, ROOT_CERTIFICATE, load_domain, load_identity
@@ -52,6 +54,8 @@ class Overlay:
         has_clocks: processes may have their wall clock stepped.
         churn_hz: how often members take up or leave what they churn, a second.
         more: further keys of every switch's, RIB's file, by role.
+        has_disk: RIBs keep snapshots on a small disk.
+        in_store: switches whose RIBs share a cluster of servers; they keep no snapshots.
 
     Raises:
         LocalError: the kernel refuses.
@@ -67,6 +71,8 @@ class Overlay:
         has_clocks: bool = False,
         churn_hz: float = 10.0,
         more: Mapping[str, Mapping[str, object]] | None = None,
+        has_disk: bool = False,
+        in_store: Sequence[str] = (),
     ) -> None:
         self.plan = plan
         self.directory = run.directory
@@ -86,6 +92,9 @@ class Overlay:
             (run.directory / "clocks").mkdir()
             self._clocks = {who: Clock(run.directory / "clocks" / who.replace(" ", "-")) for who in self.everybody()}
         self._links = LinkFaults()
+        self.disk = Disk(run) if has_disk else None
+        self.store = StoreCluster(run, self.spaces, in_store) if in_store else None
+        self._in_store = frozenset(in_store)
         for member in plan.members:
             self._admit(member)
 
@@ -94,6 +103,8 @@ class Overlay:
 
     def __exit__(self, *_: object) -> None:
         self._links.close()
+        if self.store is not None:
+            self.store.close()
         for who in list(self._frozen):
             self.thaw(who)
         with ExitStack() as undo:
@@ -211,6 +222,16 @@ class Overlay:
             return "\n".join(text.splitlines()[-lines:])
         return ""
 
+    def keeps_snapshot(self, node: str) -> bool:
+        """Return whether the RIB at a switch keeps a snapshot on the disk."""
+        return self.disk is not None and node not in self._in_store
+
+    def logs(self, who: str) -> Iterator[tuple[int, str]]:
+        """Yield each life of a process, and all that it logged."""
+        for life in range(1, self._lives.get(who, 0) + 1):
+            path = self.directory / f"{who} {life}.log".replace(" ", "-")
+            yield life, path.read_text(encoding="utf-8", errors="replace")
+
     # links
 
     def cut(self, a: str, b: str) -> None:
@@ -281,6 +302,11 @@ class Overlay:
         domain = self.plan.topology.domain_of(node)
         content["peers"] = [name for at, name in self._rib_names(domain.label) if at != node]
         content["upper"] = [name for _, name in self._rib_names(domain.upper)]
+        if self.store is not None and node in self._in_store:
+            del content["peers"]
+            content |= self.store.config
+        elif self.disk is not None:
+            content["snapshot"] = str(self.disk.snapshot(node))
         return self._write(path, {**content, **self._more.get("rib", {})})
 
     def _rib_names(self, label: str | None) -> list[tuple[str, str]]:

@@ -17,7 +17,7 @@ from faults.network import VICTIM
 from faults.oracle import Broken, Oracle
 from faults.plan import Plan
 
-__all__ = ["STRUCTURAL", "Fault", "FaultKind", "broken_by", "make_schedule"]
+__all__ = ["DISK", "STORE", "STRUCTURAL", "Fault", "FaultKind", "broken_by", "make_schedule"]
 
 
 class FaultKind(Enum):
@@ -36,14 +36,24 @@ class FaultKind(Enum):
     REVOKE = "membership revoked"
     PARTITION = "partition"
     ROAM = "member moved"
+    DISK_FULL = "disk full"
+    KILL_PRIMARY = "primary killed"
+    KILL_REPLICA = "replica killed"
+    FREEZE_PRIMARY = "primary frozen"
 
 
 STRUCTURAL: Final = frozenset({FaultKind.CUT, FaultKind.SILENT, FaultKind.KILL_SWITCH})
 _WEIGHTS: Final = {
     FaultKind.CUT: 4, FaultKind.SILENT: 3, FaultKind.LOSS: 3, FaultKind.DOUBLED: 2, FaultKind.REORDERED: 2,
     FaultKind.KILL_SWITCH: 3, FaultKind.KILL_RIB: 3, FaultKind.KILL_MEMBER: 2, FaultKind.FREEZE: 3,
-    FaultKind.CLOCK: 2, FaultKind.PARTITION: 1, FaultKind.ROAM: 4,
+    FaultKind.CLOCK: 2, FaultKind.PARTITION: 1, FaultKind.ROAM: 4, FaultKind.DISK_FULL: 2,
+    FaultKind.KILL_PRIMARY: 2, FaultKind.KILL_REPLICA: 1, FaultKind.FREEZE_PRIMARY: 2,
 }  # fmt: skip
+DISK: Final = "the disk"
+STORE: Final = "the store"
+_OF_STORE: Final = frozenset({FaultKind.KILL_PRIMARY, FaultKind.KILL_REPLICA, FaultKind.FREEZE_PRIMARY})
+_STORE_LEAST_S: Final = 3.0  # a replica takes over within two seconds: a shorter fault would end in the middle of that
+_SERVERS: Final = 3  # of a role
 _AT_ONCE: Final = 3
 _CLOCK_STEP_S: Final = 300.0
 _FIRST_S: Final = 1.0
@@ -56,7 +66,7 @@ class Fault:
 
     Attributes:
         start_s, end_s: from the start of the run; what has no end of its own ends where it starts.
-        amount: seconds of a clock step.
+        amount: seconds of a clock step; which server of the store, of those in the role.
     """
 
     kind: FaultKind
@@ -66,7 +76,7 @@ class Fault:
     amount: float = 0.0
 
     def __str__(self) -> str:
-        amount = f" {self.amount:+g} s" if self.amount else ""
+        amount = f" {self.amount:+g} s" if self.kind is FaultKind.CLOCK else ""
         return f"{self.start_s:7.2f}-{self.end_s:7.2f} s  {self.kind.value}{amount}: {', '.join(self.targets)}"
 
 
@@ -92,7 +102,13 @@ def broken_by(faults: Sequence[Fault], at: dict[str, str]) -> Broken:
 
 
 def make_schedule(
-    plan: Plan, seed: int, duration_s: float, *, pace_s: float = 2.0, kinds: Sequence[FaultKind] | None = None
+    plan: Plan,
+    seed: int,
+    duration_s: float,
+    *,
+    pace_s: float = 2.0,
+    kinds: Sequence[FaultKind] | None = None,
+    has_store: bool = False,
 ) -> list[Fault]:
     """Return the faults of a run, in the order of their starts.
 
@@ -100,8 +116,10 @@ def make_schedule(
         duration_s: when the last fault has ended.
         pace_s: mean time between two starts.
         kinds: what may happen; None: everything.
+        has_store: RIBs share a store of several servers, which may fail.
     """
-    return list(_draw(plan, random.Random(f"schedule {seed}"), duration_s, pace_s, set(kinds or FaultKind)))
+    drawn = set(kinds or FaultKind) - (frozenset() if has_store else _OF_STORE)
+    return list(_draw(plan, random.Random(f"schedule {seed}"), duration_s, pace_s, drawn))
 
 
 def _draw(
@@ -158,6 +176,13 @@ def _one(
         own = set(domain.switches)
         out = [link for link in oracle.links if len(link & own) == 1]
         return Fault(kind, (domain.label, *sorted("-".join(sorted(link)) for link in out)), now_s, end_s)
+    if kind is FaultKind.DISK_FULL:
+        killed = [f"rib {node}" for node in chance.sample(plan.ribs, chance.randrange(2))]
+        return Fault(kind, (DISK, *killed), now_s, end_s)
+    if kind in _OF_STORE:
+        end_s = now_s + chance.uniform(_STORE_LEAST_S, 8.0)
+        number = chance.randrange(_SERVERS)
+        return Fault(kind, (STORE,), now_s, end_s, number) if end_s <= duration_s else None
     mover = chance.choice(sorted(plan.homes))
     there = chance.choice([home for home in plan.homes[mover] if home != at[mover]])
     return Fault(FaultKind.ROAM, (mover, there), now_s, now_s)
@@ -184,7 +209,7 @@ def _touched(fault: Fault) -> set[str]:
     """Return what no other fault may touch meanwhile: a process by name, a link by its ends."""
     if fault.kind is FaultKind.PARTITION:
         return set(fault.targets[1:])
-    if len(fault.targets) == 2 and fault.kind is not FaultKind.ROAM:
+    if len(fault.targets) == 2 and fault.kind not in (FaultKind.ROAM, FaultKind.DISK_FULL):
         return {"-".join(fault.targets)}
     if fault.kind is FaultKind.ROAM:
         return {f"member {fault.targets[0]}"}

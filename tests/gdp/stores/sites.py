@@ -37,6 +37,7 @@ from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
 from gdp.trust.verifier import ClaimVerifier
 
+EVIDENCE_S = 3_600  # for which claims can be proven: the RtCert ends before the memberships
 START_CLUSTER = Path(__file__).parents[3] / "scripts" / "start_cluster.sh"
 
 
@@ -51,7 +52,7 @@ class Site:
         self.authority = DomainAuthority.found("site", SigningKey.generate(), self.validity)
         self.switch, self.robot = self.node(Role.SWITCH, "switch"), self.node(Role.PROXY, "robot")
         self.ribs = self.node(Role.RIB, "one"), self.node(Role.RIB, "two")
-        self.rtcert = RtCert.make(self.robot, self.switch.name, self.validity)
+        self.rtcert = RtCert.make(self.robot, self.switch.name, Validity.lasting(self.unix_s, EVIDENCE_S))
 
     def node(self, role: Role, label: str) -> Identity:
         return NodeKeys.generate(role, label).join(self.authority, self.validity)
@@ -146,17 +147,17 @@ class SnapshotPair(Pair):
 
     def __init__(self, site: Site, path: Path) -> None:
         self._path = path
-        self._memory = MemoryStore()
-        self._memory.changes = set()
-        super().__init__(site, (self._memory, MemoryStore()))
+        self.memory = MemoryStore()
+        self.memory.changes = set()
+        super().__init__(site, (self.memory, MemoryStore()))
 
     def sync(self, later_s: float = 0.0) -> list[Letter]:
         now = self.site.now(later_s)
         writer = Snapshot(self._path)
         writer.start()
-        assert self._memory.changes is not None
-        writer.write([(key, self.one.entry_of(key, now.mono_s)) for key in self._memory.changes], now.unix_s)
-        self._memory.changes.clear()
+        assert self.memory.changes is not None
+        writer.write([(key, self.one.entry_of(key, now.mono_s)) for key in self.memory.changes], now.unix_s)
+        self.memory.changes.clear()
         writer.close()
         for entries in Snapshot(self._path).load(now.unix_s):
             self.two.load(entries, now)
@@ -197,10 +198,24 @@ def cluster(folder: Path) -> Iterator[Path]:
 
 def kill_server(folder: Path, port: int) -> None:
     """Kill the server that listens on a port."""
+    os.kill(_pid_of_server(folder, port), signal.SIGKILL)
+
+
+@contextmanager
+def frozen_server(folder: Path, port: int) -> Iterator[None]:
+    """Give the server that listens on a port no time meanwhile."""
+    pid = _pid_of_server(folder, port)
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+
+def _pid_of_server(folder: Path, port: int) -> int:
     for conf in folder.glob("*/server.conf"):
         if f"tls-port {port}\n" in conf.read_text():
-            os.kill(int((conf.parent / "server.pid").read_text()), signal.SIGKILL)
-            return
+            return int((conf.parent / "server.pid").read_text())
     raise AssertionError(f"no server on port {port}")
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import LocalError
+from gdp.testbed.mounts import mount_tmpfs
 from gdp.testbed.processes import Process
 from gdp.testbed.runs import Record, Run, Runs
 
@@ -64,6 +65,19 @@ def test_the_run_of_a_killed_process_is_swept_with_its_processes(runs: Runs, tmp
         assert runs.sweep() == [run.id]
         assert left.wait(5) != 0
     assert not run.directory.exists()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount")
+def test_what_a_run_mounted_is_unmounted_with_it(runs: Runs, tmp_path: Path) -> None:
+    run = runs.start()
+    disk = run.directory / "disk"
+    run.plan_mount(disk)
+    mount_tmpfs(disk, 1 << 20)
+    (disk / "file").write_text("text")
+    rewrite(run, tmp_path, orphan)
+    assert runs.sweep() == [run.id]
+    assert not run.directory.exists()
+    assert str(disk) not in Path("/proc/self/mounts").read_text()
 
 
 def test_a_kept_run_outlives_its_process_until_it_is_taken_down(runs: Runs, tmp_path: Path) -> None:

@@ -1,0 +1,46 @@
+"""File systems in memory that a run mounts, and what takes any mount away again.
+
+Place: shell; mounting needs CAP_SYS_ADMIN in the user namespace that owns the mount namespace.
+Source: mount(2), umount2(2), tmpfs(5).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+from pathlib import Path
+from typing import Final
+
+from gdp.errors import LocalError
+
+__all__ = ["mount_tmpfs", "unmount"]
+
+_MNT_DETACH: Final = 2
+_NOTHING_THERE: Final = (errno.EINVAL, errno.ENOENT)
+
+
+def mount_tmpfs(path: Path, size_bytes: int) -> None:
+    """Make a folder and mount a file system of this size there.
+
+    Raises:
+        LocalError: the kernel refuses.
+    """
+    path.mkdir(mode=0o700)
+    libc = ctypes.CDLL(None, use_errno=True)
+    options = f"size={size_bytes},mode=0700".encode()
+    if libc.mount(b"tmpfs", os.fsencode(path), b"tmpfs", 0, options) != 0:
+        raise LocalError(f"{path}: tmpfs cannot be mounted: {os.strerror(ctypes.get_errno())}")
+
+
+def unmount(path: Path) -> None:
+    """Unmount what lies on ``path``; fine if nothing does, since mounts go with their mount namespace.
+
+    Raises:
+        LocalError: the kernel refuses.
+    """
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.umount2(os.fsencode(path), _MNT_DETACH) != 0:
+        reason = ctypes.get_errno()
+        if reason not in _NOTHING_THERE:
+            raise LocalError(f"{path} cannot be unmounted: {os.strerror(reason)}")

@@ -1,0 +1,31 @@
+"""A run with a disk and a store of six servers that says its id and waits, to be killed.
+
+Place: process of its own.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from faults.disk import Disk
+from faults.plan import make_topology
+from faults.store import StoreCluster
+
+from gdp.testbed.namespaces import Namespaces
+from gdp.testbed.runs import Runs
+
+__all__: list[str] = []
+
+
+def main() -> None:
+    """Make both, say so, and wait for the end of standard input."""
+    topology, _ = make_topology({"a": ("s1",)}, {}, (), ("s1",), {"P": "s1"})
+    run = Runs().start()
+    Disk(run).fill()
+    StoreCluster(run, Namespaces(topology, run), ["s1"])
+    print(run.id, flush=True)
+    sys.stdin.read()
+
+
+if __name__ == "__main__":
+    main()

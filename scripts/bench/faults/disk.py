@@ -1,0 +1,94 @@
+"""The disk of a run: a small file system in memory that can be full, and what RIBs must say about it.
+
+Place: I/O; a tmpfs in the run's own folder, named in its record.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from gdp.testbed.mounts import mount_tmpfs
+from gdp.testbed.runs import Run
+
+__all__ = ["BROKEN", "NOT_WRITTEN", "Disk", "snapshot_faults"]
+
+SIZE_BYTES: Final = 64 << 20  # six snapshots with their logs take 30 MB at most
+NOT_WRITTEN: Final = "snapshot not written"
+_WRITTEN: Final = "snapshot written again"
+_READ: Final = "snapshot read"
+_NOT_READ: Final = "snapshot not read"
+_UP: Final = "rib up"
+BROKEN: Final = ".broken"
+_BLOCKS_BYTES: Final = (1 << 20, 1 << 12)
+
+
+class Disk:
+    """A small file system.
+
+    Args:
+        run: in whose folder it is mounted, and whose end unmounts it.
+
+    Raises:
+        LocalError: the kernel refuses.
+    """
+
+    def __init__(self, run: Run) -> None:
+        self._path = run.directory / "disk"
+        run.plan_mount(self._path)
+        mount_tmpfs(self._path, SIZE_BYTES)
+
+    @property
+    def _ballast(self) -> Path:
+        return self._path / "ballast"
+
+    def snapshot(self, node: str) -> Path:
+        """Return where the RIB of a switch keeps its snapshot."""
+        return self._path / f"rib-{node}.sqlite"
+
+    def fill(self) -> None:
+        """Leave no block free."""
+        with self._ballast.open("wb", buffering=0) as file:
+            for size in _BLOCKS_BYTES:
+                try:
+                    while True:
+                        file.write(bytes(size))
+                except OSError as error:
+                    if error.errno != errno.ENOSPC:
+                        raise
+
+    def free(self) -> None:
+        """Give the blocks back."""
+        self._ballast.unlink(missing_ok=True)
+
+    def broken(self) -> list[str]:
+        """Return the snapshots that a RIB could not make sense of."""
+        return sorted(name for name in os.listdir(self._path) if name.endswith(BROKEN))
+
+
+def snapshot_faults(who: str, log: str, *, is_alive: bool) -> Iterator[str]:
+    """Yield, in words, what a life of a RIB said wrongly about its snapshot.
+
+    Args:
+        log: all that it logged.
+        is_alive: it runs, the disk has space, and time enough has passed to write.
+    """
+    is_failing = has_started = False
+    for line in log.splitlines():
+        if _UP in line and not has_started:
+            yield f"{who} is up and did not say what it read of its snapshot"
+        elif _READ in line or _NOT_READ in line:
+            has_started = True
+            if _READ in line and " unreadable=0 " not in line:
+                yield f"{who} read half an entry: {line}"
+        elif NOT_WRITTEN in line:
+            if is_failing:
+                yield f"{who} said twice that its snapshot is not written"
+            is_failing = True
+        elif _WRITTEN in line:
+            is_failing = False
+    if is_failing and is_alive:
+        yield f"{who} does not write its snapshot again, or does not say so"

@@ -1,0 +1,213 @@
+"""A Valkey or Redis Cluster in a namespace of the run, which RIBs reach over a bridge; servers fail on demand.
+
+Place: I/O. ``scripts/start_cluster.sh`` starts three primaries with a replica each. The servers are daemons: they are
+in the run's record, and they live in a namespace of the run, whose end ends what is inside.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import yaml
+from peers.process import FailedError
+from pyroute2 import IPRoute
+from redis import Redis
+from redis.exceptions import RedisError
+
+from gdp.errors import LocalError
+from gdp.testbed import netns_files
+from gdp.testbed.namespaces import Namespaces, silence
+from gdp.testbed.runs import Run
+
+__all__ = ["StoreCluster", "has_server"]
+
+_START_CLUSTER: Final = Path(__file__).resolve().parents[2] / "start_cluster.sh"
+_KINDS: Final = ("valkey", "redis")  # in the order of start_cluster.sh
+_BRIDGE: Final = "servers"
+_IFNAME: Final = "store"  # of a RIB's end
+_ADDRESS: Final = "10.255.77.1"
+_OF_RIBS: Final = "10.255.77.{}"
+_PREFIX_BITS: Final = 24
+_START_S: Final = 120.0
+_ANSWER_S: Final = 0.3
+_WHOLE_S: Final = 20.0
+_LOOK_S: Final = 0.05
+
+
+def has_server() -> bool:
+    """Return whether a Valkey or Redis server, with its client, is installed."""
+    return _program() is not None
+
+
+class StoreCluster:
+    """Six servers.
+
+    Args:
+        run: whose folder holds the data.
+        spaces: of the network.
+        ribs: switches in whose namespaces the RIBs run that use the cluster.
+
+    Raises:
+        LocalError: the kernel refuses, or the servers do not start.
+    """
+
+    def __init__(self, run: Run, spaces: Namespaces, ribs: Sequence[str]) -> None:
+        self._run = run
+        self._folder = run.directory / "store"
+        self._path = spaces.path(ribs[0]).with_name(f"gdp-{run.id}-store")
+        run.plan_namespace(self._path)
+        netns_files.create(self._path)
+        netns_files.inside(self._path, silence)
+        netns_files.inside(self._path, _make_bridge)
+        for at, node in enumerate(ribs, 2):
+            self._join(spaces.path(node), f"to-{node}", _OF_RIBS.format(at))
+        started = subprocess.run(
+            [*self._entering(), str(_START_CLUSTER), str(self._folder), _ADDRESS],
+            capture_output=True, text=True, check=False, timeout=_START_S, start_new_session=True,
+        )  # fmt: skip
+        if started.returncode:
+            raise LocalError(f"the store does not start: {started.stderr.strip()}")
+        self._config = yaml.safe_load(Path(started.stdout.strip()).read_text(encoding="utf-8"))
+        self._password = (self._folder / "admin.password").read_text(encoding="ascii").strip()
+        self._servers = {int(conf.parent.name): _port(conf) for conf in self._folder.glob("*/server.conf")}
+        program = _program()
+        assert program is not None  # or the script had failed
+        self._program = program
+        for number in self._servers:
+            run.note_process(self._pid(number))
+        self._away: dict[str, int] = {}  # what a fault took, by its name
+
+    @property
+    def config(self) -> Mapping[str, object]:
+        """Return the keys of a RIB's file that let it use the cluster."""
+        return dict(self._config)
+
+    def kill(self, fault: str, *, is_primary: bool, choice: int) -> str:
+        """Kill a primary that has a replica in step, or a replica (SIGKILL); return which."""
+        return self._take(fault, signal.SIGKILL, is_primary=is_primary, choice=choice)
+
+    def freeze(self, fault: str, *, choice: int) -> str:
+        """Give a primary that has a replica in step no more time; return which."""
+        return self._take(fault, signal.SIGSTOP, is_primary=True, choice=choice)
+
+    def restart(self, fault: str) -> None:
+        """Start again what a fault killed.
+
+        Raises:
+            FailedError: it does not start.
+        """
+        number = self._away.pop(fault)
+        folder = self._folder / str(number)
+        (folder / "server.pid").unlink(missing_ok=True)
+        argv = [*self._entering(), self._program, "server.conf"]
+        if subprocess.run(argv, cwd=folder, check=False, stdout=subprocess.DEVNULL).returncode:
+            raise FailedError(f"server {number} of the store does not start again")
+        end_s = time.monotonic() + _WHOLE_S
+        while self._role(number) is None:
+            if time.monotonic() > end_s:
+                raise FailedError(f"server {number} of the store does not answer")
+            time.sleep(_LOOK_S)
+        self._run.note_process(self._pid(number))
+
+    def thaw(self, fault: str) -> None:
+        """Let go on what a fault froze."""
+        with suppress(ProcessLookupError):
+            os.kill(self._pid(self._away.pop(fault)), signal.SIGCONT)
+
+    def close(self) -> None:
+        """End the servers; their data go with the run."""
+        for number in self._servers:
+            with suppress(FileNotFoundError, ProcessLookupError):
+                os.kill(self._pid(number), signal.SIGKILL)
+
+    def _take(self, fault: str, number: signal.Signals, *, is_primary: bool, choice: int) -> str:
+        end_s = time.monotonic() + _WHOLE_S
+        while not (fit := self._fit(is_primary=is_primary)):
+            if time.monotonic() > end_s:
+                raise FailedError(f"the store is not whole {_WHOLE_S:g} s after its last fault")
+            time.sleep(_LOOK_S)
+        server = self._away[fault] = fit[choice % len(fit)]
+        os.kill(self._pid(server), number)
+        return f"server {server}"
+
+    def _fit(self, *, is_primary: bool) -> list[int]:
+        """Return the servers of this role; those alone that another one could replace, or that replace none yet."""
+        roles = {number: self._role(number) for number in sorted(self._servers)}
+        if any(role is None for role in roles.values()) or list(roles.values()).count((True, True)) != len(roles) // 2:
+            return []
+        return [number for number, role in roles.items() if role is not None and role[0] is is_primary]
+
+    def _role(self, number: int) -> tuple[bool, bool] | None:
+        """Return whether a server is a primary, and whether its other half is in step; None: it does not answer."""
+        return netns_files.inside(self._path, partial(_role_of, self._servers[number], self._password, self._folder))
+
+    def _pid(self, number: int) -> int:
+        return int((self._folder / str(number) / "server.pid").read_text(encoding="ascii"))
+
+    def _entering(self) -> list[str]:
+        return ["nsenter", f"--net={self._path}", "--"]
+
+    def _join(self, rib: Path, ifname: str, address: str) -> None:
+        there = os.open(rib, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            netns_files.inside(self._path, partial(_plug, ifname, there))
+        finally:
+            os.close(there)
+        netns_files.inside(rib, partial(_raise, _IFNAME, address))
+
+
+def _program() -> str | None:
+    """Return the server that ``start_cluster.sh`` starts, too, or None."""
+    kinds = (kind for kind in _KINDS if shutil.which(f"{kind}-cli"))
+    return next((program for kind in kinds if (program := shutil.which(f"{kind}-server"))), None)
+
+
+def _make_bridge() -> None:
+    with IPRoute() as here:
+        here.link("set", index=here.link_lookup(ifname="lo")[0], state="up")
+        here.link("add", kind="bridge", ifname=_BRIDGE)
+    _raise(_BRIDGE, _ADDRESS)
+
+
+def _plug(ifname: str, namespace: int) -> None:
+    with IPRoute() as here:
+        here.link("add", kind="veth", ifname=ifname, peer={"ifname": _IFNAME, "net_ns_fd": namespace})
+        index = here.link_lookup(ifname=ifname)[0]
+        here.link("set", index=index, state="up", master=here.link_lookup(ifname=_BRIDGE)[0])
+
+
+def _raise(ifname: str, address: str) -> None:
+    with IPRoute() as here:
+        index = here.link_lookup(ifname=ifname)[0]
+        here.addr("add", index=index, address=address, prefixlen=_PREFIX_BITS)
+        here.link("set", index=index, state="up")
+
+
+def _port(conf: Path) -> int:
+    words = (line.split() for line in conf.read_text(encoding="utf-8").splitlines())
+    return next(int(each[1]) for each in words if each and each[0] == "tls-port")
+
+
+def _role_of(port: int, password: str, folder: Path) -> tuple[bool, bool] | None:
+    client = Redis(
+        host=_ADDRESS, port=port, username="admin", password=password, ssl=True, ssl_ca_certs=str(folder / "ca.pem"),
+        socket_timeout=_ANSWER_S, socket_connect_timeout=_ANSWER_S,
+    )  # fmt: skip
+    try:
+        known = client.info("replication")
+        is_primary = known["role"] == "master"
+        is_in_step = known["connected_slaves"] > 0 if is_primary else known["master_link_status"] == "up"
+        return is_primary, bool(is_in_step)
+    except (RedisError, OSError):
+        return None
+    finally:
+        client.close()
