@@ -3,8 +3,9 @@
 Place: shell; needs rclpy. Parameters: ``rate_hz``; ``calls``: how many in all, 0: until Ctrl-C; ``timeout_s``: when a
 call counts as failed; ``report_s``: how often a line is written. SIGUSR1: it calls no more, and ends when the calls
 under way have. A line is ``{"calls", "answered", "failed", "wrong", "unserved", "under_way", "median_ms", "p99_ms",
-"by_machine", "done"}``; ``unserved`` are calls left out since, after the first, no server was there. The last line has
-``"done": true``. Exit 1 if any call failed.
+"silence_ms", "unix_s", "by_machine", "done"}``; ``unserved`` are calls left out since, after the first, no server was
+there; ``silence_ms`` is the longest time between two answers since the line before, ``unix_s`` is when the line was
+written. The last line has ``"done": true``. Exit 1 if any call failed.
 """
 
 from __future__ import annotations
@@ -40,16 +41,21 @@ class Tally:
     unserved: int = 0
     by_machine: Counter[str] = field(default_factory=Counter)
     latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=10_000))
+    silence_s: float = 0.0
+    answered_s: float | None = None
 
-    def answered(self, asked: bool, answer: _Answer, took_s: float) -> None:
-        """Count an answer."""
+    def answered(self, asked: bool, answer: _Answer, took_s: float, now_s: float) -> None:
+        """Count an answer; ``now_s``: monotonic seconds."""
+        self.silence_s = max(self.silence_s, now_s - (now_s if self.answered_s is None else self.answered_s))
+        self.answered_s = now_s
         if answer.success != asked:
             self.wrong += 1
         self.by_machine[answer.message] += 1
         self.latencies_s.append(took_s)
 
-    def line(self, *, done: bool) -> str:
-        """Return the counts as one line of JSON."""
+    def line(self, *, unix_s: float, done: bool) -> str:
+        """Return the counts as one line of JSON; the longest silence begins again."""
+        silence_s, self.silence_s = self.silence_s, 0.0
         answered = self.by_machine.total()
         ranked = sorted(self.latencies_s)
         spread = {
@@ -64,7 +70,8 @@ class Tally:
             "unserved": self.unserved,
             "under_way": self.calls - answered - self.failed,
         }
-        return json.dumps({**counts, **spread, "by_machine": dict(self.by_machine), "done": done})
+        times = {"silence_ms": round(1e3 * silence_s, 3), "unix_s": unix_s}
+        return json.dumps({**counts, **spread, **times, "by_machine": dict(self.by_machine), "done": done})
 
 
 def main() -> None:
@@ -105,17 +112,22 @@ def main() -> None:
     def answered(future: rclpy.Future) -> None:
         if future in waiting and future.done():
             asked, began_s = waiting.pop(future)
-            tally.answered(asked, future.result(), time.monotonic() - began_s)
+            now_s = time.monotonic()
+            tally.answered(asked, future.result(), now_s - began_s, now_s)
 
     signal.signal(signal.SIGUSR1, finish)
     node.create_timer(1.0 / rate_hz, call)
-    node.create_timer(report_s, lambda: print(tally.line(done=False), flush=True))  # noqa: T201  # its output
+
+    def report(*, done: bool = False) -> None:
+        print(tally.line(unix_s=time.time(), done=done), flush=True)  # noqa: T201  # its output
+
+    node.create_timer(report_s, report)
     try:
         while not (most and tally.calls >= most and not waiting):
             rclpy.spin_once(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass  # both are how it ends
-    print(tally.line(done=True), flush=True)  # noqa: T201
+    report(done=True)
     node.destroy_node()
     rclpy.try_shutdown()
     sys.exit(1 if tally.failed or tally.wrong else 0)
