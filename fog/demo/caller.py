@@ -1,11 +1,12 @@
 """A robot's node that calls ``/echo`` at a rate and counts what comes back, as lines of JSON.
 
 Place: shell; needs rclpy. Parameters: ``rate_hz``; ``calls``: how many in all, 0: until Ctrl-C; ``timeout_s``: when a
-call counts as failed; ``report_s``: how often a line is written. SIGUSR1: it calls no more, and ends when the calls
-under way have. A line is ``{"calls", "answered", "failed", "wrong", "unserved", "under_way", "median_ms", "p99_ms",
-"silence_ms", "unix_s", "by_machine", "done"}``; ``unserved`` are calls left out since, after the first, no server was
-there; ``silence_ms`` is the longest time between two answers since the line before, ``unix_s`` is when the line was
-written. The last line has ``"done": true``. Exit 1 if any call failed.
+call counts as failed; ``report_s``: how often a line is written; ``depth``: how many answers may wait for this node
+(ROS 2 has 10, and drops more; after an outage all calls under way are answered at once). SIGUSR1: it calls no more, and
+ends when the calls under way have. A line is ``{"calls", "answered", "failed", "wrong", "unserved", "under_way",
+"median_ms", "p99_ms", "silence_ms", "unix_s", "by_machine", "done"}``; ``unserved`` are calls left out since, after the
+first, no server was there; ``silence_ms`` is the longest time between two answers since the line before, ``unix_s`` is
+when the line was written. The last line has ``"done": true``. Exit 1 if any call failed.
 """
 
 from __future__ import annotations
@@ -15,12 +16,14 @@ import signal
 import sys
 import time
 from collections import Counter, deque
+from copy import copy
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import ExternalShutdownException
+from rclpy.qos import qos_profile_services_default
 from std_srvs.srv import SetBool
 
 __all__ = ["Tally", "main"]
@@ -83,7 +86,9 @@ def main() -> None:
     most = int(node.declare_parameter("calls", 0).value)
     timeout_s = float(node.declare_parameter("timeout_s", 10.0, number).value)
     report_s = float(node.declare_parameter("report_s", 1.0, number).value)
-    client = node.create_client(SetBool, "/echo")
+    profile = copy(qos_profile_services_default)
+    profile.depth = int(node.declare_parameter("depth", profile.depth).value)
+    client = node.create_client(SetBool, "/echo", qos_profile=profile)
     tally = Tally()
     waiting: dict[object, tuple[bool, float]] = {}
 

@@ -34,6 +34,7 @@ _LAUNCH_FILE: Final = Path(__file__).resolve().parents[2] / "examples" / "echo.l
 _ROBOT: Final = "robot"
 _LAUNCHED: Final = 2  # by the launch file
 _REPORT_S: Final = 1.0
+_DEPTH: Final = 1_000  # answers to all calls of an outage come in one burst
 _PATIENCE_S: Final = 90.0
 _LAUNCH_S: Final = 200.0
 _STEP_S: Final = 0.02
@@ -70,6 +71,7 @@ class Cluster:
             self._journal = undo.enter_context(closing(Journal(self._site.journal)))
             self._runs = local_provider(self._site).runs
             told = ["-m", "fog.demo.caller", "--ros-args", "-p", f"rate_hz:={rate_hz}", "-p", f"report_s:={_REPORT_S}"]
+            told += ["-p", f"depth:={_DEPTH}"]
             self._caller = undo.enter_context(self._start("caller", told))
             if not self._caller.read(_PATIENCE_S)["answered"]:
                 raise FailedError("the robot's node is not answered")
