@@ -87,12 +87,21 @@ AUTOMATIC_REPLICA: Final = Gateway(gateway=_AUTOMATIC_LABEL, replica=True)
 
 
 def _read(value: object) -> object:
-    """Return the mapping for which the word ``replica`` stands; anything else is left as it is."""
+    """Return the gateway for which the word ``replica`` stands; anything else stays as it is, but lists as tuples.
+
+    What a validator of this kind returns is not JSON any more to pydantic, so that its strict mode refuses lists.
+    """
     if value == _REPLICA:
         return AUTOMATIC_REPLICA
     if isinstance(value, str):
         raise ValueError(f"{value!r}: expected the word 'replica', or a mapping with the key 'gateway'")
-    return value
+    return _with_tuples(value)
+
+
+def _with_tuples(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _with_tuples(each) for key, each in value.items()}
+    return tuple(map(_with_tuples, value)) if isinstance(value, list) else value
 
 
 Topology = Annotated[Gateway, BeforeValidator(_read)]

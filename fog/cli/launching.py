@@ -97,7 +97,9 @@ def launch(
             if None in (chosen := choices(found, plan.machines)):
                 raise LocalError(refusal(provider, plan.machines, chosen))
             plan, target = reached(plan, found)
-            whole = Priced(replace(loaded, plan=plan), choices(found, plan.machines), found.latencies, target)
+            topology = here.topology if here.provider == "local" else None
+            chosen = choices(found, plan.machines)
+            whole = Priced(replace(loaded, plan=plan), chosen, found.latencies, target, topology)
         ends = ends_with
         if not (detach or keep or loaded.keep) and loaded.robot_nodes:
             ends = "the robot's nodes"
