@@ -148,7 +148,7 @@ def fog(tmp_path: Path, space: Space) -> Iterator[Fog]:
 def test_calls_go_on_when_the_machine_that_is_the_gateway_is_killed(fog: Fog) -> None:
     fog.run("launch", str(ECHO), "--gateway", "replica", "--detach")
     fog.run("scale", "up")
-    fog.until(lambda: len(fog.serving()) == 3, "three replicas serve")
+    fog.until(lambda: len(fog.serving()) == 3 and all(each.up_unix_s for each in fog.living()), "three replicas serve")
     words = ["-m", "fog.demo.caller", "--ros-args", "-p", "rate_hz:=20.0", "-p", "depth:=1000"]
     caller = subprocess.Popen(
         [sys.executable, *words], env=fog.environment, cwd=fog.state.parent, stdout=subprocess.PIPE, text=True
@@ -160,11 +160,12 @@ def test_calls_go_on_when_the_machine_that_is_the_gateway_is_killed(fog: Fog) ->
         (lost,) = (each for each in fog.living() if each.gateway)
         host = find(local_provider(open_site(None, fog.state)).runs, lost.id).host
         assert host is not None
+        moves = fog.events().count("gateway")
         os.kill(fog.status()["supervisor_pid"], signal.SIGKILL)
         (known,) = (each["name"] for each in fog.status()["members"] if each["gateway"])  # starts another supervisor
         assert known == lost.name
         fog.until(lambda: fog.events().count("reconciled") == 2, "the other supervisor has looked")
-        assert fog.events().count("gateway") == 1
+        assert fog.events().count("gateway") == moves
         os.kill(host.pid, signal.SIGKILL)  # the kernel ends its programs; its devices stay
         fog.until(lambda: {each.name for each in fog.living() if each.gateway} - {lost.name}, "the role moves")
         fog.until(lambda: len({*fog.serving()} - {lost.name}) == 3, "the killed machine is replaced")
@@ -184,4 +185,4 @@ def test_calls_go_on_when_the_machine_that_is_the_gateway_is_killed(fog: Fog) ->
     assert now in fog.run("status")
     with closing(Journal(fog.state / "journal.sqlite3")) as journal:
         moved = [(each.machine, each.detail) for each in journal.events("echo") if each.what == "gateway"]
-    assert moved == [(lost.name, "of gateway: the first machine"), (now, f"of gateway: {lost.name} is gone: killed")]
+    assert moved[moves:] == [(now, f"of gateway: {lost.name} is gone: killed")]

@@ -52,14 +52,14 @@ def elect(group: Sequence[Record], label: str, now_s: float, patience: Patience)
     if old is None:
         lost = max((each for each in group if each.is_gone and each.gateway == label), key=_last_s, default=None)
         return Election(best, None, "the first machine" if lost is None else f"{lost.name} is gone: {lost.reason}")
-    if old.up_unix_s is None and now_s - _last_s(old) >= patience.lonely_s:
-        return Election(best, old, f"{old.name} does not come up")
+    if old.up_unix_s is None:
+        is_cut_off = best.up_unix_s is not None and not best.is_serving  # else its switch may forward already
+        is_late = now_s - _last_s(old) >= (patience.gateway_s if is_cut_off else patience.lonely_s)
+        return Election(best, old, f"{old.name} does not come up") if is_late else None
     if best.up_unix_s is None:
         return None  # it would forward nothing yet
     if old.is_outgoing:
         return Election(best, old, f"{old.name} leaves: {old.reason}")
-    if old.up_unix_s is None:
-        return Election(best, old, f"{old.name} still boots")
     if _is_suspect(old, there, now_s, patience) and _last_s(best) < (old.unheard_unix_s or 0.0):
         return Election(best, old, f"behind {old.name} no replica is heard")
     return None
