@@ -155,7 +155,9 @@ def main() -> None:
             for at in range(1, rounds + 1):
                 for case in cases:
                     progress(f"round {at}/{rounds}: {CASES[case]}")
-                    for column, value in measure(cluster, case).items():
+                    got = measure(cluster, case)
+                    progress(", ".join(f"{column}: {value:.2f}" for column, value in got.items() if value is not None))
+                    for column, value in got.items():
                         over.add(WHO, CASES[case], column, value)
             said = cluster.end_caller()
     except KeyboardInterrupt:

@@ -73,8 +73,10 @@ class Cluster:
             told = ["-m", "fog.demo.caller", "--ros-args", "-p", f"rate_hz:={rate_hz}", "-p", f"report_s:={_REPORT_S}"]
             told += ["-p", f"depth:={_DEPTH}"]
             self._caller = undo.enter_context(self._start("caller", told))
-            if not self._caller.read(_PATIENCE_S)["answered"]:
-                raise FailedError("the robot's node is not answered")
+            end_s = time.monotonic() + _PATIENCE_S
+            while not self._caller.read(_PATIENCE_S)["answered"]:
+                if time.monotonic() > end_s:
+                    raise FailedError("the robot's node is not answered")
             self._supervisors = undo.enter_context(ExitStack())
             self._undo = undo.pop_all()
 
