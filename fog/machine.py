@@ -81,6 +81,7 @@ class Machine:
         leaves_at_unix_s: when the provider will take it, once it has given notice.
         reason: why it is leaving or gone, in a few words.
         since_unix_s: when it came into this state; None: the provider does not say.
+        is_gateway: it has the uplink of its replica gateway.
     """
 
     id: str
@@ -91,3 +92,4 @@ class Machine:
     leaves_at_unix_s: float | None = None
     reason: str = ""
     since_unix_s: float | None = None
+    is_gateway: bool = False

@@ -31,7 +31,7 @@ from fog.latency.config import LatencyConfig
 from fog.latency.known import Latencies
 from fog.providers.aws.config import AwsConfig
 from fog.providers.skypilot.config import SkyPilotConfig
-from fog.topology import AUTOMATIC, Gateway
+from fog.topology import AUTOMATIC, AUTOMATIC_REPLICA, Gateway, Topology
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError
 from gdp.limits import CLAIM_LEASE_S
@@ -40,7 +40,8 @@ from gdp.nodes.schema import Directory, ExistingFile, Ifname, Section, Unique, l
 from gdp.stores.files import private, read_private, write_all
 from gdp.stores.issue import make_domain, make_node, make_owner
 
-__all__ = ["SCRATCH", "ProviderName", "Site", "SiteConfig", "open_site", "peek_site", "state_folder"]
+__all__ = ["SCRATCH", "ProviderName", "Site", "SiteConfig", "open_site", "peek_site", "save_topology", "state_folder"]
+__all__ += ["topology_now", "with_gateway"]
 
 ProviderName = Literal["local", "aws", "skypilot"]
 
@@ -76,8 +77,10 @@ class SiteConfig(Section):
     uplink: Ifname | None = Field(
         default=None, description="`local`: the port of the robot's switch that leads to the machines; it is made."
     )
-    topology: Gateway = Field(
-        default=AUTOMATIC, description="`local`: the tree of gateways to the machines. Without it there is one."
+    topology: Topology = Field(
+        default=AUTOMATIC,
+        description="`local`: the tree of gateways to the machines, or `replica`: one gateway, which is a machine. "
+        "Without it there is one dedicated gateway.",
     )
     state: Annotated[Path, AfterValidator(relative)] | None = Field(
         default=None, description="Folder of the journal. Default: $FOG_STATE, else ~/.local/state/gdp-fog."
@@ -122,6 +125,15 @@ class SiteConfig(Section):
             raise ValueError(
                 f"machine_iface is {self.device}, but the tunnel of {self.provider}.setup.vxlan is {self._tunnel}:"
                 " leave machine_iface out, or let both say the same"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _gateways_can_be_made(self) -> SiteConfig:
+        if self.provider != "local" and self.topology != AUTOMATIC:
+            raise ValueError(
+                f"topology is for the provider local: {self.provider} makes no gateways, its machines reach the robot"
+                " through their tunnels; remove topology"
             )
         return self
 
@@ -227,10 +239,11 @@ def open_site(file: Path | None, state: Path | None = None) -> Site:
         raise LocalError(f"{folder}: {error.strerror}") from error
     with (folder / "site.lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        identifier = _identifier(folder)
+        identifier, is_replica = _identifier(folder)
         (folder / SCRATCH).mkdir(mode=0o700, exist_ok=True)
         if config is None or file is None:
-            return _own(folder, identifier)
+            own = _own(folder, identifier)
+            return with_gateway(own, is_replica=is_replica)
         return _stated(config, file.absolute(), folder, identifier)
 
 
@@ -261,13 +274,45 @@ def _stands_where(file: Path | None, state: Path | None) -> tuple[Path | None, S
     return file, config, (state or (config.state if config is not None else None) or state_folder()).absolute()
 
 
-def _identifier(folder: Path) -> str:
+def with_gateway(site: Site, *, is_replica: bool) -> Site:
+    """Return a site of its own with another kind of gateway; ``save_topology`` makes it last.
+
+    Raises:
+        LocalError: a file states the site.
+    """
+    if site.file is not None:
+        raise LocalError(f"{site.file} states the site: set 'topology' there instead of --gateway")
+    return replace(site, topology=AUTOMATIC_REPLICA if is_replica else AUTOMATIC)
+
+
+def topology_now(site: Site) -> Gateway:
+    """Return a site's topology as the last launch left it.
+
+    Raises:
+        LocalError: the site's file cannot be read.
+    """
+    if site.file is not None:
+        return site.topology
+    return AUTOMATIC_REPLICA if _identifier(site.state)[1] else AUTOMATIC
+
+
+def save_topology(site: Site) -> None:
+    """Keep the topology of a site of its own for later commands; of another site it is in its file."""
+    if site.file is None:
+        with site.locked():
+            said = {"id": site.id, "replica_gateway": site.topology.replica}
+            write_all(site.state, {_SITE: private(json.dumps(said).encode())}, force=True)
+
+
+def _identifier(folder: Path) -> tuple[str, bool]:
+    """Return a site's id, and whether its own gateway is a replica."""
     path = folder / _SITE
     if not path.exists():
         write_all(folder, {_SITE: private(json.dumps({"id": secrets.token_hex(_ID_BYTES)}).encode())})
     try:
-        return str(json.loads(read_private(path))["id"])
-    except (ValueError, KeyError, TypeError) as error:
+        said = json.loads(read_private(path))
+        return str(said["id"]), bool(said.get("replica_gateway", False))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise LocalError(f"{path}: not what fog wrote; with no cluster left, the folder may be deleted") from error
 
 

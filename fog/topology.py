@@ -1,16 +1,17 @@
-"""The tree of gateways between a robot and its machines: ``topology:`` in ``fog.yaml``.
+"""Tree of gateways between a robot and its machines: ``topology:`` in ``fog.yaml``.
 
-Place: pure. A request travels once over each of its links, however many machines lie behind: copies are made where
-branches part.
+Sans-I/O. Source: FogROS2-FT, Figure 4. A request travels once over each link, however many machines lie behind: copies
+are made where branches part.
 ::
 
     topology:
-      gateway: edge                   # the robot's uplink ends here
+      gateway: edge                   # dedicated (Figure 4, left); the robot's uplink ends here
       children:
         - {gateway: west, regions: [us-west-1, us-west-2]}
-        - {gateway: east, regions: [us-east-1]}
+        - {gateway: east, replica: true, regions: [us-east-1]}    # one of its machines (Figure 4, right)
 
-A region that no gateway names is served by the first one; without ``topology`` that serves all.
+The first gateway serves every region that no gateway names. Without ``topology`` one dedicated gateway serves all;
+with ``topology: replica`` one of the machines does.
 """
 
 from __future__ import annotations
@@ -18,20 +19,27 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Annotated, Final
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from gdp.nodes.schema import Section, Unique
 
-__all__ = ["AUTOMATIC", "Gateway"]
+__all__ = ["AUTOMATIC", "AUTOMATIC_REPLICA", "Gateway", "Topology"]
 
 _LABEL: Final = r"^[a-z0-9][a-z0-9-]{0,10}$"  # ``to-LABEL`` is a device's name
 _GATEWAYS_MAX: Final = 64
+_AUTOMATIC_LABEL: Final = "gateway"
+_REPLICA: Final = "replica"
 
 
 class Gateway(Section):
-    """A gateway, the regions whose machines are its neighbours, and the gateways behind it."""
+    """A gateway, the regions whose machines are its neighbours, and the gateways behind it.
+
+    Attributes:
+        replica: one of the machines of these regions is the gateway. Otherwise it is dedicated: a switch of its own.
+    """
 
     gateway: str = Field(pattern=_LABEL)
+    replica: bool = False
     regions: Annotated[tuple[str, ...], Unique] = ()
     children: tuple[Gateway, ...] = ()
 
@@ -57,5 +65,43 @@ class Gateway(Section):
             raise ValueError(f"at most {_GATEWAYS_MAX} gateways")
         return self
 
+    @model_validator(mode="after")
+    def _replicas_are_leaves(self) -> Gateway:
+        """A machine that may be preempted carries only machines that are its equals."""
+        if self.replica and self.children:
+            raise ValueError(
+                f"gateway {self.gateway} is a replica and has children: only a dedicated gateway may have gateways"
+                " behind it (remove 'replica: true', or move the children to the gateway above)"
+            )
+        for child in self.children:
+            if child.replica and not child.regions:
+                raise ValueError(
+                    f"gateway {child.gateway} is a replica without regions: no machine could be this gateway; name"
+                    " the regions of its machines"
+                )
+        return self
 
-AUTOMATIC: Final = Gateway(gateway="gateway")
+
+AUTOMATIC: Final = Gateway(gateway=_AUTOMATIC_LABEL)
+AUTOMATIC_REPLICA: Final = Gateway(gateway=_AUTOMATIC_LABEL, replica=True)
+
+
+def _read(value: object) -> object:
+    """Return the gateway for which the word ``replica`` stands; anything else stays as it is, but lists as tuples.
+
+    What a validator of this kind returns is not JSON any more to pydantic, so that its strict mode refuses lists.
+    """
+    if value == _REPLICA:
+        return AUTOMATIC_REPLICA
+    if isinstance(value, str):
+        raise ValueError(f"{value!r}: expected the word 'replica', or a mapping with the key 'gateway'")
+    return _with_tuples(value)
+
+
+def _with_tuples(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _with_tuples(each) for key, each in value.items()}
+    return tuple(map(_with_tuples, value)) if isinstance(value, list) else value
+
+
+Topology = Annotated[Gateway, BeforeValidator(_read)]

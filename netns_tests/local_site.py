@@ -16,9 +16,13 @@ from fog.hardware import Hardware
 from fog.machine import Boot, Machine, MachineSpec, Program
 from fog.offer import Offer
 from fog.providers.local.provider import LocalProvider
+from fog.providers.local.wire import UP
 from gdp.crypto.certificates import Role
-from gdp.stores.issue import make_domain, make_node
-from gdp.stores.keyring import DELEGATIONS
+from gdp.metadata import Metadata
+from gdp.names import Name
+from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
+from gdp.stores.keyring import CARD, DELEGATIONS, ROOT_CERTIFICATE
+from gdp.trust.right import Right
 
 __all__ = ["PATIENCE_S", "Domain", "leftovers", "machine_of", "plain_gateway", "spec", "ticking", "until"]
 
@@ -81,7 +85,7 @@ class Domain:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._running: list[subprocess.Popen[str]] = []
+        self._running: list[subprocess.Popen[str] | subprocess.Popen[bytes]] = []
         make_domain(folder / "domain", "test")
 
     def gateway(self, label: str, ifaces: Sequence[str]) -> Boot:
@@ -95,16 +99,49 @@ class Domain:
         files[f"proxy/{DELEGATIONS}/.none"] = b""
         return Boot(files, (_command("switch", "gdp.cli.switch"), _command("proxy", "proxy.cli", " is attached")))
 
-    def start_robot(self, uplink: str) -> None:
-        """Start the robot's switch and the domain's RIB in this namespace."""
-        self._start("switch", self._switch("robot", [uplink], ["rib0"]))
+    def replica(self, name: str, service: Metadata) -> Boot:
+        """Return what a machine runs that serves, and that may be the gateway of its group: a switch and a member."""
+        ports = [{"iface": "eth0"}, {"iface": UP, "optional": True}]
+        files = self._node(Role.SWITCH, name, {"ports": ports, "attach": ["proxy0"]})
+        keys, served = self._member(name, service, Right.SERVE)
+        files |= {f"proxy/{path.relative_to(keys)}": path.read_bytes() for path in keys.rglob("*") if path.is_file()}
+        words = (served.to_text(), "{home}/proxy", "{home}/switch/root.crt", "proxy0", "serve")
+        member = ("sh", "-c", 'until ip link show proxy0 >/dev/null 2>&1; do sleep 0.05; done; exec "$@"', "member")
+        program = Program("proxy", (*member, "{python}", "-m", "netns_tests.uplink_child", *words), "up")
+        return Boot(files, (_command("switch", "gdp.cli.switch"), program))
+
+    def start_robot(self, uplink: str, *attach: str) -> None:
+        """Start the robot's switch and the domain's RIB in this namespace; ``attach``: what else the switch makes."""
+        self._start("switch", self._switch("robot", [uplink], ["rib0", *attach]))
         self._start("rib", self._node(Role.RIB, "robot", {"iface": "rib0"}))
+
+    def start_client(self, iface: str, service: Metadata, requests: int, size: int) -> subprocess.Popen[bytes]:
+        """Start a member beside the robot's switch that asks as it is told; see ``uplink_child``."""
+        keys, name = self._member("client", service, Right.CALL)
+        root = self._folder / "domain" / ROOT_CERTIFICATE
+        words = [name.to_text(), str(keys), str(root), iface, "call", str(requests), str(size)]
+        client = subprocess.Popen(
+            [sys.executable, "-m", "netns_tests.uplink_child", *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        self._running.append(client)
+        assert client.stdout is not None
+        assert client.stdout.readline() == b"up\n"
+        return client
 
     def close(self) -> None:
         """End the robot's side."""
         for process in reversed(self._running):
             process.terminate()
             process.communicate(timeout=PATIENCE_S)
+
+    def _member(self, label: str, service: Metadata, right: Right) -> tuple[Path, Name]:
+        keys = self._folder / f"member-{label}"
+        make_node(keys, Role.PROXY, label, self._folder / "domain")
+        if not (self._folder / "owner").exists():
+            make_owner(self._folder / "owner")
+        given = delegate(self._folder / "owner", keys / CARD, service, [right])
+        install_delegation(keys, given)
+        return keys, given.name
 
     def _switch(self, label: str, ifaces: Sequence[str], attach: Sequence[str] = ()) -> dict[str, bytes]:
         ports = [{"iface": iface} for iface in ifaces]

@@ -66,6 +66,10 @@ class Fog:
         with closing(Journal(self.state / "journal.sqlite3")) as journal:
             return journal.machines("echo", gone=False)
 
+    def events(self) -> list[str]:
+        with closing(Journal(self.state / "journal.sqlite3")) as journal:
+            return [each.what for each in journal.events("echo")]
+
     def serving(self) -> list[str]:
         return [each.name for each in self.living() if each.is_serving]
 
@@ -117,7 +121,7 @@ def test_calls_go_on_while_machines_are_taken_and_killed_and_the_supervisor_is(f
     fog.until(lambda: len(fog.living()) == 1, "one replica is let go")
     fog.run("down")
     assert json.loads(fog.run("ls", "--json")) == []
-    assert not _left(fog)
+    assert not left_of(fog)
 
 
 def test_down_ends_everything_though_launch_and_supervisor_were_killed_and_the_journal_is_gone(fog: Fog) -> None:
@@ -140,10 +144,10 @@ def test_down_ends_everything_though_launch_and_supervisor_were_killed_and_the_j
     for path in fog.state.glob("journal.sqlite3*"):
         path.unlink()
     fog.run("down", "--all")
-    assert not _left(fog)
+    assert not left_of(fog)
 
 
-def _left(fog: Fog) -> list[str]:
+def left_of(fog: Fog) -> list[str]:
     """Return the processes and devices that are still there of a site."""
     words = []
     for folder in Path("/proc").iterdir():

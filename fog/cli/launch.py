@@ -25,6 +25,7 @@ from fog.launch.probe import kept, offered
 from fog.offer import Offer
 from fog.plan.duration import duration_text
 from fog.plan.target import Target
+from fog.topology import Gateway
 
 __all__ = ["BY_HAND", "Priced", "loaded_from", "priced", "show_plan"]
 
@@ -55,12 +56,18 @@ class Priced:
         choice: for each machine of the plan.
         latencies: of the regions that have offers.
         target: what the plan's availability came to; None: it asks for none.
+        topology: the gateways to the machines; None: their provider makes none.
     """
 
     loaded: Loaded
     choice: Sequence[Offer | None]
     latencies: Mapping[str, Latency]
     target: Target | None = None
+    topology: Gateway | None = None
+
+    def gateway(self, offer: Offer | None) -> Gateway | None:
+        """Return the gateway next to a machine; None: there is none."""
+        return self.topology.serving(offer.region) if self.topology is not None and offer is not None else None
 
 
 def priced(said: Priced) -> dict[str, object]:
@@ -77,6 +84,9 @@ def priced(said: Priced) -> dict[str, object]:
             "usd_per_hour": offer.usd_per_hour if offer else None,
             "latency_ms": said.latencies[offer.region].ms if offer else None,
             "latency_source": said.latencies[offer.region].source if offer else None,
+            "gateway": {"name": gateway.gateway, "replica": gateway.replica}
+            if (gateway := said.gateway(offer)) is not None
+            else None,
         }
         for wanted, offer in zip(plan.machines, said.choice, strict=True)
     ]
@@ -136,10 +146,12 @@ def _lines(said: Priced, fields: dict[str, object], ends: str) -> list[Text]:
     limits += [f"after {plan.budget_usd:g} USD"] if plan.budget_usd else []
     carried = [f"{each.kind} {each.name} ({each.type_name})" for each in plan.carried]
     unknown = "found out by starting the nodes once on this machine"
+    replicas = {each.gateway: None for each in map(said.gateway, said.choice) if each is not None and each.replica}
     lines = [
         ("price", f"{fields['usd_per_hour']} USD/h, {fields['usd_per_month']} USD/month"),
         ("ends", ", ".join([ends, *limits])),
         *(("latency", line) for line in latency_lines(said.latencies)),
+        *(("gateway", f"{name}: one of these machines") for name in replicas),
         *(("cloud", _words(node)) for node in plan.nodes),
         ("offers", ", ".join(carried) or "nothing" if loaded.is_known else unknown),
         *(("robot", _words(each.node)) for each in loaded.robot_nodes),

@@ -10,6 +10,7 @@ import signal
 import time
 from contextlib import closing
 from dataclasses import replace
+from enum import Enum
 from pathlib import Path
 from typing import Annotated, Final, Optional
 
@@ -22,24 +23,37 @@ from fog.cli.options import AsJson, SiteFile, State, opened, peeked
 from fog.cli.robot_nodes import INTERRUPTED, resolved, run
 from fog.cli.views import a_console, event_line, print_json
 from fog.cluster import ClusterPlan
-from fog.site import Site
+from fog.site import Site, save_topology, with_gateway
 from fog.supervisor.background import LOG, ensure
 from fog.supervisor.ground import command_of, open_provider, stand
 from fog.supervisor.journal import Entry, Journal
 from gdp.errors import LocalError
 
-__all__ = ["begin", "follow", "launch"]
+__all__ = ["GatewayKind", "begin", "follow", "launch"]
 
 log = logging.getLogger(__name__)
 
 _WAIT_S: Final = 600.0
 _STEP_S: Final = 0.05
 
+
+class GatewayKind(Enum):
+    """What the gateway of a site without ``fog.yaml`` is."""
+
+    DEDICATED = "dedicated"
+    REPLICA = "replica"
+
+
+
 File = Annotated[Path, typer.Argument(metavar="FILE", help="a launch file (.py), or a plan (.json)")]
 Words = Annotated[Optional[list[str]], typer.Argument(metavar="[NAME:=VALUE]...")]  # noqa: UP045
 DryRun = Annotated[bool, typer.Option("--dry-run", help="show machines and price, start nothing")]
 Detach = Annotated[bool, typer.Option("--detach", help="end when the replicas serve; start no node of the robot")]
 Keep = Annotated[bool, typer.Option("--keep", help="leave the cluster when the robot's nodes end")]
+Gateway = Annotated[
+    Optional[GatewayKind],  # noqa: UP045
+    typer.Option("--gateway", help="without fog.yaml: a switch of its own, or one of the machines"),
+]
 EndsWith = Annotated[str, typer.Option("--ends-with", hidden=True)]  # what else, such as another launch, ends it
 Wait = Annotated[float, typer.Option("--wait", metavar="S", min=0.0, help="how long the replicas may take")]
 
@@ -53,6 +67,7 @@ def launch(
     detach: Detach = False,
     keep: Keep = False,
     wait: Wait = _WAIT_S,
+    gateway: Gateway = None,
     ends_with: EndsWith = "",
     as_json: AsJson = False,
 ) -> None:
@@ -82,7 +97,9 @@ def launch(
             if None in (chosen := choices(found, plan.machines)):
                 raise LocalError(refusal(provider, plan.machines, chosen))
             plan, target = reached(plan, found)
-            whole = Priced(replace(loaded, plan=plan), choices(found, plan.machines), found.latencies, target)
+            topology = here.topology if here.provider == "local" else None
+            chosen = choices(found, plan.machines)
+            whole = Priced(replace(loaded, plan=plan), chosen, found.latencies, target, topology)
         ends = ends_with
         if not (detach or keep or loaded.keep) and loaded.robot_nodes:
             ends = "the robot's nodes"
@@ -91,9 +108,10 @@ def launch(
 
     if dry_run:
         with peeked(site, state) as here:
-            priced(here)
+            priced(_with(here, gateway))
         return
-    with opened(site, state) as (here, journal):
+    with opened(site, state) as (known, journal):
+        here = _with(known, gateway)
         loaded = priced(here).loaded
         plan = loaded.plan
         for node in plan.nodes:
@@ -120,6 +138,10 @@ def launch(
         raise typer.Exit(code)
 
 
+def _with(site: Site, gateway: GatewayKind | None) -> Site:
+    return site if gateway is None else with_gateway(site, is_replica=gateway is GatewayKind.REPLICA)
+
+
 def begin(site: Site, journal: Journal, plan: ClusterPlan) -> None:
     """Write that a cluster is wanted, and see to it that somebody cares for it.
 
@@ -127,6 +149,7 @@ def begin(site: Site, journal: Journal, plan: ClusterPlan) -> None:
         LocalError: what it is to stand on cannot be made.
     """
     stand(site)
+    save_topology(site)
     journal.want(plan, time.time())
     ensure(site)
 

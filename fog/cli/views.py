@@ -86,6 +86,7 @@ def machine_fields(
         "name": record.name,
         "stage": stage(record, is_watched=is_watched),
         "serving": record.is_serving,
+        "gateway": record.gateway if record.gateway and not record.is_gone else None,
         "region": offer.region,
         "latency_ms": (latency_ms or {}).get(offer.region),
         "type": offer.type_name,
@@ -157,13 +158,14 @@ def clusters_table(rows: Sequence[Mapping[str, object]]) -> Table:
 
 def machines_table(rows: Sequence[Mapping[str, object]], now_s: float) -> Table:
     """Return a line for each machine."""
-    table = _table("machine", "stage", "region", "ms", "type", "kind", "USD/h", "age", "address", "")
+    table = _table("machine", "stage", "gateway", "region", "ms", "type", "kind", "USD/h", "age", "address", "")
     for row in rows:
         began = float(str(row["asked_unix_s"]))
         age = (now_s if row["gone_unix_s"] is None else float(str(row["gone_unix_s"]))) - began
         table.add_row(
             str(row["name"]),
             Text(str(row["stage"]), style=_STYLES.get(str(row["stage"]), "")),
+            str(row["gateway"] or "-"),
             str(row["region"]),
             "-" if row["latency_ms"] is None else f"{row['latency_ms']:g}",
             str(row["type"]),

@@ -1,10 +1,12 @@
 """A robot's node that calls ``/echo`` at a rate and counts what comes back, as lines of JSON.
 
 Place: shell; needs rclpy. Parameters: ``rate_hz``; ``calls``: how many in all, 0: until Ctrl-C; ``timeout_s``: when a
-call counts as failed; ``report_s``: how often a line is written. SIGUSR1: it calls no more, and ends when the calls
-under way have. A line is ``{"calls", "answered", "failed", "wrong", "unserved", "under_way", "median_ms", "p99_ms",
-"by_machine", "done"}``; ``unserved`` are calls left out since, after the first, no server was there. The last line has
-``"done": true``. Exit 1 if any call failed.
+call counts as failed; ``report_s``: how often a line is written; ``depth``: how many answers may wait for this node
+(ROS 2 has 10, and drops more; after an outage all calls under way are answered at once). SIGUSR1: it calls no more, and
+ends when the calls under way have. A line is ``{"calls", "answered", "failed", "wrong", "unserved", "under_way",
+"median_ms", "p99_ms", "silence_ms", "unix_s", "by_machine", "done"}``; ``unserved`` are calls left out since, after the
+first, no server was there; ``silence_ms`` is the longest time between two answers since the line before, ``unix_s`` is
+when the line was written. The last line has ``"done": true``. Exit 1 if any call failed.
 """
 
 from __future__ import annotations
@@ -14,12 +16,14 @@ import signal
 import sys
 import time
 from collections import Counter, deque
+from copy import copy
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import ExternalShutdownException
+from rclpy.qos import qos_profile_services_default
 from std_srvs.srv import SetBool
 
 __all__ = ["Tally", "main"]
@@ -40,16 +44,21 @@ class Tally:
     unserved: int = 0
     by_machine: Counter[str] = field(default_factory=Counter)
     latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=10_000))
+    silence_s: float = 0.0
+    answered_s: float | None = None
 
-    def answered(self, asked: bool, answer: _Answer, took_s: float) -> None:
-        """Count an answer."""
+    def answered(self, asked: bool, answer: _Answer, took_s: float, now_s: float) -> None:
+        """Count an answer; ``now_s``: monotonic seconds."""
+        self.silence_s = max(self.silence_s, now_s - (now_s if self.answered_s is None else self.answered_s))
+        self.answered_s = now_s
         if answer.success != asked:
             self.wrong += 1
         self.by_machine[answer.message] += 1
         self.latencies_s.append(took_s)
 
-    def line(self, *, done: bool) -> str:
-        """Return the counts as one line of JSON."""
+    def line(self, *, unix_s: float, done: bool) -> str:
+        """Return the counts as one line of JSON; the longest silence begins again."""
+        silence_s, self.silence_s = self.silence_s, 0.0
         answered = self.by_machine.total()
         ranked = sorted(self.latencies_s)
         spread = {
@@ -64,7 +73,8 @@ class Tally:
             "unserved": self.unserved,
             "under_way": self.calls - answered - self.failed,
         }
-        return json.dumps({**counts, **spread, "by_machine": dict(self.by_machine), "done": done})
+        times = {"silence_ms": round(1e3 * silence_s, 3), "unix_s": unix_s}
+        return json.dumps({**counts, **spread, **times, "by_machine": dict(self.by_machine), "done": done})
 
 
 def main() -> None:
@@ -76,7 +86,9 @@ def main() -> None:
     most = int(node.declare_parameter("calls", 0).value)
     timeout_s = float(node.declare_parameter("timeout_s", 10.0, number).value)
     report_s = float(node.declare_parameter("report_s", 1.0, number).value)
-    client = node.create_client(SetBool, "/echo")
+    profile = copy(qos_profile_services_default)
+    profile.depth = int(node.declare_parameter("depth", profile.depth).value)
+    client = node.create_client(SetBool, "/echo", qos_profile=profile)
     tally = Tally()
     waiting: dict[object, tuple[bool, float]] = {}
 
@@ -105,17 +117,22 @@ def main() -> None:
     def answered(future: rclpy.Future) -> None:
         if future in waiting and future.done():
             asked, began_s = waiting.pop(future)
-            tally.answered(asked, future.result(), time.monotonic() - began_s)
+            now_s = time.monotonic()
+            tally.answered(asked, future.result(), now_s - began_s, now_s)
 
     signal.signal(signal.SIGUSR1, finish)
     node.create_timer(1.0 / rate_hz, call)
-    node.create_timer(report_s, lambda: print(tally.line(done=False), flush=True))  # noqa: T201  # its output
+
+    def report(*, done: bool = False) -> None:
+        print(tally.line(unix_s=time.time(), done=done), flush=True)  # noqa: T201  # its output
+
+    node.create_timer(report_s, report)
     try:
         while not (most and tally.calls >= most and not waiting):
             rclpy.spin_once(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass  # both are how it ends
-    print(tally.line(done=True), flush=True)  # noqa: T201
+    report(done=True)
     node.destroy_node()
     rclpy.try_shutdown()
     sys.exit(1 if tally.failed or tally.wrong else 0)

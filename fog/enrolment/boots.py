@@ -4,6 +4,7 @@ Place: I/O, through ``members``. Every file names others relative to itself, so 
 ::
 
     machine   [node ...] -- ROS graph of its own -- [proxy] -- [switch] -- iface        towards the gateway
+                                                                  `-- uplink            while it is the gateway
     gateway   ifaces -- [switch] -- ifaces
     robot     ROS graph of the robot -- [proxy] -- [switch] -- uplink                   and [rib], and the watch
 """
@@ -68,6 +69,7 @@ def machine_boot(
     days: float,
     shares_host: bool,
     lease_s: float = CLAIM_LEASE_S,
+    uplink: str = "",
 ) -> tuple[Boot, Papers]:
     """Enrol a machine of a cluster; return what it boots, and the papers by which it is known.
 
@@ -78,6 +80,7 @@ def machine_boot(
         days: how long its papers hold.
         shares_host: whether other machines run on the same host.
         lease_s: of its claims.
+        uplink: the device that it has while it is the gateway of its group; empty: it never is.
 
     Raises:
         LocalError: as ``Authority.enrol``.
@@ -86,6 +89,7 @@ def machine_boot(
     switch = authority.enrol(Role.SWITCH, title, days=days)
     proxy = authority.enrol(Role.PROXY, title, plan.carried, days=days)
     domain = 1 + int(name[1:]) % _DOMAINS
+    ports = [{"iface": iface}, *([{"iface": uplink, "optional": True}] if uplink else [])]
     rules = [{**_rule(each), **each.served, "owner": _OWNER} for each in plan.carried]
     files = {
         **switch.below("switch"),
@@ -93,7 +97,7 @@ def machine_boot(
         _OWNER: authority.owner_key.read_bytes(),
         _PROFILE: _OFTEN,
         "switch.yaml": _yaml(
-            {**_who("switch"), "ports": [{"iface": iface}], "attach": ["proxy0"], "table_max": _TABLE_MAX}
+            {**_who("switch"), "ports": ports, "attach": ["proxy0"], "table_max": _TABLE_MAX}
         ),
         "proxy.yaml": _yaml(
             {

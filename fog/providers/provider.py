@@ -6,13 +6,13 @@ Place: interface.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from fog.hardware import Hardware
 from fog.machine import Boot, Machine, MachineSpec
 from fog.offer import Offer
 
-__all__ = ["Provider"]
+__all__ = ["GatewayProvider", "Provider"]
 
 
 class Provider(Protocol):
@@ -75,4 +75,34 @@ class Provider(Protocol):
 
     def close(self) -> None:
         """Let go of what the provider's adapter holds; machines stay."""
+        ...
+
+
+@runtime_checkable
+class GatewayProvider(Protocol):
+    """Provider whose machines can be the gateway of their group: FogROS2-FT, Figure 4, right.
+
+    A machine that is the gateway has one device more, towards the robot. Any machine of the group can be given it at
+    any time, and two may have theirs at once.
+
+    Attributes:
+        uplink_iface: that device, as the machine's switch names it.
+    """
+
+    uplink_iface: str
+
+    def replica_gateway(self, region: str) -> str:
+        """Return the label of the replica gateway of a region's machines; empty: their gateway is no machine."""
+        ...
+
+    def attach_uplink(self, machine: str) -> None:
+        """Make a machine the gateway. Fine if it is.
+
+        Raises:
+            LocalError: there is no such machine, or its gateway is dedicated.
+        """
+        ...
+
+    def detach_uplink(self, machine: str) -> None:
+        """Let a machine be the gateway no longer. Fine if it is not, or is gone."""
         ...

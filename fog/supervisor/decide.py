@@ -6,7 +6,7 @@ A machine that serves is let go only when as many others as are wanted serve, or
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -27,6 +27,7 @@ class Patience:
         drain_s: from telling a machine to finish until it is given back.
         release_s: until a machine that was given back and is still there is given back again.
         papers_s: this long before its papers run out, another machine takes its place.
+        gateway_s: after a machine became the gateway of its group, until silence behind it means something.
     """
 
     boot_s: float = 90.0
@@ -35,6 +36,7 @@ class Patience:
     drain_s: float = 12.0
     release_s: float = 5.0
     papers_s: float = 1_800.0
+    gateway_s: float = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +67,13 @@ Action: TypeAlias = "Launch | Drain | Release"
 
 
 def decide(
-    wanted: Sequence[Wanted], records: Sequence[Record], now_s: float, patience: Patience, *, told: bool = True
+    wanted: Sequence[Wanted],
+    records: Sequence[Record],
+    now_s: float,
+    patience: Patience,
+    *,
+    told: bool = True,
+    excused: Collection[str] = (),
 ) -> list[Action]:
     """Return what brings a cluster nearer to what is wanted.
 
@@ -73,6 +81,7 @@ def decide(
         wanted: one a machine; empty: all are given back at once.
         records: of the cluster; those that are gone are of no account.
         told: whether the overlay can be asked who serves; if not, a machine that is up counts as serving.
+        excused: names of machines that are not heard for another reason than their own, and are kept.
     """
     there = [record for record in records if not record.is_gone]
     if not wanted:
@@ -81,7 +90,7 @@ def decide(
             for each in there
             if not each.is_released or now_s - (each.released_unix_s or now_s) >= patience.release_s
         ]
-    view = _View(now_s, patience, told, any(_serves(each, told=told) for each in there))
+    view = _View(now_s, patience, told, any(_serves(each, told=told) for each in there), excused)
     actions: list[Action] = []
     fit: list[Record] = []  # to stay, if wanted
     leaving: list[Record] = []  # serve on until others do, or their time is over
@@ -122,6 +131,7 @@ class _View:
     patience: Patience
     told: bool
     is_any_serving: bool
+    excused: Collection[str]
 
     def serves(self, record: Record) -> bool:
         return _serves(record, told=self.told)
@@ -151,7 +161,7 @@ class _View:
             return Release(record.name, "did not serve in time", Ending.FAILED) if is_late else None
         since_s = record.unheard_unix_s
         patience_s = limit.unheard_s if self.is_any_serving else limit.lonely_s
-        if since_s is not None and now_s - since_s >= patience_s:
+        if since_s is not None and now_s - since_s >= patience_s and record.name not in self.excused:
             return Release(record.name, "its replica is not heard any more", Ending.TAKEN)
         return None
 

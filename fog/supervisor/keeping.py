@@ -11,17 +11,19 @@ import signal
 import threading
 import time
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from types import FrameType
 from typing import Final
 
-from fog.site import Site
+from fog.site import Site, topology_now
 from fog.supervisor.background import held
 from fog.supervisor.decide import Patience
 from fog.supervisor.ground import command_of, open_provider, stand
 from fog.supervisor.journal import Journal
 from fog.supervisor.supervisor import Supervisor
 from fog.supervisor.watch import Watch
+from fog.topology import Gateway
 from gdp.errors import StoreError
 from gdp.testbed.processes import Process
 
@@ -49,8 +51,8 @@ def supervise(site: Site, *, stays: bool = False, lock: int | None = None) -> No
 def _run(site: Site, journal: Journal, *, stays: bool) -> None:
     ended = threading.Event()
     watch = Watch(*site.watch) if site.watch is not None else None
-    regions = _regions(journal)
-    provider = open_provider(site, regions)
+    offered = _offered(site, journal)
+    provider = open_provider(replace(site, topology=offered[1]), offered[0])
     supervisor = Supervisor(
         site,
         journal,
@@ -76,9 +78,9 @@ def _run(site: Site, journal: Journal, *, stays: bool) -> None:
             stand(site)  # after a crash of this machine nothing stands
         while not ended.is_set():
             try:
-                if (now := _regions(journal)) != regions:
-                    regions = now
-                    supervisor.use(open_provider(site, regions))
+                if (now := _offered(site, journal)) != offered:
+                    offered = now
+                    supervisor.use(open_provider(replace(site, topology=offered[1]), offered[0]))
                 supervisor.look()
                 if not is_reconciled:
                     supervisor.reconciled(_begun_unix_s())
@@ -102,9 +104,10 @@ def _run(site: Site, journal: Journal, *, stays: bool) -> None:
     log.info("supervisor ends")
 
 
-def _regions(journal: Journal) -> tuple[str, ...]:
+def _offered(site: Site, journal: Journal) -> tuple[tuple[str, ...], Gateway]:
+    """Return what the provider is to have: the regions that plans name, and the gateways."""
     wanted = (each for cluster in journal.clusters() for each in cluster.plan.machines)
-    return tuple(dict.fromkeys(each.region for each in wanted if each.region))
+    return tuple(dict.fromkeys(each.region for each in wanted if each.region)), topology_now(site)
 
 
 def _begun_unix_s() -> float:

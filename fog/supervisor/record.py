@@ -36,6 +36,8 @@ class Record:
         noticed_unix_s: when the provider's notice was seen.
         drained_unix_s, released_unix_s: when it was told to finish, and given back.
         ending: how it ended, or will have ended once what was given back is gone.
+        gateway: the label of the replica gateway that it is; empty: it is none.
+        gateway_unix_s: when it last became the gateway, or ceased to be it.
     """
 
     spec: MachineSpec
@@ -55,6 +57,8 @@ class Record:
     gone_unix_s: float | None = None
     ending: Ending | None = None
     reason: str = ""
+    gateway: str = ""
+    gateway_unix_s: float | None = None
 
     @property
     def name(self) -> str:

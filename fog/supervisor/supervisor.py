@@ -20,11 +20,12 @@ from fog.enrolment.revoking import take_back
 from fog.enrolment.robot_side import forget_rules, introduce, reload
 from fog.machine import Machine, MachineSpec, MachineState
 from fog.offer import Offer
-from fog.providers.provider import Provider
+from fog.providers.provider import GatewayProvider, Provider
 from fog.site import Site
 from fog.supervisor.activity import Activity, requests_in
 from fog.supervisor.acts import Acts
 from fog.supervisor.decide import Action, Drain, Launch, Patience, decide
+from fog.supervisor.gateway_election import elect, is_settling
 from fog.supervisor.journal import LAST_WORDS, Cluster, Journal
 from fog.supervisor.last_words import keep, kept
 from fog.supervisor.place import place
@@ -47,6 +48,7 @@ _GRACE_MIN_S: Final = 2.0
 _LOG_LINES: Final = 20
 _LATE_LOGS: Final = {"aws"}  # a console as it was minutes ago, or since the last start
 _ROBOT_DAYS: Final = 365.0
+_ATTACH, _DETACH = "attach uplink", "detach uplink"
 PATIENCE: Final = Patience()
 
 
@@ -87,6 +89,7 @@ class Supervisor:
         self._settled: set[str] = set()  # down, and nothing is left of them
         self._swept: set[str] = set()  # machines of which nothing is left
         self._troubles: dict[str, str] = {}  # told once
+        self._uplinks: set[str] = set()  # machines whose uplink was seen to, since this supervisor began
         self._owner_key = load_public_key(site.authority.owner_key).compressed
 
     @property
@@ -154,13 +157,15 @@ class Supervisor:
         heard, now_s = self._heard(), time.time()
         names = [] if self._site.watch is None else _services(plan, self._owner_key)
         records = self._learn(plan, names, seen, heard, now_s)
+        excused = self._tend_gateways(plan.name, records, seen, now_s)
         self._end_orphans(plan, records, seen, now_s)
         if cluster.is_up and (why := self._limit(cluster, records, now_s)):
             self._journal.unwant(plan.name, why, now_s)
             self.wake()
             return
         wanted = plan.machines if cluster.is_up else ()
-        for action in decide(wanted, records, now_s, self._patience, told=not names or heard is not None):
+        told = not names or heard is not None
+        for action in decide(wanted, records, now_s, self._patience, told=told, excused=excused):
             self._do(plan, action, records, now_s)
         if is_new and self._plans.get(plan.name) != plan:
             self._introduce(plan)
@@ -191,6 +196,54 @@ class Supervisor:
                 self._put(after, "", "", now_s)
             records.append(after)
         return records
+
+    def _tend_gateways(
+        self, cluster: str, records: list[Record], seen: Mapping[str, Machine], now_s: float
+    ) -> frozenset[str]:
+        """Elect gateways among machines, and have the provider move their uplinks.
+
+        Args:
+            records: of the cluster; those whose role changes are replaced.
+
+        Returns the machines that may be silent because their gateway is new.
+        """
+        provider = self._provider
+        if not isinstance(provider, GatewayProvider):
+            return frozenset()
+        groups: dict[str, list[Record]] = {}
+        others = [each.plan.name for each in self._journal.clusters() if each.plan.name != cluster]
+        everyone = [*records, *(each for other in others for each in self._journal.machines(other, gone=False))]
+        for each in everyone:
+            if label := provider.replica_gateway(each.spec.offer.region):
+                groups.setdefault(label, []).append(each)
+        excused: set[str] = set()
+        for label, group in groups.items():
+            if (election := elect(group, label, now_s, self._patience)) is not None:
+                new = replace(election.new, gateway=label, gateway_unix_s=now_s)
+                old = election.old and replace(election.old, gateway="", gateway_unix_s=now_s)
+                for changed in (new, *([old] if old else [])):
+                    group[:] = [changed if each.spec == changed.spec else each for each in group]
+                    records[:] = [changed if each.spec == changed.spec else each for each in records]
+                if old is not None:
+                    self._put(old, "", "", now_s)
+                self._put(new, "gateway", f"of {label}: {election.reason}", now_s)
+            if is_settling(group, label, now_s, self._patience):
+                excused.update(each.name for each in group if each.spec.cluster == cluster)
+        for record in records:
+            if record.id and record.name in seen and not self._acts.is_busy(cluster, record.name):
+                self._tend_uplink(provider, record, seen[record.name])
+        return frozenset(excused)
+
+    def _tend_uplink(self, provider: GatewayProvider, record: Record, seen: Machine) -> None:
+        """Begin to move an uplink where the provider has it otherwise; a machine on its way out keeps its own."""
+        if record.is_gone or seen.state is MachineState.GONE:
+            return
+        cluster, name = record.spec.cluster, record.name
+        if record.gateway and not (seen.is_gateway and record.id in self._uplinks):
+            self._uplinks.add(record.id)
+            self._acts.begin(cluster, name, _ATTACH, partial(provider.attach_uplink, record.id))
+        elif seen.is_gateway and not record.gateway and not record.is_outgoing:
+            self._acts.begin(cluster, name, _DETACH, partial(provider.detach_uplink, record.id))
 
     def _do(self, plan: ClusterPlan, action: Action, records: list[Record], now_s: float) -> None:
         if isinstance(action, Launch):
@@ -244,12 +297,19 @@ class Supervisor:
             days=self._site.papers_days,
             lease_s=self._site.lease_s,
             shares_host=self._provider.name == "local",
+            uplink=self._uplink_iface(offer.region),
         )
         record = Record(spec, wanted, papers, now_s)
         records.append(record)
         detail = f"{offer.region} {offer.type_name}, {offer.usd_per_hour:.4f} USD an hour: {choice.why}"
         self._put(record, "asked", detail, now_s)
         self._acts.begin(plan.name, spec.name, "create", partial(self._provider.create, spec, boot))
+
+    def _uplink_iface(self, region: str) -> str:
+        provider = self._provider
+        if isinstance(provider, GatewayProvider) and provider.replica_gateway(region):
+            return provider.uplink_iface
+        return ""
 
     def _offered(self, wanted: Wanted, now_s: float) -> list[Offer]:
         at_s, offers = self._offers.get(wanted, (0.0, []))
@@ -269,6 +329,8 @@ class Supervisor:
                     self._put(record.ended(Ending.FAILED, reason, now_s), "refused", reason, now_s)
                 elif not record.is_gone:
                     self._put(replace(record, id=done.result), "", "", now_s)
+            elif done.what in (_ATTACH, _DETACH) and done.error is not None:  # tried again at the next look
+                self._trouble(done.cluster, f"{done.machine}: {done.what}: {done.error}", key=f"{done.cluster} uplink")
             elif done.error is not None:
                 self._journal.tell(now_s, done.cluster, done.machine, "trouble", f"{done.what}: {done.error}")
             for program, lines in kept(done.result) if done.what == "release" else ():

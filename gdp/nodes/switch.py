@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from gdp.control.settings import NodeSettings
@@ -25,6 +25,7 @@ from gdp.nodes.runtime import Runtime, now
 from gdp.nodes.single_instance import own_devices, run_alone
 from gdp.nodes.uplink import refuse_loopback
 from gdp.ports.link import LinkWatch
+from gdp.ports.plane import MAC_BYTES, Plane
 from gdp.switch.machine import Switch
 from gdp.switch.table import Table
 from gdp.switch.waiting import switch_waits
@@ -82,13 +83,14 @@ def run_switch(
         for port in config.ports:
             index = next(each.index for each in plane.ports.values() if each.ifname == port.iface)
             switch.greeter.set_timing(index, config.timing_of(port))
+        optional = {port.index for port in plane.ports.values() if port.ifname in ifaces and port.ifname not in wanted}
         runtime = Runtime(switch, plane, {port.iface: port.cost for port in config.ports})
         attachments = {port.index for port in plane.ports.values() if port.ifname not in ifaces}
         node_log = NodeLog(
             switch.greeter,
             policy,
             plane,
-            lambda now_s: switch_waits(switch, attachments, now_s),
+            lambda now_s: switch_waits(switch, attachments | _absent(plane, optional), now_s),
             rib=lambda: switch.rib,
             on_wait=on_wait,
         )
@@ -107,6 +109,11 @@ def run_switch(
             log.warning("not the best data plane plane=%s reason=%s", chosen.name, chosen.reason)
         ready(identity.name, chosen.name, chosen.reason)
         runtime.run()
+
+
+def _absent(plane: Plane, ports: Collection[int]) -> set[int]:
+    """Return those of these ports whose device is not there; nobody waits for an optional one."""
+    return {index for index in ports if plane.ports[index].mac == bytes(MAC_BYTES)}
 
 
 def _revoke(switch: Switch, directory: Path | None) -> None:

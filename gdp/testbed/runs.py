@@ -61,6 +61,7 @@ class Record:
     files: list[str] = field(default_factory=list)  # files and directories to delete
     cgroups: list[str] = field(default_factory=list)  # names
     mounts: list[str] = field(default_factory=list)  # paths that a file system is mounted on
+    passive: bool = False  # kept, and has no process whose end would end it
 
     @classmethod
     def from_text(cls, text: str) -> Record:
@@ -86,6 +87,8 @@ class Record:
         """Tell whether nobody answers for the run any more."""
         if self.boot != boot_id():
             return True
+        if self.kept and self.passive:
+            return False
         return not any(process.alive for process in (self.processes if self.kept else [self.owner]))
 
 
@@ -137,9 +140,14 @@ class Run:
             self._record.processes.append(Process.of(pid))
             self._save()
 
-    def keep(self) -> None:
-        """Let everything stand after this process ends, until ``Runs.take_down``."""
+    def keep(self, *, passive: bool = False) -> None:
+        """Let everything stand after this process ends, until ``Runs.take_down``.
+
+        Args:
+            passive: the run has namespaces and devices only; it is dead after a reboot, and never before.
+        """
         self._record.kept = True
+        self._record.passive = passive
         self._save()
 
     def end(self) -> None:

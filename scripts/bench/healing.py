@@ -3,8 +3,12 @@
     preempted      a machine is given notice: until that is seen, and until a replacement serves. Asked: at most 5 s
     killed         all its processes at once, its link gone: until that is seen, and until a replacement serves. Asked
                    of the first: at most 1 s
+    frozen         all its processes stop and its link stays up; with --gateway replica only
     supervisor     the supervisor is killed (SIGKILL), and while nobody looks a machine as well; then it is started
                    again: until the journal is right and the replacement asked for. Asked: at most 2 s
+
+With --gateway replica one of the machines is the gateway to the others, and it is always this machine that is taken.
+Then there are two figures more: until another machine has the role, and the longest time without an answer.
 
 A real ROS node calls ``/echo`` at the robot all the while. Asked: not one request fails. Every machine has a switch, a
 proxy and a real ROS node of its own; they, the robot and the supervisor share this machine's cores.
@@ -12,6 +16,7 @@ proxy and a real ROS node of its own; they, the robot and the supervisor share t
     sudo .venv/bin/python scripts/bench/healing.py                     # the whole; writes docs/benchmarks/healing.*
     sudo .venv/bin/python scripts/bench/healing.py --quick --no-save   # one round: does it work?
     sudo .venv/bin/python scripts/bench/healing.py --only killed --rounds 10 --no-save
+    sudo .venv/bin/python scripts/bench/healing.py --gateway replica   # three machines; writes healing_gateway.*
 """
 
 from __future__ import annotations
@@ -31,20 +36,25 @@ from report import Goal, Rounds, Settings, progress, show, write_json
 
 from gdp.errors import GdpError
 
-PREEMPTED, KILLED, SUPERVISOR = "preempted", "killed", "supervisor"
+PREEMPTED, KILLED, FROZEN, SUPERVISOR = "preempted", "killed", "frozen", "supervisor"
+DEDICATED, REPLICA = "dedicated", "replica"
 CASES: Final = {
     PREEMPTED: "a machine preempted with notice",
     KILLED: "a machine killed",
+    FROZEN: "a machine frozen",
     SUPERVISOR: "supervisor and a machine killed",
 }
 WHO: Final = "fog, local"
 DETECTED: Final = "until it is seen, s"
 SERVING: Final = "until a replacement serves, s"
 RECONCILED: Final = "until the journal is right, s"
+MOVED: Final = "until another machine is the gateway, s"
+SILENCE: Final = "longest time without an answer, s"
 COLUMNS: Final = {
-    PREEMPTED: (DETECTED, SERVING),
-    KILLED: (DETECTED, SERVING),
-    SUPERVISOR: (RECONCILED, SERVING),
+    PREEMPTED: (DETECTED, MOVED, SILENCE, SERVING),
+    KILLED: (DETECTED, MOVED, SILENCE, SERVING),
+    FROZEN: (DETECTED, MOVED, SILENCE, SERVING),
+    SUPERVISOR: (RECONCILED, MOVED, SILENCE, SERVING),
 }
 TRAFFIC, FAILED = "requests meanwhile", "failed"
 ASKED_S: Final = {(PREEMPTED, SERVING): 5.0, (KILLED, DETECTED): 1.0, (SUPERVISOR, RECONCILED): 2.0}
@@ -60,7 +70,8 @@ def measure(cluster: Cluster, case: str) -> dict[str, float | None]:
     Raises:
         FailedError: it is not in time.
     """
-    victim = cluster.oldest()
+    victim = cluster.oldest() if cluster.gateway == DEDICATED else cluster.gateway_machine()
+    begun_s = time.time()
     if case == SUPERVISOR:
         cluster.kill_supervisor()
         cluster.kill(victim)
@@ -73,12 +84,17 @@ def measure(cluster: Cluster, case: str) -> dict[str, float | None]:
         at_s = time.time()
         if case == PREEMPTED:
             cluster.notice(victim, NOTICE_S)
+        elif case == FROZEN:
+            cluster.freeze(victim)
         else:
             cluster.kill(victim)
         served = cluster.await_replacement(at_s)
         signs = {"notice"} if case == PREEMPTED else {"taken", "unheard"}
         first = {DETECTED: cluster.await_event(victim.name, signs, at_s) - at_s}
     cluster.await_whole(victim)
+    if cluster.gateway == REPLICA:
+        first[MOVED] = cluster.await_event(None, {"gateway"}, at_s) - at_s
+        first[SILENCE] = cluster.longest_silence(begun_s)
     return {**first, SERVING: (served.served_unix_s or at_s) - at_s}
 
 
@@ -87,7 +103,7 @@ def goals_of(over: Rounds) -> list[Goal]:
     found = []
     for case, columns in COLUMNS.items():
         for column in columns:
-            if CASES[case] in over.cases():
+            if over.spread(WHO, CASES[case], column) is not None:
                 asked_s = ASKED_S.get((case, column))
                 found.append(over.goal(f"{CASES[case]}: {column}", WHO, CASES[case], column, asked_s, at_most=True))
     return [*found, over.goal(f"{TRAFFIC}: {FAILED}", WHO, TRAFFIC, FAILED, 0.0, at_most=True)]
@@ -99,7 +115,7 @@ def panels_of(over: Rounds) -> list[Panel]:
         panel_of(over, CASES[case], column, [WHO], title=f"{CASES[case]}: {column}")
         for case, columns in COLUMNS.items()
         for column in columns
-        if CASES[case] in over.cases()
+        if over.spread(WHO, CASES[case], column) is not None
     ]
 
 
@@ -107,11 +123,13 @@ def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", action="append", choices=list(CASES), help="this part; may be repeated")
+    parser.add_argument("--gateway", choices=[DEDICATED, REPLICA], default=DEDICATED, help="(default: %(default)s)")
+    parser.add_argument("--machines", type=int, help="(default: 2, with --gateway replica 3)")
     parser.add_argument("--rounds", type=int, default=ROUNDS, help="(default: %(default)s)")
     parser.add_argument("--rate", type=float, default=RATE, help="requests a second (default: %(default)s)")
     parser.add_argument("--quick", action="store_true", help="one round")
-    parser.add_argument("--json", type=Path, default=OUTPUT / "healing.json", help="where the figures go")
-    parser.add_argument("--plot", type=Path, default=OUTPUT / "healing.png", help="where the picture goes")
+    parser.add_argument("--json", type=Path, help="where the figures go (default: docs/benchmarks)")
+    parser.add_argument("--plot", type=Path, help="where the picture goes (default: docs/benchmarks)")
     parser.add_argument("--no-plot", action="store_true", help="no picture")
     parser.add_argument("--no-save", action="store_true", help="print only")
     return parser
@@ -125,13 +143,21 @@ def main() -> None:
         require_plot()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
     state, begun_s = machine_state(), time.monotonic()
-    over, cases, rounds = Rounds(), options.only or list(CASES), 1 if options.quick else options.rounds
+    is_replica = options.gateway == REPLICA
+    cases = options.only or [case for case in CASES if is_replica or case != FROZEN]
+    if FROZEN in cases and not is_replica:
+        sys.exit("error: --only frozen is measured with --gateway replica")
+    over, rounds = Rounds(), 1 if options.quick else options.rounds
+    machines = options.machines or (3 if is_replica else 2)
+    name = "healing_gateway" if is_replica else "healing"
     try:
-        with Cluster(options.rate) as cluster:
+        with Cluster(options.rate, machines, options.gateway) as cluster:
             for at in range(1, rounds + 1):
                 for case in cases:
                     progress(f"round {at}/{rounds}: {CASES[case]}")
-                    for column, value in measure(cluster, case).items():
+                    got = measure(cluster, case)
+                    progress(", ".join(f"{column}: {value:.2f}" for column, value in got.items() if value is not None))
+                    for column, value in got.items():
                         over.add(WHO, CASES[case], column, value)
             said = cluster.end_caller()
     except KeyboardInterrupt:
@@ -142,16 +168,19 @@ def main() -> None:
         over.add(WHO, TRAFFIC, column, value)
     settings: Settings = {
         "rounds": rounds,
+        "machines": machines,
+        "gateway": options.gateway,
         "requests a second": options.rate,
         "notice, s": NOTICE_S,
         "took, s": round(time.monotonic() - begun_s),
     }
-    goals, title = goals_of(over), "A cluster of two machines of the provider local heals"
+    title = f"A cluster of {machines} machines of the provider local heals; gateway: {options.gateway}"
+    goals = goals_of(over)
     show(title, state, settings, over, goals)
     if not options.no_save:
-        write_json(options.json, "healing", state, settings, over, goals)
+        write_json(options.json or OUTPUT / f"{name}.json", name, state, settings, over, goals)
     if is_drawn:
-        save_bars(options.plot, title, str(state), panels_of(over))
+        save_bars(options.plot or OUTPUT / f"{name}.png", title, str(state), panels_of(over))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The cluster of ``healing.py``: two machines of the provider ``local``, a robot and its node that calls.
+"""Cluster of ``healing.py``: machines of the provider ``local``, a robot and its node that calls.
 
 Place: shell; what it makes is a run's, and what ``fog`` makes for it ends with ``fog down``, also after a crash.
 """
@@ -32,27 +32,32 @@ __all__ = ["Cluster"]
 
 _LAUNCH_FILE: Final = Path(__file__).resolve().parents[2] / "examples" / "echo.launch.py"
 _ROBOT: Final = "robot"
-_SIZE: Final = 2
+_LAUNCHED: Final = 2  # by the launch file
+_REPORT_S: Final = 1.0
+_DEPTH: Final = 1_000  # answers to all calls of an outage come in one burst
 _PATIENCE_S: Final = 90.0
 _LAUNCH_S: Final = 200.0
-_REPORT_S: Final = 5.0
 _STEP_S: Final = 0.02
 
 T = TypeVar("T")
 
 
 class Cluster:
-    """Two replicas that serve, and a robot that calls; a context manager that takes everything down.
+    """Replicas that serve, and a robot that calls; a context manager that takes everything down.
 
     Args:
         rate_hz: requests a second.
+        machines: how many, at least two.
+        gateway: ``dedicated`` or ``replica``.
 
     Raises:
         LocalError: the kernel refuses.
         FailedError: a process did not come up.
     """
 
-    def __init__(self, rate_hz: float) -> None:
+    def __init__(self, rate_hz: float, machines: int, gateway: str) -> None:
+        self.gateway = gateway
+        self._machines_wanted = machines
         runs = standing_runs("bench")
         sweep(runs)
         self._run = runs.start()
@@ -60,15 +65,18 @@ class Cluster:
         with ExitStack() as undo:
             undo.callback(end_all_of, self._run)
             self._spaces = Namespaces(Topology((), (DomainPlan("home", (_ROBOT,)),), ()), self._run)
-            progress("two machines boot")
+            progress(f"{machines} machines boot")
             self._launch()
             self._site = open_site(None, self._run.directory / STATE)
             self._journal = undo.enter_context(closing(Journal(self._site.journal)))
             self._runs = local_provider(self._site).runs
             told = ["-m", "fog.demo.caller", "--ros-args", "-p", f"rate_hz:={rate_hz}", "-p", f"report_s:={_REPORT_S}"]
+            told += ["-p", f"depth:={_DEPTH}"]
             self._caller = undo.enter_context(self._start("caller", told))
-            if not self._caller.read(_PATIENCE_S)["answered"]:
-                raise FailedError("the robot's node is not answered")
+            end_s = time.monotonic() + _PATIENCE_S
+            while not self._caller.read(_PATIENCE_S)["answered"]:
+                if time.monotonic() > end_s:
+                    raise FailedError("the robot's node is not answered")
             self._supervisors = undo.enter_context(ExitStack())
             self._undo = undo.pop_all()
 
@@ -82,6 +90,27 @@ class Cluster:
         """Return the machine that has served for longest."""
         serving = [each for each in self._machines() if each.is_serving]
         return min(serving, key=lambda each: each.served_unix_s or 0.0)
+
+    def gateway_machine(self) -> Record:
+        """Return the machine that is the gateway."""
+        return self._until(
+            lambda: next((each for each in self._machines() if each.gateway and not each.is_gone), None), "a gateway"
+        )
+
+    def longest_silence(self, after_s: float) -> float:
+        """Return the longest time without an answer from this moment until now, in seconds."""
+        now_s, longest_ms = time.time(), 0.0
+        while True:
+            said = self._caller.read(_PATIENCE_S)
+            unix_s = float(str(said["unix_s"]))
+            if unix_s >= after_s:
+                longest_ms = max(longest_ms, float(str(said["silence_ms"])))
+            if unix_s >= now_s:
+                return longest_ms / 1e3
+
+    def freeze(self, machine: Record) -> None:
+        """Stop all of a machine where it is."""
+        trouble.freeze(self._runs, machine.id)
 
     def notice(self, machine: Record, seconds: float) -> None:
         """Give a machine notice."""
@@ -115,14 +144,14 @@ class Cluster:
 
         return self._until(served, "a replacement that serves")
 
-    def await_event(self, machine: str, what: set[str], after_s: float) -> float:
-        """Return when one of these events was written of a machine, in seconds since 1970."""
+    def await_event(self, machine: str | None, what: set[str], after_s: float) -> float:
+        """Return when one of these events was written of a machine, or of any, in seconds since 1970."""
 
         def written() -> float | None:
-            found = (e for e in self._journal.events() if e.machine == machine and e.what in what)
+            found = (e for e in self._journal.events() if machine in (None, e.machine) and e.what in what)
             return next((each.unix_s for each in found if each.unix_s >= after_s), None)
 
-        return self._until(written, f"{machine}: {' or '.join(sorted(what))}")
+        return self._until(written, f"{machine or 'any machine'}: {' or '.join(sorted(what))}")
 
     def await_whole(self, victim: Record) -> None:
         """Return when this machine is gone and all others are as many as are wanted, and serve."""
@@ -130,9 +159,9 @@ class Cluster:
         def is_whole() -> bool | None:
             there = [each for each in self._machines() if not each.is_gone]
             is_rid = all(each.name != victim.name for each in there)
-            return (is_rid and len(there) == _SIZE and all(each.is_serving for each in there)) or None
+            return (is_rid and len(there) == self._machines_wanted and all(each.is_serving for each in there)) or None
 
-        self._until(is_whole, "two machines that serve, and no other")
+        self._until(is_whole, "as many machines as are wanted that serve, and no other")
 
     def end_caller(self) -> dict[str, float]:
         """End the robot's node; return how many requests it made, and how many failed."""
@@ -148,10 +177,15 @@ class Cluster:
         return [each for cluster in self._journal.clusters() for each in self._journal.machines(cluster.plan.name)]
 
     def _launch(self) -> None:
-        argv = [sys.executable, *fog_command(self._run, ["launch", str(_LAUNCH_FILE), "--detach"])]
+        self._fog("launch", str(_LAUNCH_FILE), "--detach", "--gateway", self.gateway)
+        if self._machines_wanted > _LAUNCHED:
+            self._fog("scale", "up", str(self._machines_wanted - _LAUNCHED))
+
+    def _fog(self, *words: str) -> None:
+        argv = [sys.executable, *fog_command(self._run, words)]
         ended = subprocess.run(self._command(argv), capture_output=True, text=True, timeout=_LAUNCH_S, check=False)
         if ended.returncode:
-            raise FailedError(f"fog launch: {(ended.stderr or ended.stdout).strip()}")
+            raise FailedError(f"fog {words[0]}: {(ended.stderr or ended.stdout).strip()}")
 
     def _start(self, what: str, arguments: Sequence[str]) -> Started:
         return Started(self._run, what, self._command, arguments)

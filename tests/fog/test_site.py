@@ -1,11 +1,12 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from fog.site import SiteConfig
-from gdp.errors import ConfigError
+from fog.site import SiteConfig, open_site, save_topology, topology_now, with_gateway
+from gdp.errors import ConfigError, LocalError
 
 TUNNEL = "aws: {setup: {vxlan: {remote: 198.51.100.7}}}\n"
 
@@ -39,3 +40,33 @@ def test_machines_with_no_way_to_the_robot_are_refused(tmp_path: Path, provider:
 
 def test_a_tunnel_of_ones_own_is_named(tmp_path: Path) -> None:
     assert site(tmp_path, "provider: skypilot", "machine_iface: tap0").device == "tap0"
+
+
+@pytest.mark.parametrize("topology", ["replica", "{gateway: edge, replica: true}"])
+def test_a_machine_may_be_the_gateway(tmp_path: Path, topology: str) -> None:
+    assert site(tmp_path, f"topology: {topology}").topology.replica
+
+
+def test_a_wrong_topology_is_refused_with_its_line(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"fog\.yaml:3:\d+: topology.*expected the word 'replica'"):
+        site(tmp_path, "topology: replicas")
+
+
+def test_gateways_are_made_by_the_provider_local_only(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="topology is for the provider local"):
+        site(tmp_path, "provider: aws", TUNNEL, "topology: replica")
+
+
+def test_the_gateway_of_a_site_of_its_own_is_kept_from_launch_to_launch(tmp_path: Path) -> None:
+    own = open_site(None, tmp_path / "state")
+    assert not own.topology.replica
+    save_topology(with_gateway(own, is_replica=True))
+    assert open_site(None, tmp_path / "state").topology.replica
+    assert topology_now(own).replica
+    assert open_site(None, tmp_path / "state").id == own.id
+
+
+def test_what_a_file_states_no_option_changes(tmp_path: Path) -> None:
+    stated = replace(open_site(None, tmp_path / "state"), file=tmp_path / "fog.yaml")
+    with pytest.raises(LocalError, match="set 'topology' there"):
+        with_gateway(stated, is_replica=True)

@@ -1,7 +1,8 @@
-"""The gateways of a site: namespaces with a switch each, joined to the robot and to each other as a tree.
+"""The gateways of a site: namespaces joined to the robot and to each other as a tree.
 
 Place: shell; needs root of the machine or of a user namespace. All of it is one kept run; ``network.json`` in its
-folder tells which.
+folder tells which. A dedicated gateway has a switch in its namespace. A replica gateway has two bridges there: the
+switch is that of a machine, which ``provider.py`` connects with both.
 """
 
 from __future__ import annotations
@@ -16,7 +17,20 @@ from typing import Final
 from fog.host.bundle import install
 from fog.machine import Boot
 from fog.providers.local.begin import begin
-from fog.providers.local.wire import MACHINES, UP, delete, exists, join, make_segment, make_space, space_path
+from fog.providers.local.wire import (
+    MACHINES,
+    SEGMENT,
+    UP,
+    UPLINK_BRIDGE,
+    delete,
+    exists,
+    join,
+    make_bridge,
+    make_segment,
+    make_space,
+    plug,
+    space_path,
+)
 from fog.topology import Gateway
 from gdp.errors import LocalError
 from gdp.testbed.processes import Process
@@ -86,7 +100,7 @@ class Network:
             raise LocalError("the gateways that stand have another topology; 'fog down --all' first")
         run = self._runs.resume(standing.record.run)
         for gateway in self._topology.walk():
-            if not standing.is_up(gateway.gateway):
+            if not gateway.replica and not standing.is_up(gateway.gateway):
                 log.warning("gateway started again gateway=%s", gateway.gateway)
                 self._start(run, standing, gateway)
 
@@ -107,6 +121,11 @@ class Network:
         if standing is None or not standing.record.kept:
             raise LocalError("the local network is not open")
         return standing.space(standing.topology.serving(region).gateway)
+
+    def replica_gateway(self, region: str) -> str:
+        """Return the label of the replica gateway of a region's machines; empty: theirs is dedicated."""
+        serving = self._topology.serving(region)
+        return serving.gateway if serving.replica else ""
 
     def _find(self) -> _Standing | None:
         for record in self._runs.all():
@@ -129,14 +148,23 @@ class Network:
                 space = standing.space(gateway.gateway)
                 run.plan_namespace(space)
                 make_space(space, "")
-                make_segment(space)
+                if gateway.replica:
+                    make_bridge(space, SEGMENT)
+                    make_bridge(space, UPLINK_BRIDGE)
+                else:
+                    make_segment(space)
             join(self._robot, self._uplink, standing.space(self._topology.gateway), UP)
             for gateway in gateways:
                 for child in gateway.children:
                     ends = standing.space(gateway.gateway), standing.space(child.gateway)
                     join(ends[0], f"to-{child.gateway}", ends[1], UP)
             for gateway in gateways:
-                self._start(run, standing, gateway)
+                if gateway.replica:
+                    plug(standing.space(gateway.gateway), UP, bridge=UPLINK_BRIDGE)
+                else:
+                    self._start(run, standing, gateway)
+            if self._topology.replica:
+                run.keep(passive=True)
         except BaseException:
             run.end()
             delete(self._robot, self._uplink)

@@ -30,7 +30,7 @@ from fog.providers.local.machine_file import MachineFile
 from fog.providers.local.network import GatewayBoot, Network
 from fog.providers.local.standing import Standing, find, standing
 from fog.providers.local.trouble import hold, kill
-from fog.providers.local.wire import MACHINE_DEVICE, delete, join, make_space, plug
+from fog.providers.local.wire import MACHINE_DEVICE, UP, UPLINK_BRIDGE, delete, exists, join, make_space, plug
 from fog.topology import AUTOMATIC, Gateway
 from gdp.errors import LocalError, StoreError
 from gdp.testbed.processes import end_all
@@ -64,6 +64,7 @@ class LocalProvider:
 
     name = "local"
     poll_s = 0.2
+    uplink_iface = UP
 
     def __init__(
         self,
@@ -154,6 +155,26 @@ class LocalProvider:
     def drain(self, machine: str) -> None:
         self._tell(machine, signal.SIGUSR1)
 
+    def replica_gateway(self, region: str) -> str:
+        return self._network.replica_gateway(region)
+
+    def attach_uplink(self, machine: str) -> None:
+        with self._alone():
+            found = find(self._runs, machine)
+            if not self.replica_gateway(found.file.spec.offer.region):
+                raise LocalError(f"machine {machine}: the gateway of {found.file.spec.offer.region} is dedicated")
+            if not exists(found.gateway, found.uplink_plug):
+                join(found.gateway, found.uplink_plug, found.space, UP)
+            plug(found.gateway, found.uplink_plug, bridge=UPLINK_BRIDGE)
+            found.gateway_mark.touch()
+
+    def detach_uplink(self, machine: str) -> None:
+        with self._alone():
+            for each in standing(self._runs):
+                if each.id == machine:
+                    delete(each.gateway, each.uplink_plug)
+                    each.gateway_mark.unlink(missing_ok=True)
+
     def log(self, machine: str, program: str, lines: int) -> str:
         if not _NAME.fullmatch(program or "machine"):
             raise LocalError(f"no program {program!r}")
@@ -216,7 +237,7 @@ class LocalProvider:
             hold(each, held=False)
         end_all([each.host for each in machines if each.host is not None], _END_PATIENCE_S)
         for each in machines:
-            for device in (each.plug, each.relay_out):
+            for device in (each.plug, each.uplink_plug, each.relay_out):
                 delete(each.gateway, device)  # by itself it would go some time after its namespace
             with self._alone():  # a command may end what the supervisor just ends
                 if each.id in {record.run for record in self._runs.all()}:

@@ -70,6 +70,16 @@ class Standing:
         return f"e-{self.id}"
 
     @property
+    def uplink_plug(self) -> str:
+        """Return the far end of its second device, which it has while it is the gateway."""
+        return f"g-{self.id}"
+
+    @property
+    def gateway_mark(self) -> Path:
+        """Return the file that is there while it is the gateway."""
+        return self.directory / "gateway"
+
+    @property
     def address(self) -> str:
         """Return its own address: the id's three bytes."""
         return ".".join(map(str, (10, *bytes.fromhex(self.id))))
@@ -99,6 +109,7 @@ class Standing:
             read_notice(self.home),
             reason,
             self._since_unix_s(state),
+            is_gateway=self.gateway_mark.exists(),
         )
 
     def _since_unix_s(self, state: MachineState) -> float | None:

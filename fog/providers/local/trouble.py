@@ -42,7 +42,8 @@ def kill(runs: Runs, machine: str) -> None:
     for group in groups:
         with suppress(ProcessLookupError):
             os.killpg(group, signal.SIGKILL)
-    delete(found.gateway, found.plug)
+    for device in (found.plug, found.uplink_plug):
+        delete(found.gateway, device)
 
 
 def freeze(runs: Runs, machine: str) -> None:

@@ -11,6 +11,11 @@ Place: shell; needs CAP_NET_ADMIN in the namespaces it works in. One gateway's n
                   eth0 of a machine    ||
                                     eth0 of another
 
+Where a machine is the gateway, the namespace has no switch and no ``machines``. A second bridge keeps the link towards
+the robot up while the role moves::
+
+    up ---- uplink (a bridge) ---- g-1f2e3d ==== up of the machine that is the gateway
+
 Two ends of a pair must not share an index, or Linux may tell of a lost carrier a whole second late (see
 ``gdp/testbed/namespaces.py``); so one end has a high one. No device but the loopback has an address.
 """
@@ -34,11 +39,14 @@ if TYPE_CHECKING:
 __all__ = [
     "MACHINES",
     "MACHINE_DEVICE",
+    "SEGMENT",
     "UP",
+    "UPLINK_BRIDGE",
     "delete",
     "exists",
     "join",
     "join_within",
+    "make_bridge",
     "make_segment",
     "make_space",
     "plug",
@@ -48,7 +56,8 @@ __all__ = [
 MACHINE_DEVICE: Final = "eth0"
 UP: Final = "up"
 MACHINES: Final = "machines"
-_SEGMENT: Final = "segment"
+SEGMENT: Final = "segment"
+UPLINK_BRIDGE: Final = "uplink"
 _MTU: Final = 1_500
 _LOOPBACK: Final = 1
 _HIGH_INDEX: Final = 1 << 20
@@ -101,29 +110,37 @@ def join_within(space: Path, device: str, other: str) -> None:
 
 
 def make_segment(gateway: Path) -> None:
-    """Make a gateway's bridge, and its port on it.
+    """Make a dedicated gateway's bridge, and its port on it.
+
+    Raises:
+        LocalError: the kernel refuses.
+    """
+    make_bridge(gateway, SEGMENT)
+    join_within(gateway, MACHINES, f"{MACHINES}-b")
+    plug(gateway, f"{MACHINES}-b")
+
+
+def make_bridge(space: Path, name: str) -> None:
+    """Make a bridge.
 
     Raises:
         LocalError: the kernel refuses.
     """
 
     def make(links: IPRoute) -> None:
-        links.link("add", ifname=_SEGMENT, kind="bridge", br_mcast_snooping=0)
-        _set_up(_SEGMENT, links)
+        links.link("add", ifname=name, kind="bridge", br_mcast_snooping=0)
+        _set_up(name, links)
+
+    _ask(space, make)
 
 
-    _ask(gateway, make)
-    join_within(gateway, MACHINES, f"{MACHINES}-b")
-    plug(gateway, f"{MACHINES}-b")
-
-
-def plug(gateway: Path, device: str, *, into: bool = True) -> None:
-    """Connect a device with a gateway's segment, or take it off.
+def plug(gateway: Path, device: str, *, into: bool = True, bridge: str = SEGMENT) -> None:
+    """Connect a device with a bridge of a gateway's namespace, or take it off.
 
     Raises:
         LocalError: the kernel refuses.
     """
-    _ask(gateway, partial(_enslave, device) if into else partial(_release, device))
+    _ask(gateway, partial(_enslave, device, bridge) if into else partial(_release, device))
 
 
 def delete(space: Path | None, device: str) -> None:
@@ -188,8 +205,8 @@ def _set_up(device: str, links: IPRoute) -> None:
     links.link("set", index=_index(device, links), state="up")
 
 
-def _enslave(device: str, links: IPRoute) -> None:
-    links.link("set", index=_index(device, links), master=_index(_SEGMENT, links))
+def _enslave(device: str, bridge: str, links: IPRoute) -> None:
+    links.link("set", index=_index(device, links), master=_index(bridge, links))
 
 
 def _release(device: str, links: IPRoute) -> None:

@@ -69,6 +69,36 @@ def test_machines_and_their_stage_are_told(fog: Run, journal: Journal) -> None:
     assert "serving" in fog("status").output
 
 
+def test_the_machine_that_is_the_gateway_is_told(fog: Run, journal: Journal) -> None:
+    journal.want(PLAN, time.time())
+    for each in (replace(serving("m1"), gateway="edge"), serving("m2")):
+        journal.put(each, time.time())
+    gone = replace(serving("m3"), gateway="edge").ended(Ending.TAKEN, "killed", time.time())
+    journal.put(gone, time.time())
+    told = json.loads(fog("status", "--all", "--json").output)
+    assert [each["gateway"] for each in told["members"]] == ["edge", None, None]
+    (line,) = (each for each in fog("status").output.splitlines() if each.startswith("m1"))
+    assert line.split()[:3] == ["m1", "serving", "edge"]
+
+
+@pytest.mark.parametrize("kind", ["dedicated", "replica"])
+def test_a_dry_run_says_which_gateway_a_machine_is_behind(fog: Run, kind: str) -> None:
+    words = ["launch", str(ROOT / "examples" / "echo.launch.py"), "--dry-run", "--gateway", kind]
+    is_replica = kind == "replica"
+    told = json.loads(fog(*words, "--json").output)
+    assert {each["gateway"]["replica"] for each in told["machines"]} == {is_replica}
+    assert ("gateway gateway: one of these machines" in fog(*words).output) is is_replica
+
+
+def test_where_a_file_states_the_site_no_option_does(fog: Run, tmp_path: Path) -> None:
+    for folder in ("domain", "owner"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "fog.yaml").write_text("domain: domain\nowner: owner\n")
+    words = ["launch", str(ROOT / "examples" / "echo.launch.py"), "--dry-run", "--gateway", "replica"]
+    result = fog(*words)
+    assert (result.exit_code, "set 'topology' there" in result.output) == (2, True)
+
+
 def test_cost_is_price_by_time(fog: Run, journal: Journal) -> None:
     up(journal)
     (told,) = json.loads(fog("cost", "--json").output)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import yaml
 
 from fog.cluster import Carried, CloudNode, ClusterPlan
 from fog.enrolment.boots import PROXY
@@ -63,6 +64,44 @@ class Memory:
 
     def close(self) -> None:
         pass
+
+
+class Grouped(Memory):
+    """A provider whose machines are one group, of which one is the gateway."""
+
+    uplink_iface = "up"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ports: dict[str, list[object]] = {}
+        self.fails = 0  # so many more
+
+    def create(self, spec: MachineSpec, boot: Boot) -> str:
+        self.ports[spec.name] = yaml.safe_load(boot.files["switch.yaml"])["ports"]
+        return super().create(spec, boot)
+
+    def replica_gateway(self, region: str) -> str:
+        return "edge"
+
+    def attach_uplink(self, machine: str) -> None:
+        if self.fails:
+            self.fails -= 1
+            raise StoreError("not now")
+        self._set(machine, is_gateway=True)
+
+    def detach_uplink(self, machine: str) -> None:
+        self._set(machine, is_gateway=False)
+
+    def gateways(self) -> list[str]:
+        return [name for name, each in self.machines.items() if each.is_gateway]
+
+    def _set(self, machine: str, *, is_gateway: bool) -> None:
+        name = machine.removeprefix("id-")
+        self.machines[name] = replace(self.machines[name], is_gateway=is_gateway)
+
+
+def elected(journal: Journal) -> list[str]:
+    return [each.name for each in journal.machines("c", gone=False) if each.gateway == "edge"]
 
 
 @pytest.fixture
@@ -241,3 +280,91 @@ def test_where_logs_come_late_the_robot_tells_whether_it_calls_and_else_it_count
         ours.look()
     ours.close()
     assert journal.cluster("c").is_up is is_up
+
+
+def test_one_machine_becomes_the_gateway_and_every_machine_can(site: Site, journal: Journal) -> None:
+    provider = Grouped()
+    ours = supervisor(site, journal, provider)
+    journal.want(PLAN, time.time())
+    work(ours, lambda: len(serving(journal)) == 2 and provider.gateways() == elected(journal) != [])
+    ours.close()
+    assert len(elected(journal)) == 1
+    uplink = {"iface": "up", "optional": True}
+    assert all(uplink in ports for ports in provider.ports.values())
+
+
+def test_a_lost_gateway_is_succeeded_in_the_same_look(site: Site, journal: Journal) -> None:
+    provider = Grouped()
+    ours = supervisor(site, journal, provider)
+    journal.want(PLAN, time.time())
+    work(ours, lambda: len(serving(journal)) == 2 and provider.gateways())
+    (lost,) = elected(journal)
+    provider.machines[lost] = replace(provider.machines[lost], state=MachineState.GONE, reason="killed")
+    ours.look()
+    assert elected(journal) == [({"m1", "m2"} - {lost}).pop()]
+    work(ours, lambda: provider.gateways() == elected(journal))
+    ours.close()
+    moved = [each for each in journal.events("c") if each.what == "gateway"]
+    assert [each.detail for each in moved] == ["of edge: the first machine", f"of edge: {lost} is gone: killed"]
+
+
+def test_a_gateway_with_a_notice_hands_over_and_keeps_its_uplink_until_it_is_gone(site: Site, journal: Journal) -> None:
+    provider = Grouped()
+    ours = supervisor(site, journal, provider)
+    journal.want(PLAN, time.time())
+    work(ours, lambda: len(serving(journal)) == 2 and provider.gateways())
+    (old,) = elected(journal)
+    noticed = replace(provider.machines[old], state=MachineState.LEAVING, leaves_at_unix_s=time.time() + 60)
+    provider.machines[old] = noticed
+    provider.drain = lambda machine: None  # type: ignore[method-assign]  # it takes its time
+    work(ours, lambda: elected(journal) != [old] and len(provider.gateways()) == 2)
+    del provider.machines[old]
+    work(ours, lambda: provider.gateways() == elected(journal))
+    ours.close()
+
+
+@pytest.mark.parametrize("written", ["before the act", "not at all"])
+def test_a_supervisor_that_begins_again_finds_the_gateway(site: Site, journal: Journal, written: str) -> None:
+    provider = Grouped()
+    first = supervisor(site, journal, provider)
+    journal.want(PLAN, time.time())
+    work(first, lambda: len(serving(journal)) == 2 and provider.gateways())
+    first.close()
+    (kept,) = elected(journal)
+    (other,) = {"m1", "m2"} - {kept}
+    if written == "before the act":
+        provider.detach_uplink(f"id-{kept}")
+    else:
+        provider.attach_uplink(f"id-{other}")
+    second = supervisor(site, journal, provider)
+    work(second, lambda: provider.gateways() == [kept] == elected(journal))
+    second.close()
+
+
+def test_an_uplink_that_cannot_be_attached_is_told_once_and_tried_again(site: Site, journal: Journal) -> None:
+    provider = Grouped()
+    provider.fails = 5
+    ours = supervisor(site, journal, provider)
+    journal.want(PLAN, time.time())
+    work(ours, provider.gateways)
+    ours.close()
+    assert [each.detail for each in journal.events("c") if each.what == "trouble"] == ["m1: attach uplink: not now"]
+
+
+def test_the_gateway_is_one_for_all_clusters_of_a_site(site: Site, journal: Journal) -> None:
+    provider = Grouped()
+    provider.describe = lambda cluster: [  # type: ignore[method-assign]
+        each for each in provider.machines.values() if each.spec.cluster == cluster
+    ]
+    numbers = iter(range(1, 9))
+    journal.next_machine = lambda cluster: f"m{next(numbers)}"  # type: ignore[method-assign]
+    ours = supervisor(site, journal, provider)
+    journal.want(PLAN, time.time())
+    journal.want(replace(PLAN, name="d"), time.time())
+    work(ours, lambda: len(serving(journal)) == 2 and len(provider.machines) == 4 and provider.gateways())
+    assert len(provider.gateways()) == 1
+    journal.unwant("c", "test", time.time())
+    work(ours, lambda: not journal.machines("c", gone=False) and len(provider.gateways()) == 1)
+    ours.close()
+    (kept,) = provider.gateways()
+    assert provider.machines[kept].spec.cluster == "d"

@@ -1,0 +1,88 @@
+"""Election of the machine that is the gateway of its group: one of the machines next to a replica gateway.
+
+Sans-I/O. Source: FogROS2-FT, Figure 4, right; the election is made by the supervisor, not among the machines as in VRRP
+(RFC 9568), because only the provider can move the uplink.
+
+A gateway keeps its role while it works. Each answer follows from the records alone, so a supervisor that was killed and
+started again elects the same machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from fog.supervisor.decide import Patience
+from fog.supervisor.record import Record
+
+__all__ = ["Election", "elect", "is_settling"]
+
+
+@dataclass(frozen=True, slots=True)
+class Election:
+    """A change of the role.
+
+    Args:
+        new: the machine that becomes the gateway.
+        old: the machine that was it, if it is there still.
+        reason: why, in a few words.
+    """
+
+    new: Record
+    old: Record | None
+    reason: str
+
+
+def elect(group: Sequence[Record], label: str, now_s: float, patience: Patience) -> Election | None:
+    """Return the change of a group's gateway that is due; None: it stays as it is, or no machine can be the gateway.
+
+    Preferred are, in this order: machines that are up, that are heard, that were not the gateway before, that are not
+    spot machines, that are older.
+
+    Args:
+        group: the machines next to this gateway, of all clusters. Those that are gone only explain a change.
+        label: of the gateway.
+    """
+    there = [each for each in group if not each.is_gone and each.id]
+    old = next((each for each in there if each.gateway == label), None)
+    fit = [each for each in there if each is not old and not each.is_outgoing]
+    if not fit:
+        return None
+    best = min(fit, key=_rank)
+    if old is None:
+        lost = max((each for each in group if each.is_gone and each.gateway == label), key=_last_s, default=None)
+        return Election(best, None, "the first machine" if lost is None else f"{lost.name} is gone: {lost.reason}")
+    if old.up_unix_s is None:
+        is_cut_off = best.up_unix_s is not None and not best.is_serving  # else its switch may forward already
+        is_late = now_s - _last_s(old) >= (patience.gateway_s if is_cut_off else patience.lonely_s)
+        return Election(best, old, f"{old.name} does not come up") if is_late else None
+    if best.up_unix_s is None:
+        return None  # it would forward nothing yet
+    if old.is_outgoing:
+        return Election(best, old, f"{old.name} leaves: {old.reason}")
+    if _is_suspect(old, there, now_s, patience) and _last_s(best) < (old.unheard_unix_s or 0.0):
+        return Election(best, old, f"behind {old.name} no replica is heard")
+    return None
+
+
+def is_settling(group: Sequence[Record], label: str, now_s: float, patience: Patience) -> bool:
+    """Return whether the gateway is so new that the silence of the machines behind it means nothing yet."""
+    since_s = max((_last_s(each) for each in group if each.gateway == label), default=0.0)
+    return now_s - since_s < patience.gateway_s
+
+
+def _is_suspect(gateway: Record, there: Sequence[Record], now_s: float, patience: Patience) -> bool:
+    """Return whether a gateway that runs seems to forward nothing: no replica of the group is heard."""
+    if gateway.unheard_unix_s is None or any(each.is_serving for each in there):
+        return False
+    since_s = max(gateway.unheard_unix_s + patience.unheard_s, _last_s(gateway) + patience.gateway_s)
+    return now_s >= since_s
+
+
+def _rank(record: Record) -> tuple[bool, bool, float, bool, float, str]:
+    is_spot = record.spec.offer.is_spot
+    return record.up_unix_s is None, not record.is_serving, _last_s(record), is_spot, record.asked_unix_s, record.name
+
+
+def _last_s(record: Record) -> float:
+    return record.gateway_unix_s or 0.0

@@ -1,0 +1,188 @@
+"""A machine that is the gateway of its group: its switch forwards to the others, and the role moves when it is lost.
+
+::
+
+    [robot, RIB] === fog0 === bridge === up [m1] eth0 === segment === eth0 [m2]  eth0 [m3]
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from pyroute2 import IPRoute
+
+from fog.machine import MachineState
+from fog.providers.local import trouble
+from fog.providers.local.provider import LocalProvider
+from fog.providers.local.standing import find
+from fog.providers.local.wire import UP, exists
+from fog.site import open_site
+from fog.supervisor.ground import local_provider
+from fog.supervisor.journal import Journal
+from fog.topology import AUTOMATIC_REPLICA, Gateway
+from gdp.errors import LocalError
+from gdp.limits import CALL_QUIET_S
+from gdp.metadata import Metadata
+from gdp.testbed import netns_files
+from netns_tests.local_site import PATIENCE_S, Domain, leftovers, machine_of, plain_gateway, spec, ticking, until
+from netns_tests.spaces import Space
+from netns_tests.test_fog import Fog, left_of
+from netns_tests.test_uplink import BYTES, OVERHEAD_BYTES, PARTS, REQUESTS, tell
+from tests.pages import ROOT
+
+pytestmark = pytest.mark.netns
+needs_ros2 = pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy is not installed: scripts/setup.sh --ros2")
+
+SERVICE = Metadata({"kind": "service", "name": "/plan", "type": "std_srvs/srv/SetBool"})
+ECHO = ROOT / "examples" / "echo.launch.py"
+
+
+@pytest.fixture
+def provider(tmp_path: Path, space: Space) -> Iterator[LocalProvider]:
+    folder = tmp_path / "local"
+    made = LocalProvider(folder, plain_gateway, AUTOMATIC_REPLICA)
+    made.open_network()
+    yield made
+    runs = [record.run for record in made.runs.all()]
+    made.terminate([each.id for each in made.describe("test")])
+    made.close_network()
+    assert leftovers(folder, runs) == []
+    assert not exists(None, "fog0")
+
+
+def received_bytes(machine: str, provider: LocalProvider) -> int:
+    """Return what came out of the robot's uplink at the far end of it: the device of the gateway's namespace."""
+
+    def look() -> int:
+        with IPRoute() as ipr:
+            (link,) = ipr.get_links(ifname=UP)
+            return int(link.get_attr("IFLA_STATS64")["rx_bytes"])
+
+    return netns_files.inside(find(provider.runs, machine).gateway, look)
+
+
+def test_a_group_without_machines_stands_until_it_is_closed(provider: LocalProvider) -> None:
+    (network,) = provider.runs.all()
+    assert provider.sweep() == []
+    provider.open_network()
+    assert [each.run for each in provider.runs.all()] == [network.run]
+
+
+def test_the_uplink_moves_from_machine_to_machine(provider: LocalProvider) -> None:
+    first, second = (provider.create(spec(name), ticking()) for name in ("m1", "m2"))
+    provider.attach_uplink(first)
+    provider.attach_uplink(first)
+    assert machine_of(provider, first).is_gateway
+    assert exists(find(provider.runs, first).space, UP)
+    provider.attach_uplink(second)
+    provider.detach_uplink(first)
+    provider.detach_uplink(first)
+    assert [machine_of(provider, each).is_gateway for each in (first, second)] == [False, True]
+    assert not exists(find(provider.runs, first).space, UP)
+    lost = find(provider.runs, second)
+    trouble.kill(provider.runs, second)
+    assert not exists(lost.gateway, lost.uplink_plug)
+    assert exists(lost.gateway, UP)
+
+
+def test_behind_a_dedicated_gateway_no_machine_is_one(tmp_path: Path, space: Space) -> None:
+    west = Gateway(gateway="west", replica=True, regions=("us-west-1",))
+    provider = LocalProvider(tmp_path / "local", plain_gateway, Gateway(gateway="edge", children=(west,)))
+    provider.open_network()
+    try:
+        beside, behind = (provider.create(spec(name, region), ticking()) for name, region in
+                          (("m1", "mars-1"), ("m2", "us-west-1")))  # fmt: skip
+        with pytest.raises(LocalError, match="mars-1 is dedicated"):
+            provider.attach_uplink(beside)
+        provider.attach_uplink(behind)
+        assert (provider.replica_gateway("mars-1"), provider.replica_gateway("us-west-1")) == ("", "west")
+    finally:
+        provider.terminate([each.id for each in provider.describe("test")])
+        provider.close_network()
+
+
+def test_the_uplink_carries_one_copy_of_a_request_whichever_machine_is_the_gateway(
+    provider: LocalProvider, tmp_path: Path
+) -> None:
+    domain = Domain(tmp_path)
+    domain.start_robot("fog0", "client0")
+    try:
+        machines = [provider.create(spec(name), domain.replica(name, SERVICE)) for name in ("m1", "m2", "m3")]
+        provider.attach_uplink(machines[0])
+        for each in machines:
+            until(lambda m=each: machine_of(provider, m).state is MachineState.RUNNING, "running")
+        client = domain.start_client("client0", SERVICE, REQUESTS, BYTES)
+        once = REQUESTS * (BYTES + PARTS * OVERHEAD_BYTES)
+        for gateway, before in ((machines[0], None), (machines[1], machines[0])):
+            provider.attach_uplink(gateway)
+            if before is not None:
+                provider.detach_uplink(before)
+            tell(client, len(machines))
+            tell(client, "go")  # what was on its way when the uplink moved is repaired
+            sent = received_bytes(gateway, provider)
+            tell(client, "go")
+            assert once < received_bytes(gateway, provider) - sent < 1.15 * once
+    finally:
+        domain.close()
+
+
+@pytest.fixture
+def fog(tmp_path: Path, space: Space) -> Iterator[Fog]:
+    subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
+    made = Fog(tmp_path / "state")
+    yield made
+    made.run("down", "--all")
+    assert not left_of(made)
+
+
+@needs_ros2
+def test_calls_go_on_when_the_machine_that_is_the_gateway_is_killed(fog: Fog) -> None:
+    fog.run("launch", str(ECHO), "--gateway", "replica", "--detach")
+    fog.run("scale", "up")
+    fog.until(lambda: len(fog.serving()) == 3 and all(each.up_unix_s for each in fog.living()), "three replicas serve")
+    words = ["-m", "fog.demo.caller", "--ros-args", "-p", "rate_hz:=20.0", "-p", "depth:=1000"]
+    caller = subprocess.Popen(
+        [sys.executable, *words], env=fog.environment, cwd=fog.state.parent, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert caller.stdout is not None
+        while not json.loads(caller.stdout.readline())["answered"]:
+            pass
+        (lost,) = (each for each in fog.living() if each.gateway)
+        host = find(local_provider(open_site(None, fog.state)).runs, lost.id).host
+        assert host is not None
+        moves = fog.events().count("gateway")
+        os.kill(fog.status()["supervisor_pid"], signal.SIGKILL)
+        (known,) = (each["name"] for each in fog.status()["members"] if each["gateway"])  # starts another supervisor
+        assert known == lost.name
+        fog.until(lambda: fog.events().count("reconciled") == 2, "the other supervisor has looked")
+        assert fog.events().count("gateway") == moves
+        os.kill(host.pid, signal.SIGKILL)  # the kernel ends its programs; its devices stay
+        fog.until(lambda: {each.name for each in fog.living() if each.gateway} - {lost.name}, "the role moves")
+        fog.until(lambda: len({*fog.serving()} - {lost.name}) == 3, "the killed machine is replaced")
+        (now,) = (each.name for each in fog.living() if each.gateway)
+        caller.send_signal(signal.SIGUSR1)
+        lines = [json.loads(line) for line in caller.communicate(timeout=PATIENCE_S)[0].splitlines()]
+        last, silence_s = lines[-1], max(each["silence_ms"] for each in lines) / 1e3
+        counts = {key: last[key] for key in ("calls", "answered", "failed", "wrong", "unserved")}
+        print(f"silence {silence_s:.2f} s, {counts}")  # pytest -s shows it: the cost of a lost gateway
+        assert last["answered"] + last["failed"] == last["calls"]
+        if silence_s < CALL_QUIET_S:  # on a busy machine the hand-over may take longer; then servers count as gone
+            assert last["failed"] == last["wrong"] == last["unserved"] == 0
+        assert lines[-2]["answered"] < last["answered"]
+    finally:
+        caller.kill()
+        caller.wait()
+    assert now in fog.run("status")
+    with closing(Journal(fog.state / "journal.sqlite3")) as journal:
+        moved = [(each.machine, each.detail) for each in journal.events("echo") if each.what == "gateway"]
+    assert moved[moves:] == [(now, f"of gateway: {lost.name} is gone: killed")]
