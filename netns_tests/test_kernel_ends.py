@@ -222,3 +222,23 @@ def test_where_it_is_allowed_it_is_what_auto_takes(ports: list[str]) -> None:
     argv = [sys.executable, "-c", CHOOSE, "auto"]
     ended = subprocess.run(argv, check=True, capture_output=True, text=True, env=WHERE, cwd=PROJECT)
     assert ended.stdout == "kernel|\n"
+
+
+def test_a_device_that_another_switch_still_holds_is_opened_when_that_lets_go(space: Space) -> None:
+    space.veth("one", "two", PORT_MACS[0], PEER_MACS[0])
+    former, later = KernelPlane(["one"]), KernelPlane()
+    try:
+        index = later.add_port("moved", may_be_absent=True)
+        for words in (("set", "one", "down"), ("set", "one", "name", "moved"), ("set", "moved", "up")):
+            space.ip(*words)
+        end_s = time.monotonic() + 1.0
+        while time.monotonic() < end_s:
+            later.poll(0.1)
+        assert not later.port_state(index)
+        former.close()
+        end_s = time.monotonic() + PATIENCE_S
+        while not later.port_state(index) and time.monotonic() < end_s:
+            later.poll(1.0)
+        assert later.port_state(index)
+    finally:
+        later.close()

@@ -2,7 +2,8 @@
 
 Place: I/O; how a frame is read, decided on and sent is left to the plane that builds on this.
 A port outlives its device. When the device is deleted, or moved away, the port is down; when one of that name appears,
-the port opens it anew. The kernel's own word (netlink) decides, so a cut link is known within milliseconds.
+the port opens it anew. The kernel's own word (netlink) decides, so a cut link is known within milliseconds. A device
+that cannot be opened (another process may still have it) is tried again until it can.
 
 A port's life::
 
@@ -12,7 +13,9 @@ A port's life::
 
 from __future__ import annotations
 
+import logging
 import select
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -27,6 +30,9 @@ from gdp.switch.table import Hops, Table
 
 __all__ = ["LinkedPlane", "NoDeviceError"]
 
+log = logging.getLogger(__name__)
+
+_OPEN_AGAIN_S: Final = 0.2
 _MTU_MAX_BYTES: Final = FRAME_MAX_BYTES - ETHER_BYTES
 _AUDIT_POLLS: Final = 256  # a busy plane asks the kernel for its drops this often, an idle one each time
 
@@ -51,6 +57,8 @@ class LinkedPlane(ABC):
         self._ports: dict[int, Port] = {}
         self._mtus: dict[int, int] = {}  # of the ports that are up
         self._devices: dict[int, int] = {}  # ifindex of an open device -> port index
+        self._unopened: dict[int, str] = {}  # port index to why its device cannot be opened
+        self._open_again_s = 0.0
         self._counters = Counters()
         self._polls = 0
         self._next_index = 0
@@ -112,6 +120,8 @@ class LinkedPlane(ABC):
         return self._counters
 
     def poll(self, timeout_s: float | None) -> list[Arrival]:
+        if self._unopened:
+            timeout_s = self._open_again(timeout_s)
         events = self._epoll.poll(timeout_s)
         self._polls += 1
         if not events or not self._polls % _AUDIT_POLLS:
@@ -161,6 +171,7 @@ class LinkedPlane(ABC):
 
     def remove_port(self, index: int) -> None:
         if self._ports.pop(index, None) is not None:
+            self._unopened.pop(index, None)
             self._close_device(index)
             self._mtus.pop(index, None)
             self._devices = {ifindex: port for ifindex, port in self._devices.items() if port != index}
@@ -212,9 +223,22 @@ class LinkedPlane(ABC):
                     continue
             self._follow(self._ports[index], link)
 
+    def _open_again(self, timeout_s: float | None) -> float:
+        """Try the devices that could not be opened, if it is time; return how long to wait at most."""
+        now_s = time.monotonic()
+        if now_s >= self._open_again_s:
+            self._open_again_s = now_s + _OPEN_AGAIN_S
+            for index in list(self._unopened):
+                link = self._links.ask(self._ports[index].ifname)
+                if link is not None:
+                    self._follow(self._ports[index], link)
+        left_s = self._open_again_s - now_s
+        return left_s if timeout_s is None else min(timeout_s, left_s)
+
     def _follow(self, port: Port, link: Link) -> None:
         """Bring a port in step with its device."""
         if link.gone:
+            self._unopened.pop(port.index, None)
             self._close_device(port.index)
             del self._devices[link.ifindex]
         after = replace(port, up=False)
@@ -231,6 +255,11 @@ class LinkedPlane(ABC):
             return after
         try:
             self._widen(after) if is_open else self._open(after)
-        except LocalError:  # gone again, or not ready: its next news tries once more
+        except LocalError as error:  # gone again, not ready, or another process has it
+            if before.index not in self._unopened:
+                log.warning("%s; it is tried again", error)
+            self._unopened[before.index] = str(error)
             return replace(after, up=False)
+        if self._unopened.pop(before.index, None) is not None:
+            log.info("port opened ifname=%s", after.ifname)
         return after
