@@ -48,7 +48,7 @@ _EAGER_HELLOS: Final = 4  # after a change, so that a lost one delays nobody
 _HELLOS_MISSED: Final = 5  # idle hello intervals after which keepalives alone keep nobody up
 _RECHECK_S: Final = 1.0  # a membership may be revoked or run out while keepalives come
 _LATE_S: Final = 0.02  # called later than this, a node had no time of its own
-_CLASH_S: Final = 2.0  # for so long another node must have our identity
+_CLASH_S: Final = 3.0  # for so long another node must have our identity
 _CLASH_PAUSE_S: Final = 10.0  # above the time between two idle hellos
 _TOGETHER: Final = 0.125  # of an interval: keepalives due within it leave at once
 
@@ -245,6 +245,7 @@ class Greeter:
             raise StatementError(DropReason.REPLAYED, "hello")
         statement.verify(member.key)
         self._refuse_rival(port, hello, member.name, arrival.mac, now.mono_s)
+        self.rivals.take(member.name, hello.life)
         if known is None:
             if len(port.neighbours) >= NEIGHBOURS_PER_PORT:
                 raise StatementError(DropReason.QUOTA, "neighbours on one port")
@@ -304,7 +305,7 @@ class Greeter:
                 self.let_go(other, now_s)
         if not has_older and (elsewhere is None or hello.life <= elsewhere):
             return
-        self.rivals.refuse(name, now_s)
+        self.rivals.refuse(name, hello.life, now_s)
         if self.rivals.tell(port.index, hello.nonce, name, now_s):
             port.hurry(now_s)
         raise StatementError(DropReason.IN_USE, "an older node with this identity is alive")
@@ -312,7 +313,7 @@ class Greeter:
     def let_go(self, neighbour: Neighbour, now_s: float) -> None:
         """Have ``expire`` let a neighbour go, for an older node with its identity is alive."""
         self._next_s = None
-        self.rivals.refuse(neighbour.name, now_s)
+        self.rivals.refuse(neighbour.name, neighbour.life, now_s)
         self.rivals.tell(neighbour.port, neighbour.nonce, neighbour.name, now_s)
         neighbour.heard_s = float("-inf")
 

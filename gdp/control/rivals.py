@@ -27,25 +27,39 @@ class _Session:
     until_s: float
 
 
+@dataclass(slots=True)
+class _Refused:
+    life: bytes
+    until_s: float
+
+
 class Rivals:
     """The sessions at this node's ports whose identity another node has, too.
 
     Attributes:
         refusals: hellos that were refused because an older node has their identity.
-        changes: how often an identity was refused anew.
+        changes: how often an identity came to be refused, or is no more because the same node was taken.
     """
 
     def __init__(self) -> None:
         self._sessions: dict[tuple[int, bytes], _Session] = {}
-        self._refused: dict[Name, float] = {}
+        self._refused: dict[Name, _Refused] = {}
         self.refusals = 0
         self.changes = 0
 
-    def refuse(self, name: Name, now_s: float) -> None:
+    def refuse(self, name: Name, life: bytes, now_s: float) -> None:
         """Note that a hello was refused."""
         self.refusals += 1
-        self.changes += self._refused.get(name, now_s) <= now_s
-        _put(self._refused, name, now_s + _TOLD_S)
+        known = self._refused.get(name)
+        self.changes += known is None or known.until_s <= now_s
+        _put(self._refused, name, _Refused(life, now_s + _TOLD_S))
+
+    def take(self, name: Name, life: bytes) -> None:
+        """Note that a hello was taken; if it was refused before, the older life was only not known to be dead."""
+        known = self._refused.get(name)
+        if known is not None and known.life == life:
+            del self._refused[name]
+            self.changes += 1
 
     def tell(self, port: int, nonce: bytes, name: Name, now_s: float) -> bool:
         """See that a session hears of its rival; return whether it has not yet."""
@@ -64,8 +78,12 @@ class Rivals:
         """Return the identities of which a hello was refused lately."""
         if not self._refused:
             return []
-        self._refused = {name: until_s for name, until_s in self._refused.items() if until_s > now_s}
+        self._refused = {name: each for name, each in self._refused.items() if each.until_s > now_s}
         return sorted(self._refused)
+
+    def next_expiry(self) -> float | None:
+        """Return the monotonic second at which ``refused`` changes by itself, or None."""
+        return min((each.until_s for each in self._refused.values()), default=None)
 
 
 def _put(held: dict[_K, _V], key: _K, value: _V) -> None:

@@ -157,7 +157,13 @@ class Flooding:
 
     def next_timeout(self) -> float:
         """Return the monotonic second of the next timer."""
-        times = (self._refresh_at_s, self.link_states.next_expiry(), self._stub_until_s, self.damping.next_reuse())
+        times = (
+            self._refresh_at_s,
+            self.link_states.next_expiry(),
+            self._stub_until_s,
+            self.damping.next_reuse(),
+            self._greeter.rivals.next_expiry(),
+        )
         return min(time for time in times if time is not None)
 
     def _originate(self, now_s: float) -> None:

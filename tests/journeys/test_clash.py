@@ -189,6 +189,18 @@ def test_a_switch_that_is_restarted_is_nobodys_rival() -> None:
     assert all(switch.greeter.rivals.refusals == 0 for switch in world.switches.values())
 
 
+def test_a_switch_whose_death_not_all_neighbours_have_noticed_is_nobodys_rival() -> None:
+    world = ring()
+    flow = flowing(world)
+    world.network.stop("nuc2")
+    world.network.set_link(world.cables[frozenset(("nuc1", "nuc2"))], up=False)  # nuc3 does not know yet
+    world.network.set_link(world.cables[frozenset(("nuc1", "nuc2"))], up=True)
+    world.restart_switch("nuc2")
+    world.network.run(3)
+    flow.outlive()
+    assert world.switches["nuc2"].greeter.clashes == 0
+
+
 def test_the_older_of_two_nodes_keeps_serving_when_the_other_one_is_in_another_domain() -> None:
     world = ring()
     there, back = flowing(world), flowing(world, "/answers", SERVER, (ROBOT,))
