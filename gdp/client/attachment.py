@@ -79,17 +79,7 @@ class Attachment:
         self._sequence = settings.first_sequence
         self.splitter = ControlSplitter(identity.name, settings.incarnation)
         self.joiner = ControlJoiner()
-        self.greeter = Greeter(
-            identity,
-            policy,
-            self.splitter,
-            settings.random_bytes,
-            hello_s=settings.hello_s,
-            dead_s=settings.dead_s,
-            timing=settings.timing,
-            incarnation=settings.incarnation,
-            life=settings.life,
-        )
+        self.greeter = Greeter.of_node(identity, policy, self.splitter, settings)
         self._claims: dict[tuple[Name, Right], Claimed] = {}
         self._switch: Neighbour | None = None
         self._switch_nonce = b""  # of the session with it

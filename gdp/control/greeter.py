@@ -24,6 +24,7 @@ from gdp.control.join import Join
 from gdp.control.keepalive import KeepaliveSession, Slowness
 from gdp.control.neighbour import TRANSITIONS, Neighbour, NeighbourEvent, NeighbourState
 from gdp.control.rivals import Rivals
+from gdp.control.settings import NodeSettings
 from gdp.control.strangers import Strangers
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
 from gdp.crypto.identity import Identity
@@ -184,6 +185,32 @@ class Greeter:
         self.clash_told_by: Name | None = None
         self._clash_since_s = self._clash_s = float("-inf")
         self.ports: dict[int, LinkPort] = {}
+
+    @classmethod
+    def of_node(
+        cls,
+        identity: Identity,
+        policy: Policy,
+        splitter: ControlSplitter,
+        settings: NodeSettings,
+        *,
+        digest_for: Callable[[LinkPort], bytes] = lambda _: bytes(DIGEST_BYTES),
+        life_elsewhere: Callable[[Name], bytes | None] = lambda _: None,
+    ) -> Greeter:
+        """Return the greeter of a node with these settings."""
+        return cls(
+            identity,
+            policy,
+            splitter,
+            settings.random_bytes,
+            hello_s=settings.hello_s,
+            dead_s=settings.dead_s,
+            timing=settings.timing,
+            incarnation=settings.incarnation,
+            life=settings.life,
+            digest_for=digest_for,
+            life_elsewhere=life_elsewhere,
+        )
 
     def set_timing(self, index: int, timing: Timing) -> None:
         """Want other keepalives on one port, from its next session on."""

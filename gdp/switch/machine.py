@@ -70,19 +70,10 @@ class Switch:
         self._splitter = ControlSplitter(identity.name, settings.incarnation)
         self._joiner = ControlJoiner()
         self._hellos = ControlJoiner()
-        self.greeter = Greeter(
-            identity,
-            policy,
-            self._splitter,
-            settings.random_bytes,
-            hello_s=settings.hello_s,
-            dead_s=settings.dead_s,
-            timing=settings.timing,
-            incarnation=settings.incarnation,
-            life=settings.life,
-            digest_for=self._digest_for,
-            life_elsewhere=self._life_elsewhere,
-        )
+        self.greeter = Greeter.of_node(
+            identity, policy, self._splitter, settings,
+            digest_for=self._digest_for, life_elsewhere=self._life_elsewhere,
+        )  # fmt: skip
         self._outbox = Outbox(self.greeter, self._splitter)
         self._flooding = Flooding(
             identity, policy, self.greeter, self._send_link_state, settings.first_sequence, settings.life
