@@ -41,7 +41,8 @@ class Robot:
     def meet(self, peers: int) -> None:
         """Return when it has so many peers."""
         deadline_s = time.monotonic() + PATIENCE_S
-        assert self._runtime.run(lambda: len(self._member.peers(self._service)) == peers, deadline_s)
+        is_met = self._runtime.run(lambda: len(self._member.peers(self._service)) == peers, deadline_s)
+        assert is_met, f"{len(self._member.peers(self._service))} peers, not {peers}"
 
     def publish(self) -> None:
         """Ask all; return when all have confirmed."""

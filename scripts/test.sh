@@ -34,7 +34,7 @@ if [[ $# -gt 0 ]]; then
 fi
 # Tests with namespaces mostly wait for processes, so two lanes run side by side, equally long. Timers of nodes that
 # share two cores with other tests may starve: what failed runs once more with nothing beside it, and is told.
-clusters=(netns_tests/test_{bench_replicas,experiments,fog,fog_demo,leaving,local_provider}.py)
+clusters=(netns_tests/test_{bench_replicas,experiments,fog,fog_demo,leaving,local_provider,replica_gateway}.py)
 declare -A lanes=(["clusters"]="tests ${clusters[*]}" ["spaces"]="netns_tests ${clusters[*]/#/--ignore=}")
 # shellcheck disable=SC2086  # words
 lane() { run -o "cache_dir=.pytest_cache/$1" ${lanes[$1]} "${@:2}"; }
