@@ -130,7 +130,7 @@ def test_the_uplink_carries_one_copy_of_a_request_whichever_machine_is_the_gatew
             tell(client, "go")  # what was on its way when the uplink moved is repaired
             sent = received_bytes(gateway, provider)
             tell(client, "go")
-            assert once < received_bytes(gateway, provider) - sent < 1.15 * once
+            assert once < received_bytes(gateway, provider) - sent < 1.5 * once  # two copies are 2.0 or more
     finally:
         domain.close()
 
