@@ -79,7 +79,7 @@ class Flooding:
         self.paths = Paths(identity.name, self._domain, self.link_states)
         self.damping = Damping()
         self._said: dict[Scope, tuple[object, ...]] = {}
-        self._refresh_at_s = 0.0
+        self._refresh_at_s: dict[Scope, float] = {}  # each by itself: news in one scope renew nothing of the other
         self._synced_s: dict[tuple[int, Name], float] = {}
         self._differs_s: dict[tuple[int, Name], float] = {}  # since when keepalives show other ones
 
@@ -151,14 +151,15 @@ class Flooding:
             self._stub_until_s = None
         self.link_states.expire(now_s)
         self.damping.expire(now_s)
-        if now_s >= self._refresh_at_s:
-            self._said.clear()
+        for scope, refresh_at_s in self._refresh_at_s.items():
+            if now_s >= refresh_at_s:
+                self._said.pop(scope, None)
         self._originate(now_s)
 
     def next_timeout(self) -> float:
         """Return the monotonic second of the next timer."""
         times = (
-            self._refresh_at_s,
+            min(self._refresh_at_s.values(), default=0.0),
             self.link_states.next_expiry(),
             self._stub_until_s,
             self.damping.next_reuse(),
@@ -170,13 +171,14 @@ class Flooding:
         switches = [each for each in self._greeter.all_up() if each.role == Role.SWITCH]
         links = tuple(sorted(Adjacency(n.name, n.domain, self._cost(n), n.mtu) for n in switches))
         if self.is_displaced:
+            self._refresh_at_s = dict.fromkeys(self._refresh_at_s, now_s + LINK_STATE_REFRESH_S)
             return
         self._rivals_seen = self._greeter.rivals.changes
         ribs = {AttachedRib(n.name, n.domain, n.nonce, n.life) for n in self._greeter.all_up() if n.role == Role.RIB}
         refused = tuple(self._greeter.rivals.refused(now_s))
         self._say(Scope.DOMAIN, links, (), tuple(sorted(ribs)), (), refused, now_s)
         leaving = tuple(link for link in links if link.domain != self._domain)
-        if leaving or Scope.BORDER in self._said or self.link_states.sequence_of(self._identity.name, Scope.BORDER):
+        if leaving or Scope.BORDER in self._refresh_at_s or self._had_border_state():
             inside = tuple(
                 Adjacency(border, self._domain, max(distance, 1), 1)
                 for border, distance in self.paths.borders().items()
@@ -184,6 +186,10 @@ class Flooding:
             )
             members = tuple(sorted(self.paths.members()))
             self._say(Scope.BORDER, leaving, inside, tuple(sorted(self.paths.ribs_inside())), members, refused, now_s)
+
+    def _had_border_state(self) -> bool:
+        """Return whether others may hold a border state of ours, of an earlier life perhaps."""
+        return self.link_states.sequence_of(self._identity.name, Scope.BORDER) > 0
 
     def _say(
         self,
@@ -205,7 +211,7 @@ class Flooding:
         )
         wire = state.to_wire(self._identity.key, self._identity.membership)
         self.link_states.put(state, wire, now_s)
-        self._refresh_at_s = now_s + LINK_STATE_REFRESH_S
+        self._refresh_at_s[scope] = now_s + LINK_STATE_REFRESH_S
         self._flood(scope, wire)
 
     def _outdo(self, state: LinkState, now_s: float) -> None:

@@ -191,3 +191,21 @@ def test_a_node_that_died_is_sought_a_few_times_a_second() -> None:
     world.network.stop(ROBOT)
     world.network.run(SHORT_S)
     assert 0 < tap.count(Kind.RIB_REQUEST) < 10 * SHORT_S
+
+
+def test_a_switch_at_the_border_of_a_domain_that_never_rests_stays_in_its_own() -> None:
+    plan = Topology(
+        (Link("a1", "a2"), Link("a2", "b2"), Link("b2", "b1"), Link("a1", "a3"), Link("a3", "b3"), Link("b3", "b1")),
+        (DomainPlan("a", ("a1", "a2", "a3")), DomainPlan("b", ("b1", "b2", "b3"), upper="a")),
+        (Attachment("a1", "rib", "rib"), Attachment("b1", "rib", "rib")),
+    )
+    world = World(plan, lease_s=LEASE_S)
+    world.network.run(5)
+    ribs = {world.ribs[domain].name for domain in ("a", "b")}
+    for _ in range(9):  # each time something changes at the border, and nothing in a3's own part of the domain
+        world.network.stop("a2")
+        world.network.run(1.5)
+        world.restart_switch("a2")
+        for _ in range(12):
+            world.network.run(1)
+            assert {world.switches["a3"].rib, world.switches["b3"].rib} == ribs
