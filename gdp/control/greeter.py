@@ -322,35 +322,37 @@ class Greeter:
         if any((other.port, other.mac) == (port.index, mac) for other in others):
             return  # it was restarted there
         elsewhere = self._life_elsewhere(name)
-        has_older = any(other.life < hello.life for other in others)
-        if not others and (elsewhere is None or hello.life <= elsewhere):
-            return
+        is_outlived_here = any(other.life < hello.life for other in others)
         for other in others:
-            if self.rivals.tell(other.port, other.nonce, name, now_s):
-                self.ports[other.port].hurry(now_s)
-            if not has_older:
+            if is_outlived_here:
+                self._tell_rival(other.port, other.nonce, name, now_s)
+            else:
                 self.let_go(other, now_s)
-        if not has_older and (elsewhere is None or hello.life <= elsewhere):
+        if not is_outlived_here and (elsewhere is None or hello.life <= elsewhere):
             return
         self.rivals.refuse(name, hello.life, now_s)
-        if self.rivals.tell(port.index, hello.nonce, name, now_s):
-            port.hurry(now_s)
+        self._tell_rival(port.index, hello.nonce, name, now_s)
         raise StatementError(DropReason.IN_USE, "an older node with this identity is alive")
 
     def let_go(self, neighbour: Neighbour, now_s: float) -> None:
         """Have ``expire`` let a neighbour go, for an older node with its identity is alive."""
         self._next_s = None
         self.rivals.refuse(neighbour.name, neighbour.life, now_s)
-        self.rivals.tell(neighbour.port, neighbour.nonce, neighbour.name, now_s)
+        self._tell_rival(neighbour.port, neighbour.nonce, neighbour.name, now_s)
         neighbour.heard_s = float("-inf")
 
     def tell_rivals(self, name: Name, now_s: float) -> None:
         """Tell a neighbour, where it is one, that another node has its identity."""
         for port in self.ports.values():
             held = port.neighbours.get(name)
-            if held is not None and self.rivals.tell(port.index, held.nonce, name, now_s):
-                self._next_s = None
-                port.hurry(now_s)
+            if held is not None:
+                self._tell_rival(port.index, held.nonce, name, now_s)
+
+    def _tell_rival(self, port: int, nonce: bytes, name: Name, now_s: float) -> None:
+        """See that hellos tell a session of its rival, soon if that is news to it."""
+        if self.rivals.tell(port, nonce, name, now_s):
+            self._next_s = None
+            self.ports[port].hurry(now_s)
 
     def note_clash(self, told_by: Name, now_s: float, *, is_proven: bool = False) -> None:
         """Note that another node has our own identity.

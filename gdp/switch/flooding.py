@@ -168,11 +168,11 @@ class Flooding:
         return min(time for time in times if time is not None)
 
     def _originate(self, now_s: float) -> None:
-        switches = [each for each in self._greeter.all_up() if each.role == Role.SWITCH]
-        links = tuple(sorted(Adjacency(n.name, n.domain, self._cost(n), n.mtu) for n in switches))
         if self.is_displaced:
             self._refresh_at_s = dict.fromkeys(self._refresh_at_s, now_s + LINK_STATE_REFRESH_S)
             return
+        switches = [each for each in self._greeter.all_up() if each.role == Role.SWITCH]
+        links = tuple(sorted(Adjacency(n.name, n.domain, self._cost(n), n.mtu) for n in switches))
         self._rivals_seen = self._greeter.rivals.changes
         ribs = {AttachedRib(n.name, n.domain, n.nonce, n.life) for n in self._greeter.all_up() if n.role == Role.RIB}
         refused = tuple(self._greeter.rivals.refused(now_s))

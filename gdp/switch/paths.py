@@ -139,6 +139,8 @@ class Paths:
             hosts = {host: rib.life for host, rib in self._ribs.get(name, {}).items() if host != self._me}
         else:
             hosts = {} if (life := self._lives.get(name)) is None else {name: life}
+        if not hosts:
+            return None  # a proxy, say: nothing is computed for its hellos
         everywhere = frozenset(self._domains.values())
         lives = [life for host, life in hosts.items() if host in self._to_all(everywhere)]
         return min(lives, default=None)
