@@ -23,6 +23,7 @@ from gdp.names import Name
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, DELEGATIONS, ROOT_CERTIFICATE
 from gdp.trust.right import Right
+from tests.pages import ROOT
 
 __all__ = ["PATIENCE_S", "Domain", "leftovers", "machine_of", "plain_gateway", "spec", "ticking", "until"]
 
@@ -106,7 +107,8 @@ class Domain:
         keys, served = self._member(name, service, Right.SERVE)
         files |= {f"proxy/{path.relative_to(keys)}": path.read_bytes() for path in keys.rglob("*") if path.is_file()}
         words = (served.to_text(), "{home}/proxy", "{home}/switch/root.crt", "proxy0", "serve")
-        member = ("sh", "-c", 'until ip link show proxy0 >/dev/null 2>&1; do sleep 0.05; done; exec "$@"', "member")
+        wait = 'until ip link show proxy0 >/dev/null 2>&1; do sleep 0.05; done; exec "$@"'
+        member = ("env", f"PYTHONPATH={ROOT}", "sh", "-c", wait, "member")  # a machine has no checkout of the tests
         program = Program("proxy", (*member, "{python}", "-m", "netns_tests.uplink_child", *words), "up")
         return Boot(files, (_command("switch", "gdp.cli.switch"), program))
 
