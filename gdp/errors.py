@@ -70,6 +70,9 @@ class DropReason(IntEnum):
     REVOKED = 34
     UNAVAILABLE = 35  # a RIB's store did not answer; the sender may try again
     IN_USE = 36  # another node with this identity is alive elsewhere
+    INTERNAL = 37  # it drew an error of this program's own
+    QUARANTINED = 38  # from a sender whose statements drew such errors
+    MISPLACED = 39  # no proof that a node is attached where this says
 
     @property
     def label(self) -> str:

@@ -46,6 +46,9 @@ NACKS_PER_REPORT: Final = 24  # ranges: a report, sealed and alone in its frame,
 
 # Control plane
 CONTROL_MAX_BYTES: Final = 16 << 10  # one statement with its evidence
+CLAIM_MAX_BYTES: Final = 9 << 10  # with its evidence: a relay, an answer or a join around it must fit one statement
+WITHDRAWAL_MAX_BYTES: Final = 1 << 10
+SEQUENCE_AHEAD_S: Final = 366 * 86_400.0  # sequence numbers are wall-clock milliseconds, at most so far ahead
 CONTROL_PARTS_MAX: Final = 64
 CONTROL_JOIN_BYTES: Final = 1 << 20  # reassembly of control messages, per node
 CONTROL_JOIN_SOURCE_BYTES: Final = 64 << 10

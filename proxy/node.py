@@ -127,6 +127,7 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
             member.attachment.greeter,
             policy,
             plane,
+            member.boundary,
             lambda now_s: attachment_waits(member.attachment, now_s),
             rival=lambda: member.attachment.rival_at,
             local_name=_local_names(config),

@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import signal
 
+from gdp.control.boundary import ErrorBoundary
+
 
 def pytest_configure() -> None:
-    """Take Ctrl-C again: a shell starts what is in its background with it ignored, and children inherit that."""
+    """Take Ctrl-C again: a shell starts what is in its background with it ignored, and children inherit that.
+
+    Errors that a node would contain fail the test that draws them.
+    """
+    ErrorBoundary.reraises = True
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)

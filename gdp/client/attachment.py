@@ -23,6 +23,7 @@ from gdp.control.presence import Presence
 from gdp.control.settings import NodeSettings
 from gdp.control.verdict import Verdict
 from gdp.crypto.certificates import Role
+from gdp.crypto.fields import check_sequence
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse, sign
 from gdp.crypto.subject import Subject
@@ -45,7 +46,9 @@ _MOVED_S: Final = 5.0  # claims name the former switch for so long after a move
 _ECHO_S: Final = 0.02  # the greeter answers a new session within this time
 _IN_USE_SOON_S: Final = 0.1  # a refused node asks again: its earlier life may be known to be dead any moment
 _IN_USE_S: Final = 2.0  # ... and after so long this seldom
-_RTCERT_S: Final = 3_600
+_RTCERT_S: Final = 7_200
+_RTCERT_RENEW_S: Final = 1_800  # so that it holds at clocks that are an hour ahead, too
+_RTCERTS_MAX: Final = 32
 _RTCERT_BEFORE_S: Final = 900  # it is dated back by so much, for clocks that lag
 
 
@@ -79,15 +82,18 @@ class Attachment:
         self._sequence = settings.first_sequence
         self.splitter = ControlSplitter(identity.name, settings.incarnation)
         self.joiner = ControlJoiner()
-        self.greeter = Greeter.of_node(identity, policy, self.splitter, settings)
+        is_rib = identity.member.role is Role.RIB
+        self.greeter = Greeter.of_node(
+            identity, policy, self.splitter, settings, rtcert_for=self._rtcert_for if is_rib else None
+        )
         self._claims: dict[tuple[Name, Right], Claimed] = {}
         self._switch: Neighbour | None = None
         self._switch_nonce = b""  # of the session with it
         self._last = ZERO  # the switch of the newest attachment, the present one too
         self._former = ZERO  # the one before
         self._moved_s = float("-inf")
-        self._rtcert = b""
-        self._rtcert_until_s = 0.0
+        self._rtcerts: dict[Name, tuple[bytes, float]] = {}  # by switch, with the monotonic second of the next one
+        self._now = Instant(0.0, 0.0)
         self._out: list[Transmit] = []
         self._in_use_s = 0.0  # since when another node with this identity keeps its place
         self.clashes = 0  # signs of another node with this identity
@@ -194,6 +200,7 @@ class Attachment:
 
     def timeout(self, now: Instant) -> None:
         """Renew what is due."""
+        self._now = now
         if self.greeter.expire(now.mono_s):
             self._choose_switch(now.mono_s)
         self.joiner.expire(now.mono_s)
@@ -230,7 +237,6 @@ class Attachment:
         self._switch = best
         self._switch_nonce = b"" if best is None else best.nonce
         if best is not None and not is_same:
-            self._rtcert = b""
             if best.name != self._last:
                 self._former, self._last, self._moved_s = self._last, best.name, now_s
             echo_at_s = self.greeter.ports[best.port].hello_at_s
@@ -242,15 +248,11 @@ class Attachment:
 
     def _claim_wire(self, each: Claimed, now: Instant) -> bytes:
         assert self._switch is not None
-        if not self._rtcert or now.mono_s >= self._rtcert_until_s:
-            validity = Validity(int(now.unix_s) - _RTCERT_BEFORE_S, int(now.unix_s) + _RTCERT_S)
-            self._rtcert = RtCert.make(self._identity, self._switch.name, validity)
-            self._rtcert_until_s = now.mono_s + _RTCERT_S / 2
         return make_claim(
             self._identity,
             each.right,
             each.subject,
-            rtcert=self._rtcert,
+            rtcert=self._rtcert_for(self._switch.name),
             sequence=self._next_sequence(),
             incarnation=self._incarnation,
             lease_s=self._lease_s,
@@ -258,6 +260,18 @@ class Attachment:
             chain=each.chain,
             previous=self._former if now.mono_s - self._moved_s < _MOVED_S else ZERO,
         )
+
+    def _rtcert_for(self, switch: Name) -> bytes:
+        """Return the certificate by which this node lets a switch attract its traffic."""
+        rtcert, until_s = self._rtcerts.get(switch, (b"", float("-inf")))
+        if self._now.mono_s >= until_s:
+            unix_s = int(self._now.unix_s)
+            rtcert = RtCert.make(self._identity, switch, Validity(unix_s - _RTCERT_BEFORE_S, unix_s + _RTCERT_S))
+            self._rtcerts.pop(switch, None)
+            self._rtcerts[switch] = rtcert, self._now.mono_s + _RTCERT_RENEW_S
+            if len(self._rtcerts) > _RTCERTS_MAX:
+                del self._rtcerts[next(iter(self._rtcerts))]
+        return rtcert
 
     def _note_newest(self, join: Join) -> None:
         """Note how new a join is.
@@ -289,6 +303,7 @@ class Attachment:
                 self.rival_at = presence.other
             return None
         verdict = Verdict.from_fields(statement.expect(StatementType.VERDICT))
+        check_sequence(verdict.sequence, now.unix_s)
         for (name, _), each in self._claims.items():
             if name == verdict.name and verdict.advertiser == self._identity.name:
                 self._judge(each, verdict, now.mono_s)

@@ -40,7 +40,7 @@ from gdp.message.loss import Losses, LossReason, LostRange, explain
 from gdp.message.memory import Budget
 from gdp.message.move import Move
 from gdp.message.report import Missing, Report, ReportFlag
-from gdp.message.status import Status
+from gdp.message.status import Start, Status
 from gdp.names import Name
 
 __all__ = ["Delivered", "Ended", "Feed", "FeedState", "Reader"]
@@ -339,11 +339,12 @@ class Feed:
             return
         self._is_reliable = bool(joined.flags & _WAITING)
         if self.state is FeedState.NEW:
-            if self._reader.name not in status.starts:
+            start = status.starts.get(self._reader.name)
+            if start is None or start.incarnation != self._reader.incarnation:
                 return
             self.state = FeedState.LIVE
             self._note = self._note_sealer(epoch)
-            self._begin(status, is_latched=bool(joined.flags & _LATCHED))
+            self._begin(status, start, is_latched=bool(joined.flags & _LATCHED))
             for number in [n for n in self._ready if not 0 <= n - self._expected < REPLAY_WINDOW_MESSAGES]:
                 self._take_ready(number)
             self._data.begin(self._expected, self._ready)
@@ -365,9 +366,9 @@ class Feed:
         self._known = max(self._known, status.sent_sequence)
         self._report_at_s = now_s
 
-    def _begin(self, status: Status, *, is_latched: bool) -> None:
+    def _begin(self, status: Status, start: Start, *, is_latched: bool) -> None:
         """Begin where the publisher says, and count what came between this and what was read before."""
-        start, before = status.starts[self._reader.name], self._before
+        before = self._before
         self._expected = start.number
         if before.resumes or not is_latched:
             self._expected = max(start.number, before.number)

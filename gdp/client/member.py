@@ -22,6 +22,7 @@ from gdp.client.publisher import Publisher
 from gdp.client.readers import CALLS, TOPICS
 from gdp.client.source import Source
 from gdp.client.subscription import Message, Subscription, Subscriptions, Topic
+from gdp.control.boundary import ErrorBoundary
 from gdp.control.join import Join
 from gdp.control.query import Answer
 from gdp.control.settings import NodeSettings
@@ -61,6 +62,7 @@ class Member:
         self._under_way: tuple[Feed, Subscription] | None = None  # whose next part is expected
         self._now_s = 0.0
         self._awake_s = 0.0  # since when this member has had time
+        self.boundary = ErrorBoundary()
         self._drops: Counter[DropReason] = Counter()
         self.attachment = Attachment(identity, policy, settings)
         self.attachment.claim(identity.subject, Right.ATTACH, (), is_global=True)
@@ -271,6 +273,9 @@ class Member:
                 self._drops[DropReason.UNKNOWN_KIND] += 1
         except RemoteError as error:
             self._drops[error.reason] += 1
+        except Exception as error:  # one frame must not end the node
+            self.boundary.note(error)
+            self._drops[DropReason.INTERNAL] += 1
 
     def port_changed(self, port: int, up: bool, now: Instant) -> None:
         """Learn that a port's link came or went."""

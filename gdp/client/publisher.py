@@ -461,8 +461,9 @@ class Publisher:
             is_gone = oldest is not None and reader.start is not None and reader.start.number < oldest
             if reader.start is None or is_gone or not self._repairs_wanted:
                 number = self._first_of(report)
-                reader.start = Start(number, self._ledger.begin_of(number, self._first_waiting()), reader.confirmed)
-                reader.sequence = min(report.sequence, self._ledger.last + 1) or reader.start.sequence
+                begin = self._ledger.begin_of(number, self._first_waiting())
+                reader.start = Start(reader.incarnation, number, begin, reader.confirmed)
+                reader.sequence = min(report.sequence, self._ledger.last + 1) or begin
                 if self._repairs_wanted and now_s >= reader.out_until_s:
                     self._window.add_reader(name, number, now_s)
                     if number < self._next_number and report.next_number and self._window.readers > 1:

@@ -57,6 +57,9 @@ class RibHost:
                 statements += self._take(arrival, now)
             except RemoteError as error:
                 self._drops[error.reason] += 1
+            except Exception as error:  # one frame must not end the RIB
+                self.rib.boundary.note(error)
+                self._drops[DropReason.INTERNAL] += 1
         self.rib.receive_all(statements, now)
         self._note_connection(now)
         self._post()

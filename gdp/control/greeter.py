@@ -19,13 +19,14 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gdp.control.frames import ControlSplitter
-from gdp.control.hello import DIGEST_BYTES, LIFE_BYTES, NO_KEEPALIVES, NONCE_BYTES, Hello, Timing
+from gdp.control.hello import DIGEST_BYTES, LIFE_BYTES, NO_KEEPALIVES, NONCE_BYTES, RTCERTS_MAX, Hello, Timing
 from gdp.control.join import Join
 from gdp.control.keepalive import KeepaliveSession, Slowness
 from gdp.control.neighbour import TRANSITIONS, Neighbour, NeighbourEvent, NeighbourState
 from gdp.control.rivals import Rivals
 from gdp.control.settings import NodeSettings
 from gdp.control.strangers import Strangers
+from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType
@@ -37,11 +38,13 @@ from gdp.limits import DEAD_S, HELLO_IDLE, HELLO_S, MTU_MIN_BYTES
 from gdp.message.replay import ReplayWindow
 from gdp.names import Name
 from gdp.trust.domain import Policy
+from gdp.trust.rtcert import RtCertCache
 
 __all__ = ["Change", "Greeter", "LinkPort"]
 
 NEIGHBOURS_PER_PORT: Final = 32
 _UNHEARD: Final = (-1, -1)
+_RTCERTS_REMEMBERED: Final = 256
 _ENDED_MAX: Final = 1_024  # sessions of the far ends, remembered for one session of a port
 _JOINS_WINDOW: Final = 1_024  # how far joins may overtake each other
 _ANSWER_S: Final = 0.02  # a stranger's hello is answered at once, but not more often than this
@@ -142,6 +145,7 @@ class Greeter:
         life: mark of this node's life, ``LIFE_BYTES``.
         digest_for: what to say of our link state to the far end of a port.
         life_elsewhere: the mark of a node with a name that is known to be alive, but at none of our ports; or None.
+        rtcert_for: of a RIB, its RtCert for a switch; None of any other node.
 
     Attributes:
         rivals: nodes that share an identity with another one, at our ports.
@@ -163,6 +167,7 @@ class Greeter:
         life: bytes = bytes(LIFE_BYTES),
         digest_for: Callable[[LinkPort], bytes] = lambda _: bytes(DIGEST_BYTES),
         life_elsewhere: Callable[[Name], bytes | None] = lambda _: None,
+        rtcert_for: Callable[[Name], bytes] | None = None,
     ) -> None:
         self._identity = identity
         self._policy = policy
@@ -180,6 +185,8 @@ class Greeter:
         self._digest_for = digest_for
         self._life = life
         self._life_elsewhere = life_elsewhere
+        self._rtcert_for = rtcert_for
+        self._rtcerts = RtCertCache(_RTCERTS_REMEMBERED)
         self.rivals = Rivals()
         self.clashes = 0
         self.clash_told_by: Name | None = None
@@ -196,6 +203,7 @@ class Greeter:
         *,
         digest_for: Callable[[LinkPort], bytes] = lambda _: bytes(DIGEST_BYTES),
         life_elsewhere: Callable[[Name], bytes | None] = lambda _: None,
+        rtcert_for: Callable[[Name], bytes] | None = None,
     ) -> Greeter:
         """Return the greeter of a node with these settings."""
         return cls(
@@ -210,6 +218,7 @@ class Greeter:
             life=settings.life,
             digest_for=digest_for,
             life_elsewhere=life_elsewhere,
+            rtcert_for=rtcert_for,
         )
 
     def set_timing(self, index: int, timing: Timing) -> None:
@@ -295,6 +304,7 @@ class Greeter:
         known.mac, known.mtu, known.nonce, known.candidate = arrival.mac, mtu, hello.nonce, b""
         known.sequence, known.digest, known.greeted_s = hello.sequence, hello.digest, now.mono_s
         known.member, known.checked_s, known.life = member, now.mono_s, hello.life
+        had_proof, known.proof = known.proof is not None, self._proof_of_place(hello, member)
         self._note_clash(port, known, hello, now.mono_s)
         self._alive(known, now.mono_s)
         if is_two_way and known.keepalives is None:
@@ -302,9 +312,24 @@ class Greeter:
         change = self._step(known, NeighbourEvent.TWO_WAY if is_two_way else NeighbourEvent.ONE_WAY)
         if change is None and is_new_session and is_two_way:
             return known, NeighbourState.GONE  # it restarted, and has forgotten what we told it
-        if change is None and is_resized and known.state is NeighbourState.UP:
+        is_placed = (known.proof is not None) is not had_proof
+        if change is None and (is_resized or is_placed) and known.state is NeighbourState.UP:
             return known, known.state
         return change
+
+    def _proof_of_place(self, hello: Hello, member: Membership) -> tuple[bytes, bytes] | None:
+        """Return what proves to others that a RIB is attached to this switch, or None.
+
+        Raises:
+            StatementError: its hello carries what it did not sign.
+        """
+        if member.role is not Role.RIB:
+            return None
+        for wire in hello.rtcerts:
+            rtcert = self._rtcerts.verified(wire, member.name, member.key)
+            if rtcert.switch == self._identity.name:
+                return hello.membership, wire
+        return None
 
     def _refuse_rival(self, port: LinkPort, hello: Hello, name: Name, mac: bytes, now_s: float) -> None:
         """Take a hello's word only if no older node with its identity is alive; a younger one is let go.
@@ -502,9 +527,16 @@ class Greeter:
         identity, timing = self._identity, self._timings.get(port.index, self._timing)
         hello = Hello(
             port.nonce, port.sequence, heard, port.own_mtu, self._digest_for(port), identity.membership,
-            timing, port.exchange_key.public, self._life, self.rivals.on(port.index, now_s),
+            timing, port.exchange_key.public, self._life, self.rivals.on(port.index, now_s), self._rtcerts_on(port),
         )  # fmt: skip
         return self._splitter.split(Kind.HELLO, hello.to_wire(identity.name, identity.key), port.hello_mtu)
+
+    def _rtcerts_on(self, port: LinkPort) -> tuple[bytes, ...]:
+        """Return a RIB's RtCerts for the switches that it hears on a port."""
+        if self._rtcert_for is None:
+            return ()
+        switches = sorted(each.name for each in port.neighbours.values() if each.role is Role.SWITCH)
+        return tuple(self._rtcert_for(name) for name in switches[:RTCERTS_MAX])
 
     def _lose(self, port: LinkPort, lost: list[Neighbour], event: NeighbourEvent) -> list[Change]:
         for neighbour in lost:

@@ -23,6 +23,7 @@ __all__ = [
     "MULTIPLIER_MAX",
     "NONCE_BYTES",
     "NO_KEEPALIVES",
+    "RTCERTS_MAX",
     "Hello",
     "Timing",
 ]
@@ -31,6 +32,7 @@ NONCE_BYTES: Final = 8
 DIGEST_BYTES: Final = 8
 LIFE_BYTES: Final = 16  # first sequence number (wall-clock milliseconds of the start), incarnation; big-endian
 HEARD_MAX: Final = 32
+RTCERTS_MAX: Final = 8
 INTERVAL_MAX_MS: Final = 60_000
 MULTIPLIER_MAX: Final = 255
 
@@ -70,6 +72,7 @@ class Hello:
         timing: what the sender wants of keepalives.
         exchange_key: X25519, for the key of keepalives; empty where the sender wants none.
         life: mark of the sender's life, ``LIFE_BYTES``.
+        rtcerts: of a RIB, one for each switch that it hears here: which switch may speak of it.
         rivals: nonces of those at this port whose identity another node has, too; refused are those not in ``heard``.
     """
 
@@ -83,6 +86,7 @@ class Hello:
     exchange_key: bytes = b""
     life: bytes = bytes(LIFE_BYTES)
     rivals: tuple[bytes, ...] = ()
+    rtcerts: tuple[bytes, ...] = ()
 
     def to_wire(self, signer: Name, key: SigningKey) -> bytes:
         """Return the signed statement."""
@@ -97,6 +101,7 @@ class Hello:
             "x": self.exchange_key,
             "b": self.life,
             "u": list(self.rivals[:HEARD_MAX]),
+            "r": list(self.rtcerts[:RTCERTS_MAX]),
         }
         return sign(StatementType.HELLO, body, signer, key)
 
@@ -118,6 +123,7 @@ class Hello:
             fields.bytes_("x", EXCHANGE_KEY_BYTES) if fields.get("x") != b"" else b"",
             fields.bytes_("b", LIFE_BYTES),
             tuple(fields.byte_strings("u", HEARD_MAX, NONCE_BYTES)),
+            tuple(fields.byte_strings("r", RTCERTS_MAX)),
         )
 
 

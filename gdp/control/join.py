@@ -86,5 +86,5 @@ class Join:
             fields.bytes_("i", NONCE_BYTES),
             fields.uint("s"),
             fields.uint("v"),
-            fields.name("b"),
+            fields.optional_name("b"),
         )

@@ -9,17 +9,17 @@ failure parts a domain, each part is reached through the borders that list it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 from gdp.control.hello import LIFE_BYTES, NONCE_BYTES
 from gdp.crypto.fields import Fields
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import StatementType, sign
 from gdp.errors import DropReason, StatementError
-from gdp.limits import FRAME_MAX_BYTES
-from gdp.names import Name
+from gdp.limits import CONTROL_MAX_BYTES, FRAME_MAX_BYTES
+from gdp.names import ZERO, Name
 
 __all__ = ["Adjacency", "AttachedRib", "LinkState", "Scope"]
 
@@ -27,6 +27,12 @@ LINKS_MAX: Final = 128
 RIBS_MAX: Final = 16
 MEMBERS_MAX: Final = 128  # 4.4 kB; of a larger domain the rest is reached through the nearest border
 COST_MAX: Final = 1 << 24
+_HEAD_BYTES: Final = 320  # COSE, keys, heads, sequence number, life and signature
+_LINK_BYTES: Final = 80
+_NAME_BYTES: Final = 34
+_RIB_BYTES: Final = 110  # beside its two certificates
+
+_T = TypeVar("_T")
 
 
 class Scope(Enum):
@@ -52,12 +58,21 @@ class AttachedRib(NamedTuple):
         domain: the RIB's own, which may differ from the switch's.
         session: nonce of its present session with its switch; a restarted or moved RIB has another one.
         life: mark of its life (``LIFE_BYTES``), which tells two nodes with one identity apart.
+        membership: its certificate, DER.
+        rtcert: by which it lets a switch attract its traffic.
     """
 
     name: Name
     domain: Name
     session: bytes
     life: bytes = bytes(LIFE_BYTES)
+    membership: bytes = b""
+    rtcert: bytes = b""
+
+    @property
+    def cost_bytes(self) -> int:
+        """Return what it takes of a statement, at most."""
+        return _RIB_BYTES + len(self.membership) + len(self.rtcert)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,18 +89,41 @@ class LinkState:
     members: tuple[Name, ...] = ()  # BORDER only: switches of the domain that are reachable within it from here
     life: bytes = bytes(LIFE_BYTES)  # mark of the origin's life
     refused: tuple[Name, ...] = ()  # identities refused at this switch, for an older node has them
+    is_partial: bool = False  # there are members that are not listed
+
+    def fitted(self, membership: bytes) -> LinkState:
+        """Return as much of it as one statement carries beside the signer's certificate: RIBs and links first."""
+        room = CONTROL_MAX_BYTES - _HEAD_BYTES - len(membership)
+        ribs = _cut(self.ribs[:RIBS_MAX], [each.cost_bytes for each in self.ribs], room // 2)
+        room -= sum(each.cost_bytes for each in ribs)
+        links = _cut(self.links[:LINKS_MAX], [_LINK_BYTES] * len(self.links), room)
+        room -= _LINK_BYTES * len(links)
+        refused = _cut(self.refused[:RIBS_MAX], [_NAME_BYTES] * len(self.refused), room)
+        room -= _NAME_BYTES * len(refused)
+        inside = _cut(self.inside[:LINKS_MAX], [_LINK_BYTES] * len(self.inside), room)
+        room -= _LINK_BYTES * len(inside)
+        members = _cut(self.members[:MEMBERS_MAX], [_NAME_BYTES] * len(self.members), room)
+        return replace(
+            self, links=links, inside=inside, ribs=ribs, members=members, refused=refused,
+            is_partial=len(members) < len(self.members),
+        )  # fmt: skip
 
     def to_wire(self, key: SigningKey, membership: bytes) -> bytes:
-        """Return the signed statement."""
+        """Return the signed statement.
+
+        Raises:
+            LocalError: it does not fit; ``fitted`` does.
+        """
         body = {
             "o": self.scope.value,
             "s": self.sequence,
-            "l": [list(each) for each in self.links[:LINKS_MAX]],
-            "i": [list(each) for each in self.inside[:LINKS_MAX]],
-            "r": [list(each) for each in self.ribs[:RIBS_MAX]],
-            "m": list(self.members[:MEMBERS_MAX]),
+            "l": [list(each) for each in self.links],
+            "i": [list(each) for each in self.inside],
+            "r": [list(each) for each in self.ribs],
+            "m": list(self.members),
+            "z": self.is_partial,
             "b": self.life,
-            "u": list(self.refused[:RIBS_MAX]),
+            "u": list(self.refused),
             "c": membership,
         }
         return sign(StatementType.LINK_STATE, body, self.origin, key)
@@ -111,17 +149,32 @@ class LinkState:
             tuple(fields.names("m", MEMBERS_MAX)),
             fields.bytes_("b", LIFE_BYTES),
             tuple(fields.names("u", RIBS_MAX)),
+            fields.flag("z"),
         )
+
+
+def _cut(items: tuple[_T, ...], costs: list[int], room: int) -> tuple[_T, ...]:
+    """Return the first items, as far as their costs fit."""
+    kept: list[_T] = []
+    for item, cost in zip(items, costs, strict=False):
+        room -= cost
+        if room < 0:
+            break
+        kept.append(item)
+    return tuple(kept)
 
 
 def _ribs(fields: Fields) -> tuple[AttachedRib, ...]:
     found = []
     for each in fields.list_("r", RIBS_MAX):
         match each:
-            case [bytes(name), bytes(domain), bytes(session), bytes(life)] if (
-                len(name) == len(domain) == 32 and len(session) == NONCE_BYTES and len(life) == LIFE_BYTES
+            case [bytes(name), bytes(domain), bytes(session), bytes(life), bytes(membership), bytes(rtcert)] if (
+                len(name) == len(domain) == 32
+                and ZERO not in (name, domain)
+                and len(session) == NONCE_BYTES
+                and len(life) == LIFE_BYTES
             ):
-                found.append(AttachedRib(Name(name), Name(domain), session, life))
+                found.append(AttachedRib(Name(name), Name(domain), session, life, membership, rtcert))
             case _:
                 raise StatementError(DropReason.MALFORMED, "RIB")
     return tuple(found)
@@ -132,7 +185,7 @@ def _adjacencies(fields: Fields, key: str) -> tuple[Adjacency, ...]:
     for each in fields.list_(key, LINKS_MAX):
         match each:
             case [bytes(name), bytes(domain), int(cost), int(mtu)] if (
-                len(name) == len(domain) == 32 and 0 < cost <= COST_MAX and 0 < mtu <= FRAME_MAX_BYTES
+                len(name) == len(domain) == 32 and ZERO not in (name, domain) and 0 < cost <= COST_MAX and 0 < mtu <= FRAME_MAX_BYTES
             ):
                 found.append(Adjacency(Name(name), Name(domain), cost, mtu))
             case _:

@@ -80,4 +80,5 @@ class Neighbour:
     keepalives: KeepaliveSession | None = None  # while it is up and both ends want them
     lateness_s: float = 0.0  # of this node, in all, when the neighbour was last heard
     life: bytes = bytes(LIFE_BYTES)
+    proof: tuple[bytes, bytes] | None = None  # of a RIB that is attached here: its membership, its RtCert for us
     refuses_us: bool = False  # its last hello said that an older node has our identity

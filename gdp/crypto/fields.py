@@ -10,9 +10,10 @@ from typing import NoReturn
 
 from gdp.crypto.cbor import Value
 from gdp.errors import DropReason, StatementError
-from gdp.names import NAME_BYTES, Name
+from gdp.limits import SEQUENCE_AHEAD_S
+from gdp.names import NAME_BYTES, ZERO, Name
 
-__all__ = ["Fields"]
+__all__ = ["Fields", "check_sequence"]
 
 _UINT_MAX = (1 << 64) - 1
 _TEXT_MAX_CHARS = 4_096
@@ -78,7 +79,14 @@ class Fields(Mapping[str, Value]):
         return value
 
     def name(self, key: str) -> Name:
-        """Return a name."""
+        """Return a name; zero is none."""
+        name = Name(self.bytes_(key, NAME_BYTES))
+        if name == ZERO:
+            _refuse(key, "a name")
+        return name
+
+    def optional_name(self, key: str) -> Name:
+        """Return a name, or ``ZERO`` for none."""
         return Name(self.bytes_(key, NAME_BYTES))
 
     def list_(self, key: str, maximum: int) -> list[Value]:
@@ -90,7 +98,10 @@ class Fields(Mapping[str, Value]):
 
     def names(self, key: str, maximum: int) -> list[Name]:
         """Return a list of names."""
-        return [Name(item) for item in self.byte_strings(key, maximum, NAME_BYTES)]
+        names = [Name(item) for item in self.byte_strings(key, maximum, NAME_BYTES)]
+        if ZERO in names:
+            _refuse(key, "a list of names")
+        return names
 
     def byte_strings(self, key: str, maximum: int, size: int | None = None) -> list[bytes]:
         """Return a list of byte strings, each of ``size`` bytes if given."""
@@ -125,6 +136,19 @@ class Fields(Mapping[str, Value]):
                 _refuse(key, "a list of maps")
             result.append(Fields(item))
         return result
+
+
+def check_sequence(sequence: int, unix_s: float) -> None:
+    """Return if a sequence number leaves room for newer ones.
+
+    They are milliseconds of wall clocks, which may be wrong. One of the far future would be the last that its owner, or
+    whoever has to go above it, can use.
+
+    Raises:
+        StatementError: MALFORMED.
+    """
+    if sequence > (unix_s + SEQUENCE_AHEAD_S) * 1_000:
+        raise StatementError(DropReason.MALFORMED, "a sequence number of the far future")
 
 
 def _refuse(key: str, expected: str) -> NoReturn:

@@ -2,8 +2,9 @@
 
 Place: pure. It travels as a sealed and signed message. Wire form, big-endian: ``oldest (8) | its sequence number (8) |
 sent number (8) | sent part (4) | its sequence number (8) | starts (2) | moves (1) | gone (1)``, for each start ``reader
-(32) | number (8) | sequence number (8) | confirmed (8)``, for each move ``first (8) | span (8) | to (8)``, for each
-range that is gone ``first (8) | last (8) | reason (1)``, then the description, empty when this status brings none.
+(32) | its incarnation (8) | number (8) | sequence number (8) | confirmed (8)``, for each move ``first (8) | span (8) |
+to (8)``, for each range that is gone ``first (8) | last (8) | reason (1)``, then the description, empty when this
+status brings none.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ __all__ = ["STARTS_MAX", "Start", "Status"]
 
 STARTS_MAX: Final = 64  # readers that one status tells where to begin; more get the next one
 _HEAD: Final = struct.Struct("!QQQIQHBB")
-_START: Final = struct.Struct("!32sQQQ")
+_START: Final = struct.Struct("!32sQQQQ")
 _MOVE: Final = struct.Struct("!QQQ")
 _GONE: Final = struct.Struct("!QQB")
 
@@ -31,11 +32,13 @@ class Start(NamedTuple):
     """Where a new reader begins.
 
     Args:
+        incarnation: of the reader; a recorded status opens nothing to a later life.
         number: the first message number that is its.
         sequence: the first sequence number under it.
         confirmed: below which a former life of this reader had confirmed everything; 0: not known.
     """
 
+    incarnation: int
     number: int
     sequence: int
     confirmed: int = 0

@@ -9,6 +9,7 @@ import logging
 from collections.abc import Callable, Mapping
 from typing import Final
 
+from gdp.control.boundary import ErrorBoundary
 from gdp.control.greeter import Greeter
 from gdp.control.waiting import Wait, WaitLog, WaitReason
 from gdp.effects import Instant
@@ -32,7 +33,7 @@ def no_name(name: Name) -> str:
 
 
 class NodeLog:
-    """Logs neighbours that come and go, the RIB in use, and what a node waits for.
+    """Logs neighbours that come and go, the RIB in use, errors that were contained, and what a node waits for.
 
     Args:
         waits: what is waited for at a monotonic second.
@@ -47,6 +48,7 @@ class NodeLog:
         greeter: Greeter,
         policy: Policy,
         plane: Plane,
+        boundary: ErrorBoundary,
         waits: Callable[[float], list[Wait]],
         *,
         rib: Callable[[], Name | None] | None = None,
@@ -57,6 +59,7 @@ class NodeLog:
         self._greeter = greeter
         self._policy = policy
         self._plane = plane
+        self._boundary = boundary
         self._waits = waits
         self._rib = rib
         self._known_rib: Name | None = None
@@ -70,6 +73,8 @@ class NodeLog:
 
     def look(self, now: Instant) -> None:
         """Log what changed since the last look."""
+        for text in self._boundary.take():
+            log.error("a statement drew an error of this program and was dropped; the node goes on\n%s", text)
         self._look_at_neighbours()
         if self._rib is not None and (rib := self._rib()) != self._known_rib:
             self._known_rib = rib

@@ -63,6 +63,7 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
             host.attachment.greeter,
             policy,
             plane,
+            rib.boundary,
             lambda now_s: attachment_waits(host.attachment, now_s),
             on_wait=on_wait,
         )

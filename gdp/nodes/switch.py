@@ -90,6 +90,7 @@ def run_switch(
             switch.greeter,
             policy,
             plane,
+            switch.boundary,
             lambda now_s: switch_waits(switch, attachments | _absent(plane, optional), now_s),
             rib=lambda: switch.rib,
             on_wait=on_wait,

@@ -15,18 +15,20 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
+from gdp.control.boundary import ErrorBoundary
 from gdp.control.presence import IdentityChecks, Presence
 from gdp.control.query import Answer, Query
 from gdp.control.relay import Relay
 from gdp.control.replica import Digest, Entry, Fetch, Inventory, Key, Replicas
 from gdp.control.verdict import Verdict
 from gdp.crypto.certificates import Membership, Role
+from gdp.crypto.fields import Fields, check_sequence
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.effects import Instant
 from gdp.errors import DropReason, RemoteError, StatementError, StoreError
 from gdp.frame.kinds import Kind
-from gdp.limits import LEASE_MAX_S, NEGATIVE_LEASE_S, RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX
+from gdp.limits import LEASE_MAX_S, NEGATIVE_LEASE_S, RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX, WITHDRAWAL_MAX_BYTES
 from gdp.names import Name
 from gdp.rib.above import Above
 from gdp.rib.digest_tree import DigestTree
@@ -95,6 +97,7 @@ class Rib:
         self._replication = self._replication_over(store.digests)
         self._now_s = 0.0  # of the last call
         self._letters: list[Letter] = []
+        self.boundary = ErrorBoundary()
         self.identities = IdentityChecks()
         self.refusals: Counter[DropReason] = Counter()
         self.accepted = 0
@@ -136,6 +139,9 @@ class Rib:
             self.refusals[error.reason] += 1
         except StoreError:
             self.refusals[DropReason.UNAVAILABLE] += 1  # no answer: who sent it will try again
+        except Exception as error:  # one statement must not end the RIB
+            self.boundary.note(error)
+            self.refusals[DropReason.INTERNAL] += 1
 
     def receive_all(self, wires: Sequence[tuple[bytes, Name]], now: Instant) -> None:
         """Take statements, each with its sender; what they are about is read from the store in one go."""
@@ -322,7 +328,7 @@ class Rib:
         )
 
     def _take_withdrawal(self, withdrawal: Statement, member: Membership, now: Instant) -> None:
-        fields = withdrawal.expect(StatementType.WITHDRAW)
+        fields = _withdrawal(withdrawal, now)
         name, advertiser, sequence = fields.name("n"), withdrawal.signer, fields.uint("s")
         known = self._store.get(name, advertiser)
         if not isinstance(known, Route) or sequence < known.sequence:
@@ -650,7 +656,7 @@ class Rib:
         return is_same and isinstance(known, Route) and (known.is_from_above or expires_s > known.expires_s)
 
     def _take_withdrawn_entry(self, entry: Entry, withdrawal: Statement, now: Instant) -> None:
-        fields = withdrawal.expect(StatementType.WITHDRAW)
+        fields = _withdrawal(withdrawal, now)
         name, sequence = fields.name("n"), fields.uint("s")
         known = self._store.get(name, withdrawal.signer)
         if known is not None and _rank(known) >= 2 * sequence + 1:
@@ -688,6 +694,19 @@ def _name_in(wire: bytes) -> Name | None:
         return statement.fields.name("name" if statement.type is StatementType.ADVERTISE else "n")
     except StatementError:
         return None
+
+
+def _withdrawal(statement: Statement, now: Instant) -> Fields:
+    """Return what a withdrawal says.
+
+    Raises:
+        StatementError: MALFORMED, or TOO_BIG to be passed on.
+    """
+    fields = statement.expect(StatementType.WITHDRAW)
+    if len(statement.wire) > WITHDRAWAL_MAX_BYTES:
+        raise StatementError(DropReason.TOO_BIG, "a withdrawal")
+    check_sequence(fields.uint("s"), now.unix_s)
+    return fields
 
 
 def _rank(known: Route | Withdrawn) -> int:

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from gdp.control.neighbour import Neighbour
 from gdp.control.verdict import Verdict
+from gdp.crypto.fields import check_sequence
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType
 from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
+from gdp.limits import WITHDRAWAL_MAX_BYTES
 from gdp.names import ZERO, Name
 from gdp.switch.attached import Attached
 from gdp.switch.inquirer import Inquirer
@@ -120,6 +122,9 @@ class Claims:
         fields = statement.expect(StatementType.WITHDRAW)
         if statement.signer != neighbour.name:
             raise StatementError(DropReason.UNKNOWN_SENDER, "a withdrawal that its maker did not bring")
+        if len(statement.wire) > WITHDRAWAL_MAX_BYTES:
+            raise StatementError(DropReason.TOO_BIG, "a withdrawal")
+        check_sequence(fields.uint("s"), now.unix_s)
         statement.verify(neighbour.key)
         name = fields.name("n")
         if fields.uint("s") <= self._sequence_of(name, neighbour):

@@ -8,7 +8,9 @@ passed through until it has learnt the network again (RFC 6987, stub router on s
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Final
 
 from gdp.control.greeter import Greeter, LinkPort
@@ -16,6 +18,7 @@ from gdp.control.hello import DIGEST_BYTES, LIFE_BYTES
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
 from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
+from gdp.crypto.fields import check_sequence
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement
 from gdp.effects import Instant
@@ -26,10 +29,12 @@ from gdp.switch.damping import Damping
 from gdp.switch.link_states import LinkStates
 from gdp.switch.paths import Paths
 from gdp.trust.domain import Policy
+from gdp.trust.rtcert import RtCertCache
 
 __all__ = ["Flooding"]
 
 _LIVES_MAX: Final = 64
+_RTCERTS_REMEMBERED: Final = 1_024
 _ANSWERS: Final = 5  # of another life of ours to what we say; a few old link states may be left of a dead one
 _STUB_S: Final = 2.0  # after a restart, until the trees and ways through here are set up
 _STUB_COST: Final = 1 << 20  # above every real way, so only what has no other way passes
@@ -78,6 +83,8 @@ class Flooding:
         self.link_states = LinkStates(self._domain)
         self.paths = Paths(identity.name, self._domain, self.link_states)
         self.damping = Damping()
+        self._rtcerts = RtCertCache(_RTCERTS_REMEMBERED)
+        self.drops: Counter[DropReason] = Counter()  # RIBs in link states that are not believed
         self._said: dict[Scope, tuple[object, ...]] = {}
         self._refresh_at_s: dict[Scope, float] = {}  # each by itself: news in one scope renew nothing of the other
         self._synced_s: dict[tuple[int, Name], float] = {}
@@ -99,6 +106,7 @@ class Flooding:
             scope = Scope.BORDER if fields.text("o", 8) == Scope.BORDER.value else Scope.DOMAIN
             if not self.link_states.is_news(statement.signer, scope, fields.uint("s")):
                 return False
+        check_sequence(fields.uint("s"), now.unix_s)
         member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
         if member.name != statement.signer or member.role is not Role.SWITCH:
             raise StatementError(DropReason.BAD_CERTIFICATE, "a link state is signed by a switch")
@@ -109,10 +117,29 @@ class Flooding:
         if state.origin == self._identity.name:
             self._outdo(state, now.mono_s)
             return False
-        if not self.link_states.put(state, statement.wire, now.mono_s):
+        proven = tuple(rib for rib in state.ribs if self._is_placed(rib, state, now.unix_s))
+        if not self.link_states.put(replace(state, ribs=proven), statement.wire, now.mono_s):
             return False
         self._flood(state.scope, statement.wire, but=neighbour)
         return True
+
+    def _is_placed(self, rib: AttachedRib, state: LinkState, unix_s: float) -> bool:
+        """Return whether a RIB has proven that it is reached where a link state says so.
+
+        A border speaks of the RIBs of its own domain, and of those that are attached to itself.
+        """
+        try:
+            member = self._policy.verify_membership(rib.membership, unix_s)
+            rtcert = self._rtcerts.verified(rib.rtcert, member.name, member.key)
+            rtcert.validity.check(unix_s, "RtCert")
+        except StatementError as error:
+            self.drops[error.reason] += 1
+            return False
+        is_its = (member.role, member.name, member.domain) == (Role.RIB, rib.name, rib.domain)
+        is_here = rtcert.switch == state.origin or (state.scope is Scope.BORDER and member.domain == state.domain)
+        if not (is_its and is_here):
+            self.drops[DropReason.MISPLACED] += 1
+        return is_its and is_here
 
     def tell_of_rivals(self, now_s: float) -> None:
         """Say anew which identities are refused here, if that changed; cheap when it did not."""
@@ -174,7 +201,11 @@ class Flooding:
         switches = [each for each in self._greeter.all_up() if each.role == Role.SWITCH]
         links = tuple(sorted(Adjacency(n.name, n.domain, self._cost(n), n.mtu) for n in switches))
         self._rivals_seen = self._greeter.rivals.changes
-        ribs = {AttachedRib(n.name, n.domain, n.nonce, n.life) for n in self._greeter.all_up() if n.role == Role.RIB}
+        ribs = {
+            AttachedRib(n.name, n.domain, n.nonce, n.life, *n.proof)
+            for n in self._greeter.all_up()
+            if n.role == Role.RIB and n.proof is not None
+        }
         refused = tuple(self._greeter.rivals.refused(now_s))
         self._say(Scope.DOMAIN, links, (), tuple(sorted(ribs)), (), refused, now_s)
         leaving = tuple(link for link in links if link.domain != self._domain)
@@ -208,7 +239,7 @@ class Flooding:
         self._sequence += 1
         state = LinkState(
             self._identity.name, self._domain, scope, self._sequence, links, inside, ribs, members, self._life, refused
-        )
+        ).fitted(self._identity.membership)
         wire = state.to_wire(self._identity.key, self._identity.membership)
         self.link_states.put(state, wire, now_s)
         self._refresh_at_s[scope] = now_s + LINK_STATE_REFRESH_S

@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Final
 
+from gdp.control.boundary import ErrorBoundary
 from gdp.control.frames import ControlJoiner, ControlSplitter
 from gdp.control.greeter import Change, Greeter, LinkPort
 from gdp.control.join import Join
@@ -110,6 +111,7 @@ class Switch:
             identity, self._verifier, self.attached, self.places, self.planter, self.unicast, self.inquirer,
             self.relocations, self._outbox,
         )  # fmt: skip
+        self.boundary = ErrorBoundary()
         self._drops: Counter[DropReason] = Counter()
         self._rest_due_s: float | None = None  # when something other than the greeter is due; None: to be looked up
 
@@ -136,7 +138,7 @@ class Switch:
     def drops(self) -> Mapping[DropReason, int]:
         """Return what the control plane dropped, by reason."""
         joiners = self._joiner.drops + self._hellos.drops
-        return self._drops + joiners + self.parked.drops + self.planter.drops + self.unicast.drops
+        return self._drops + joiners + self._flooding.drops + self.parked.drops + self.planter.drops + self.unicast.drops
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Instant) -> None:
         """Begin to use a port, or learn that the MTU or cost of one that is up has changed."""
@@ -167,6 +169,9 @@ class Switch:
                     self._take(arrival, header, now)
             except RemoteError as error:
                 self._drops[error.reason] += 1
+            except Exception as error:  # one frame must not end the switch
+                self.boundary.note(error)
+                self._drops[DropReason.INTERNAL] += 1
         if has_others:
             self._rest_due_s = None
             self._presence.answer(now.mono_s)
@@ -277,7 +282,9 @@ class Switch:
                 self._sender(arrival)  # for strangers no state is kept
             wire = joiner.add(header, arrival.frame, now.mono_s, arrival.via)
             if wire is not None:
-                self._take_control(arrival, header.kind, parse(wire), now)
+                statement = parse(wire)
+                with self.boundary.guard(arrival.via + statement.signer, now.mono_s):
+                    self._take_control(arrival, header.kind, statement, now)
             return
         neighbour = self._sender(arrival)  # nor is anything answered or looked for in their name
         if header.destination == self.name:
@@ -332,10 +339,14 @@ class Switch:
     def _take_own(self, header: Header, arrival: Arrival, now: Instant) -> None:
         if header.kind in (Kind.RIB_ANSWER, Kind.RELOCATE):
             wire = self._joiner.add(header, arrival.frame, now.mono_s, arrival.via)
-            if wire is not None and header.kind == Kind.RIB_ANSWER:
-                self.inquirer.receive(parse(wire), now)
-            elif wire is not None:
-                self._relocated(parse(wire), now)
+            if wire is None:
+                return
+            statement = parse(wire)
+            with self.boundary.guard(arrival.via + statement.signer, now.mono_s):
+                if header.kind == Kind.RIB_ANSWER:
+                    self.inquirer.receive(statement, now)
+                else:
+                    self._relocated(statement, now)
         elif header.kind == Kind.ECHO_REQUEST:
             back = header._replace(
                 kind=Kind.ECHO_REPLY, hops_left=HOPS_MAX, destination=header.source, source=self.name,

@@ -9,7 +9,7 @@ from gdp.control.frames import ControlSplitter
 from gdp.control.greeter import Greeter
 from gdp.control.neighbour import Neighbour
 from gdp.effects import Transmit
-from gdp.names import ZERO, Name
+from gdp.names import Name
 from gdp.switch.table import Hop, ProtectedHop
 
 __all__ = ["Outbox"]
@@ -35,7 +35,6 @@ class Outbox:
 
     def far(self, kind: int, statement: bytes, destination: Name) -> list[bytes]:
         """Return the frames of a statement that goes further than a neighbour."""
-        assert destination != ZERO
         mtu = min((port.mtu for port in self._greeter.ports.values()), default=1_500)
         return self._splitter.split(kind, statement, mtu, destination)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
-from gdp.control.link_state import MEMBERS_MAX, Adjacency, AttachedRib, LinkState, Scope
+from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
 from gdp.crypto.certificates import Role
 from gdp.names import Name
 from gdp.switch.link_states import LinkStates
@@ -50,14 +50,16 @@ class Paths:
         self._graph: nx.DiGraph[Name] | None = None
         self._members: frozenset[Name] = frozenset()  # switches of our domain that are reachable within it
         self._domains: dict[Name, Name] = {}  # of every switch that is known by name
-        self._borders_of: dict[Name, list[Name]] = {}  # of a switch that is not in the graph: borders that list it
+        # Of a switch that is not in the graph, and its domain: borders of that domain that list it.
+        self._borders_of: dict[tuple[Name, Name], list[Name]] = {}
         self._beyond: dict[Name, list[Name]] = {}  # by domain: borders that are reached over links between domains
         self._open_borders: dict[Name, list[Name]] = {}  # by domain: borders that could not list all their switches
         self._ribs: dict[Name, dict[Name, AttachedRib]] = {}  # RIB to the switches where it is attached or reached
+        self._known_domains: frozenset[Name] = frozenset()
         self._lives: dict[Name, bytes] = {}  # of every switch whose link state is known
         self._refused: frozenset[Name] = frozenset()
         self._ways: dict[tuple[Name, frozenset[Name]], dict[Name, Way]] = {}
-        self._alternates: dict[tuple[Name, frozenset[Name]], Name | None] = {}
+        self._alternates: dict[tuple[Name, Name, frozenset[Name]], Name | None] = {}
         self.has_alternates = False
 
     def to_switch(self, switch: Name, domain: Name, allowed: frozenset[Name]) -> Way | None:
@@ -72,7 +74,7 @@ class Paths:
         way = self._pick(self._to_all(allowed), switch, domain)
         if way is None or not self.has_alternates:
             return way
-        key = switch, allowed
+        key = switch, domain, allowed & self._known_domains
         if key not in self._alternates:
             if len(self._alternates) >= _ALTERNATES_CACHE_MAX:
                 self._alternates.clear()
@@ -109,7 +111,7 @@ class Paths:
     def _pick(self, ways: dict[Name, Way], switch: Name, domain: Name) -> Way | None:
         if switch in ways:
             return ways[switch]
-        borders = self._borders_of.get(switch) or self._fallback_borders(domain)
+        borders = self._borders_of.get((switch, domain)) or self._fallback_borders(domain)
         return min((ways[each] for each in borders if each in ways), key=lambda way: way.distance, default=None)
 
     def _fallback_borders(self, domain: Name) -> list[Name]:
@@ -191,12 +193,13 @@ class Paths:
     def _to_all(self, allowed: frozenset[Name], start: Name | None = None) -> dict[Name, Way]:
         """Return the ways from a switch, this one if not given, to all others."""
         self._refresh()
-        key = start or self._me, allowed
-        ways = self._ways.get(key)
+        key = start or self._me, allowed & self._known_domains  # a stranger's list may name others, each time anew
+        ways = self._ways.pop(key, None)
         if ways is None:
+            ways = self._compute(*key)
             if len(self._ways) >= _CACHE_MAX:
-                self._ways.clear()
-            ways = self._ways[key] = self._compute(*key)
+                del self._ways[next(iter(self._ways))]  # the least used
+        self._ways[key] = ways
         return ways
 
     def _compute(self, start: Name, allowed: frozenset[Name]) -> dict[Name, Way]:
@@ -229,6 +232,7 @@ class Paths:
         beyond = [state for state in self._link_states.states(Scope.BORDER) if state.origin not in self._members]
         self._domains = {member: state.domain for state in beyond for member in state.members}
         self._domains |= {state.origin: state.domain for state in [*home, *beyond]}
+        self._known_domains = frozenset(self._domains.values())
         self._borders_of, self._open_borders, self._beyond, self._ribs = {}, {}, {}, {}
         others = [state for state in [*inside, *beyond] if state.origin != self._me]
         self._lives = {state.origin: state.life for state in others}
@@ -236,8 +240,8 @@ class Paths:
         for state in beyond:
             self._beyond.setdefault(state.domain, []).append(state.origin)
             for member in state.members:
-                self._borders_of.setdefault(member, []).append(state.origin)
-            if len(state.members) >= MEMBERS_MAX:
+                self._borders_of.setdefault((member, state.domain), []).append(state.origin)
+            if state.is_partial:
                 self._open_borders.setdefault(state.domain, []).append(state.origin)
         for state in [*inside, *beyond]:
             for rib in state.ribs:

@@ -19,8 +19,8 @@ from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType
 from gdp.crypto.subject import Subject
-from gdp.errors import LocalError
-from gdp.limits import CHAIN_MAX, LEASE_MAX_S, LEASE_MIN_S
+from gdp.errors import DropReason, LocalError, StatementError
+from gdp.limits import CHAIN_MAX, CLAIM_MAX_BYTES, LEASE_MAX_S, LEASE_MIN_S
 from gdp.names import ZERO, Name
 from gdp.trust.adcert import Chain
 from gdp.trust.right import Right
@@ -114,9 +114,11 @@ class ClaimBody:
         """Read a parsed statement; the name's hash is checked, no signature is.
 
         Raises:
-            StatementError: MALFORMED or WRONG_NAME.
+            StatementError: MALFORMED, WRONG_NAME or TOO_BIG.
         """
         fields = statement.expect(StatementType.ADVERTISE)
+        if len(statement.wire) > CLAIM_MAX_BYTES:
+            raise StatementError(DropReason.TOO_BIG, f"a claim of {len(statement.wire)} bytes")
         return cls(
             subject=Subject.from_fields(fields, fields.name("name")),
             right=Right.from_wire(fields.text("right")),
@@ -192,4 +194,7 @@ def make_claim(
         rtcert=rtcert,
         previous=previous,
     )
-    return identity.sign(StatementType.ADVERTISE, body.to_fields())
+    wire = identity.sign(StatementType.ADVERTISE, body.to_fields())
+    if len(wire) > CLAIM_MAX_BYTES:
+        raise LocalError(f"a claim of {len(wire)} bytes, above {CLAIM_MAX_BYTES}: shorten metadata or delegations")
+    return wire

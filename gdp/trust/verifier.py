@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Final
 
 from gdp.crypto.certificates import Membership
+from gdp.crypto.fields import check_sequence
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, StatementError
 from gdp.limits import LEASE_MAX_S, LEASE_MIN_S
@@ -77,6 +78,7 @@ class ClaimVerifier:
         body = ClaimBody.from_statement(statement)
         if not LEASE_MIN_S * _MS <= body.lease_ms <= LEASE_MAX_S * _MS:
             raise StatementError(DropReason.LEASE_BOUNDS, f"{body.lease_ms} ms")
+        check_sequence(body.sequence, unix_s)
         member = self.policy.verify_membership(body.membership, unix_s)
         if member.name != statement.signer:
             raise StatementError(DropReason.BAD_CERTIFICATE, "the membership is of another node")

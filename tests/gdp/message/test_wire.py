@@ -22,7 +22,7 @@ MOVES = st.lists(
     st.builds(lambda first, span, gap: Move(first, span, first + span + gap), *[st.integers(1, 1 << 60)] * 3),
     max_size=MOVES_MAX,
 ).map(tuple)
-STARTS = st.dictionaries(st.binary(min_size=32, max_size=32), st.builds(Start, U64, U64, U64), max_size=STARTS_MAX)
+STARTS = st.dictionaries(st.binary(min_size=32, max_size=32), st.builds(Start, U64, U64, U64, U64), max_size=STARTS_MAX)
 RANGES = st.tuples(U64, U64).map(sorted)
 GONE = st.lists(
     st.builds(lambda ends, reason: LostRange(*ends, reason), RANGES, st.sampled_from(LossReason)), max_size=GONE_MAX

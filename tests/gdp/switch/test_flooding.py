@@ -47,7 +47,7 @@ def test_borders_are_known_everywhere() -> None:
 def test_an_inside_state_that_leaves_its_domain_is_refused() -> None:
     world = ring()
     nuc2 = world.identities["nuc2"]
-    state = LinkState(nuc2.name, nuc2.root.domain, Scope.DOMAIN, 1 << 60, (), (), ())
+    state = LinkState(nuc2.name, nuc2.root.domain, Scope.DOMAIN, 1_810_000_000_000, (), (), ())
     say(world, state, "nuc2", "nuc3")
     assert world.switches["nuc3"].drops()[DropReason.WRONG_DOMAIN] == 1
     assert bytes(nuc2.name) not in origins(world, "nuc3", Scope.DOMAIN)
@@ -56,7 +56,7 @@ def test_an_inside_state_that_leaves_its_domain_is_refused() -> None:
 def test_ones_own_state_of_an_earlier_life_is_outdone() -> None:
     world = ring()
     nuc1 = world.identities["nuc1"]
-    ahead = 1 << 50
+    ahead = 1_810_000_000_000
     say(world, LinkState(nuc1.name, nuc1.root.domain, Scope.DOMAIN, ahead, (), (), ()), "nuc1", "nuc1")
     known = world.switches["nuc2"]._flooding.link_states
     assert known.sequence_of(nuc1.name, Scope.DOMAIN) > ahead

@@ -1,0 +1,72 @@
+"""Recorded frames and statements, of any age, that a stranger at a link plays back: nothing acts twice."""
+
+from __future__ import annotations
+
+import pytest
+
+from gdp.client.feed import FeedState
+from gdp.frame.kinds import Kind
+from gdp.trust.right import Right
+from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
+from tests.journeys.services import Party, outlive
+from tests.journeys.test_attacks import mac_of, still_flows
+
+
+def recorded_life(flow: Flow) -> Tap:
+    """Return what went to the reader while the robot sent it five commands."""
+    tap = Tap("nuc5", SERVER)
+    flow.world.network.taps.append(tap)
+    for number in range(5):
+        flow.publish(b"DRIVE FORWARD %d" % number)
+    assert flow.world.network.run(5, lambda: flow.has(SERVER, 5))
+    flow.world.network.run(2)
+    flow.world.network.taps.clear()
+    return tap
+
+
+@pytest.mark.parametrize("reliable", [True, False])
+def test_a10_commands_of_an_hour_ago_are_not_handed_to_a_restarted_reader(reliable: bool) -> None:
+    world = ring()
+    tap = Tap("nuc5", SERVER)
+    world.network.taps.append(tap)
+    flow = flowing(world, reliable=reliable)
+    tap.frames += recorded_life(flow).frames
+    world.network.freeze(ROBOT)  # nothing of its own comes in between
+    reader = world.restart_member(SERVER)
+    assert world.network.run(10, lambda: reader.attachment.is_attached)
+    reader.subscribe(world.topic(flow.name, reader, [Right.READ]))
+    world.network.touch(SERVER)
+    assert world.network.run(10, lambda: bool(reader.feeds_of(flow.topic.name)))
+    for frame in [each for each in tap.frames if each[1] in (Kind.STATUS, Kind.DATA)] * 2:
+        world.network.inject(SERVER, 0, frame, mac_of(world, SERVER))
+    world.network.run(1)
+    assert reader.take_messages() == []
+    assert [each.state for each in reader.feeds_of(flow.topic.name)] == [FeedState.NEW]
+    world.network.thaw(ROBOT)
+    flow.got[SERVER] = []
+    assert world.network.run(20, lambda: reader.feeds_of(flow.topic.name)[0].state is FeedState.LIVE)
+    still_flows(flow)
+    flow.outlive()
+
+
+def test_a11_a_request_of_ten_minutes_ago_is_not_handed_to_a_restarted_server() -> None:
+    world = ring()
+    tap = Tap("nuc5", SERVER)
+    world.network.taps.append(tap)
+    server, client = Party(world, SERVER, Right.SERVE), Party(world, ROBOT, Right.CALL)
+    assert world.network.run(10, lambda: client.member.peers(client.service) != [])
+    client.publish(b"open the gripper")
+    assert world.network.run(10, lambda: server.bodies() == [b"open the gripper"])
+    world.network.taps.clear()
+    world.network.freeze(ROBOT)
+    restarted = world.restart_member(SERVER)
+    assert world.network.run(10, lambda: restarted.attachment.is_attached)
+    server.got.clear()
+    server.begin()
+    assert world.network.run(10, lambda: restarted.feeds_of(server.service) != [])
+    for frame in [each for each in tap.frames if each[1] in (Kind.STATUS, Kind.DATA)] * 2:
+        world.network.inject(SERVER, 0, frame, mac_of(world, SERVER))
+    world.network.run(1)
+    assert server.bodies() == []
+    world.network.thaw(ROBOT)
+    outlive(world, client, server)
