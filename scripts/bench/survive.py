@@ -60,7 +60,7 @@ class Measured:
         silence_s: from the event on.
         return_s: when it was taken back.
         new_name_s: until a name that is new after the event was read.
-        told_lost: what R was told that it missed.
+        told_lost: what R was told that it missed of the steady flow.
         never: events after which the flow did not come back in time; their silence is at least the patience.
     """
 
@@ -99,7 +99,7 @@ class Flowing:
                 if each.channel == 0:
                     self.arrivals_ns.append(each.at_ns)
                     self.numbers[each.life, each.number] += 1
-            elif each.kind == Kind.LOST:
+            elif each.kind == Kind.LOST and each.channel == 0:
                 self.told_lost += each.number
             elif each.kind == Kind.WRONG:
                 raise FailedError(f"R had a message of channel {each.other} on channel {each.channel}")
