@@ -14,7 +14,7 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from proxy.serial.dialect import Dialect, MisfitError, Wide
-from proxy.serial.layout import Wire, inline_codes
+from proxy.serial.layout import RUN_MAX, Wire, inline_codes
 from proxy.serial.schema import Array, Number, Record, Text, Type
 
 __all__ = ["Reader", "Tree", "read_with"]
@@ -70,8 +70,11 @@ class _Compiler:
     def _steps(self, record: Record) -> list[_Step]:
         steps: list[_Step] = []
         run: list[tuple[str, Type]] = []
+        left = RUN_MAX
         for name, kind in record.fields:
-            if inline_codes(kind, self._dialect.inline_max, self._inline) is not None:
+            codes = inline_codes(kind, self._dialect.inline_max, self._inline)
+            if codes is not None and (isinstance(kind, Number) or len(codes) <= left):
+                left -= len(codes)
                 run.append((name, kind))
                 continue
             if run:
