@@ -12,6 +12,7 @@ from typing import Final, Literal, TypeAlias
 import cbor2
 
 from gdp.errors import DropReason, LocalError, RemoteError
+from proxy.serial.cbor_bounds import check_bounds
 from proxy.serial.schema import DEFINITION_MAX_BYTES, definition_bytes
 
 __all__ = ["Channel", "DefinitionFormat", "Qos", "RosVersion"]
@@ -19,6 +20,7 @@ __all__ = ["Channel", "DefinitionFormat", "Qos", "RosVersion"]
 RosVersion: TypeAlias = Literal[1, 2]
 DefinitionFormat: TypeAlias = Literal["msg", "idl", ""]
 
+_ITEMS_MAX: Final = 4_096
 CHANNEL_MAX_BYTES: Final = 128 << 10
 _TEXT_MAX: Final = 1024
 _QOS_MAX: Final = 64
@@ -102,6 +104,7 @@ class Channel:
         if len(wire) > CHANNEL_MAX_BYTES:
             raise RemoteError(DropReason.MALFORMED, f"a description of {len(wire)} bytes")
         try:
+            check_bounds(wire, _ITEMS_MAX)
             fields = cbor2.loads(wire)
         except (cbor2.CBORDecodeError, RecursionError, ValueError, TypeError, OverflowError) as error:
             raise RemoteError(DropReason.MALFORMED, "a description that is not CBOR") from error

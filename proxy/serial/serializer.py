@@ -15,13 +15,14 @@ import pybase64
 
 from gdp.errors import DropReason, RemoteError
 from proxy.serial.bounded_cache import BoundedCache, digest_of
+from proxy.serial.cbor_bounds import check_bounds
 from proxy.serial.cbor_dialect import CborDialect
 from proxy.serial.channel import Channel
 from proxy.serial.dialect import Dialect, MisfitError, Wide
 from proxy.serial.json_dialect import JsonDialect
 from proxy.serial.layout import Wire
 from proxy.serial.native_dialect import NativeDialect
-from proxy.serial.reader import Reader, read_with
+from proxy.serial.reader import ITEMS_MAX, Reader, read_with
 from proxy.serial.schema import Array as ArrayType
 from proxy.serial.schema import DefinitionError, Record, Sequence, Text, Type, parse
 from proxy.serial.writer import Writer, write_with
@@ -34,6 +35,8 @@ _PREFIX: Final = b"\x00\x01\x00\x00"
 _PAD_MAX: Final = 3  # bytes that a writer may add to reach a multiple of four
 _RAW: Final = "$raw"  # no field can be called so
 _NATIVE: Final = NativeDialect()
+_CONTAINERS_MAX: Final = 4 * ITEMS_MAX  # of JSON; texts may hold some of their signs
+_CBOR_ITEMS_MAX: Final = 8 * ITEMS_MAX  # numbers count too
 _CODECS_MAX: Final = 256  # compiled types, of all encodings
 
 
@@ -89,7 +92,7 @@ class Serializer:
         if self._encoding == "cdr":
             return body
         try:
-            tree = orjson.loads(body) if self._encoding == "json" else cbor2.loads(body)
+            tree = _json(body) if self._encoding == "json" else _cbor(body)
             if isinstance(tree, dict) and _RAW in tree:
                 return _raw_of(tree[_RAW])
             if self._codec is None:
@@ -119,6 +122,19 @@ def canonical(channel: Channel, raw: bytes) -> bytes:
         return raw
     tree = codec.to_tree(raw)
     return raw if tree is None else codec.to_raw(tree)
+
+
+def _json(body: bytes) -> object:
+    if body.count(b"{") + body.count(b"[") > _CONTAINERS_MAX:
+        raise MisfitError(f"more than {_CONTAINERS_MAX} maps and arrays")
+    value: object = orjson.loads(body)
+    return value
+
+
+def _cbor(body: bytes) -> object:
+    check_bounds(body, _CBOR_ITEMS_MAX)
+    value: object = cbor2.loads(body)
+    return value
 
 
 def _raw_of(value: object) -> bytes:

@@ -79,9 +79,8 @@ SHAPES = [("msg", name, text) for name, text in MSG.items()] + [("idl", name, te
 def test_a27_a_definition_of_64_kib_costs_little_time_and_memory(form: DefinitionFormat, name: str, text: str) -> None:
     tracemalloc.start()
     try:
-        with lines_run(1_000_000):  # some 50 ms
-            with contextlib.suppress(DefinitionError):
-                parse(f"a/msg/{name.title().replace(' ', '')}", text, form, 2)
+        with lines_run(1_000_000), contextlib.suppress(DefinitionError):  # some 50 ms
+            parse(f"a/msg/{name.title().replace(' ', '')}", text, form, 2)
         peak_bytes = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
