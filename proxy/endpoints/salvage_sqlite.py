@@ -109,8 +109,12 @@ class SqliteSource:
     def messages(self) -> Iterator[Message]:
         """Yield messages in time order."""
         for stamp_ns, row, topic in self._order:
-            with closing(self._db.execute("SELECT data FROM messages WHERE id = ?", (row,))) as rows:
-                found = rows.fetchone()
+            try:
+                with closing(self._db.execute("SELECT data FROM messages WHERE id = ?", (row,))) as rows:
+                    found = rows.fetchone()
+            except (apsw.Error, UnicodeDecodeError) as error:
+                self.unread = self._tally.text(f"the message in row {row} cannot be read ({error})")
+                continue
             if found is not None and isinstance(found[0], bytes):
                 yield Message(self._index[topic], stamp_ns, found[0])
             else:

@@ -158,9 +158,10 @@ def test_a28_a_folder_of_compressed_messages_or_files_unpacks_within_bounds(tmp_
     [
         (TOPICS, f"CREATE VIEW messages AS {ENDLESS} 1 AS timestamp, x'00' AS data FROM c"),
         (MESSAGES, f"CREATE VIEW topics AS {ENDLESS} 1 AS name, 1 AS type, 'cdr' AS serialization_format FROM c"),
+        (TOPICS, MESSAGES, f"CREATE VIEW schema AS SELECT max(id) AS schema_version FROM ({ENDLESS} 1 AS z FROM c)"),
         (TOPICS, "CREATE VIRTUAL TABLE messages USING fts5(id, topic_id, timestamp, data)"),
     ],
-    ids=["messages", "topics", "virtual"],
+    ids=["messages", "topics", "schema", "virtual"],
 )
 def test_a29_a_database_with_views_or_virtual_tables_is_refused(
     tmp_path: Path, suffix: str, statements: Sequence[str]

@@ -36,7 +36,7 @@ _HANG_S: Final = 10.0
 
 
 class HangError(BaseException):
-    """A decoder did not come back."""
+    """A decoder took too much processor time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,8 +131,8 @@ def _minimised(decoder: Decoder, inputs: Sequence[bytes]) -> list[bytes]:
 
 def _execute(outcome: Outcome, data: bytes) -> None:
     outcome.executions += 1
-    before = signal.signal(signal.SIGALRM, _hang)
-    signal.setitimer(signal.ITIMER_REAL, _HANG_S)
+    before = signal.signal(signal.SIGPROF, _hang)
+    signal.setitimer(signal.ITIMER_PROF, _HANG_S)
     try:
         outcome.decoder.run(data)
     except outcome.decoder.allowed:
@@ -143,8 +143,8 @@ def _execute(outcome: Outcome, data: bytes) -> None:
         outcome.foreign += 1
         outcome.findings.setdefault(_place(error), Finding(data, f"{type(error).__name__}: {error}"[:200]))
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, before)
 
 
 def _traced(outcome: Outcome, data: bytes, seen: set[tuple[str, int]]) -> bool:
