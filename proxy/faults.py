@@ -1,6 +1,8 @@
 """What went wrong on this machine with something that a rule names: counted each time, told once.
 
 Place: shell; it logs. A warning names the topic as the robot calls it, on the machine that owns it and nowhere else.
+What goes on is told again by its count, at a thousand, ten thousand and so on. A detail may hold words of a far node:
+it is escaped and cut.
 """
 
 from __future__ import annotations
@@ -11,11 +13,14 @@ from collections.abc import Mapping
 from enum import Enum
 from typing import Final
 
+from proxy.printable import printable
+
 __all__ = ["Fault", "Faults"]
 
 log = logging.getLogger(__name__)
 
 _TOLD_MAX: Final = 4_096
+_COUNT_TOLD: Final = 1_000  # the first count that is told
 
 
 class Fault(str, Enum):
@@ -40,17 +45,18 @@ class Faults:
 
     def __init__(self) -> None:
         self._counts: Counter[Fault] = Counter()
-        self._told: dict[tuple[str, Fault], None] = {}
+        self._told: dict[tuple[str, Fault], int] = {}
 
     def tell(self, what: str, fault: Fault, detail: str) -> None:
         """Count a fault; warn of the first of its kind about ``what``, a local name."""
         self._counts[fault] += 1
-        if (what, fault) in self._told:
-            return
-        self._told[what, fault] = None
+        count = self._told[what, fault] = self._told.get((what, fault), 0) + 1
         if len(self._told) > _TOLD_MAX:
             del self._told[next(iter(self._told))]
-        log.warning("%s: %s: %s", what, fault.value, detail)
+        if count == 1:
+            log.warning("%s: %s: %s", printable(what), fault.value, printable(detail))
+        elif count >= _COUNT_TOLD and str(count).strip("0") == "1":
+            log.warning("%s: %s: %d times by now", printable(what), fault.value, count)
 
     def over(self, what: str, fault: Fault) -> None:
         """Learn that a fault is over: another one will be told again."""

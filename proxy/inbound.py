@@ -1,28 +1,31 @@
 """Messages from the overlay on their way to a local endpoint: described, decoded, handed over, counted.
 
-Place: shell; the endpoint does the I/O.
+Place: shell; the endpoint does the I/O. A message goes where its rule says; the topic that its publisher names is not
+looked at. What publishers describe is kept within bounds, and each has a bounded number of channels at the sink.
 """
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Sequence
-from typing import Protocol
+from dataclasses import replace
+from typing import Final, Protocol
 
 from gdp.client.member import Message
 from gdp.errors import LocalError, RemoteError
 from gdp.names import Name
 from proxy.config import Rule
+from proxy.faults import Fault
 from proxy.node import ProxyNode
-from proxy.parcel import Description, Parcel
+from proxy.parcel import CHANNELS_MAX, Description, Parcel
 from proxy.serial.channel import Channel
 from proxy.serial.serializer import Serializer
+from proxy.sources import Sources
 from proxy.tally import Tally
 
 __all__ = ["Inbound", "Sink"]
 
-log = logging.getLogger(__name__)
+_PUBLISHERS_MAX: Final = 4_096  # whose channels at the sink are counted
 
 
 class Sink(Protocol):
@@ -38,9 +41,9 @@ class Sink(Protocol):
 class _Source:
     """One publisher's description, made ready."""
 
-    def __init__(self, description: Description, sink: Sink | None) -> None:
+    def __init__(self, description: Description, handles: Sequence[int | None]) -> None:
         self.serializers = [Serializer(channel, description.encoding) for channel in description.channels]
-        self.handles = [None if sink is None else sink.add(channel) for channel in description.channels]
+        self.handles = handles
 
 
 class Inbound:
@@ -55,7 +58,8 @@ class Inbound:
         self._sink = sink
         self._rules = {rule.overlay_name: rule for rule in rules}
         self.tallies = {name: Tally(rule.name, rule.type_name) for name, rule in self._rules.items()}
-        self._sources: dict[tuple[Name, bytes, bytes], _Source | None] = {}
+        self._sources = {name: Sources[_Source]() for name in self._rules}
+        self._handles: dict[tuple[Name, bytes], set[int]] = {}  # of each publisher of each topic, at the sink
 
     @property
     def received(self) -> int:
@@ -80,7 +84,8 @@ class Inbound:
                 self._take(message, tally)
             except (LocalError, RemoteError) as error:
                 tally.refused += 1
-                log.warning("message of %s not handed over: %s", tally.topic, error)
+                fault = Fault.MALFORMED if isinstance(error, RemoteError) else Fault.REFUSED
+                self._node.faults.tell(tally.topic, fault, f"a message was not handed over: {error}")
 
     def to_fields(self) -> list[dict[str, object]]:
         """Return the figures of every topic."""
@@ -105,17 +110,28 @@ class Inbound:
         self._node.traffic.received(len(delivered.message))
 
     def _source(self, message: Message) -> _Source | None:
-        """Return what describes a message; a description is read once."""
-        key = (message.topic, message.delivered.publisher, message.description)
-        if key not in self._sources:
-            self._sources[key] = None
+        """Return what describes a message, None where it was refused; a description is read once while it is kept."""
+        sources, publisher = self._sources[message.topic], message.delivered.publisher
+        if (publisher, message.description) not in sources:
+            sources.put(publisher, message.description, None)
+            rule = self._rules[message.topic]
             description = Description.from_wire(message.description)
-            self._check(self._rules[message.topic], description)
-            self._sources[key] = _Source(description, self._sink)
-        return self._sources[key]
+            for channel in description.channels:
+                if channel.type_name != rule.type_name:
+                    raise LocalError(f"{rule.name} is {channel.type_name}, not {rule.type_name} as the rule says")
+            handles = [self._add(message.topic, publisher, channel) for channel in description.channels]
+            sources.put(publisher, message.description, _Source(description, handles))
+        return sources.get(publisher, message.description)
 
-    @staticmethod
-    def _check(rule: Rule, description: Description) -> None:
-        for channel in description.channels:
-            if channel.type_name != rule.type_name:
-                raise LocalError(f"{rule.name} is {channel.type_name}, not {rule.type_name} as the rule says")
+    def _add(self, topic: Name, publisher: bytes, channel: Channel) -> int | None:
+        """Return the sink's handle for a publisher's channel under the rule's own name."""
+        if self._sink is None:
+            return None
+        known = self._handles.setdefault((topic, publisher), set())
+        if len(self._handles) > _PUBLISHERS_MAX:
+            del self._handles[next(iter(self._handles))]
+        if len(known) >= CHANNELS_MAX:
+            raise LocalError(f"its publisher has described more than {CHANNELS_MAX} channels")
+        handle = self._sink.add(replace(channel, topic=self._rules[topic].local))
+        known.add(handle)
+        return handle

@@ -12,13 +12,15 @@ from typing import Final, NamedTuple
 
 from gdp.crypto.cbor import decode, encode
 from gdp.errors import DropReason, LocalError, RemoteError
-from proxy.serial.channel import CHANNEL_MAX_BYTES, Channel
+from proxy.serial.channel import Channel
+from proxy.serial.schema import DEFINITION_MAX_BYTES, definition_bytes
 from proxy.serial.serializer import Encoding
 
 __all__ = ["Description", "Parcel"]
 
 VERSION: Final = 1
 CHANNELS_MAX: Final = 256
+DESCRIPTION_MAX_BYTES: Final = 4 << 20  # many channels of one topic may bring the same definition
 _HEAD: Final = struct.Struct("!BHQ")
 _ENCODINGS: Final[dict[object, Encoding]] = {"json": "json", "cbor": "cbor", "cdr": "cdr"}
 
@@ -64,11 +66,22 @@ class Description:
         """Return the wire form.
 
         Raises:
-            LocalError: too many channels.
+            LocalError: too many channels, or too much to say of them.
         """
         if len(self.channels) > CHANNELS_MAX:
             raise LocalError(f"{len(self.channels)} connections of one topic; at most {CHANNELS_MAX} are allowed")
-        return encode({"e": self.encoding, "c": [channel.to_wire() for channel in self.channels]})
+        if self.definitions_bytes > DEFINITION_MAX_BYTES:
+            detail = f"definitions of {self.definitions_bytes} bytes; at most {DEFINITION_MAX_BYTES} are allowed"
+            raise LocalError(detail)
+        wire = encode({"e": self.encoding, "c": [channel.to_wire() for channel in self.channels]})
+        if len(wire) > DESCRIPTION_MAX_BYTES:
+            raise LocalError(f"a description of {len(wire)} bytes; at most {DESCRIPTION_MAX_BYTES} are allowed")
+        return wire
+
+    @property
+    def definitions_bytes(self) -> int:
+        """Return the length of all different definitions together."""
+        return sum(map(definition_bytes, {channel.definition for channel in self.channels}))
 
     @classmethod
     def from_wire(cls, wire: bytes) -> Description:
@@ -77,9 +90,11 @@ class Description:
         Raises:
             RemoteError: MALFORMED, whatever else these bytes are.
         """
-        match decode(wire, CHANNEL_MAX_BYTES * CHANNELS_MAX):
+        match decode(wire, DESCRIPTION_MAX_BYTES):
             case {"e": str(encoding), "c": [*channels]} if encoding in _ENCODINGS and 0 < len(channels) <= CHANNELS_MAX:
                 wires = [each for each in channels if isinstance(each, bytes)]
                 if len(wires) == len(channels):
-                    return cls(_ENCODINGS[encoding], tuple(map(Channel.from_wire, wires)))
+                    description = cls(_ENCODINGS[encoding], tuple(map(Channel.from_wire, wires)))
+                    if description.definitions_bytes <= DEFINITION_MAX_BYTES:
+                        return description
         raise RemoteError(DropReason.MALFORMED, "description")

@@ -244,6 +244,8 @@ def _translated(path: Path) -> Iterator[None]:
         yield
     except sqlite3.Error as error:
         raise StoreError(f"{path}: {error}") from error
+    except UnicodeDecodeError as error:  # texts of a broken file, sqlite3's own words about them among those
+        raise StoreError(f"{path}: not a text: {error}") from error
 
 
 def _plain(value: object) -> object:

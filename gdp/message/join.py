@@ -124,6 +124,8 @@ class Joiner:
         self._budget = budget
         self._patience_s = patience_s
         self._unfinished: dict[int, _Unfinished] = {}
+        self._unfinished_bytes = 0
+        budget.register(self, source)
         self.window = ReplayWindow()
         self.drops: Counter[DropReason] = Counter()
         self.highest = -1  # highest message number of which an authentic part came
@@ -158,7 +160,7 @@ class Joiner:
             wanted = min(len(arrivals) - at - taken, heads.count - part + heads.first)
             cost = message.header.length + _PART_OVERHEAD_BYTES
             if message.prepaid_bytes < wanted * cost:
-                if not self._budget.reserve(self._source, _PREPAID_BYTES + wanted * cost):
+                if not self._take(_PREPAID_BYTES + wanted * cost):
                     break
                 message.held_bytes += _PREPAID_BYTES + wanted * cost
                 message.prepaid_bytes += _PREPAID_BYTES + wanted * cost
@@ -258,7 +260,7 @@ class Joiner:
             message.running.update(early)
             message.hashed += 1
             message.held_bytes -= len(early)
-            self._budget.release(self._source, len(early))
+            self._give_back(len(early))
 
     def _finish(self, header: Header, message: _Unfinished) -> Joined | None:
         number = header.number
@@ -279,7 +281,27 @@ class Joiner:
         return True
 
     def _drop(self, number: int) -> None:
-        self._budget.release(self._source, self._unfinished.pop(number).held_bytes)
+        self._give_back(self._unfinished.pop(number).held_bytes)
+
+    @property
+    def unfinished_bytes(self) -> int:
+        """Return how much memory unfinished messages hold."""
+        return self._unfinished_bytes
+
+    def give_way(self) -> None:
+        """Drop the message that is needed last: somebody who holds less needs the memory."""
+        if self._unfinished:
+            self._drop(max(self._unfinished))
+            self.drops[DropReason.ABANDONED] += 1
+
+    def _take(self, size: int) -> bool:
+        is_taken = self._budget.reserve(self._source, size, self)
+        self._unfinished_bytes += size if is_taken else 0
+        return is_taken
+
+    def _give_back(self, size: int) -> None:
+        self._unfinished_bytes -= size
+        self._budget.release(self._source, size)
 
     def _make_room(self, number: int) -> bool:
         """Return whether one more message may be begun; the highest number gives way to a lower one."""
@@ -294,7 +316,7 @@ class Joiner:
 
     def _reserve(self, number: int, cost: int) -> bool:
         """Take memory for a part of a message, if need be from messages with higher numbers."""
-        while not self._budget.reserve(self._source, cost):
+        while not self._take(cost):
             highest = max(self._unfinished, default=-1)
             if number >= highest:
                 return False

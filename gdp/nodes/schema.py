@@ -5,7 +5,7 @@ Place: shell; loading reads files and changes nothing. ``gdp/nodes/config.py`` a
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Final, TypeVar, get_args
 
@@ -34,6 +34,7 @@ __all__ = [
 ]
 
 _SHOULD_BE: Final = "Input should be "  # how pydantic begins when a value is of the wrong kind or out of bounds
+_PATH_SHOWN: Final = 200  # characters
 _IFNAME_MAX: Final = 15  # IFNAMSIZ - 1; Linux, include/uapi/linux/if.h
 _WORDS: Final = {
     "an object": "a mapping of keys to values",
@@ -57,23 +58,34 @@ class Section(BaseModel):
 def relative(path: Path, info: ValidationInfo) -> Path:
     """Return ``path`` as seen from the file that names it; ``load`` puts that folder into the context."""
     base = info.context["base"] if isinstance(info.context, dict) else Path()
-    return Path(base) / path.expanduser()
+    try:
+        return Path(base) / path.expanduser()
+    except RuntimeError as error:
+        raise ValueError(f"no such home directory: {str(path)[:_PATH_SHOWN]}") from error
+
+
+def _is_there(look: Callable[[], bool]) -> bool:
+    """Return what a look at a path says; a path that the system does not take, such as one too long, is not there."""
+    try:
+        return look()
+    except OSError:
+        return False
 
 
 def _file(path: Path) -> Path:
-    if not path.is_file():
+    if not _is_there(path.is_file):
         raise ValueError(f"no such file: {path}")
     return path
 
 
 def _directory(path: Path) -> Path:
-    if not path.is_dir():
+    if not _is_there(path.is_dir):
         raise ValueError(f"no such directory: {path}")
     return path
 
 
 def _writable_place(path: Path) -> Path:
-    if not path.parent.is_dir():
+    if not _is_there(path.parent.is_dir):
         raise ValueError(f"no such directory: {path.parent}")
     return path
 

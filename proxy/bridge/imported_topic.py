@@ -26,12 +26,13 @@ from proxy.parcel import Description, Parcel
 from proxy.qos import default, offer, unmatched
 from proxy.serial.channel import Channel, Qos
 from proxy.serial.schema import DefinitionError
+from proxy.sources import Sources
 from proxy.tally import Tally
 
 __all__ = ["ImportedTopic"]
 
 _SAMPLES_MAX = 4_096  # latencies kept
-_SOURCES_MAX = 1_024  # descriptions kept ready; the oldest go
+_FAR_MAX = 1_024  # publishers whose QoS is kept; the oldest go
 
 
 class ImportedTopic:
@@ -52,7 +53,7 @@ class ImportedTopic:
         self._channel: Channel | None = None  # as it is offered here
         self._far: dict[bytes, Qos] = {}  # what publishers offer, by name
         self._kept = deque[bytes]()  # what the virtual publisher keeps for late joiners, for another one in its place
-        self._sources: dict[tuple[bytes, bytes], Incoming | None] = {}
+        self._sources = Sources[Incoming]()
         self._is_joined = False
         self._past_losses = Losses()  # of when a local reader stood before
         self._pace = Pace(wish.rule.max_hz)
@@ -74,7 +75,7 @@ class ImportedTopic:
                 self._shut()  # what it keeps grows old, and comes again with the next reader
         if self._channel is not None:
             self._offer(self._channel)
-        self._sources = {key: incoming for key, incoming in self._sources.items() if incoming}  # others may do now
+        self._sources.forget_refused()  # others may do now
 
     def receive(self, message: Message, now_s: float) -> None:
         """Take a message from the overlay."""
@@ -133,12 +134,12 @@ class ImportedTopic:
 
     def _receive(self, message: Message, now_s: float) -> None:
         delivered, traffic, rule = message.delivered, self._site.traffic, self._wish.rule
-        key = (delivered.publisher, message.description)
-        if key not in self._sources:
-            self._sources[key] = self._describe(delivered.publisher, Description.from_wire(message.description))
-            while len(self._sources) > _SOURCES_MAX:
-                del self._sources[next(iter(self._sources))]
-        incoming = self._sources[key]
+        publisher = delivered.publisher
+        if (publisher, message.description) not in self._sources:
+            self._sources.put(publisher, message.description, None)
+            ready = self._describe(publisher, Description.from_wire(message.description))
+            self._sources.put(publisher, message.description, ready)
+        incoming = self._sources.get(publisher, message.description)
         if incoming is None or self._handle is None:
             self.tally.refused += 1
             return
@@ -172,7 +173,7 @@ class ImportedTopic:
             self._site.faults.tell(what, Fault.OTHER_TYPE, f"the far side's definition does not fit: {error}")
             return None
         self._far[publisher] = source.qos[0] if source.qos else default(latched=source.latched)
-        while len(self._far) > _SOURCES_MAX:
+        while len(self._far) > _FAR_MAX:
             del self._far[next(iter(self._far))]
         try:
             self._offer(incoming.target)

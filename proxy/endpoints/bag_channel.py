@@ -21,12 +21,18 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.interfaces import Qos as RosbagsQos
+from rosbags.rosbag2.errors import ReaderError
+from rosbags.rosbag2.metadata import parse_qos
+from ruamel.yaml.error import YAMLError
 
 from gdp.errors import LocalError
+from proxy.endpoints.unpacking import SalvageError
 from proxy.serial.channel import Channel, DefinitionFormat, Qos
 from proxy.serial.standard import standard_definition, type_hash
 
-__all__ = ["from_connection", "from_ros2", "to_qos"]
+__all__ = ["from_connection", "from_ros2", "offered_qos", "to_qos"]
+
+_QOS_TEXT_MAX = 64 << 10
 
 _FORMATS: dict[MessageDefinitionFormat, DefinitionFormat] = {
     MessageDefinitionFormat.MSG: "msg",
@@ -90,6 +96,22 @@ def from_ros2(
         qos=tuple(_from_qos(profile) for profile in profiles),
         latched=any(profile.durability is QosDurability.TRANSIENT_LOCAL for profile in profiles),
     )
+
+
+def offered_qos(profiles: object) -> list[RosbagsQos]:
+    """Return the QoS profiles that a recording says were offered: a YAML text, or a list of maps.
+
+    Raises:
+        SalvageError: it is neither, or too long.
+    """
+    if isinstance(profiles, str) and len(profiles) > _QOS_TEXT_MAX:
+        raise SalvageError(f"QoS profiles of {len(profiles)} characters")
+    try:
+        return parse_qos(profiles)  # type: ignore[arg-type]
+    except (ReaderError, YAMLError, ArithmeticError, AttributeError, LookupError, RecursionError) as error:
+        raise SalvageError(f"QoS profiles that cannot be read: {type(error).__name__}") from error
+    except (AssertionError, TypeError, ValueError) as error:
+        raise SalvageError(f"QoS profiles that cannot be read: {error}") from error
 
 
 def _from_qos(profile: RosbagsQos) -> Qos:

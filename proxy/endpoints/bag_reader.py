@@ -20,12 +20,17 @@ from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag1 import ReaderError as ReaderError1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import ReaderError as ReaderError2
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
 
 from gdp.errors import ConfigError, LocalError
 from proxy.endpoints import salvage_mcap, salvage_ros1, salvage_sqlite
 from proxy.endpoints.bag_channel import from_connection
 from proxy.endpoints.bag_source import Message, Source
 from proxy.endpoints.joined import JoinedSource
+from proxy.endpoints.sqlite_guard import guarded
+from proxy.endpoints.unpacked import UnpackedSource
+from proxy.endpoints.unpacking import bound_rosbags, check_file
 from proxy.serial.channel import Channel
 from proxy.serial.schema import DefinitionError, UnparsedError, parse
 
@@ -47,10 +52,16 @@ _FOREIGN: Final = (
     TypeError,
     AssertionError,
     RuntimeError,
+    ArithmeticError,
+    AttributeError,
+    MemoryError,
+    YAMLError,
+    LocalError,
     struct.error,
     apsw.Error,
     zstd.ZstdError,
 )
+_METADATA_MAX_BYTES: Final = 1 << 20
 _STORAGE: Final = ("*.mcap", "*.db3")
 
 
@@ -68,7 +79,7 @@ class BagReader:
         self.path = Path(path)
         try:
             self._source = _open(self.path)
-        except (LocalError, *_FOREIGN) as error:
+        except _FOREIGN as error:
             raise ConfigError(str(self.path), "", f"cannot be read: {_reason(error)}") from error
         try:
             for channel in self._source.channels:
@@ -151,11 +162,29 @@ def _open(path: Path) -> Source:
 
 def _open_folder(path: Path) -> Source:
     storage = sorted(file for pattern in _STORAGE for file in path.glob(pattern))
+    compression = _compression(path / "metadata.yaml")
+    if compression == "message":  # each one is unpacked here, within bounds
+        return UnpackedSource(JoinedSource([_open(file) for file in storage]))
+    if compression == "file":
+        for file in path.glob("*.zstd"):
+            check_file(file)
     if (path / "metadata.yaml").exists() and all(map(_is_whole, storage)):
         return _Rosbag2Source(path)
     if not storage:
         raise LocalError("the folder has neither metadata.yaml nor a storage file")
     return JoinedSource([_open(file) for file in storage])
+
+
+def _compression(metadata: Path) -> str:
+    """Return what a folder says of its compression: ``message``, ``file``, or anything else for none."""
+    if not metadata.exists():
+        return ""
+    if metadata.stat().st_size > _METADATA_MAX_BYTES:
+        raise LocalError(f"{metadata.name} has more than {_METADATA_MAX_BYTES} bytes")
+    match YAML(typ="safe").load(metadata.read_text()):
+        case {"rosbag2_bagfile_information": {"compression_mode": str(mode)}}:
+            return mode.lower()
+    return ""
 
 
 def _is_whole(storage: Path) -> bool:
@@ -185,6 +214,8 @@ class _IndexedSource:
         given = 0
         try:
             for connection, stamp_ns, raw in read():
+                if isinstance(raw, int | str):
+                    raise ReaderError2("a message that is not bytes")
                 yield Message(self._index[_key(connection)], stamp_ns, bytes(raw))
                 given += 1
         except _FOREIGN as error:
@@ -207,10 +238,11 @@ class _Rosbag1Source(_IndexedSource):
 class _Rosbag2Source(_IndexedSource):
     def __init__(self, path: Path) -> None:
         self._reader = Reader2(path)
-        self._reader.open()
+        with guarded():
+            self._reader.open()
         try:
             super().__init__(self._reader.connections, self._reader.message_count)
-        except LocalError:
+        except _FOREIGN:
             self._reader.close()
             raise
 
@@ -219,6 +251,9 @@ class _Rosbag2Source(_IndexedSource):
 
     def close(self) -> None:
         self._reader.close()
+
+
+bound_rosbags()
 
 
 def _key(connection: Connection) -> tuple[int, str]:

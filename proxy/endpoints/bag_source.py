@@ -5,24 +5,15 @@ Place: I/O; files are opened for reading only.
 
 from __future__ import annotations
 
-import bz2
-import sys
 from collections import OrderedDict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple, Protocol
 
-from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
-
-from gdp.errors import LocalError
+from proxy.endpoints.unpacking import CHUNK_MAX_BYTES, unpack
 from proxy.serial.channel import Channel
 
-if sys.version_info >= (3, 14):
-    from compression import zstd
-else:
-    from backports import zstd
-
-__all__ = ["Chunk", "Message", "Place", "SalvageError", "ScannedSource", "Source", "Tally", "unpack"]
+__all__ = ["Chunk", "Message", "Place", "ScannedSource", "Source", "Tally"]
 
 _CHUNKS_KEPT: Final = 4  # unpacked at a time; neighbours in time are neighbours in the file
 
@@ -55,16 +46,13 @@ class Source(Protocol):
         """Close the files."""
 
 
-class SalvageError(LocalError):
-    """Not even the beginning of a file is a recording."""
-
-
 class Chunk(NamedTuple):
     """A run of records, perhaps compressed."""
 
     at: int  # file offset of its data
     size: int  # bytes in the file, fewer than written where the file ends in it
     compression: str
+    unpacked: int | None  # bytes, as its header says
 
 
 class Place(NamedTuple):
@@ -76,28 +64,6 @@ class Place(NamedTuple):
     chunk: int  # index, -1: in the file itself
     at: int
     size: int
-
-
-def unpack(compression: str, data: bytes) -> bytes:
-    """Return as much of a chunk as its bytes give; a chunk that ends early gives its beginning.
-
-    Raises:
-        SalvageError: the compression is unknown or the bytes are not of it.
-    """
-    try:
-        match compression:
-            case "" | "none":
-                return data
-            case "lz4":
-                return bytes(LZ4FrameDecompressor().decompress(data))
-            case "zstd":
-                return bytes(zstd.ZstdDecompressor().decompress(data))
-            case "bz2":
-                return bz2.BZ2Decompressor().decompress(data)
-            case _:
-                raise SalvageError(f"compression {compression!r} is not supported")
-    except (RuntimeError, OSError, ValueError, EOFError, zstd.ZstdError) as error:
-        raise SalvageError(f"a chunk cannot be unpacked: {error}") from error
 
 
 class Tally:
@@ -149,8 +115,10 @@ class ScannedSource:
         if place.chunk not in self._unpacked:
             chunk = self._chunks[place.chunk]
             self._file.seek(chunk.at)
-            self._unpacked[place.chunk] = unpack(chunk.compression, self._file.read(chunk.size))
-            if len(self._unpacked) > _CHUNKS_KEPT:
+            self._unpacked[place.chunk] = unpack(chunk.compression, self._file.read(chunk.size), chunk.unpacked)
+            while len(self._unpacked) > 1 and (
+                len(self._unpacked) > _CHUNKS_KEPT or sum(map(len, self._unpacked.values())) > CHUNK_MAX_BYTES
+            ):
                 self._unpacked.popitem(last=False)
         self._unpacked.move_to_end(place.chunk)
         return self._unpacked[place.chunk][place.at : place.at + place.size]

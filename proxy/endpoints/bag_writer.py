@@ -21,12 +21,16 @@ from rosbags.rosbag2 import WriterError as WriterError2
 
 from gdp.errors import LocalError
 from proxy.endpoints.bag_channel import to_qos
+from proxy.serial.bounded_cache import digest_of
 from proxy.serial.channel import Channel, RosVersion
+from proxy.serial.schema import definition_bytes
 
 __all__ = ["BagWriter"]
 
 _UNKNOWN_HASH: Final = "RIHS01_" + "0" * 64
 _STAMPS_NS: Final = {1: (1 << 32) * 1_000_000_000, 2: 1 << 63}
+_CONNECTIONS_MAX: Final = 4_096  # rosbags keeps each, and its definition, until the file is finished
+_DEFINITIONS_MAX_BYTES: Final = 64 << 20
 _ANY_MD5: Final = "*"  # ROS 1's own word for an unknown one
 
 
@@ -50,7 +54,8 @@ class BagWriter:
             self._folder = Path(tempfile.mkdtemp(prefix=f".{self.path.name}.", dir=self.path.parent))
         except OSError as error:
             raise LocalError(f"{self.path} cannot be made: {error.strerror}") from error
-        self._handles: dict[Channel, int] = {}
+        self._handles: dict[tuple[object, ...], int] = {}  # by what the format can tell
+        self._definitions_bytes = 0
         self._connections: list[Connection] = []
         self._writer1: Writer1 | None = None
         self._writer2: Writer2 | None = None
@@ -65,20 +70,22 @@ class BagWriter:
         """Return the handle of a channel, the same for an equal one.
 
         Raises:
-            LocalError: a channel of the other ROS, or one that the format cannot hold.
+            LocalError: a channel of the other ROS, one that the format cannot hold, or one too many.
         """
         if channel.ros != self._ros:
             raise LocalError(f"{channel.topic} is of ROS {channel.ros}, the recording of ROS {self._ros}")
-        if channel not in self._handles:
-            known = self._like(channel)
-            if known is None:
-                try:
-                    self._connections.append(self._connect(channel))
-                except (WriterError1, WriterError2, AssertionError) as error:
-                    raise LocalError(f"{channel.topic} cannot be recorded: {error}") from error
-                known = len(self._connections) - 1
-            self._handles[channel] = known
-        return self._handles[channel]
+        told_by = _told_by(channel)
+        if told_by not in self._handles:
+            size = self._definitions_bytes + definition_bytes(channel.definition)
+            if len(self._connections) >= _CONNECTIONS_MAX or size > _DEFINITIONS_MAX_BYTES:
+                raise LocalError(f"{channel.topic} cannot be recorded: the recording has too many channels")
+            try:
+                self._connections.append(self._connect(channel))
+            except (WriterError1, WriterError2, AssertionError) as error:
+                raise LocalError(f"{channel.topic} cannot be recorded: {error}") from error
+            self._definitions_bytes = size
+            self._handles[told_by] = len(self._connections) - 1
+        return self._handles[told_by]
 
     def write(self, handle: int, stamp_ns: int, raw: bytes) -> None:
         """Record one message.
@@ -150,10 +157,6 @@ class BagWriter:
             return self._folder / "bag" / "bag.mcap"
         return self._folder / "bag"
 
-    def _like(self, channel: Channel) -> int | None:
-        """Return a handle that the format cannot tell from this channel's."""
-        return next((handle for known, handle in self._handles.items() if _told_by(known) == _told_by(channel)), None)
-
     def _connect(self, channel: Channel) -> Connection:
         if self._writer1 is not None:
             return self._writer1.add_connection(
@@ -178,4 +181,5 @@ class BagWriter:
 def _told_by(channel: Channel) -> tuple[object, ...]:
     if channel.ros == 2:  # the hash and the definition belong to the type, not to the channel
         return channel.topic, channel.type_name, channel.qos
-    return channel.topic, channel.type_name, channel.definition, channel.hash, channel.latched, channel.callerid
+    definition = digest_of(channel.definition)
+    return channel.topic, channel.type_name, definition, channel.hash, channel.latched, channel.callerid

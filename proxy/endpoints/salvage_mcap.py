@@ -11,11 +11,9 @@ import struct
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from rosbags.rosbag2.errors import ReaderError
-from rosbags.rosbag2.metadata import parse_qos
-
-from proxy.endpoints.bag_channel import from_ros2
-from proxy.endpoints.bag_source import Chunk, Place, SalvageError, ScannedSource, Tally, unpack
+from proxy.endpoints.bag_channel import from_ros2, offered_qos
+from proxy.endpoints.bag_source import Chunk, Place, ScannedSource, Tally
+from proxy.endpoints.unpacking import SalvageError, unpack
 from proxy.serial.channel import Channel, DefinitionFormat
 
 __all__ = ["MAGIC", "is_indexed", "scan"]
@@ -95,7 +93,7 @@ class _Found:
                     self._message(file.read(_MESSAGE_HEAD.size), -1, start, length)
                 elif there == length and code in (_SCHEMA, _CHANNEL):
                     self._describe(code, file.read(there))
-            except (struct.error, UnicodeDecodeError, ReaderError, SalvageError) as error:
+            except (struct.error, UnicodeDecodeError, SalvageError) as error:
                 return f"a record at byte {at} cannot be read ({error})"
             if there < length:
                 return f"the file ends in the middle, at byte {size}"
@@ -107,11 +105,11 @@ class _Found:
         (size,) = _LENGTH.unpack_from(record, at)
         at += _LENGTH.size
         size = min(size, len(record) - at)
-        data = unpack(compression, record[at : at + size])
+        data = unpack(compression, record[at : at + size], unpacked_size)
         if len(data) < unpacked_size:
             self.tally.missing_bytes = unpacked_size - len(data)
         self.tally.walked_bytes += len(data)
-        self.chunks.append(Chunk(start + at, size, compression))
+        self.chunks.append(Chunk(start + at, size, compression, unpacked_size))
         at = 0
         while at + _RECORD.size <= len(data):
             code, length = _RECORD.unpack_from(data, at)
@@ -151,7 +149,7 @@ class _Found:
             raise SalvageError(f"topic {topic} is in {encoding}, not CDR")
         name, definition_format, definition = self._schemas.get(schema, ("", "", ""))
         metadata = _map(record, at)
-        profiles = parse_qos(metadata.get("offered_qos_profiles", ""))
+        profiles = offered_qos(metadata.get("offered_qos_profiles", ""))
         digest = metadata.get("topic_type_hash", "")
         self._index[number] = len(self.channels)
         self.channels.append(from_ros2(topic, name, digest, definition, definition_format, profiles))

@@ -13,7 +13,8 @@ from typing import BinaryIO, Final
 
 from rosbags.typesys.msg import normalize_msgtype
 
-from proxy.endpoints.bag_source import Chunk, Place, SalvageError, ScannedSource, Tally, unpack
+from proxy.endpoints.bag_source import Chunk, Place, ScannedSource, Tally
+from proxy.endpoints.unpacking import SalvageError, unpack
 from proxy.serial.channel import Channel
 
 __all__ = ["MAGIC", "scan"]
@@ -84,8 +85,9 @@ class _Found:
 
     def _chunk(self, header: dict[bytes, bytes], packed: bytes, start: int) -> None:
         compression = header[b"compression"].decode()
-        data = unpack(compression, packed)
-        self.chunks.append(Chunk(start, len(packed), compression))
+        (size,) = _SIZE.unpack(header[b"size"])
+        data = unpack(compression, packed, size)
+        self.chunks.append(Chunk(start, len(packed), compression, size))
         at = 0
         while at + _SIZE.size <= len(data):
             (size,) = _SIZE.unpack_from(data, at)

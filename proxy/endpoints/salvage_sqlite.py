@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import sqlite3
 import tempfile
 from collections.abc import Iterator
 from contextlib import closing
@@ -16,10 +15,12 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import quote
 
-from rosbags.rosbag2.metadata import parse_qos
+import apsw
 
-from proxy.endpoints.bag_channel import from_ros2
-from proxy.endpoints.bag_source import Message, SalvageError, Tally
+from proxy.endpoints.bag_channel import from_ros2, offered_qos
+from proxy.endpoints.bag_source import Message, Tally
+from proxy.endpoints.sqlite_guard import check_schema, guard
+from proxy.endpoints.unpacking import SalvageError
 from proxy.serial.channel import Channel, DefinitionFormat
 
 __all__ = ["MAGIC", "SqliteSource", "is_whole"]
@@ -81,14 +82,23 @@ class SqliteSource:
         self._tally.walked_bytes = path.stat().st_size
         self._copy, file = _whole_pages(path) if self._tally.missing_bytes else (None, path)
         mode = "mode=ro" if _journal(path).exists() and file == path else "immutable=1"
-        self._db = sqlite3.connect(f"file:{quote(str(file))}?{mode}", uri=True)
+        flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
+        try:
+            self._db = apsw.Connection(f"file:{quote(str(file))}?{mode}", flags=flags)
+        except apsw.Error as error:
+            raise SalvageError(f"the database cannot be opened: {error}") from error
+        guard(self._db)
         try:
             # Without this SQLite refuses a file with fewer pages than its header says.
             self._db.execute("PRAGMA writable_schema=ON")
+            check_schema(self._db)
             self._read_topics()
-        except sqlite3.Error as error:
+        except (apsw.Error, TypeError, ValueError) as error:
             self.close()
             raise SalvageError(f"the database cannot be read: {error}") from error
+        except SalvageError:
+            self.close()
+            raise
         self._find_messages()
 
     @property
@@ -99,9 +109,16 @@ class SqliteSource:
     def messages(self) -> Iterator[Message]:
         """Yield messages in time order."""
         for stamp_ns, row, topic in self._order:
-            with closing(self._db.execute("SELECT data FROM messages WHERE id = ?", (row,))) as rows:
-                (raw,) = rows.fetchone()
-            yield Message(self._index[topic], stamp_ns, bytes(raw))
+            try:
+                with closing(self._db.execute("SELECT data FROM messages WHERE id = ?", (row,))) as rows:
+                    found = rows.fetchone()
+            except (apsw.Error, UnicodeDecodeError) as error:
+                self.unread = self._tally.text(f"the message in row {row} cannot be read ({error})")
+                continue
+            if found is not None and isinstance(found[0], bytes):
+                yield Message(self._index[topic], stamp_ns, found[0])
+            else:
+                self.unread = self._tally.text(f"the message in row {row} is not bytes")
 
     def close(self) -> None:
         """Close the database."""
@@ -129,7 +146,7 @@ class SqliteSource:
             definition_format, definition = definitions.get(type_name, ("", ""))
             self._index[int(number)] = len(self.channels)
             self.channels.append(
-                from_ros2(topic, type_name, type_hash, definition, definition_format, parse_qos(profiles))
+                from_ros2(topic, type_name, type_hash, definition, definition_format, offered_qos(profiles))
             )
 
     def _find_messages(self) -> None:
@@ -138,10 +155,10 @@ class SqliteSource:
             # the data is asked for as well, so that a row whose pages are gone is found out here
             rows = self._db.execute("SELECT id, topic_id, timestamp, data FROM messages ORDER BY id")
             for row, topic, stamp_ns, _ in rows:
-                if topic in self._index:
+                if topic in self._index and isinstance(stamp_ns, int):
                     self._order.append((int(stamp_ns), int(row), int(topic)))
                     self._tally.messages += 1
-        except sqlite3.Error as error:
+        except apsw.Error as error:
             reason = f"the file ends in the middle ({error})"
         self._order.sort()
         if self._tally.missing_bytes and not reason:

@@ -12,15 +12,17 @@ from typing import Final, Literal, TypeAlias
 import cbor2
 
 from gdp.errors import DropReason, LocalError, RemoteError
+from proxy.serial.cbor_bounds import check_bounds
+from proxy.serial.schema import DEFINITION_MAX_BYTES, definition_bytes
 
 __all__ = ["Channel", "DefinitionFormat", "Qos", "RosVersion"]
 
 RosVersion: TypeAlias = Literal[1, 2]
 DefinitionFormat: TypeAlias = Literal["msg", "idl", ""]
 
-CHANNEL_MAX_BYTES: Final = 1 << 20
+_ITEMS_MAX: Final = 4_096
+CHANNEL_MAX_BYTES: Final = 128 << 10
 _TEXT_MAX: Final = 1024
-_DEFINITION_MAX: Final = 900_000
 _QOS_MAX: Final = 64
 _TIME_MAX: Final = 1 << 63
 
@@ -102,6 +104,7 @@ class Channel:
         if len(wire) > CHANNEL_MAX_BYTES:
             raise RemoteError(DropReason.MALFORMED, f"a description of {len(wire)} bytes")
         try:
+            check_bounds(wire, _ITEMS_MAX)
             fields = cbor2.loads(wire)
         except (cbor2.CBORDecodeError, RecursionError, ValueError, TypeError, OverflowError) as error:
             raise RemoteError(DropReason.MALFORMED, "a description that is not CBOR") from error
@@ -120,7 +123,7 @@ class Channel:
             type_name=_text(fields.get("n")),
             ros=1 if ros == 1 else 2,
             hash=_text(fields.get("h")),
-            definition=_text(fields.get("d"), _DEFINITION_MAX),
+            definition=_definition(fields.get("d")),
             definition_format="msg" if definition_format == "msg" else "idl" if definition_format == "idl" else "",
             qos=tuple(_qos(profile) for profile in profiles),
             latched=_flag(fields.get("l")),
@@ -162,6 +165,13 @@ def _text(value: object, limit: int = _TEXT_MAX) -> str:
     if not isinstance(value, str) or len(value) > limit:
         raise RemoteError(DropReason.MALFORMED, f"a text of at most {limit} characters was expected")
     return value
+
+
+def _definition(value: object) -> str:
+    definition = _text(value, DEFINITION_MAX_BYTES)
+    if definition_bytes(definition) > DEFINITION_MAX_BYTES:
+        raise RemoteError(DropReason.MALFORMED, f"a definition of more than {DEFINITION_MAX_BYTES} bytes")
+    return definition
 
 
 def _whole(value: object) -> int:

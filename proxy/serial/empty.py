@@ -9,9 +9,12 @@ from __future__ import annotations
 
 from typing import Final
 
+from gdp.limits import MESSAGE_MAX_BYTES
 from proxy.serial.channel import Channel
+from proxy.serial.cost import fixed_bytes, items_of
 from proxy.serial.dialect import Wide
 from proxy.serial.native_dialect import NativeDialect
+from proxy.serial.reader import ITEMS_MAX
 from proxy.serial.schema import Array, DefinitionError, Number, Record, Text, Type, parse
 from proxy.serial.serializer import Codec
 from proxy.serial.service import Service
@@ -36,7 +39,7 @@ class NoAnswer:
         response: the service's response.
 
     Raises:
-        DefinitionError: its definition cannot be read.
+        DefinitionError: its definition cannot be read, or its fixed arrays are too large.
 
     Attributes:
         says_reason: whether the response has ``success`` and ``message``.
@@ -44,6 +47,8 @@ class NoAnswer:
 
     def __init__(self, response: Channel) -> None:
         record = parse(response.type_name, response.definition, response.definition_format, response.ros)
+        if fixed_bytes(record, {}) > MESSAGE_MAX_BYTES or items_of(record, {}) > ITEMS_MAX:
+            raise DefinitionError(f"{response.type_name}: an empty message is too large")
         self._codec = Codec(record, response.ros, _LEAVES, None)
         self._fields = record.fields
         self.says_reason = {_SUCCESS, _MESSAGE} <= set(record.fields)

@@ -12,9 +12,28 @@ from typing import Final
 from proxy.serial.dialect import BITS
 from proxy.serial.schema import SIZES, Array, Number, Record, Type
 
-__all__ = ["Wire", "inline_codes", "structs_for"]
+__all__ = ["RUN_MAX", "Phases", "Wire", "inline_codes", "structs_for"]
 
+_AS_BITS: Final = str.maketrans(BITS)
+RUN_MAX: Final = 4_096  # numbers of one record that are unpacked in runs; further arrays and records go one by one
 _INLINE_MAX: Final = 256  # numbers in one record that still count as one run
+
+
+class Phases(dict[int, struct.Struct]):
+    """The struct of a run for each place modulo 8 that it may start at, made when it is first needed."""
+
+    __slots__ = ("_cdr", "_letters", "_order")
+
+    def __init__(self, letters: str, order: str, *, cdr: bool) -> None:
+        super().__init__()
+        self._letters = letters
+        self._order = order
+        self._cdr = cdr
+
+    def __missing__(self, phase: int) -> struct.Struct:
+        made = struct.Struct(self._order + (_padded(self._letters, phase) if self._cdr else self._letters))
+        self[phase] = made
+        return made
 
 
 class Wire:
@@ -31,12 +50,10 @@ class Wire:
         self.cdr = cdr
         self.order = order
 
-    def structs(self, codes: str, *, as_bits: bool) -> tuple[struct.Struct, ...]:
+    def structs(self, codes: str, *, as_bits: bool) -> Phases:
         """Return the struct of a run for each place modulo 8 that it may start at."""
-        letters = "".join(BITS.get(code, code) for code in codes) if as_bits else codes
-        if not self.cdr:
-            return (struct.Struct(self.order + letters),) * 8
-        return tuple(struct.Struct(self.order + _padded(letters, phase)) for phase in range(8))
+        letters = codes.translate(_AS_BITS) if as_bits else codes
+        return Phases(letters, self.order, cdr=self.cdr)
 
 
 def structs_for(wire: Wire, code: str) -> struct.Struct:

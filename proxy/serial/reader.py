@@ -2,7 +2,8 @@
 
 Place: pure. A step takes the body, a position and the tree so far, and returns the position after it. Numbers that lie
 side by side, in nested records too, are unpacked in one call.
-Errors: bytes that do not fit the type raise ``MisfitError`` or ``struct.error``; nothing is allocated beyond them.
+Errors: bytes that do not fit the type raise ``MisfitError`` or ``struct.error``. The values of a message, in nested and
+fixed arrays too, are counted against one budget before they are made. A reader keeps that budget: it is for one thread.
 """
 
 from __future__ import annotations
@@ -13,11 +14,12 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
+from proxy.serial.cost import fixed_bytes, items_of
 from proxy.serial.dialect import Dialect, MisfitError, Wide
-from proxy.serial.layout import Wire, inline_codes
+from proxy.serial.layout import RUN_MAX, Wire, inline_codes
 from proxy.serial.schema import Array, Number, Record, Text, Type
 
-__all__ = ["Reader", "Tree", "read_with"]
+__all__ = ["ITEMS_MAX", "Reader", "Tree", "read_with"]
 
 Tree: TypeAlias = dict[str, object]
 Reader: TypeAlias = "Callable[[memoryview, int], tuple[object, int]]"
@@ -25,12 +27,14 @@ _Step: TypeAlias = "Callable[[memoryview, int, Tree], int]"
 _Values: TypeAlias = "tuple[object, ...] | list[object]"
 _Shape: TypeAlias = "Callable[[_Values, Tree], None]"
 
-_EMPTY_ITEMS_MAX: Final = 1 << 16  # items that take no bytes; a count alone must not cost memory
+ITEMS_MAX: Final = 1 << 19  # records, lists and texts of one message: some 150 MB
+_ITEMS_FREE: Final = 4_096  # ... of which a message may have so many whatever its length
+_ITEMS_PER_BYTE: Final = 4  # ... and so many for each of its bytes
 
 
 def read_with(record: Record, wire: Wire, dialect: Dialect, layout: Wide = Wide.FOUR) -> Reader:
     """Return the compiled reader of a record: (body, position) to (tree, position after it)."""
-    return _Compiler(wire, dialect, layout).record(record)
+    return _Compiler(wire, dialect, layout).message(record)
 
 
 class _Compiler:
@@ -41,6 +45,22 @@ class _Compiler:
         self._inline: dict[int, str | None] = {}
         self._records: dict[int, Reader] = {}
         self._count = struct.Struct(wire.order + "I").unpack_from
+        self._items_known: dict[int, int] = {}
+        self._bytes_known: dict[int, int] = {}
+        self._items_left = [0]  # of the message that is being read
+
+    def message(self, record: Record) -> Reader:
+        """Return the reader of a whole message."""
+        read_record, left = self.record(record), self._items_left
+        fixed = items_of(record, self._items_known)
+
+        def read(body: memoryview, at: int) -> tuple[object, int]:
+            left[0] = min(ITEMS_MAX, _ITEMS_FREE + _ITEMS_PER_BYTE * len(body)) - fixed
+            if left[0] < 0:
+                raise MisfitError("more values than such a message may have")
+            return read_record(body, at)
+
+        return read
 
     def record(self, record: Record) -> Reader:
         if id(record) not in self._records:
@@ -70,8 +90,11 @@ class _Compiler:
     def _steps(self, record: Record) -> list[_Step]:
         steps: list[_Step] = []
         run: list[tuple[str, Type]] = []
+        left = RUN_MAX
         for name, kind in record.fields:
-            if inline_codes(kind, self._dialect.inline_max, self._inline) is not None:
+            codes = inline_codes(kind, self._dialect.inline_max, self._inline)
+            if codes is not None and (isinstance(kind, Number) or len(codes) <= left):
+                left -= len(codes)
                 run.append((name, kind))
                 continue
             if run:
@@ -231,8 +254,9 @@ class _Compiler:
         return read
 
     def _items(self, read_item: Reader, item: Text | Record, fixed: int | None) -> Reader:
-        cdr, count = self._wire.cdr, self._count
-        hollow = isinstance(item, Record) and not item.fields
+        cdr, count, left = self._wire.cdr, self._count, self._items_left
+        each = items_of(item, self._items_known)
+        least = fixed_bytes(item, self._bytes_known)
 
         def read(body: memoryview, at: int) -> tuple[object, int]:
             if fixed is None:
@@ -242,8 +266,12 @@ class _Compiler:
                 at += 4
             else:
                 number = fixed
-            if number > (_EMPTY_ITEMS_MAX if hollow else len(body) - at):
+            if number * least > len(body) - at:
                 raise MisfitError("more items than the message can hold")
+            if fixed is None:  # a fixed array was counted with what holds it
+                left[0] -= number * each
+                if left[0] < 0:
+                    raise MisfitError("more values than such a message may have")
             items: list[object] = []
             for _ in range(number):
                 value, at = read_item(body, at)

@@ -1,24 +1,25 @@
 """A message type as a tree of five nouns, read from the definition text that travels with a channel.
 
-Place: pure. rosbags parses the text (ROS 1 and ROS 2 ``msg``, ROS 2 ``idl``); nothing is generated and nothing is
-executed, since a definition may come from a peer.
+Place: pure. A definition may come from a peer: its text is bounded, parsed in time proportional to its length
+(``msg_text``, ``idl_text``), and nothing is generated or executed. Types are kept by the hash of their definition.
 Source: the ROS 2 interface definition article; ROS 1 ``msg`` wiki page.
 """
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Final, TypeAlias
 
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc, Typesdict
-from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
 
 from gdp.errors import LocalError
+from proxy.serial.bounded_cache import BoundedCache, digest_of
+from proxy.serial.idl_text import parse_idl
+from proxy.serial.msg_text import parse_msg
 
 __all__ = [
+    "DEFINITION_MAX_BYTES",
     "Array",
     "DefinitionError",
     "Number",
@@ -27,11 +28,14 @@ __all__ = [
     "Text",
     "Type",
     "UnparsedError",
+    "definition_bytes",
     "msg_name",
     "parse",
     "parsed",
 ]
 
+DEFINITION_MAX_BYTES: Final = 64 << 10  # of a text in UTF-8; parsed in the loop that must also say hello
+_KEPT_MAX: Final = 256  # parsed definitions
 _DEPTH_MAX: Final = 32  # records within records
 _FIELDS_MAX: Final = 4_096  # of a type with all that it contains: each record as often as it stands somewhere
 _RULE: Final = "=" * 80 + "\n"
@@ -123,7 +127,6 @@ _BUILTIN: Final[dict[int, dict[str, tuple[tuple[str, Type], ...]]]] = {
 }
 
 
-@lru_cache(maxsize=1024)
 def parse(type_name: str, definition: str, definition_format: str, ros: int) -> Record:
     """Return the type as a tree.
 
@@ -135,11 +138,15 @@ def parse(type_name: str, definition: str, definition_format: str, ros: int) -> 
 
     Raises:
         UnparsedError: the text cannot be read.
-        DefinitionError: no definition, a used type that it lacks, a type within itself, or a field of a kind that has
-            no form here (``wchar``, ``long double``, fixed point).
+        DefinitionError: no definition, one of more than ``DEFINITION_MAX_BYTES``, a used type that it lacks, a type
+            within itself, or a field of a kind that has no form here (``wchar``, ``long double``, fixed point).
     """
-    types = parsed(type_name, definition, definition_format)
-    return _Builder(types, ros).record(msg_name(type_name, definition_format), 0)
+
+    def build() -> Record:
+        types = parsed(type_name, definition, definition_format)
+        return _Builder(types, ros).record(msg_name(type_name, definition_format), 0)
+
+    return _records.get(digest_of(type_name, definition, definition_format, ros), build)
 
 
 def msg_name(type_name: str, definition_format: str) -> str:
@@ -154,29 +161,27 @@ def parsed(type_name: str, definition: str, definition_format: str) -> Typesdict
     """Return constants and fields of the types in a definition.
 
     Raises:
-        DefinitionError: there is none.
+        DefinitionError: there is none, or it is longer than ``DEFINITION_MAX_BYTES``.
         UnparsedError: the text cannot be read.
     """
     if definition_format not in ("msg", "idl"):
         raise DefinitionError(f"{type_name}: no definition")
+    if definition_bytes(definition) > DEFINITION_MAX_BYTES:
+        raise DefinitionError(f"{type_name}: a definition of more than {DEFINITION_MAX_BYTES} bytes")
     text = definition.replace("\r\n", "\n")
     try:
         if definition_format == "msg":
-            return get_types_from_msg(_plain_wide(text), msg_name(type_name, "msg"))
+            return parse_msg(text, msg_name(type_name, "msg"))
         if not text.startswith(f"{_RULE}IDL: "):
-            return get_types_from_idl(text)
-        types: Typesdict = {}
-        for section in text.split(_RULE)[1:]:
-            types.update(get_types_from_idl(section.partition("\n")[2]))
-        return types
-    except (TypesysError, RecursionError, ValueError, KeyError, AssertionError) as error:
+            return parse_idl(text)
+        return parse_idl("".join(section.partition("\n")[2] for section in text.split(_RULE)[1:]))
+    except ValueError as error:
         raise UnparsedError(f"{type_name}: the definition cannot be parsed: {_first_line(error)}") from error
 
 
-def _plain_wide(text: str) -> str:
-    """Drop the bounds of wide strings and their constants, which rosbags' ``msg`` grammar does not know."""
-    text = re.sub(r"(?m)^[ \t]*wstring(<=\d+)?[ \t]+[A-Z]\w*[ \t]*=.*$", "", text)
-    return re.sub(r"(?m)^([ \t]*wstring)<=\d+", r"\1", text)
+def definition_bytes(definition: str) -> int:
+    """Return the length of a definition in UTF-8."""
+    return len(definition) if definition.isascii() else len(definition.encode("utf-8", "surrogatepass"))
 
 
 def _first_line(error: BaseException) -> str:
@@ -242,3 +247,6 @@ class _Builder:
         if base not in _NUMBERS:
             raise DefinitionError(f"{owner}: a field of type {base}")
         return _NUMBERS[base]
+
+
+_records: Final = BoundedCache[Record](_KEPT_MAX, DefinitionError)

@@ -7,7 +7,6 @@ Source: DESIGN section 8; OMG CDR encapsulation (RTPS 2.2, section 10): two byte
 from __future__ import annotations
 
 import struct
-from functools import lru_cache
 from typing import Final, Literal, TypeAlias
 
 import cbor2
@@ -15,13 +14,15 @@ import orjson
 import pybase64
 
 from gdp.errors import DropReason, RemoteError
+from proxy.serial.bounded_cache import BoundedCache, digest_of
+from proxy.serial.cbor_bounds import check_bounds
 from proxy.serial.cbor_dialect import CborDialect
 from proxy.serial.channel import Channel
 from proxy.serial.dialect import Dialect, MisfitError, Wide
 from proxy.serial.json_dialect import JsonDialect
 from proxy.serial.layout import Wire
 from proxy.serial.native_dialect import NativeDialect
-from proxy.serial.reader import Reader, read_with
+from proxy.serial.reader import ITEMS_MAX, Reader, read_with
 from proxy.serial.schema import Array as ArrayType
 from proxy.serial.schema import DefinitionError, Record, Sequence, Text, Type, parse
 from proxy.serial.writer import Writer, write_with
@@ -34,6 +35,9 @@ _PREFIX: Final = b"\x00\x01\x00\x00"
 _PAD_MAX: Final = 3  # bytes that a writer may add to reach a multiple of four
 _RAW: Final = "$raw"  # no field can be called so
 _NATIVE: Final = NativeDialect()
+_CONTAINERS_MAX: Final = 4 * ITEMS_MAX  # of JSON; texts may hold some of their signs
+_CBOR_ITEMS_MAX: Final = 8 * ITEMS_MAX  # numbers count too
+_CODECS_MAX: Final = 256  # compiled types, of all encodings
 
 
 # How a body is written; ``cdr``: the bytes as they are, whichever ROS wrote them.
@@ -88,7 +92,7 @@ class Serializer:
         if self._encoding == "cdr":
             return body
         try:
-            tree = orjson.loads(body) if self._encoding == "json" else cbor2.loads(body)
+            tree = _json(body) if self._encoding == "json" else _cbor(body)
             if isinstance(tree, dict) and _RAW in tree:
                 return _raw_of(tree[_RAW])
             if self._codec is None:
@@ -120,6 +124,19 @@ def canonical(channel: Channel, raw: bytes) -> bytes:
     return raw if tree is None else codec.to_raw(tree)
 
 
+def _json(body: bytes) -> object:
+    if body.count(b"{") + body.count(b"[") > _CONTAINERS_MAX:
+        raise MisfitError(f"more than {_CONTAINERS_MAX} maps and arrays")
+    value: object = orjson.loads(body)
+    return value
+
+
+def _cbor(body: bytes) -> object:
+    check_bounds(body, _CBOR_ITEMS_MAX)
+    value: object = cbor2.loads(body)
+    return value
+
+
 def _raw_of(value: object) -> bytes:
     if isinstance(value, bytes):
         return value
@@ -129,54 +146,58 @@ def _raw_of(value: object) -> bytes:
 
 
 class Codec:
-    """Readers for each way a message of the type may lie, and the one writer."""
+    """Readers for each way a message of the type may lie, and the one writer; each is compiled when it is needed."""
 
-    __slots__ = ("_dialect", "_readers", "_record", "_ros", "_turned", "_write")
+    __slots__ = ("_dialect", "_layouts", "_readers", "_record", "_ros", "_turned", "_writer")
 
     def __init__(self, record: Record, ros: int, dialect: Dialect, turned: Codec | None) -> None:
         self._record = record
         self._ros = ros
         self._dialect = dialect
         self._turned = turned  # reads what is big-endian; None where this one does itself
-        wire = Wire(cdr=ros == 2)
-        layouts = tuple(Wide) if _has_wide(record, set()) else (Wide.FOUR,)
-        self._readers: dict[bytes, tuple[Reader, ...]] = {
-            _LITTLE: tuple(read_with(record, wire, dialect, layout) for layout in layouts)
-        }
-        if turned is None:
-            big = Wire(cdr=True, order=">")
-            self._readers[_BIG] = tuple(read_with(record, big, dialect, layout) for layout in layouts)
-        self._write: Writer = write_with(record, wire, dialect)
+        self._layouts = tuple(Wide) if _has_wide(record, set()) else (Wide.FOUR,)
+        self._readers: dict[tuple[bytes, Wide], Reader] = {}
+        self._writer: Writer | None = None
 
     def to_tree(self, raw: bytes) -> object | None:
         """Return the tree of a message, None where it does not fit the type."""
         if self._ros == 1:
-            return _first_fit(self._readers[_LITTLE], memoryview(raw), 0)
+            return self._first_fit(_LITTLE, memoryview(raw), 0)
         if len(raw) < len(_PREFIX):
             return None
         order = raw[:2]
         if order == _BIG and self._turned is not None:
             tree = self._turned.to_tree(raw)
             return None if tree is None else self.to_tree(self._turned.to_raw(tree))
-        readers = self._readers.get(order)
-        return None if readers is None else _first_fit(readers, memoryview(raw)[len(_PREFIX) :], _PAD_MAX)
+        if order not in (_LITTLE, _BIG):
+            return None
+        return self._first_fit(order, memoryview(raw)[len(_PREFIX) :], _PAD_MAX)
 
     def to_raw(self, tree: object) -> bytes:
         """Return the message of a tree; raises what the writer raises."""
         body = bytearray()
-        self._write(body, tree)
+        if self._writer is None:
+            self._writer = write_with(self._record, Wire(cdr=self._ros == 2), self._dialect)
+        self._writer(body, tree)
         return bytes(body) if self._ros == 1 else b"".join((_PREFIX, body))
 
 
-def _first_fit(readers: tuple[Reader, ...], body: memoryview, pad_max: int) -> object | None:
-    for read in readers:
-        try:
-            tree, end = read(body, 0)
-        except (MisfitError, struct.error):
-            continue
-        if end <= len(body) <= end + pad_max:
-            return tree
-    return None
+    def _first_fit(self, order: bytes, body: memoryview, pad_max: int) -> object | None:
+        for layout in self._layouts:
+            try:
+                tree, end = self._reader(order, layout)(body, 0)
+            except (MisfitError, struct.error):
+                continue
+            if end <= len(body) <= end + pad_max:
+                return tree
+        return None
+
+    def _reader(self, order: bytes, layout: Wide) -> Reader:
+        key = (order, layout)
+        if key not in self._readers:
+            wire = Wire(cdr=self._ros == 2, order=">" if order == _BIG else "<")
+            self._readers[key] = read_with(self._record, wire, self._dialect, layout)
+        return self._readers[key]
 
 
 def _has_wide(kind: Type, seen: set[int]) -> bool:
@@ -190,12 +211,21 @@ def _has_wide(kind: Type, seen: set[int]) -> bool:
     return any(_has_wide(field, seen) for _, field in kind.fields)
 
 
-@lru_cache(maxsize=1024)
 def _native(type_name: str, definition: str, definition_format: str, ros: int) -> Codec:
-    return Codec(parse(type_name, definition, definition_format, ros), ros, _NATIVE, None)
+    def build() -> Codec:
+        return Codec(parse(type_name, definition, definition_format, ros), ros, _NATIVE, None)
+
+    return _codecs.get(digest_of("native", type_name, definition, definition_format, ros), build)
 
 
 def _codec(channel: Channel, encoding: Encoding) -> Codec:
     named = (channel.type_name, channel.definition, channel.definition_format, channel.ros)
-    dialect: Dialect = JsonDialect() if encoding == "json" else CborDialect()
-    return Codec(parse(*named), channel.ros, dialect, _native(*named))
+
+    def build() -> Codec:
+        dialect: Dialect = JsonDialect() if encoding == "json" else CborDialect()
+        return Codec(parse(*named), channel.ros, dialect, _native(*named))
+
+    return _codecs.get(digest_of(encoding, *named), build)
+
+
+_codecs: Final = BoundedCache[Codec](_CODECS_MAX, DefinitionError)

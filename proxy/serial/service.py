@@ -11,10 +11,12 @@ from typing import Final
 import cbor2
 
 from gdp.errors import DropReason, RemoteError
+from proxy.serial.cbor_bounds import check_bounds
 from proxy.serial.channel import CHANNEL_MAX_BYTES, Channel, RosVersion
 
 __all__ = ["Service"]
 
+_ITEMS_MAX: Final = 16
 _WIRE_MAX_BYTES: Final = 2 * CHANNEL_MAX_BYTES + 4_096
 
 
@@ -66,6 +68,7 @@ class Service:
         if len(wire) > _WIRE_MAX_BYTES:
             raise RemoteError(DropReason.MALFORMED, "a service description that is too long")
         try:
+            check_bounds(wire, _ITEMS_MAX)
             fields = cbor2.loads(wire)
         except (cbor2.CBORDecodeError, RecursionError, ValueError, TypeError, OverflowError) as error:
             raise RemoteError(DropReason.MALFORMED, "a service description that is not CBOR") from error

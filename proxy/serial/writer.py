@@ -13,7 +13,7 @@ from operator import itemgetter
 from typing import Final, TypeAlias
 
 from proxy.serial.dialect import Dialect, MisfitError, Wide
-from proxy.serial.layout import Wire, inline_codes
+from proxy.serial.layout import RUN_MAX, Wire, inline_codes
 from proxy.serial.schema import Array, Number, Record, Text, Type
 
 __all__ = ["Writer", "write_with"]
@@ -53,8 +53,11 @@ class _Compiler:
     def _steps(self, record: Record) -> list[Writer]:
         steps: list[Writer] = []
         run: list[tuple[str, Type]] = []
+        left = RUN_MAX
         for name, kind in record.fields:
-            if self._codes(kind) is not None:
+            codes = self._codes(kind)
+            if codes is not None and (isinstance(kind, Number) or len(codes) <= left):
+                left -= len(codes)
                 run.append((name, kind))
                 continue
             if run:

@@ -17,8 +17,9 @@ import xmlrpc.client
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 from urllib.parse import urlsplit
+from xml.parsers.expat import ExpatError
 
 __all__ = ["LocalEnd", "Look", "Master", "MasterError", "Watch"]
 
@@ -30,6 +31,26 @@ _HIDDEN_TOPICS: Final = frozenset({"/rosout", "/rosout_agg"})
 _HIDDEN_SERVICES: Final = ("/get_loggers", "/set_logger_level")
 _LENGTH: Final = struct.Struct("<I")
 _HEADER_MAX: Final = 1 << 20
+_ANSWER_MAX_BYTES: Final = 16 << 20
+_PIECE_BYTES: Final = 64 << 10
+_REASON_MAX: Final = 300
+
+
+# What xmlrpc.client raises for an answer that is no XML-RPC; the parser's handlers fail in many ways.
+_FOREIGN: Final = (
+    OSError,
+    xmlrpc.client.Error,
+    http.client.HTTPException,
+    ExpatError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    ArithmeticError,
+    AssertionError,
+    MemoryError,
+    RecursionError,
+)
 
 
 class MasterError(Exception):
@@ -62,10 +83,27 @@ class Look:
 
 
 class _Transport(xmlrpc.client.Transport):
+    accept_gzip_encoding = False
+
     def make_connection(self, host: tuple[str, dict[str, str]] | str) -> http.client.HTTPConnection:
         connection = super().make_connection(host)
         connection.timeout = _PATIENCE_S
         return connection
+
+
+    def parse_response(self, response: http.client.HTTPResponse) -> tuple[Any, ...]:
+        """Read an answer as it is, unpacked and at most ``_ANSWER_MAX_BYTES`` long."""
+        if response.getheader("Content-Encoding", ""):
+            raise MasterError("an answer in an encoding that nobody asked for")
+        parser, target = self.getparser()
+        left = _ANSWER_MAX_BYTES
+        while data := response.read(_PIECE_BYTES):
+            left -= len(data)
+            if left < 0:
+                raise MasterError(f"an answer of more than {_ANSWER_MAX_BYTES} bytes")
+            parser.feed(data)
+        parser.close()
+        return target.close()
 
 
 class Master:
@@ -87,9 +125,12 @@ class Master:
         try:
             answers = several()
             return [_value(answers[index]) for index in range(len(calls))]
-        except (OSError, xmlrpc.client.Error, http.client.HTTPException, ValueError, LookupError, TypeError) as error:
+        except MasterError:
             self._proxy("close")()
-            raise MasterError(str(error) or type(error).__name__) from error
+            raise
+        except _FOREIGN as error:
+            self._proxy("close")()
+            raise MasterError(str(error)[:_REASON_MAX] or type(error).__name__) from error
 
 
 class Watch:
@@ -232,6 +273,8 @@ def _read_header(sock: socket.socket) -> dict[str, str]:
     at = 0
     while at + 4 <= length:
         (size,) = _LENGTH.unpack_from(body, at)
+        if at + 4 + size > length:
+            raise MasterError("a header that is none")
         key, _, value = body[at + 4 : at + 4 + size].decode("utf-8", "replace").partition("=")
         fields[key] = value
         at += 4 + size
@@ -259,10 +302,16 @@ def _state(state: object) -> tuple[list[tuple[str, list[str]]], ...]:
     """Return publishers, subscribers, servers: each (name, nodes)."""
     if not isinstance(state, list) or len(state) != 3:
         raise MasterError("a state that is none")
-    return tuple([(str(name), [str(node) for node in nodes]) for name, nodes in part] for part in state)
+    try:
+        return tuple([(str(name), [str(node) for node in nodes]) for name, nodes in part] for part in state)
+    except (TypeError, ValueError) as error:
+        raise MasterError("a state that is none") from error
 
 
 def _pairs(named: object) -> Iterable[tuple[str, str]]:
     if not isinstance(named, list):
         raise MasterError("topic types that are none")
-    return ((str(topic), str(type_name)) for topic, type_name in named)
+    try:
+        return [(str(topic), str(type_name)) for topic, type_name in named]
+    except (TypeError, ValueError) as error:
+        raise MasterError("topic types that are none") from error

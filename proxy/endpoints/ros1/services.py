@@ -27,6 +27,7 @@ __all__ = ["Dial", "Server", "tickets"]
 _WORKERS: Final = 64  # calls of one service under way at once; more wait their turn
 _CONNECT_S: Final = 5.0
 _IDLE_S: Final = 10.0  # a connection costs the server a thread
+_SAID_MAX: Final = 4_096  # characters of a server's words
 _RESPONDED: Final = " responded with an error: "
 _CANNOT: Final = "service cannot process request: "
 
@@ -213,9 +214,10 @@ def _reason(error: Exception) -> str:
     _, found, tail = str(error).partition(_RESPONDED)
     if not found:
         return str(error)
+    tail = tail[:_SAID_MAX]
     try:
         said = ast.literal_eval(tail)
-    except (ValueError, SyntaxError):
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
         return tail
     text = said.decode("utf-8", "replace") if isinstance(said, bytes) else str(said)
     return text.removeprefix(_CANNOT)

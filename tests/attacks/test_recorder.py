@@ -1,0 +1,163 @@
+"""Attacks of a publisher on a proxy that records what it sends, and on one with a live graph."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from gdp.client.member import Message
+from gdp.client.reading import Delivered
+from gdp.message.loss import Losses
+from gdp.names import Name
+from proxy.config import Rule
+from proxy.faults import Fault, Faults
+from proxy.inbound import Inbound
+from proxy.node import ProxyNode
+from proxy.parcel import CHANNELS_MAX, Description, Parcel
+from proxy.serial.channel import Channel, Qos
+from proxy.sources import Sources
+from proxy.traffic import Traffic
+
+TOPIC = Name(b"t" * 32)
+NEVER = (9_223_372_036, 854_775_807)
+
+
+class Sink:
+    """A recording in memory."""
+
+    def __init__(self) -> None:
+        self.channels: list[Channel] = []
+        self.written: list[tuple[str, bytes]] = []
+
+    def add(self, channel: Channel) -> int:
+        if channel not in self.channels:
+            self.channels.append(channel)
+        return self.channels.index(channel)
+
+    def write(self, handle: int, stamp_ns: int, raw: bytes) -> None:
+        self.written.append((self.channels[handle].topic, raw))
+
+
+class Recorder:
+    """The way from a member to a recording, about one topic: /chatter."""
+
+    def __init__(self) -> None:
+        self.sink = Sink()
+        self.messages: list[Message] = []
+        self.faults = Faults()
+        member = SimpleNamespace(take_messages=self._take, losses_of=lambda _: Losses())
+        node = SimpleNamespace(member=member, traffic=Traffic(), faults=self.faults)
+        rule = SimpleNamespace(name="/chatter", local="/chatter", type_name="a/msg/B", overlay_name=TOPIC)
+        self.inbound = Inbound(cast(ProxyNode, node), [cast(Rule, rule)], self.sink)
+
+    def _take(self) -> Sequence[Message]:
+        messages, self.messages = self.messages, []
+        return messages
+
+    def receive(self, description: bytes, *wires: bytes, publisher: bytes = b"p" * 32) -> None:
+        self.messages = [
+            _message(description, Delivered(publisher, 1, number, wire, 1, 1)) for number, wire in enumerate(wires)
+        ]
+        self.inbound.take()
+
+
+def _message(description: bytes, delivered: Delivered) -> Message:
+    fields: dict[str, Any] = {"topic": TOPIC, "description": description, "delivered": delivered}
+    return Message(**fields)
+
+
+def described(*channels: Channel) -> bytes:
+    return Description("cdr", channels).to_wire()
+
+
+def channel(topic: str = "/chatter", definition: str = "int8 a\n", depth: int = 1) -> Channel:
+    qos = Qos("keep_last", depth, "reliable", "volatile", NEVER, NEVER, "automatic", NEVER, plain_names=False)
+    return Channel(topic, "a/msg/B", 2, definition=definition, definition_format="msg", qos=(qos,))
+
+
+def parcel(number: int = 0, body: bytes = b"\0\1\0\0x") -> bytes:
+    return Parcel(number, 0, body).to_wire()
+
+
+def test_a25_a_recording_has_the_topic_of_the_rule_whatever_its_publisher_says() -> None:
+    recorder = Recorder()
+    recorder.receive(described(channel("/emergency_stop")), parcel())
+    assert recorder.sink.written == [("/chatter", b"\0\1\0\0x")]
+    assert [each.topic for each in recorder.sink.channels] == ["/chatter"]
+
+
+def test_a26_a_recorder_keeps_a_bounded_part_of_changing_descriptions() -> None:
+    recorder = Recorder()
+    for number in range(100):
+        recorder.receive(described(channel(definition=f"int8 a{number}\n" + "#\n" * 30_000)), parcel())
+    (sources,) = recorder.inbound._sources.values()
+    assert len(sources) <= 8
+    assert sources.held_bytes <= 1 << 20
+
+
+def test_a26_a_publisher_has_a_bounded_number_of_channels_in_a_recording() -> None:
+    recorder = Recorder()
+    for depth in range(CHANNELS_MAX + 20):
+        recorder.receive(described(channel(depth=depth)), parcel())
+    assert len(recorder.sink.channels) == CHANNELS_MAX
+    recorder.receive(described(channel(depth=1_000)), parcel(), publisher=b"q" * 32)
+    assert len(recorder.sink.channels) == CHANNELS_MAX + 1
+
+
+def test_a26_a_description_that_comes_again_after_it_was_forgotten_has_its_old_channel() -> None:
+    recorder = Recorder()
+    for round_ in range(2):
+        for depth in range(20):
+            recorder.receive(described(channel(depth=depth)), parcel())
+        assert len(recorder.sink.channels) == 20, round_
+    assert len(recorder.sink.written) == 40
+
+
+def test_a26_descriptions_are_bounded_by_their_bytes_and_the_least_used_goes() -> None:
+    sources = Sources[int](count_max=100, bytes_max=100_000, each_max=4)
+    for number in range(200):
+        sources.put(bytes([number]), bytes(20_000), number)
+        assert sources.held_bytes <= 100_000
+    assert sources.get(bytes([199]), bytes(20_000)) == 199
+    for number in range(10):
+        sources.put(b"one", bytes([number]), number)
+    assert (bytes([199]), bytes(20_000)) in sources
+    assert len([number for number in range(10) if (b"one", bytes([number])) in sources]) == 4
+
+
+def test_a26_what_was_refused_costs_once_while_it_is_kept() -> None:
+    recorder = Recorder()
+    recorder.receive(b"\xff" * 100, *[parcel()] * 50)
+    assert recorder.faults.counts["malformed"] == 1
+    assert recorder.inbound.lost == 50
+
+
+def test_a54_a_far_publisher_writes_neither_lines_nor_escapes_into_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    recorder = Recorder()
+    evil = Channel("/chatter", "x\nERROR all is lost\x1b[2J", 2)
+    with caplog.at_level(logging.DEBUG):
+        recorder.receive(described(evil), parcel())
+    text = "".join(record.getMessage() for record in caplog.records)
+    assert "all is lost" in text
+    assert text.isprintable()
+
+
+def test_a54_many_messages_that_cannot_be_taken_are_told_in_a_few_lines(caplog: pytest.LogCaptureFixture) -> None:
+    recorder = Recorder()
+    with caplog.at_level(logging.DEBUG):
+        recorder.receive(described(channel()), *[b""] * 16_000)
+    assert len(caplog.records) <= 3
+    assert sum(len(record.getMessage()) for record in caplog.records) < 1_000
+    assert "10000 times" in caplog.messages[-1]
+    assert recorder.faults.counts["malformed"] == 16_000
+    assert recorder.inbound.lost == 16_000
+
+
+def test_a54_a_fault_tells_far_words_as_one_short_line(caplog: pytest.LogCaptureFixture) -> None:
+    Faults().tell("/t", Fault.OTHER_TYPE, "the far side sends \r\n\x1b]0;owned\x07\u202e" + "x" * 100_000)
+    assert caplog.messages[0].isprintable()
+    assert len(caplog.messages[0]) < 400

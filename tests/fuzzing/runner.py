@@ -1,0 +1,190 @@
+"""The loop that gives a decoder mutated inputs, and what came of it.
+
+An input that runs lines of this project that none before it ran joins the corpus. Lines are traced in one execution of
+``_TRACE_EVERY``, since tracing slows a decoder down by a factor of ten or more.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import random
+import signal
+import sys
+import time
+import tracemalloc
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final
+
+from tests.fuzzing.decoder import Decoder
+from tests.fuzzing.mutation import mutated
+
+__all__ = ["CORPUS", "Finding", "HangError", "Outcome", "corpus_of", "fuzz", "keep"]
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+CORPUS: Final = ROOT / "tests" / "corpus"
+_ROOMS: Final = tuple(str(ROOT / room) for room in ("gdp", "proxy", "fog"))
+_TRACE_EVERY: Final = 8
+_MEMORY_EVERY: Final = 16
+_MEMORY_LEAST_BYTES: Final = 4 << 10  # a shorter input counts as one of this length
+_CORPUS_MAX: Final = 512
+_KEPT_MAX_BYTES: Final = 4 << 10  # of a file that is added to the corpus
+_KEPT_FILES_MAX: Final = 12  # of one decoder; findings are kept beside
+_HANG_S: Final = 10.0
+
+
+class HangError(BaseException):
+    """A decoder took too much processor time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """An input for which a decoder raised what it may not."""
+
+    data: bytes
+    error: str
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What became of one decoder.
+
+    Attributes:
+        findings: the first input of each kind of foreign exception.
+        foreign: executions that raised a foreign exception.
+        slowest_ms: processor time of one execution that was not traced.
+        memory_ratio: most bytes held at a time by one execution, over the length of its input.
+        found: inputs that ran new lines.
+    """
+
+    decoder: Decoder
+    executions: int = 0
+    refused: int = 0
+    foreign: int = 0
+    slowest_ms: float = 0.0
+    memory_ratio: float = 0.0
+    findings: dict[str, Finding] = field(default_factory=dict)
+    found: list[bytes] = field(default_factory=list)
+
+
+def corpus_of(decoder: Decoder) -> list[bytes]:
+    """Return the seeds of a decoder, and what its folder holds."""
+    folder = CORPUS / decoder.name
+    kept = [path.read_bytes() for path in sorted(folder.iterdir())] if folder.is_dir() else []
+    return [*decoder.seeds, *kept]
+
+
+def fuzz(decoder: Decoder, seconds: float, seed: int, executions_max: int | None = None) -> Outcome:
+    """Give a decoder its corpus, then mutated inputs.
+
+    Args:
+        seconds: how long; the corpus is run in any case.
+        executions_max: of mutated inputs; None: as many as there is time for.
+    """
+    rng = random.Random(f"{seed} {decoder.name}")
+    outcome = Outcome(decoder)
+    corpus = corpus_of(decoder)
+    seen: set[tuple[str, int]] = set()
+    for data in corpus:
+        _traced(outcome, data, seen)
+    deadline_s = time.monotonic() + seconds
+    while time.monotonic() < deadline_s and (executions_max is None or outcome.executions < executions_max):
+        data = mutated(decoder, corpus, rng)
+        if outcome.executions % _TRACE_EVERY == 0:
+            if _traced(outcome, data, seen) and len(corpus) < _CORPUS_MAX:
+                corpus.append(data)
+                outcome.found.append(data)
+        elif outcome.executions % _MEMORY_EVERY == 1:
+            _measured(outcome, data)
+        else:
+            begun_s = time.thread_time()
+            _execute(outcome, data)
+            outcome.slowest_ms = max(outcome.slowest_ms, 1e3 * (time.thread_time() - begun_s))
+    return outcome
+
+
+def keep(outcome: Outcome) -> list[Path]:
+    """Write short inputs that ran new lines, and all findings, into the corpus; return the new files."""
+    folder = CORPUS / outcome.decoder.name
+    small = [data for data in outcome.found if len(data) <= _KEPT_MAX_BYTES]
+    room = max(0, _KEPT_FILES_MAX - len(list(folder.iterdir()))) if folder.is_dir() else _KEPT_FILES_MAX
+    written = []
+    for data in [*_minimised(outcome.decoder, small)[:room], *(finding.data for finding in outcome.findings.values())]:
+        path = folder / hashlib.sha256(data).hexdigest()[:16]
+        if not path.exists():
+            folder.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+            written.append(path)
+    return written
+
+
+def _minimised(decoder: Decoder, inputs: Sequence[bytes]) -> list[bytes]:
+    """Return those inputs, shortest first, that run lines which no other one of them and no seed runs."""
+    seen: set[tuple[str, int]] = set()
+    outcome = Outcome(decoder)
+    for data in corpus_of(decoder):
+        _traced(outcome, data, seen)
+    return [data for data in sorted(inputs, key=len) if _traced(outcome, data, seen)]
+
+
+def _execute(outcome: Outcome, data: bytes) -> None:
+    outcome.executions += 1
+    before = signal.signal(signal.SIGPROF, _hang)
+    signal.setitimer(signal.ITIMER_PROF, _HANG_S)
+    try:
+        outcome.decoder.run(data)
+    except outcome.decoder.allowed:
+        outcome.refused += 1
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        outcome.foreign += 1
+        outcome.findings.setdefault(_place(error), Finding(data, f"{type(error).__name__}: {error}"[:200]))
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, before)
+
+
+def _traced(outcome: Outcome, data: bytes, seen: set[tuple[str, int]]) -> bool:
+    """Execute; return whether that ran lines that were not seen before."""
+    count = len(seen)
+
+    def trace(frame: FrameType, event: str, arg: Any) -> Any:
+        name = frame.f_code.co_filename
+        if not name.startswith(_ROOMS):
+            return None
+        seen.add((name, frame.f_lineno))
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        _execute(outcome, data)
+    finally:
+        sys.settrace(before)
+    return len(seen) > count
+
+
+def _measured(outcome: Outcome, data: bytes) -> None:
+    tracemalloc.start()
+    try:
+        _execute(outcome, data)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    outcome.memory_ratio = max(outcome.memory_ratio, peak / max(len(data), _MEMORY_LEAST_BYTES))
+
+
+def _hang(number: int, frame: FrameType | None) -> None:
+    raise HangError(f"more than {_HANG_S:g} s")
+
+
+def _place(error: BaseException) -> str:
+    """Return the kind of an exception and where it was raised, which tells findings apart."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    where = "" if trace is None else f"{Path(trace.tb_frame.f_code.co_filename).name}:{trace.tb_lineno}"
+    return f"{type(error).__name__} {where}"

@@ -1,0 +1,161 @@
+"""Decoders of what comes from the network: frames, statements, certificates, sealed parts, notes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from itertools import count
+from typing import Final
+
+from gdp.control.frames import ControlJoiner, ControlSplitter
+from gdp.control.keepalive import open_keepalive, seal_keepalive
+from gdp.control.presence import Presence
+from gdp.control.replica import Digest, Entry, Fetch, Inventory, Item, Replicas
+from gdp.crypto import cbor
+from gdp.crypto.certificates import Root, Unverified
+from gdp.crypto.envelope import Opener
+from gdp.crypto.kem import KemPublicKey
+from gdp.crypto.keys import PublicKey
+from gdp.crypto.note import NoteOpener, NoteSealer
+from gdp.crypto.statements import Fields, Statement, parse
+from gdp.crypto.subject import Subject
+from gdp.crypto.validity import Validity
+from gdp.crypto.x509_form import read_request
+from gdp.errors import FrameError, LocalError, RemoteError, StatementError
+from gdp.frame import codec
+from gdp.frame.kinds import Flag, Kind
+from gdp.message import bundle
+from gdp.message.report import Missing, Report, ReportFlag
+from gdp.message.status import Start, Status
+from gdp.names import Name
+from gdp.trust.adcert import AdCert
+from gdp.trust.card import Card
+from gdp.trust.claim import ClaimBody
+from gdp.trust.delegation import Delegation
+from gdp.trust.revocation import Revocation
+from tests.fuzzing.decoder import Decoder
+from tests.gdp.control.test_bodies import BODIES
+from tests.gdp.message.sealed import INCARNATION, SECRET, SOURCE, TOPIC, seal
+from tests.gdp.trust.world import CAMERA, DAY, LAB, NOW, ROBOT, SCHOOL, adcert, claim
+
+__all__ = ["DECODERS"]
+
+_A: Final = Name(b"a" * 32)
+_NODE: Final = ROBOT
+_ENTRY: Final = Entry(b"claim", b"cert", _A, _A, _A, (_A,), 9.0, is_from_above=False)
+_READS: Final[dict[str, tuple[bytes, Callable[[Fields], object]]]] = {
+    **{name.replace(" ", "-"): (wire, read) for name, (wire, _, read) in BODIES.items()},
+    "presence": (Presence(_A, 1, _A).to_wire(_NODE.name, _NODE.key, b"cert"), Presence.from_fields),
+    "digest": (Digest(b"", bytes(8), is_last=True).to_wire(_NODE.name, _NODE.key, b"cert"), Digest.from_fields),
+    "fetch": (Fetch((b"a",), ((_A, _A),)).to_wire(_NODE.name, _NODE.key, b"cert"), Fetch.from_fields),
+    "inventory": (
+        Inventory((Item(_A, _A, 1, is_withdrawn=False),), is_last=True).to_wire(_NODE.name, _NODE.key, b"cert"),
+        Inventory.from_fields,
+    ),
+    "replicas": (Replicas((_ENTRY,), is_last=True).to_wire(_NODE.name, _NODE.key, b"cert"), Replicas.from_fields),
+}
+_STATEMENTS: Final[dict[str, tuple[bytes, Callable[[Statement], object]]]] = {
+    "adcert": (adcert(), AdCert.from_statement),
+    "claim": (claim(), ClaimBody.from_statement),
+    "revocation": (Revocation.make(LAB.key, CAMERA, bytes(32), NOW), Revocation.from_statement),
+}
+_FRAMES: Final = seal(1, bytes(500))
+_KEY: Final = bytes(32)
+_HEADER: Final = codec.Header(Kind.KEEPALIVE, Flag.LAST, 64, 0, 16, 1, 0, 1, 1, bytes(32), bytes(_A))
+
+
+def _body(wire: bytes) -> bytes:
+    return cbor.encode(dict(parse(wire).body))
+
+
+def _fields(data: bytes) -> Fields:
+    value = cbor.decode(data)
+    return Fields(value if isinstance(value, Mapping) else {})
+
+
+def _of_fields(read: Callable[[Fields], object]) -> Callable[[bytes], object]:
+    return lambda data: read(_fields(data))
+
+
+def _of_statement(wire: bytes, read: Callable[[Statement], object]) -> Callable[[bytes], object]:
+    statement = parse(wire)
+    return lambda data: read(replace(statement, fields=_fields(data)))
+
+
+def _control(data: bytes) -> object:
+    """Take frames, each after two bytes of its length."""
+    joiner, at, got = ControlJoiner(), 0, []
+    while at + 2 <= len(data):
+        end = at + 2 + int.from_bytes(data[at : at + 2], "big")
+        frame = data[at + 2 : end]
+        at = end
+        got.append(joiner.add(codec.decode(frame), frame, float(len(got))))
+    return got
+
+
+def _control_seed() -> bytes:
+    frames = ControlSplitter(_NODE.name, 7).split(Kind.HELLO, bytes(3_000), 1_500)
+    return b"".join(len(frame).to_bytes(2, "big") + frame for frame in frames)
+
+
+def _envelope(data: bytes) -> object:
+    return Opener(SECRET, Kind.DATA, SOURCE, INCARNATION, TOPIC).open(codec.decode(data), data)
+
+
+def _note(data: bytes) -> object:
+    return NoteOpener(SECRET, Kind.REPORT, SOURCE, 5, TOPIC, TOPIC, 9).open(codec.decode(data), data)
+
+
+def _note_seed() -> bytes:
+    return NoteSealer(SECRET, 1, Kind.REPORT, SOURCE, 5, TOPIC, TOPIC, 9, count(1)).seal(b"body")
+
+
+_REPORT: Final = Report(ReportFlag.NONE, 5, 1, (Missing(5, 1, 2),))
+_STATUS: Final = Status(1, 5, 0, {bytes(32): Start(1, 1)}, b"description")
+
+DECODERS: Final = (
+    Decoder("frame", codec.decode, tuple(_FRAMES[:2]), (FrameError,)),
+    Decoder("control", _control, (_control_seed(),), (FrameError,)),
+    Decoder("cbor", cbor.decode, (cbor.encode({"a": [1, b"x", None, 1.5]}),), (StatementError,), is_cbor=True),
+    Decoder("statement", parse, tuple(wire for wire, _ in _READS.values()), (StatementError,)),
+    *(
+        Decoder(name, _of_fields(read), (_body(wire),), (StatementError,), is_cbor=True)
+        for name, (wire, read) in _READS.items()
+    ),
+    *(
+        Decoder(name, _of_statement(wire, read), (_body(wire),), (StatementError,), is_cbor=True)
+        for name, (wire, read) in _STATEMENTS.items()
+    ),
+    Decoder(
+        "subject",
+        _of_fields(lambda fields: Subject.from_fields(fields, CAMERA.name)),
+        (cbor.encode(CAMERA.to_fields()),),
+        (StatementError,),
+        is_cbor=True,
+    ),
+    Decoder(
+        "validity", _of_fields(Validity.from_fields), (cbor.encode(DAY.to_fields()),), (StatementError,), is_cbor=True
+    ),
+    Decoder("delegation", Delegation.from_wire, (cbor.encode({"format": ""}),), (StatementError,), is_cbor=True),
+    Decoder("card", Card.from_wire, (Card.make(_NODE),), (StatementError,)),
+    Decoder("root", Root.from_wire, (SCHOOL.root.wire,), (StatementError,)),
+    Decoder("membership", Unverified.from_wire, (_NODE.membership,), (StatementError,)),
+    Decoder("request", read_request, (_NODE.membership,), (StatementError,)),
+    Decoder("kem-key", KemPublicKey.from_wire, (_NODE.kem.public.wire,), (StatementError, LocalError)),
+    Decoder("public-key", PublicKey.from_compressed, (LAB.key.public.compressed,), (StatementError,)),
+    Decoder("public-pem", PublicKey.from_pem, (LAB.key.public.to_pem(),), (LocalError, StatementError)),
+    Decoder("envelope", _envelope, tuple(_FRAMES), (RemoteError,)),
+    Decoder("note", _note, (_note_seed(),), (RemoteError,)),
+    Decoder(
+        "keepalive",
+        lambda data: open_keepalive(_KEY, data),
+        (seal_keepalive(_KEY, _HEADER, 0, 3, bytes(8)),),
+        (FrameError,),
+    ),
+    Decoder("report", Report.from_wire, (_REPORT.to_wire(),), (FrameError,)),
+    Decoder("status", Status.from_wire, (_STATUS.to_wire(),), (FrameError,)),
+    Decoder("bundle", bundle.unpack, (bundle.pack([b"a", b"bc"]),), (FrameError,)),
+    Decoder(
+        "name", lambda data: Name.from_text(data.decode("latin-1")), (_A.to_text().encode(),), (LocalError, ValueError)
+    ),
+)

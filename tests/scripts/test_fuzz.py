@@ -1,0 +1,66 @@
+"""The fuzzer, and each decoder for a fraction of a second."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.fuzzing.decoder import Decoder
+from tests.fuzzing.registry import DECODERS
+from tests.fuzzing.runner import corpus_of, fuzz
+from tests.pages import ROOT
+
+SCRIPT = ROOT / "scripts" / "fuzz.py"
+EXECUTIONS = 60  # of mutated inputs for each decoder
+
+
+def run(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, SCRIPT, *words], capture_output=True, text=True, check=False, timeout=120)
+
+
+@pytest.mark.parametrize("decoder", DECODERS, ids=lambda decoder: decoder.name)
+def test_a_decoder_returns_or_raises_an_error_of_its_own(decoder: Decoder) -> None:
+    outcome = fuzz(decoder, 0.2, 1, EXECUTIONS)
+    assert {place: finding.error for place, finding in outcome.findings.items()} == {}
+
+
+def test_every_decoder_has_a_name_of_its_own_and_an_input() -> None:
+    names = [decoder.name for decoder in DECODERS]
+    assert len(set(names)) == len(names)
+    assert all(corpus_of(decoder) for decoder in DECODERS)
+
+
+def test_a_foreign_exception_is_found_and_told_apart_by_its_place() -> None:
+    def bad(data: bytes) -> object:
+        if b"x" in data:
+            return data[1_000_000]
+        raise ValueError("refused")
+
+    outcome = fuzz(Decoder("bad", bad, (b"xyz",), (ValueError,)), 5.0, 1, 200)
+    (finding,) = outcome.findings.values()
+    assert finding.error.startswith("IndexError")
+    assert 0 < outcome.foreign < outcome.executions == outcome.foreign + outcome.refused
+
+
+def test_the_same_seed_gives_the_same_inputs() -> None:
+    taken: list[list[bytes]] = [[], []]
+    for inputs in taken:
+        fuzz(Decoder("same", inputs.append, (b"seed", b"other"), ()), 5.0, 3, 100)
+    assert taken[0] == taken[1]
+
+
+def test_the_script_lists_its_decoders_and_refuses_unknown_ones() -> None:
+    listed = run("--list")
+    assert listed.returncode == 0
+    assert "msg " in listed.stdout
+    assert run("--only", "nonsense").returncode == 2
+
+
+def test_the_script_ends_with_a_table(tmp_path: Path) -> None:
+    done = run("--only", "frame,msg", "--seconds", "0.1")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "2 decoders, 0 with a foreign exception" in done.stdout
+    assert "Examples" in run("--help").stdout
