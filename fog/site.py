@@ -39,6 +39,7 @@ from gdp.nodes.config import LeaseSeconds, SwitchConfig
 from gdp.nodes.schema import Directory, ExistingFile, Ifname, Section, Unique, load, relative
 from gdp.stores.files import private, read_private, write_all
 from gdp.stores.issue import make_domain, make_node, make_owner
+from gdp.stores.ownership import refuse_foreign_folder
 
 __all__ = ["SCRATCH", "ProviderName", "Site", "SiteConfig", "open_site", "peek_site", "save_topology", "state_folder"]
 __all__ += ["topology_now", "with_gateway"]
@@ -235,6 +236,7 @@ def open_site(file: Path | None, state: Path | None = None) -> Site:
     file, config, folder = _stands_where(file, state)
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        refuse_foreign_folder(folder, "its keys admit machines and let them serve")
     except OSError as error:
         raise LocalError(f"{folder}: {error.strerror}") from error
     with (folder / "site.lock").open("a") as lock:
