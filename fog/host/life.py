@@ -1,7 +1,8 @@
 """One life of a program: started, listened to, ended.
 
 Place: shell. Each leads a session of its own, so that what it starts ends with it; the kernel kills it when the
-machine's own process ends, however that comes about (``PR_SET_PDEATHSIG``, by setpriv(1)).
+machine's own process ends, however that comes about (``PR_SET_PDEATHSIG``, by setpriv(1)). It inherits no
+credentials of the environment (``fog/child_environment``).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
+from fog.child_environment import child_environment
 from fog.host.bounded_log import BoundedLog
 from fog.machine import Program
 
@@ -54,7 +56,7 @@ class Life:
                 stdout=says,
                 stderr=says,
                 cwd=home,
-                env={**os.environ, "PYTHONUNBUFFERED": "1", **environment},
+                env={**child_environment(os.environ), "PYTHONUNBUFFERED": "1", **environment},
                 start_new_session=True,
             )
         except OSError:
