@@ -20,7 +20,8 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.stores.ownership import refuse_foreign_file, refuse_shared_folder
 
-__all__ = ["FILE_MAX_BYTES", "NewFile", "private", "public", "read_private", "read_public", "write_all"]
+__all__ = ["FILE_MAX_BYTES", "NewFile", "private", "public", "read_private", "read_public", "refuse_existing"]
+__all__ += ["write_all"]
 
 FILE_MAX_BYTES: Final = 1 << 20
 _PRIVATE_MODE: Final = 0o600
@@ -63,8 +64,8 @@ def write_all(directory: Path, files: Mapping[str, NewFile], *, force: bool = Fa
         if any(not new.mode & (stat.S_IRWXG | stat.S_IRWXO) for new in files.values()):
             refuse_shared_folder(directory)
         for name in files:
-            if not force and os.path.lexists(directory / name):
-                raise LocalError(f"{directory / name}: is there already; --force replaces it")
+            if not force:
+                refuse_existing(directory / name)
         for name, new in files.items():
             _write(directory / name, new, force=force)
     except OSError as error:
@@ -88,6 +89,16 @@ def read_private(path: Path) -> bytes:
             write to its directory, or as for ``read_public``.
     """
     return _read(path, is_private=True)
+
+
+def refuse_existing(path: Path) -> None:
+    """Refuse to replace a file, or a link of its name.
+
+    Raises:
+        LocalError: it is there already.
+    """
+    if os.path.lexists(path):
+        raise LocalError(f"{path}: is there already; --force replaces it")
 
 
 def _write(path: Path, new: NewFile, *, force: bool) -> None:
