@@ -130,6 +130,18 @@ class SiteConfig(Section):
         return self
 
     @model_validator(mode="after")
+    def _has_something_to_install(self) -> SiteConfig:
+        """A machine that installs nothing boots, costs, and never serves."""
+        setups = {"aws": self.aws.setup, "skypilot": self.skypilot.setup}
+        has_image = bool(self.aws.images) if self.provider == "aws" else False
+        if self.provider in setups and not setups[self.provider].has_requirements and not has_image:
+            raise ValueError(
+                f"machines of {self.provider} have nothing to install: name the wheels of this package and of the"
+                f" nodes, each with its hash, in {self.provider}.setup.requirements or requirements_file"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _gateways_can_be_made(self) -> SiteConfig:
         if self.provider != "local" and self.topology != AUTOMATIC:
             raise ValueError(

@@ -6,8 +6,8 @@ takes at most 16 KiB of user data, before base64, and cloud-init reads it gzippe
 
 ``cloud_config`` is for providers that take user data, ``shell_script`` for those that only run a script as root; both
 come to the same files. What programs say goes to the journal and the console under their names, ``switch[712]: ...``;
-``lines_of`` finds it there. What is installed is named by ``Setup.requirements``, for pip: the package is on no public
-index yet, so a wheel's URL belongs there. A machine whose programs are done powers itself off.
+``lines_of`` finds it there. What pip installs is pinned by hash (``requirements``), for it runs beside the machine's
+keys. A machine whose programs are done powers itself off.
 """
 
 from __future__ import annotations
@@ -21,14 +21,15 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv6Address
-from typing import Final
+from typing import Annotated, Final
 
 import yaml
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from fog.host.bundle import BOOT_FILE, read_programs
+from fog.providers.requirements import pinned, read_requirements
 from gdp.errors import LocalError
-from gdp.nodes.schema import Section
+from gdp.nodes.schema import ExistingFile, Section
 
 __all__ = ["HOME", "USER_DATA_MAX_BYTES", "VXLAN_PORT", "Placed", "Setup", "Vxlan", "cloud_config", "placed"]
 __all__ += ["lines_of", "shell_script", "user_data"]
@@ -37,6 +38,7 @@ HOME: Final = "/var/lib/fog"
 USER_DATA_MAX_BYTES: Final = 16 * 1024
 VXLAN_PORT: Final = 4789  # RFC 7348
 _INSTALLED: Final = "/opt/fog"
+_REQUIREMENTS: Final = "/etc/fog-requirements.txt"
 _INSTALL: Final = "/usr/local/sbin/fog-install"
 _PACKAGES: Final = ("python3-venv", "iproute2", "util-linux")
 _PRIVATE: Final = 0o600
@@ -67,14 +69,21 @@ class Vxlan(Section):
 
 
 class Setup(Section):
-    """What a machine installs beside its boot: ``requirements`` for pip, such as ``gdp-ros[ros2]``, a wheel's URL or
-    the package that holds the nodes; ``packages`` of the distribution, beside those that are needed anyway. Without
-    ``vxlan`` the devices that the boot's switch names must be there without it.
+    """What a machine installs beside its boot: for pip, each with its hash, ``requirements`` (the wheel of this package,
+    those with the nodes, and all that they need) and the file ``requirements_file``; ``packages`` of the distribution,
+    beside those that are needed anyway. Without ``vxlan`` the devices that the boot's switch names must be there
+    without it. There is no default for pip: a name that nobody holds on an index would be somebody's to take.
     """
 
-    requirements: tuple[str, ...] = Field(default=("gdp-ros[ros2]",), min_length=1)
+    requirements: tuple[Annotated[str, AfterValidator(pinned)], ...] = ()
+    requirements_file: ExistingFile | None = None
     packages: tuple[str, ...] = ()
     vxlan: Vxlan | None = None
+
+    @property
+    def has_requirements(self) -> bool:
+        """Return whether pip installs anything; else the image brings ``/opt/fog``."""
+        return bool(self.requirements) or self.requirements_file is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,12 +107,13 @@ def placed(files: Mapping[str, bytes], setup: Setup) -> list[Placed]:
         files: a packed boot: path below the machine's folder -> content.
 
     Raises:
-        LocalError: a path leads out of that folder.
+        LocalError: a path leads out of that folder, or the file of requirements is not pinned by hash.
     """
     for path in files:
         if path.startswith("/") or ".." in path.split("/"):
             raise LocalError(f"a boot's file {path!r} lies outside the machine's folder")
     own = [Placed(f"{HOME}/{path}", content) for path, content in sorted(files.items())]
+    own.append(Placed(_REQUIREMENTS, _requirements(setup), 0o644))
     own.append(Placed(_INSTALL, _install(setup).encode(), 0o755))
     own.append(Placed("/etc/systemd/system/fog-machine.service", _service(setup).encode(), 0o644))
     own.append(Placed("/etc/systemd/system/fog-log@.service", _LOG.encode(), 0o644))
@@ -145,7 +155,8 @@ def user_data(files: Mapping[str, bytes], setup: Setup) -> bytes:
     if len(data) > USER_DATA_MAX_BYTES:
         raise LocalError(
             f"the machine's files come to {len(data)} bytes of user data, EC2 takes {USER_DATA_MAX_BYTES}: "
-            "put what is large (models, meshes, code) into a package named in `requirements`"
+            "put what is large (models, meshes, code) into a package named in `requirements`, and keep of a "
+            "requirements file the hashes for the machines' platform only"
         )
     return data
 
@@ -191,13 +202,24 @@ def _start(files: Mapping[str, bytes], setup: Setup) -> list[str]:
 
 def _install(setup: Setup) -> str:
     # the service runs it before each start, so that an index that cannot be reached now is asked again
+    if not setup.has_requirements:
+        return f"""#!/bin/sh
+[ -x {_INSTALLED}/bin/fog-machine ] && exit 0
+echo 'nothing is installed: name it, pinned by hash, in requirements or requirements_file of setup' >&2
+exit 1
+"""
     return f"""#!/bin/sh
 set -eu
 [ -e {_INSTALLED}/complete ] && exit 0
 python3 -m venv {_INSTALLED}
-{_INSTALLED}/bin/pip install --no-input --quiet -- {shlex.join(setup.requirements)}
+{_INSTALLED}/bin/pip install --no-input --quiet --require-hashes --requirement {_REQUIREMENTS}
 touch {_INSTALLED}/complete
 """
+
+
+def _requirements(setup: Setup) -> bytes:
+    own = b"" if setup.requirements_file is None else read_requirements(setup.requirements_file).rstrip() + b"\n"
+    return own + "".join(f"{each}\n" for each in setup.requirements).encode()
 
 
 def _service(setup: Setup) -> str:
