@@ -27,6 +27,7 @@ import yaml
 from pydantic import AfterValidator, Field
 
 from fog.host.bundle import BOOT_FILE, read_programs
+from fog.host.life import NODE_USER
 from fog.providers.requirements import pinned, read_requirements
 from gdp.errors import LocalError
 from gdp.nodes.schema import ExistingFile, Section
@@ -42,6 +43,43 @@ _REQUIREMENTS: Final = "/etc/fog-requirements.txt"
 _INSTALL: Final = "/usr/local/sbin/fog-install"
 _PACKAGES: Final = ("python3-venv", "iproute2", "util-linux")
 _PRIVATE: Final = 0o600
+_NODE_USER: Final = "fog-node"  # runs the users' nodes: it reads no key of the machine
+_NODE_HOME: Final = "/var/lib/fog-node"
+_MAKE_USER: Final = (
+    f"id -u {_NODE_USER} >/dev/null 2>&1 || useradd --system --user-group --shell /usr/sbin/nologin"
+    f" --home-dir {_NODE_HOME} --create-home {_NODE_USER}"
+)
+# Source: systemd.exec(5), systemd.resource-control(5). Root without most capabilities: it changes to the nodes' user
+# (SETUID, SETGID, SETPCAP), ends their processes (KILL), and meets ROS's files of that user (DAC_OVERRIDE).
+_FENCES: Final = f"""NoNewPrivileges=yes
+CapabilityBoundingSet=CAP_NET_RAW CAP_NET_ADMIN CAP_BPF CAP_PERFMON CAP_SETUID CAP_SETGID CAP_SETPCAP CAP_KILL
+CapabilityBoundingSet=CAP_DAC_OVERRIDE
+ProtectSystem=strict
+ReadWritePaths={HOME} -{_NODE_HOME}
+ProtectHome=yes
+PrivateTmp=yes
+ProtectClock=yes
+ProtectControlGroups=yes
+ProtectHostname=yes
+ProtectKernelLogs=yes
+ProtectKernelModules=yes
+LockPersonality=yes
+RestrictNamespaces=yes
+RestrictSUIDSGID=yes
+RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK AF_PACKET
+SystemCallArchitectures=native
+SystemCallFilter=@system-service bpf capset seccomp landlock_create_ruleset landlock_add_rule landlock_restrict_self
+SystemCallErrorNumber=EPERM
+MemoryMax=90%
+LimitNOFILE=65536
+RuntimeDirectory=fog
+RuntimeDirectoryMode=0700
+"""
+_CLOSE: Final = (
+    ["chmod", "-R", "go-rwx", HOME],
+    ["chmod", "go+x", HOME],  # to what nodes of their own user read, by its path
+    ["find", HOME, "-maxdepth", "1", "-name", "*.xml", "-exec", "chmod", "go+r", "{}", "+"],  # the middleware's profile
+)
 _LOG: Final = f"""[Unit]
 Description=The log of a machine's program %i, for the journal and the console
 
@@ -69,10 +107,10 @@ class Vxlan(Section):
 
 
 class Setup(Section):
-    """What a machine installs beside its boot: for pip, each with its hash, ``requirements`` (the wheel of this package,
-    those with the nodes, and all that they need) and the file ``requirements_file``; ``packages`` of the distribution,
-    beside those that are needed anyway. Without ``vxlan`` the devices that the boot's switch names must be there
-    without it. There is no default for pip: a name that nobody holds on an index would be somebody's to take.
+    """What a machine installs beside its boot: for pip, each with its hash, ``requirements`` (the wheel of this
+    package, those with the nodes, and all that they need) and the file ``requirements_file``; ``packages`` of the
+    distribution, beside those that are needed anyway. Without ``vxlan`` the devices that the boot's switch names must
+    be there without it. There is no default for pip: a name that nobody holds on an index would be somebody's to take.
     """
 
     requirements: tuple[Annotated[str, AfterValidator(pinned)], ...] = ()
@@ -140,7 +178,7 @@ def cloud_config(files: Mapping[str, bytes], setup: Setup) -> str:
         "package_update": True,
         "packages": [*_PACKAGES, *setup.packages],
         "write_files": written,
-        "runcmd": [["chmod", "-R", "go-rwx", HOME], *(shlex.split(line) for line in _start(files, setup))],
+        "runcmd": [*_CLOSE, *(shlex.split(line) for line in _start(files, setup))],
     }
     return "#cloud-config\n" + yaml.safe_dump(config, sort_keys=False, width=4096)
 
@@ -171,7 +209,7 @@ def shell_script(files: Mapping[str, bytes], setup: Setup) -> str:
         "set -euo pipefail",
         "base64 -d <<'EOF' | sudo tar --extract --gzip --no-same-owner --directory / --file -",
         f"{_tar(files, setup)}EOF",
-        f"sudo chmod -R go-rwx {HOME}",
+        *(f"sudo {shlex.join(line)}" for line in _CLOSE),
         f"sudo env DEBIAN_FRONTEND=noninteractive apt-get install -qq {shlex.join([*_PACKAGES, *setup.packages])}",
         *(f"sudo {line}" for line in _start(files, setup)),
     ]
@@ -204,12 +242,14 @@ def _install(setup: Setup) -> str:
     # the service runs it before each start, so that an index that cannot be reached now is asked again
     if not setup.has_requirements:
         return f"""#!/bin/sh
+{_MAKE_USER}
 [ -x {_INSTALLED}/bin/fog-machine ] && exit 0
 echo 'nothing is installed: name it, pinned by hash, in requirements or requirements_file of setup' >&2
 exit 1
 """
     return f"""#!/bin/sh
 set -eu
+{_MAKE_USER}
 [ -e {_INSTALLED}/complete ] && exit 0
 python3 -m venv {_INSTALLED}
 {_INSTALLED}/bin/pip install --no-input --quiet --require-hashes --requirement {_REQUIREMENTS}
@@ -232,8 +272,10 @@ StartLimitIntervalSec=0
 SuccessAction=poweroff
 
 [Service]
-ExecStartPre={_INSTALL}
+ExecStartPre=+{_INSTALL}
 ExecStart={_INSTALLED}/bin/fog-machine --home {HOME}
+Environment={NODE_USER}={_NODE_USER} FASTDDS_BUILTIN_TRANSPORTS=UDPv4
+Environment=XDG_RUNTIME_DIR=%t/fog HOME={HOME} ROS_HOME={HOME}/ros
 TimeoutStartSec=20min
 Restart=on-failure
 RestartSec=5
@@ -241,7 +283,7 @@ KillMode=mixed
 SyslogIdentifier=fog-machine
 StandardOutput=journal+console
 StandardError=journal+console
-
+{_FENCES}
 [Install]
 WantedBy=multi-user.target
 """

@@ -108,6 +108,7 @@ class SwitchConfig(Section):
     lease_s: LeaseSeconds = CLAIM_LEASE_S
     keepalive_ms: KeepaliveMs = KEEPALIVE_MS
     detect_multiplier: DetectMultiplier = DETECT_MULTIPLIER
+    sandbox: bool = True
 
     def timing_of(self, port: PortConfig) -> Timing:
         """Return what is wanted of keepalives on a port."""
@@ -211,6 +212,7 @@ class RibConfig(Section):
     snapshot: NewFile | None = None
     quotas: Quotas = Quotas()
     metrics: Metrics | None = None
+    sandbox: bool = True
 
     @model_validator(mode="after")
     def _a_shared_store_needs_no_copies(self) -> RibConfig:
