@@ -38,6 +38,7 @@ from gdp.nodes.schema import (
 )
 from gdp.ports.kernel.shapes import ENTRIES_DEFAULT
 from gdp.stores.cluster_address import ClusterAddress
+from gdp.stores.files import read_private
 
 __all__ = ["DataPlane", "LeaseSeconds", "PortConfig", "Quotas", "RibConfig", "SwitchConfig"]
 
@@ -176,8 +177,13 @@ class ClusterConfig(Section):
     key: ExistingFile | None = None
 
     def address(self) -> ClusterAddress:
-        """Return what the store connects to; the password's file is read now."""
-        password = "" if self.password_file is None else self.password_file.read_text().strip()
+        """Return what the store connects to; the password's file is read now.
+
+        Raises:
+            LocalError: that file is not private.
+        """
+        file = self.password_file
+        password = "" if file is None else read_private(file).decode("utf-8", "replace").strip()
         split = (node.rpartition(":") for node in self.nodes)
         nodes = tuple((host.strip("[]"), int(port)) for host, _, port in split)
         return ClusterAddress(nodes, self.username, password, self.ca, self.cert, self.key)

