@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from fog.providers.cloud_init import Setup, placed
 from gdp.crypto.certificates import Role
 from gdp.metadata import Metadata
 from gdp.ports.confine import landlock
@@ -138,7 +139,7 @@ def test_a53_commands_that_are_up_keep_only_what_they_need(commands: Commands, s
     switch.until("port=p0 up=True")
     switch.process.send_signal(signal.SIGHUP)
     assert [proxy.end(), rib.end(), switch.end()] == [0, 0, 0]
-    assert (commands.home / "kept" / "received.mcap").exists()
+    assert {path.name for path in (commands.home / "kept").iterdir()} == {"received.mcap", "routes"}
     left = subprocess.run(["ip", "-o", "link"], capture_output=True, text=True, check=True).stdout
     assert "rib0" not in left
     assert "proxy0" not in left
@@ -173,6 +174,28 @@ def test_a53_a_revocation_is_read_after_rights_are_given_away(commands: Commands
     switch.until("revocation not taken")
     assert "Permission denied" not in switch.log.read_text()
     assert switch.end() == 0
+
+
+def test_a52_only_root_reaches_the_metadata_service(space: Space) -> None:
+    (script,) = (file for file in placed({}, Setup()) if file.path.endswith("fog-install"))
+    rules = [line for line in script.content.decode().splitlines() if line.startswith("ip ")]
+    space.ip("add", "p0", "type", "bridge")
+    for words in ("addr add 169.254.169.1/24 dev p0", "link set p0 up"):
+        subprocess.run(["ip", *words.split()], check=True)
+
+    def reaches(uid: int, port: int) -> bool:
+        words = f"ip route get 169.254.169.254 uid {uid} ipproto tcp dport {port}"
+        return not subprocess.run(words.split(), capture_output=True, check=False).returncode
+
+    assert reaches(1_000, 80)
+    for _ in range(2):  # at each start of the service
+        subprocess.run(["sh", "-euc", "\n".join(rules)], check=True)
+    assert not reaches(1_000, 80)
+    assert not reaches(65_534, 80)
+    assert reaches(0, 80)
+    assert reaches(1_000, 443)
+    shown = subprocess.run(["ip", "rule"], capture_output=True, text=True, check=True).stdout
+    assert shown.count("169.254.169.254") == 1
 
 
 def test_a53_the_sandbox_can_be_left_out(commands: Commands) -> None:

@@ -49,6 +49,13 @@ _MAKE_USER: Final = (
     f"id -u {_NODE_USER} >/dev/null 2>&1 || useradd --system --user-group --shell /usr/sbin/nologin"
     f" --home-dir {_NODE_HOME} --create-home {_NODE_USER}"
 )
+# User data, with the machine's keys, can be read from the metadata service: only root's programs reach it. By rules of
+# routing, which need no packet filter; name service on that address (UDP) is left alone.
+_METADATA: Final = "".join(
+    f"{ip} rule del pref 90 2>/dev/null || true\n"
+    f"{ip} rule add pref 90 uidrange 1-4294967294 ipproto tcp dport 80 to {address} prohibit{otherwise}\n"
+    for ip, address, otherwise in (("ip", "169.254.169.254", ""), ("ip -6", "fd00:ec2::254", " || true"))
+)
 # Source: systemd.exec(5), systemd.resource-control(5). Root without most capabilities: it changes to the nodes' user
 # (SETUID, SETGID, SETPCAP), ends their processes (KILL), and meets ROS's files of that user (DAC_OVERRIDE).
 _FENCES: Final = f"""NoNewPrivileges=yes
@@ -242,15 +249,16 @@ def _install(setup: Setup) -> str:
     # the service runs it before each start, so that an index that cannot be reached now is asked again
     if not setup.has_requirements:
         return f"""#!/bin/sh
+set -eu
 {_MAKE_USER}
-[ -x {_INSTALLED}/bin/fog-machine ] && exit 0
+{_METADATA}[ -x {_INSTALLED}/bin/fog-machine ] && exit 0
 echo 'nothing is installed: name it, pinned by hash, in requirements or requirements_file of setup' >&2
 exit 1
 """
     return f"""#!/bin/sh
 set -eu
 {_MAKE_USER}
-[ -e {_INSTALLED}/complete ] && exit 0
+{_METADATA}[ -e {_INSTALLED}/complete ] && exit 0
 python3 -m venv {_INSTALLED}
 {_INSTALLED}/bin/pip install --no-input --quiet --require-hashes --requirement {_REQUIREMENTS}
 touch {_INSTALLED}/complete
