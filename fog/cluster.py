@@ -111,5 +111,7 @@ class ClusterPlan:
                 items["budget_usd"],
                 items.get("availability"),
             )
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except json.JSONDecodeError as error:
+            raise LocalError(f"line {error.lineno}: JSON is expected: {error.msg}") from error
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise LocalError(f"not the plan of a cluster: {error!r}") from error

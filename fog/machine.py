@@ -48,6 +48,8 @@ class Program:
         ready: what a line of its output contains when it is up; empty: it is up when it runs.
         environment: beside the machine's own; ``{home}`` as in ``argv``.
         restarts: whether it is started again when it ends; else its end ends the machine.
+        is_users: it runs the user's code: where the machine has a user for that, as this one, without a capability and
+            without a way to the machine's keys.
     """
 
     name: str
@@ -55,6 +57,7 @@ class Program:
     ready: str = ""
     environment: Mapping[str, str] = field(default_factory=dict)
     restarts: bool = True
+    is_users: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,6 +39,7 @@ from gdp.nodes.config import LeaseSeconds, SwitchConfig
 from gdp.nodes.schema import Directory, ExistingFile, Ifname, Section, Unique, load, relative
 from gdp.stores.files import private, read_private, write_all
 from gdp.stores.issue import make_domain, make_node, make_owner
+from gdp.stores.ownership import refuse_foreign_folder
 
 __all__ = ["SCRATCH", "ProviderName", "Site", "SiteConfig", "open_site", "peek_site", "save_topology", "state_folder"]
 __all__ += ["topology_now", "with_gateway"]
@@ -125,6 +126,18 @@ class SiteConfig(Section):
             raise ValueError(
                 f"machine_iface is {self.device}, but the tunnel of {self.provider}.setup.vxlan is {self._tunnel}:"
                 " leave machine_iface out, or let both say the same"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _has_something_to_install(self) -> SiteConfig:
+        """A machine that installs nothing boots, costs, and never serves."""
+        setups = {"aws": self.aws.setup, "skypilot": self.skypilot.setup}
+        has_image = bool(self.aws.images) if self.provider == "aws" else False
+        if self.provider in setups and not setups[self.provider].has_requirements and not has_image:
+            raise ValueError(
+                f"machines of {self.provider} have nothing to install: name the wheels of this package and of the"
+                f" nodes, each with its hash, in {self.provider}.setup.requirements or requirements_file"
             )
         return self
 
@@ -235,6 +248,7 @@ def open_site(file: Path | None, state: Path | None = None) -> Site:
     file, config, folder = _stands_where(file, state)
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        refuse_foreign_folder(folder, "its keys admit machines and let them serve")
     except OSError as error:
         raise LocalError(f"{folder}: {error.strerror}") from error
     with (folder / "site.lock").open("a") as lock:

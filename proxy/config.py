@@ -80,6 +80,9 @@ class ProxyConfig(Section):
         le=SPIN_MAX_US,
         description="Microseconds to look for more frames before sleeping, where most waits were shorter. 0: never.",
     )
+    sandbox: bool = Field(
+        default=True, description="Whether the process gives away the rights that it needs no more once it is up."
+    )
 
     @classmethod
     def load(cls, path: Path) -> ProxyConfig:

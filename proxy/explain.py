@@ -16,7 +16,7 @@ from gdp.trust.right import Right
 from proxy.endpoints.endpoint import End, Graph, Role
 from proxy.finding import Direction, Finding, Match
 from proxy.rules.choice import choose, imported
-from proxy.rules.rule import Kind, Rule
+from proxy.rules.rule import SALT, Kind, Rule
 from proxy.serial.channel import Qos
 
 __all__ = ["Delegated", "explain"]
@@ -215,15 +215,20 @@ def _qos_in_words(qos: Qos) -> str:
     return f"{qos.reliability}, {qos.durability}".replace("_", " ")
 
 
+def _shown(metadata: Metadata) -> dict[str, str | int]:
+    """Return metadata without the salt's text."""
+    return {key: "(hidden)" if key == SALT else value for key, value in metadata.items()}
+
+
 def _how_to_delegate(metadata: Metadata, right: str) -> str:
     """Return how the owner makes the delegation: a command, as far as one can state these metadata."""
     words = ["gdp", "delegate", "name", "--owner", "OWNER", "--card", "node.card", "--right", right]
     for key, value in metadata.items():
         if isinstance(value, int) and key != "pin":
-            return f"its owner makes one for these metadata: {dict(metadata)}"
+            return f"its owner makes one for these metadata: {_shown(metadata)}"
         if key in ("kind", "name", "type", *_OPTIONS) or isinstance(value, int):
             words += [f"--{key}", str(value)]
         else:
-            words += ["--meta", f"{key}={value}"]
+            words += ["--salt-file", "FILE"] if key == SALT else ["--meta", f"{key}={value}"]
     words += ["--out", f"{str(metadata['name']).strip('/').replace('/', '_')}.delegation"]
     return f"its owner makes one with: {shlex.join(words)}"

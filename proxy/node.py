@@ -26,6 +26,7 @@ from gdp.names import Name
 from gdp.nodes.counts import count_list
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
+from gdp.nodes.rights import confine_proxy
 from gdp.nodes.runtime import Runtime
 from gdp.nodes.single_instance import run_alone
 from gdp.nodes.uplink import open_uplink
@@ -137,6 +138,9 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
         node = ProxyNode(identity, member, runtime, plane, node_log)
         stack.callback(signal.signal, signal.SIGUSR1, signal.signal(signal.SIGUSR1, node.leave_soon))
         stack.enter_context(runtime.signals(node.reload))
+        if config.sandbox:
+            recordings = () if config.record is None else (config.record.path.parent,)
+            confine_proxy((config.identity, config.delegations), recordings, has_ros=bool(config.ros))
         if config.metrics is not None:
             from gdp.telemetry.metrics import Metrics
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 
 import typer
 
+from fog.child_environment import child_environment
 from fog.launch.resolve import PYTHON, command_line
 from gdp.errors import LocalError
 
@@ -64,7 +65,7 @@ def run(nodes: Sequence[Started], logs: Path) -> int:
 
 
 def _start(each: RobotNode, words: Sequence[str], path: Path) -> subprocess.Popen[bytes]:
-    environment = {**os.environ, **each.node.environment}
+    environment = {**child_environment(os.environ, has_desktop=True), **each.node.environment}
     if each.output in ("screen", "both"):
         return subprocess.Popen(words, env=environment)
     path.parent.mkdir(mode=0o700, exist_ok=True)

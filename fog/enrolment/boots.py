@@ -113,7 +113,7 @@ def machine_boot(
     environment = {"FOG_CLUSTER": plan.name, "FOG_MACHINE": name, "ROS_DOMAIN_ID": str(domain)}
     environment |= dict.fromkeys(_PROFILES, f"{{home}}/{_PROFILE}") | (_UDP_ONLY if shares_host else {})
     nodes = [
-        Program(name, tuple(command(node)), environment={**environment, **node.environment})
+        Program(name, tuple(command(node)), environment={**environment, **node.environment}, is_users=True)
         for name, node in zip(node_names(plan), plan.nodes, strict=True)
     ]
     programs = (*nodes, _switch(), _proxy(environment))

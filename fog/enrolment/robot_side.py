@@ -2,7 +2,8 @@
 
 Place: I/O; edits files that are at hand, signals processes of this machine.
 A rule that the file already has, also one with a pattern, is enough. Otherwise one line is added for each name, marked
-with the cluster's, and taken out again when the cluster is gone; nothing else of the file is touched.
+with the cluster's, and taken out again when the cluster is gone; nothing else of the file is touched. A file that is
+private, or that has the salt of a name in it, is private afterwards.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import json
 import os
 import re
 import signal
+import stat
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,7 +23,7 @@ from fog.cluster import Carried
 from fog.enrolment.boots import robot_rule
 from fog.enrolment.members import Authority, metadata_of
 from gdp.errors import LocalError
-from gdp.stores.files import public, write_all
+from gdp.stores.files import private, public, write_all
 from gdp.stores.keyring import load_public_key
 from proxy.config import ProxyConfig
 from proxy.rules import choice
@@ -34,6 +36,7 @@ _EMPTY: Final = re.compile(r"^import:[ \t]*\n(?=[^\s#-]|\Z)", re.MULTILINE)  # a
 _NEXT: Final = re.compile(r"^[^\s#-]", re.MULTILINE)
 _PROGRAMS: Final = ("gdp-proxy", "proxy.cli")
 _CAUGHT: Final = re.compile(r"^SigCgt:\s*([0-9a-f]+)$", re.MULTILINE)
+_SALT: Final = re.compile(r"""\bsalt["']?[ \t]*:""")  # under `metadata`
 _ITEM: Final = re.compile(r"^(?P<indent>[ \t]*)-[ \t]", re.MULTILINE)
 
 
@@ -139,4 +142,6 @@ def _with_lines(text: str, rules: Sequence[str]) -> str:
 
 
 def _write(path: Path, text: str) -> None:
-    write_all(path.parent, {path.name: public(text.encode())}, force=True)
+    is_private = not path.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO)
+    new = private if is_private or _SALT.search(text) else public
+    write_all(path.parent, {path.name: new(text.encode())}, force=True)

@@ -57,9 +57,20 @@ def read_programs(content: bytes) -> tuple[Program, ...]:
     """
     try:
         told = json.loads(content)["programs"]
-        return tuple(Program(**{**each, "argv": tuple(each["argv"])}) for each in told)
-    except (ValueError, KeyError, TypeError) as error:
+        programs = tuple(Program(**{**each, "argv": tuple(each["argv"])}) for each in told)
+        for program in programs:
+            _refuse_what_cannot_start(program)
+    except json.JSONDecodeError as error:
+        raise LocalError(f"{BOOT_FILE}:{error.lineno}: JSON is expected: {error.msg}") from error
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise LocalError(f"{BOOT_FILE} is none: {error!r}") from error
+    return programs
+
+
+def _refuse_what_cannot_start(program: Program) -> None:
+    texts = (program.name, program.ready, *program.argv, *program.environment, *program.environment.values())
+    if not program.argv or not all(isinstance(text, str) and "\0" not in text for text in texts):
+        raise LocalError(f"{BOOT_FILE} is none: program {program.name!r} has no words, or other things than text")
 
 
 def install(home: Path, boot: Boot) -> None:

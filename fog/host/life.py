@@ -1,13 +1,15 @@
 """One life of a program: started, listened to, ended.
 
 Place: shell. Each leads a session of its own, so that what it starts ends with it; the kernel kills it when the
-machine's own process ends, however that comes about (``PR_SET_PDEATHSIG``, by setpriv(1)).
+machine's own process ends, however that comes about (``PR_SET_PDEATHSIG``, by setpriv(1)). It inherits no
+credentials of the environment (``fog/child_environment``).
 """
 
 from __future__ import annotations
 
 import asyncio
 import os
+import pwd
 import signal
 import subprocess
 import sys
@@ -16,10 +18,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
+from fog.child_environment import child_environment
 from fog.host.bounded_log import BoundedLog
 from fog.machine import Program
 
-__all__ = ["Life"]
+__all__ = ["NODE_USER", "Life"]
+
+NODE_USER: Final = "FOG_NODE_USER"  # the variable that names the user who runs nodes; without it: the machine's own
 
 _READ_BYTES: Final = 1 << 16
 
@@ -28,12 +33,12 @@ class Life:
     """A process that runs.
 
     Args:
-        home: the machine's folder; the process begins there.
+        home: the machine's folder; the process begins there, or in the home of ``FOG_NODE_USER``.
         log: takes what it says.
         on_ready: called when it is up.
 
     Raises:
-        OSError: it cannot be started.
+        OSError: it cannot be started, or there is no such user as ``FOG_NODE_USER`` says.
     """
 
     def __init__(self, program: Program, home: Path, log: BoundedLog, on_ready: Callable[[], None]) -> None:
@@ -45,16 +50,18 @@ class Life:
         self.ended: asyncio.Future[int] = self._loop.create_future()
         words = [word.replace("{home}", str(home)).replace("{python}", sys.executable) for word in program.argv]
         environment = {key: value.replace("{home}", str(home)) for key, value in program.environment.items()}
+        user = os.environ.get(NODE_USER, "") if program.is_users else ""
+        own = _home_of(user)
         self._hears, says = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         os.set_blocking(says, True)  # ours alone must not wait
         try:
             self._process: subprocess.Popen[bytes] = subprocess.Popen(
-                ["setpriv", "--pdeathsig", "KILL", "--", *words],
+                ["setpriv", "--pdeathsig", "KILL", *_as_user(user), "--", *words],
                 stdin=subprocess.DEVNULL,
                 stdout=says,
                 stderr=says,
-                cwd=home,
-                env={**os.environ, "PYTHONUNBUFFERED": "1", **environment},
+                cwd=own.get("HOME", home),
+                env={**child_environment(os.environ), "PYTHONUNBUFFERED": "1", **own, **environment},
                 start_new_session=True,
             )
         except OSError:
@@ -122,3 +129,21 @@ class Life:
         os.close(self._hears)
         self._on_ready = None
         self.ended.set_result(self._process.wait())
+
+
+def _as_user(user: str) -> list[str]:
+    """Return the options of setpriv(1) by which a program runs as another user, without any capability to come."""
+    if not user:
+        return []
+    rights = ["--inh-caps=-all", "--ambient-caps=-all", "--bounding-set=-all", "--no-new-privs"]
+    return ["--reuid", user, "--regid", user, "--init-groups", *rights]
+
+
+def _home_of(user: str) -> dict[str, str]:
+    if not user:
+        return {}
+    try:
+        home = pwd.getpwnam(user).pw_dir
+    except KeyError as error:
+        raise FileNotFoundError(f"no user {user}, whom {NODE_USER} names") from error
+    return {"HOME": home, "USER": user, "LOGNAME": user, "ROS_HOME": f"{home}/.ros", "XDG_RUNTIME_DIR": home}

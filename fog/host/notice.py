@@ -6,6 +6,7 @@ Place: the file system.
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Final
 
@@ -28,9 +29,10 @@ def write_notice(home: Path, leaves_at_unix_s: float) -> None:
 def read_notice(home: Path) -> float | None:
     """Return when the machine will be taken, as Unix time; None: nobody said so."""
     try:
-        return float(json.loads((home / NOTICE_FILE).read_bytes())["leaves_at_unix_s"])
-    except (OSError, ValueError, KeyError, TypeError):
+        leaves_at_unix_s = float(json.loads((home / NOTICE_FILE).read_bytes())["leaves_at_unix_s"])
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return None
+    return leaves_at_unix_s if math.isfinite(leaves_at_unix_s) else None
 
 
 def given_unix_s(home: Path) -> float | None:

@@ -61,5 +61,5 @@ class Status:
             told = json.loads((home / STATUS_FILE).read_bytes())
             programs = {name: ProgramStatus(**each) for name, each in told["programs"].items()}
             return cls(MachineState(told["state"]), told["changed_unix_s"], programs, told["reason"])
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             return None

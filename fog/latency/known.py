@@ -143,7 +143,8 @@ class Latencies:
     def _read(self) -> dict[str, _Kept]:
         try:
             return {region: _Kept(**each) for region, each in json.loads(self._path.read_bytes()).items()}
-        except (OSError, ValueError, TypeError, AttributeError):  # none yet, or another version's: measured again
+        except (OSError, ValueError, TypeError, AttributeError, RecursionError):
+            # none yet, or another version's: measured again
             return {}
 
     def _write(self, kept: Mapping[str, _Kept]) -> None:

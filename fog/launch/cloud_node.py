@@ -9,10 +9,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final, cast
 
-import yaml
-
 from fog.cluster import CloudNode
 from fog.launch.description import LaunchConfiguration, Node, Parameters, Text, written
+from fog.launch.parameter_yaml import BYTES_MAX, read_parameters
 from fog.launch.ros_args import named, parameters_of_file, parameters_of_map, remapped
 from gdp.errors import LocalError
 
@@ -53,9 +52,16 @@ def parameters_in(path: Path, name: str | None, namespace: str | None, *, has_tu
         LocalError: it cannot be read or used.
     """
     try:
-        document = yaml.load(path.read_text(encoding="utf-8"), _WithTuples if has_tuples else yaml.SafeLoader)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise LocalError(f"parameters: {path}: {error}") from error
+        with path.open("rb") as file:
+            raw = file.read(BYTES_MAX + 1)
+    except OSError as error:
+        raise LocalError(f"parameters: {path}: {error.strerror}") from error
+    try:
+        text = raw.decode()
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise LocalError(f"parameters: {path}:{line}: UTF-8 text is expected") from error
+    document = read_parameters(text, f"parameters: {path}", has_tuples=has_tuples)
     return parameters_of_file(document, str(path), name, namespace)
 
 
@@ -68,23 +74,8 @@ def parameter_rule(rule: str) -> str:
     key, _, value = rule.partition(":=")
     if _TUPLE not in value:
         return rule
-    try:
-        document = yaml.load(value, _WithTuples)
-    except yaml.YAMLError as error:
-        raise LocalError(f"parameter {key}: {error}") from error
-    (_, rule) = parameters_of_map({key: document})
+    (_, rule) = parameters_of_map({key: read_parameters(value, f"parameter {key}", has_tuples=True)})
     return rule
-
-
-def _list(loader: yaml.SafeLoader, node: yaml.SequenceNode) -> list[object]:
-    return list(loader.construct_sequence(node))
-
-
-class _WithTuples(yaml.SafeLoader):
-    """Reads ``!!python/tuple`` as a list; anything else of Python is refused."""
-
-
-_WithTuples.add_constructor("tag:yaml.org,2002:python/tuple", _list)
 
 
 def _parameters(said: Parameters, given: Mapping[str, str], name: str | None, namespace: str | None) -> list[str]:
@@ -100,7 +91,7 @@ def _put_in(parameters: Mapping[str, object], given: Mapping[str, str]) -> dict[
         if isinstance(value, Mapping):
             values[key] = _put_in(value, given)
         elif isinstance(value, LaunchConfiguration) or _has_argument(value):
-            values[key] = yaml.safe_load(written(cast("Text", value), given))
+            values[key] = read_parameters(written(cast("Text", value), given), f"parameter {key}")
         else:
             values[key] = value
     return values

@@ -90,6 +90,11 @@ def load(path: Path, arguments: Mapping[str, str], probe: Probe | None = None) -
             return Loaded(ClusterPlan.from_json(path.read_text(encoding="utf-8")), keep=True)
         except OSError as error:
             raise ConfigError(str(path), "", f"cannot be read: {error.strerror}") from error
+        except UnicodeDecodeError as error:
+            line = error.object.count(b"\n", 0, error.start) + 1
+            raise ConfigError(f"{path}:{line}", "", "UTF-8 text is expected") from error
+        except LocalError as error:
+            raise ConfigError(str(path), "", str(error)) from error
     description = _described(path)
     if has_ros_launch():
         from fog.launch.real_node import gathered
@@ -170,7 +175,7 @@ def _described(path: Path) -> object:
         raise ConfigError(_place(path, error), "", f"{error}{advice}") from error
     except GdpError as error:
         raise ConfigError(_place(path, error), "", str(error)) from error
-    except Exception as error:  # whatever the user's code raises is the user's to know, with its line
+    except (Exception, SystemExit) as error:  # whatever the user's code raises is the user's to know, with its line
         raise ConfigError(_place(path, error), "", f"{type(error).__name__}: {error}") from error
     return described
 

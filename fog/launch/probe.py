@@ -15,6 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
+from fog.child_environment import child_environment
 from fog.cluster import CloudNode
 from fog.launch.resolve import PYTHON, command_line, file_of
 from gdp.errors import LocalError
@@ -68,7 +69,7 @@ def _found(nodes: Sequence[CloudNode]) -> Found:
         "nodes": [{"argv": _argv(node), "environment": dict(node.environment)} for node in nodes],
     }
     environment = {
-        **os.environ,
+        **child_environment(os.environ),
         "ROS_DOMAIN_ID": str(domain),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "FOG_MACHINE": "probe",

@@ -18,6 +18,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final, TypedDict
 
+from fog.child_environment import child_environment
 from gdp.errors import LocalError
 from proxy.bridge.parts import action_of, is_part
 from proxy.endpoints.endpoint import Graph, Role
@@ -101,7 +102,7 @@ def _started(start: _Start, log: Path) -> Iterator[tuple[int, Path]]:
     with log.open("wb") as output:
         process = subprocess.Popen(
             start["argv"],
-            env={**os.environ, **start["environment"]},
+            env={**child_environment(os.environ), **start["environment"]},
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,

@@ -17,6 +17,7 @@ from gdp.errors import LocalError
 __all__ = ["named", "parameters_of_file", "parameters_of_map", "remapped"]
 
 _PARAMETERS: Final = "ros__parameters"
+_INT_MIN, _INT_MAX = -(1 << 63), (1 << 63) - 1
 _Section: TypeAlias = tuple[Sequence[str], Mapping[str, object]]
 
 
@@ -40,7 +41,13 @@ def parameters_of_map(parameters: Mapping[str, object], prefix: str = "") -> lis
     Raises:
         LocalError: a value that no parameter can have.
     """
-    return [word for key, value in _flat(parameters) for word in ("-p", f"{prefix}{key}:={_yaml(key, value)}")]
+    words = []
+    for key, value in _flat(parameters):
+        word = f"{prefix}{key}:={_yaml(key, value)}"
+        if "\0" in word or not _is_unicode(word):
+            raise LocalError(f"parameter {key!r}: a zero byte or half a surrogate pair cannot be in a command line")
+        words += ["-p", word]
+    return words
 
 
 def parameters_of_file(document: object, where: str, name: str | None, namespace: str | None) -> list[str]:
@@ -94,9 +101,19 @@ def _flat(parameters: Mapping[str, object], group: str = "") -> Iterator[tuple[s
             yield f"{group}{key}", value
 
 
+def _is_unicode(text: str) -> bool:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def _yaml(key: str, value: object) -> str:
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
         return f"[{', '.join(_yaml(key, each) for each in value)}]"
+    if isinstance(value, int) and not _INT_MIN <= value <= _INT_MAX:
+        raise LocalError(f"parameter {key}: a whole number of a parameter has 64 bits")
     if isinstance(value, float) and not math.isfinite(value):
         return ".nan" if math.isnan(value) else ".inf" if value > 0 else "-.inf"
     if isinstance(value, bool | int | float | str):

@@ -6,8 +6,8 @@ takes at most 16 KiB of user data, before base64, and cloud-init reads it gzippe
 
 ``cloud_config`` is for providers that take user data, ``shell_script`` for those that only run a script as root; both
 come to the same files. What programs say goes to the journal and the console under their names, ``switch[712]: ...``;
-``lines_of`` finds it there. What is installed is named by ``Setup.requirements``, for pip: the package is on no public
-index yet, so a wheel's URL belongs there. A machine whose programs are done powers itself off.
+``lines_of`` finds it there. What pip installs is pinned by hash (``requirements``), for it runs beside the machine's
+keys. A machine whose programs are done powers itself off.
 """
 
 from __future__ import annotations
@@ -21,14 +21,16 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv6Address
-from typing import Final
+from typing import Annotated, Final
 
 import yaml
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from fog.host.bundle import BOOT_FILE, read_programs
+from fog.host.life import NODE_USER
+from fog.providers.requirements import pinned, read_requirements
 from gdp.errors import LocalError
-from gdp.nodes.schema import Section
+from gdp.nodes.schema import ExistingFile, Section
 
 __all__ = ["HOME", "USER_DATA_MAX_BYTES", "VXLAN_PORT", "Placed", "Setup", "Vxlan", "cloud_config", "placed"]
 __all__ += ["lines_of", "shell_script", "user_data"]
@@ -37,9 +39,54 @@ HOME: Final = "/var/lib/fog"
 USER_DATA_MAX_BYTES: Final = 16 * 1024
 VXLAN_PORT: Final = 4789  # RFC 7348
 _INSTALLED: Final = "/opt/fog"
+_REQUIREMENTS: Final = "/etc/fog-requirements.txt"
 _INSTALL: Final = "/usr/local/sbin/fog-install"
 _PACKAGES: Final = ("python3-venv", "iproute2", "util-linux")
 _PRIVATE: Final = 0o600
+_NODE_USER: Final = "fog-node"  # runs the users' nodes: it reads no key of the machine
+_NODE_HOME: Final = "/var/lib/fog-node"
+_MAKE_USER: Final = (
+    f"id -u {_NODE_USER} >/dev/null 2>&1 || useradd --system --user-group --shell /usr/sbin/nologin"
+    f" --home-dir {_NODE_HOME} --create-home {_NODE_USER}"
+)
+# User data, with the machine's keys, can be read from the metadata service: only root's programs reach it. By rules of
+# routing, which need no packet filter; name service on that address (UDP) is left alone.
+_METADATA: Final = "".join(
+    f"{ip} rule del pref 90 2>/dev/null || true\n"
+    f"{ip} rule add pref 90 uidrange 1-4294967294 ipproto tcp dport 80 to {address} prohibit{otherwise}\n"
+    for ip, address, otherwise in (("ip", "169.254.169.254", ""), ("ip -6", "fd00:ec2::254", " || true"))
+)
+# Source: systemd.exec(5), systemd.resource-control(5). Root without most capabilities: it changes to the nodes' user
+# (SETUID, SETGID, SETPCAP), ends their processes (KILL), and meets ROS's files of that user (DAC_OVERRIDE).
+_FENCES: Final = f"""NoNewPrivileges=yes
+CapabilityBoundingSet=CAP_NET_RAW CAP_NET_ADMIN CAP_BPF CAP_PERFMON CAP_SETUID CAP_SETGID CAP_SETPCAP CAP_KILL
+CapabilityBoundingSet=CAP_DAC_OVERRIDE
+ProtectSystem=strict
+ReadWritePaths={HOME} -{_NODE_HOME}
+ProtectHome=yes
+PrivateTmp=yes
+ProtectClock=yes
+ProtectControlGroups=yes
+ProtectHostname=yes
+ProtectKernelLogs=yes
+ProtectKernelModules=yes
+LockPersonality=yes
+RestrictNamespaces=yes
+RestrictSUIDSGID=yes
+RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK AF_PACKET
+SystemCallArchitectures=native
+SystemCallFilter=@system-service bpf capset seccomp landlock_create_ruleset landlock_add_rule landlock_restrict_self
+SystemCallErrorNumber=EPERM
+MemoryMax=90%
+LimitNOFILE=65536
+RuntimeDirectory=fog
+RuntimeDirectoryMode=0700
+"""
+_CLOSE: Final = (
+    ["chmod", "-R", "go-rwx", HOME],
+    ["chmod", "go+x", HOME],  # to what nodes of their own user read, by its path
+    ["find", HOME, "-maxdepth", "1", "-name", "*.xml", "-exec", "chmod", "go+r", "{}", "+"],  # the middleware's profile
+)
 _LOG: Final = f"""[Unit]
 Description=The log of a machine's program %i, for the journal and the console
 
@@ -67,14 +114,21 @@ class Vxlan(Section):
 
 
 class Setup(Section):
-    """What a machine installs beside its boot: ``requirements`` for pip, such as ``gdp-ros[ros2]``, a wheel's URL or
-    the package that holds the nodes; ``packages`` of the distribution, beside those that are needed anyway. Without
-    ``vxlan`` the devices that the boot's switch names must be there without it.
+    """What a machine installs beside its boot: for pip, each with its hash, ``requirements`` (the wheel of this
+    package, those with the nodes, and all that they need) and the file ``requirements_file``; ``packages`` of the
+    distribution, beside those that are needed anyway. Without ``vxlan`` the devices that the boot's switch names must
+    be there without it. There is no default for pip: a name that nobody holds on an index would be somebody's to take.
     """
 
-    requirements: tuple[str, ...] = Field(default=("gdp-ros[ros2]",), min_length=1)
+    requirements: tuple[Annotated[str, AfterValidator(pinned)], ...] = ()
+    requirements_file: ExistingFile | None = None
     packages: tuple[str, ...] = ()
     vxlan: Vxlan | None = None
+
+    @property
+    def has_requirements(self) -> bool:
+        """Return whether pip installs anything; else the image brings ``/opt/fog``."""
+        return bool(self.requirements) or self.requirements_file is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,12 +152,13 @@ def placed(files: Mapping[str, bytes], setup: Setup) -> list[Placed]:
         files: a packed boot: path below the machine's folder -> content.
 
     Raises:
-        LocalError: a path leads out of that folder.
+        LocalError: a path leads out of that folder, or the file of requirements is not pinned by hash.
     """
     for path in files:
         if path.startswith("/") or ".." in path.split("/"):
             raise LocalError(f"a boot's file {path!r} lies outside the machine's folder")
     own = [Placed(f"{HOME}/{path}", content) for path, content in sorted(files.items())]
+    own.append(Placed(_REQUIREMENTS, _requirements(setup), 0o644))
     own.append(Placed(_INSTALL, _install(setup).encode(), 0o755))
     own.append(Placed("/etc/systemd/system/fog-machine.service", _service(setup).encode(), 0o644))
     own.append(Placed("/etc/systemd/system/fog-log@.service", _LOG.encode(), 0o644))
@@ -130,7 +185,7 @@ def cloud_config(files: Mapping[str, bytes], setup: Setup) -> str:
         "package_update": True,
         "packages": [*_PACKAGES, *setup.packages],
         "write_files": written,
-        "runcmd": [["chmod", "-R", "go-rwx", HOME], *(shlex.split(line) for line in _start(files, setup))],
+        "runcmd": [*_CLOSE, *(shlex.split(line) for line in _start(files, setup))],
     }
     return "#cloud-config\n" + yaml.safe_dump(config, sort_keys=False, width=4096)
 
@@ -145,7 +200,8 @@ def user_data(files: Mapping[str, bytes], setup: Setup) -> bytes:
     if len(data) > USER_DATA_MAX_BYTES:
         raise LocalError(
             f"the machine's files come to {len(data)} bytes of user data, EC2 takes {USER_DATA_MAX_BYTES}: "
-            "put what is large (models, meshes, code) into a package named in `requirements`"
+            "put what is large (models, meshes, code) into a package named in `requirements`, and keep of a "
+            "requirements file the hashes for the machines' platform only"
         )
     return data
 
@@ -160,7 +216,7 @@ def shell_script(files: Mapping[str, bytes], setup: Setup) -> str:
         "set -euo pipefail",
         "base64 -d <<'EOF' | sudo tar --extract --gzip --no-same-owner --directory / --file -",
         f"{_tar(files, setup)}EOF",
-        f"sudo chmod -R go-rwx {HOME}",
+        *(f"sudo {shlex.join(line)}" for line in _CLOSE),
         f"sudo env DEBIAN_FRONTEND=noninteractive apt-get install -qq {shlex.join([*_PACKAGES, *setup.packages])}",
         *(f"sudo {line}" for line in _start(files, setup)),
     ]
@@ -191,13 +247,27 @@ def _start(files: Mapping[str, bytes], setup: Setup) -> list[str]:
 
 def _install(setup: Setup) -> str:
     # the service runs it before each start, so that an index that cannot be reached now is asked again
+    if not setup.has_requirements:
+        return f"""#!/bin/sh
+set -eu
+{_MAKE_USER}
+{_METADATA}[ -x {_INSTALLED}/bin/fog-machine ] && exit 0
+echo 'nothing is installed: name it, pinned by hash, in requirements or requirements_file of setup' >&2
+exit 1
+"""
     return f"""#!/bin/sh
 set -eu
-[ -e {_INSTALLED}/complete ] && exit 0
+{_MAKE_USER}
+{_METADATA}[ -e {_INSTALLED}/complete ] && exit 0
 python3 -m venv {_INSTALLED}
-{_INSTALLED}/bin/pip install --no-input --quiet -- {shlex.join(setup.requirements)}
+{_INSTALLED}/bin/pip install --no-input --quiet --require-hashes --requirement {_REQUIREMENTS}
 touch {_INSTALLED}/complete
 """
+
+
+def _requirements(setup: Setup) -> bytes:
+    own = b"" if setup.requirements_file is None else read_requirements(setup.requirements_file).rstrip() + b"\n"
+    return own + "".join(f"{each}\n" for each in setup.requirements).encode()
 
 
 def _service(setup: Setup) -> str:
@@ -210,8 +280,10 @@ StartLimitIntervalSec=0
 SuccessAction=poweroff
 
 [Service]
-ExecStartPre={_INSTALL}
+ExecStartPre=+{_INSTALL}
 ExecStart={_INSTALLED}/bin/fog-machine --home {HOME}
+Environment={NODE_USER}={_NODE_USER} FASTDDS_BUILTIN_TRANSPORTS=UDPv4
+Environment=XDG_RUNTIME_DIR=%t/fog HOME={HOME} ROS_HOME={HOME}/ros
 TimeoutStartSec=20min
 Restart=on-failure
 RestartSec=5
@@ -219,7 +291,7 @@ KillMode=mixed
 SyslogIdentifier=fog-machine
 StandardOutput=journal+console
 StandardError=journal+console
-
+{_FENCES}
 [Install]
 WantedBy=multi-user.target
 """

@@ -127,8 +127,11 @@ class Journal:
     def clusters(self) -> list[Cluster]:
         """Return all clusters that there are or were, in the order of their names."""
         with _translated(self._path):
-            rows = self._file.execute("SELECT plan, is_up, why, begun_unix_s FROM clusters ORDER BY name").fetchall()
-        return [Cluster(ClusterPlan.from_json(plan), bool(is_up), why, begun) for plan, is_up, why, begun in rows]
+            query = "SELECT name, plan, is_up, why, begun_unix_s FROM clusters ORDER BY name"
+            rows = self._file.execute(query).fetchall()
+        return [
+            Cluster(self._plan(name, plan), bool(is_up), why, begun) for name, plan, is_up, why, begun in rows
+        ]
 
     def cluster(self, name: str) -> Cluster:
         """Return a cluster.
@@ -169,10 +172,10 @@ class Journal:
         Args:
             gone: those that are no more as well.
         """
-        query = "SELECT record FROM machines WHERE cluster = ?" + ("" if gone else " AND is_gone = 0")
+        query = "SELECT name, record FROM machines WHERE cluster = ?" + ("" if gone else " AND is_gone = 0")
         with _translated(self._path):
             rows = self._file.execute(query, (cluster,)).fetchall()
-        return sorted((_record(json.loads(row)) for (row,) in rows), key=lambda each: int(each.name[1:]))
+        return sorted((self._machine(cluster, *row) for row in rows), key=_number)
 
     def tell(
         self,
@@ -210,6 +213,18 @@ class Journal:
         with _translated(self._path):
             rows = self._file.execute(query, (after, cluster, cluster, -1 if last is None else last)).fetchall()
         return [Entry(*row) for row in reversed(rows)]
+
+    def _plan(self, name: str, plan: str) -> ClusterPlan:
+        try:
+            return ClusterPlan.from_json(plan)
+        except LocalError as error:
+            raise StoreError(f"{self._path}: clusters: {name}: {error}") from error
+
+    def _machine(self, cluster: str, name: str, record: str) -> Record:
+        try:
+            return _record(json.loads(record))
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise StoreError(f"{self._path}: machines: {cluster} {name}: not the record of one: {error!r}") from error
 
     @contextmanager
     def _writing(self) -> Iterator[sqlite3.Connection]:
@@ -268,4 +283,10 @@ def _record(items: dict[str, object]) -> Record:
                 state=MachineState(rest["state"]),
                 ending=None if rest["ending"] is None else Ending(rest["ending"]),
             )
-    raise StoreError("a machine in the journal that cannot be read")
+    raise ValueError("a part is missing")
+
+
+def _number(record: Record) -> int:
+    """Return the number of a machine, as ``next_machine`` gave it."""
+    digits = record.name[1:]
+    return int(digits) if digits.isascii() and digits.isdigit() and len(digits) < 20 else 0

@@ -5,20 +5,26 @@ Place: shell.
 
 from __future__ import annotations
 
+import json
+import shlex
+import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Optional
 
 import typer
 
 from gdp.cli import options
-from gdp.cli.output import show, span
-from gdp.crypto.certificates import Membership
-from gdp.crypto.x509_form import to_pem
+from gdp.cli.output import moment, show, span
+from gdp.crypto.certificates import Membership, Role
+from gdp.crypto.x509_form import read_request, to_pem
 from gdp.errors import LocalError
-from gdp.stores.files import public, read_public, write_all
+from gdp.names import Name
+from gdp.stores.files import public, read_public, refuse_existing, write_all
 from gdp.stores.issue import MEMBER_DAYS, admit, admit_node, install_membership
-from gdp.stores.keyring import CARD, NODE_CERTIFICATE, load_domain, load_root, parsed
+from gdp.stores.keyring import CARD, NODE_CERTIFICATE, load_domain, load_node_keys, load_root, parsed
+from gdp.stores.ledger import LEDGER, read_ledger
 from gdp.trust.revocation import Revocation
 
 __all__ = ["app"]
@@ -34,6 +40,14 @@ Request = Annotated[
     Optional[Path],  # noqa: UP045
     typer.Option("--request", metavar="FILE", help="a node.csr from elsewhere; needs --out"),
 ]
+ExpectedRole = Annotated[
+    Optional[Role],  # noqa: UP045
+    typer.Option("--role", help="what the node is to be; compared with its request. Asked for at a terminal"),
+]
+ExpectedLabel = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--label", help="its name for people; compared with its request. Asked for at a terminal"),
+]
 RootFile = Annotated[Path, typer.Option("--root", metavar="FILE", help="the domain's root certificate")]
 CertificateFile = Annotated[Path, typer.Argument(metavar="FILE", help="a membership, PEM or DER")]
 OutFile = Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="where to write it")]
@@ -45,28 +59,54 @@ def issue(
     node: Node = None,
     request: Request = None,
     out: options.Out = None,
+    role: ExpectedRole = None,
+    label: ExpectedLabel = None,
     days: options.Days = MEMBER_DAYS,
     force: options.Force = False,
     as_json: options.Json = False,
 ) -> None:
-    """Admit a node to a domain.
+    """Admit a node to a domain, as what you say that it is. The domain's ledger, issued.jsonl, keeps what was issued.
 
     \b
     Examples:
-      gdp cert issue --domain keys/school --node keys/robot
-      gdp cert issue --domain keys/school --request node.csr --out node.crt
+      gdp cert issue --domain keys/school --node keys/robot --role proxy --label robot
+      gdp cert issue --domain keys/school --request node.csr --role switch --label roof --out node.crt
     """
     if node is not None and request is None and out is None:
+        keys = load_node_keys(node)
+        _state(keys.subject.name, keys.role.value, keys.label, days, role, label)
         member = admit_node(domain, node, days=days, force=force).member
         written = {"certificate": str(node / NODE_CERTIFICATE), "card": str(node / CARD)}
     elif node is None and request is not None and out is not None:
+        if not force:
+            refuse_existing(out)
         asked = read_public(request)
+        holder = parsed(request, read_request, asked)
+        _state(holder.subject.name, holder.unit, holder.label, days, role, label)
         member = parsed(request, lambda wire: admit(domain, wire, days=days), asked)
         write_all(out.parent, {out.name: public(to_pem(member.wire))}, force=force)
         written = {"certificate": str(out)}
     else:
         raise LocalError("cert issue: give either --node, or --request with --out")
     show({**_described(member), **written}, as_json=as_json)
+
+
+@app.command("issued")
+def issued(domain: Domain, as_json: options.Json = False) -> None:
+    """Verify the ledger of a domain and print what was issued, the oldest first.
+
+    \b
+    Example:
+      gdp cert issued --domain keys/school
+    """
+    lines = read_ledger(domain)
+    for line in lines:
+        until = moment(line.until_unix_s)
+        if as_json:
+            typer.echo(json.dumps(asdict(line)))
+        else:
+            typer.echo(f"{moment(line.at_unix_s)}  {line.role:<6}  {line.label}  {line.name}  until {until}")
+    typer.echo(f"{domain / LEDGER}: {len(lines)} memberships, the chain of hashes holds", err=True)
 
 
 @app.command("install")
@@ -115,6 +155,29 @@ def revoke(
     statement = Revocation.make(authority.key, subject, member.fingerprint, member.not_after_unix_s)
     write_all(out.parent, {out.name: public(statement)}, force=force)
     show({**_described(member), "revocation": str(out)}, as_json=as_json)
+
+
+def _state(name: Name, role: str, label: str, days: float, wanted: Role | None, called: str | None) -> None:
+    """Say what is about to be signed, and see that it is what was meant.
+
+    Args:
+        name, role, label: as the request says.
+        wanted, called: as the caller says; None: a person at the terminal confirms.
+
+    Raises:
+        LocalError: the request asks for something else, or nobody can be asked.
+    """
+    if wanted is not None and wanted.value != role:
+        raise LocalError(f"the request asks for the role {role}, not {wanted.value}: nothing was signed")
+    if called is not None and called != label:
+        raise LocalError(f"the request asks for the label {label!r}, not {called!r}: nothing was signed")
+    typer.echo(f"about to sign: {role} {label!r}, name {name.to_text()}, for {days:g} days at most", err=True)
+    if wanted is not None and called is not None:
+        return
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        raise LocalError(f"cert issue: say what is meant: --role {role} --label {shlex.quote(label)}")
+    if not typer.confirm("Is this what you mean?", err=True):
+        raise LocalError("nothing was signed")
 
 
 def _member(file: Path, root: Path) -> Membership:

@@ -19,6 +19,7 @@ from gdp.cli.output import (
     show,
     span,
 )
+from gdp.cli.salt import SaltFile
 from gdp.crypto.statements import parse
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
@@ -60,6 +61,7 @@ def name(
     description: options.Description = None,
     pin: options.Pin = None,
     more: options.More = [],  # noqa: B006 (the library copies it)
+    salt_file: SaltFile = None,
     epochs: Epochs = "0",
     days: options.Days = DELEGATION_DAYS,
     may_delegate: MayDelegate = False,
@@ -85,6 +87,7 @@ def name(
         description=description,
         pin=pin,
         more=more,
+        salt_file=salt_file,
     )
     face = load_card(card)
     if root is not None:

@@ -12,6 +12,7 @@ import typer
 
 from gdp.cli import options
 from gdp.cli.output import metadata_from_options, show
+from gdp.cli.salt import SaltFile, hidden
 from gdp.crypto.subject import Subject
 from gdp.stores.keyring import load_public_key
 
@@ -32,6 +33,7 @@ def name(
     description: options.Description = None,
     pin: options.Pin = None,
     more: options.More = [],  # noqa: B006 (the library copies it)
+    salt_file: SaltFile = None,
     owner: Owner = None,
     as_json: options.Json = False,
 ) -> None:
@@ -41,6 +43,7 @@ def name(
     Example:
       gdp name --kind topic --name /camera/image --type sensor_msgs/msg/Image --author lab --owner owner.pub
       gdp name --kind action --name /navigate --type nav2_msgs/action/NavigateToPose --owner owner.pub
+      gdp name --kind topic --name /camera/image --type sensor_msgs/msg/Image --owner owner.pub --salt-file camera.salt
     """
     metadata = metadata_from_options(
         kind=kind,
@@ -51,6 +54,7 @@ def name(
         description=description,
         pin=pin,
         more=more,
+        salt_file=salt_file,
     )
     subject = Subject.of(metadata, load_public_key(owner).compressed if owner is not None else b"")
     result = {
@@ -58,6 +62,6 @@ def name(
         "short": subject.name.short,
         "digest": subject.digest.hex(),
         "owner": subject.owner_key.hex() or None,
-        "metadata": dict(metadata),
+        "metadata": hidden(metadata),
     }
     show(result, as_json=as_json, plain=subject.name.to_text())

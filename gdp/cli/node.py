@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,6 +30,10 @@ __all__ = [
     "failing_clearly",
     "set_up_logging",
 ]
+
+# NumPy's OpenBLAS starts a thread for each core as soon as it is loaded. No command uses them, and a thread that is
+# there before rights are given away keeps them.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 _OURS: Final = ("gdp", "proxy", "fog")
 WRONG: Final = 2  # exit code of a wrong configuration

@@ -8,9 +8,11 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime, timezone
+from pathlib import Path
 
 import typer
 
+from gdp.cli.salt import SALT, read_salt
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
 from gdp.metadata import Metadata
@@ -52,11 +54,12 @@ def metadata_from_options(
     description: str | None,
     pin: int | None,
     more: Sequence[str],
+    salt_file: Path | None = None,
 ) -> Metadata:
     """Return the metadata that the options of ``gdp name`` describe; what is not given is not in them.
 
     Raises:
-        LocalError: an unknown kind, a key given twice, or a value of the wrong form.
+        LocalError: an unknown kind, a key given twice, a salt as an argument, or a value of the wrong form.
     """
     given: dict[str, str | int | None] = {
         "kind": kind,
@@ -72,20 +75,25 @@ def metadata_from_options(
         if key in items:
             raise LocalError(f"metadata {key!r} is given twice")
         items[key] = value
-    return Metadata(items)
+    return Metadata({**items, **read_salt(salt_file)})
 
 
 def items_from_text(texts: Iterable[str]) -> dict[str, str]:
     """Read ``key=value`` options.
 
     Raises:
-        LocalError: one without ``=``, or a key twice.
+        LocalError: one without ``=``, a key twice, or the salt of a name, which every user of the host could read here.
     """
     items: dict[str, str] = {}
     for text in texts:
         key, equals, value = text.partition("=")
         if not equals or not key:
             raise LocalError(f"--meta {text!r}: expected key=value")
+        if key == SALT:
+            raise LocalError(
+                "--meta salt=...: every user of this host reads arguments; put it into a private file and say"
+                " --salt-file FILE, or set GDP_SALT"
+            )
         if key in items:
             raise LocalError(f"metadata {key!r} is given twice")
         items[key] = value

@@ -38,6 +38,7 @@ from gdp.nodes.schema import (
 )
 from gdp.ports.kernel.shapes import ENTRIES_DEFAULT
 from gdp.stores.cluster_address import ClusterAddress
+from gdp.stores.files import read_private
 
 __all__ = ["DataPlane", "LeaseSeconds", "PortConfig", "Quotas", "RibConfig", "SwitchConfig"]
 
@@ -108,6 +109,7 @@ class SwitchConfig(Section):
     lease_s: LeaseSeconds = CLAIM_LEASE_S
     keepalive_ms: KeepaliveMs = KEEPALIVE_MS
     detect_multiplier: DetectMultiplier = DETECT_MULTIPLIER
+    sandbox: bool = True
 
     def timing_of(self, port: PortConfig) -> Timing:
         """Return what is wanted of keepalives on a port."""
@@ -175,8 +177,13 @@ class ClusterConfig(Section):
     key: ExistingFile | None = None
 
     def address(self) -> ClusterAddress:
-        """Return what the store connects to; the password's file is read now."""
-        password = "" if self.password_file is None else self.password_file.read_text().strip()
+        """Return what the store connects to; the password's file is read now.
+
+        Raises:
+            LocalError: that file is not private.
+        """
+        file = self.password_file
+        password = "" if file is None else read_private(file).decode("utf-8", "replace").strip()
         split = (node.rpartition(":") for node in self.nodes)
         nodes = tuple((host.strip("[]"), int(port)) for host, _, port in split)
         return ClusterAddress(nodes, self.username, password, self.ca, self.cert, self.key)
@@ -211,6 +218,7 @@ class RibConfig(Section):
     snapshot: NewFile | None = None
     quotas: Quotas = Quotas()
     metrics: Metrics | None = None
+    sandbox: bool = True
 
     @model_validator(mode="after")
     def _a_shared_store_needs_no_copies(self) -> RibConfig:

@@ -20,6 +20,7 @@ from gdp.nodes.counts import count_list
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.rib_upkeep import MemoryUpkeep, Upkeep
+from gdp.nodes.rights import confine_rib
 from gdp.nodes.runtime import Runtime, now
 from gdp.nodes.single_instance import run_alone
 from gdp.nodes.uplink import open_uplink
@@ -51,6 +52,8 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
     attachment = NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes, lease_s=config.lease_s)
     with contextlib.ExitStack() as stack:
         stack.enter_context(run_alone("RIB", identity.name))
+        if config.sandbox:
+            confine_rib(config)  # before the thread that keeps copies; the device can still be opened
         upkeep = _upkeep(config, policy)
         stack.callback(upkeep.close)
         rib = Rib(identity, policy, upkeep.store, settings)

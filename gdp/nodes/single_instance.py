@@ -29,7 +29,7 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.names import Name
 
-__all__ = ["own_devices", "run_alone"]
+__all__ = ["lock_directory", "own_devices", "run_alone"]
 
 log = logging.getLogger(__name__)
 
@@ -145,6 +145,11 @@ def _command(pid: int) -> str:
         words = [Path(words[1]).name, *words[2:]]
     text = shlex.join(words)
     return text if len(text) <= _COMMAND_MAX else f"{text[:_COMMAND_MAX]}..."
+
+
+def lock_directory() -> Path:
+    """Return where this user's locks lie, whether it is there or not."""
+    return _place()
 
 
 def _directory() -> Path | None:

@@ -21,6 +21,7 @@ from gdp.nodes.data_plane import Chosen, choose_plane
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.pairs import attach_pairs, switch_end
+from gdp.nodes.rights import confine_switch
 from gdp.nodes.runtime import Runtime, now
 from gdp.nodes.single_instance import own_devices, run_alone
 from gdp.nodes.uplink import refuse_loopback
@@ -99,6 +100,8 @@ def run_switch(
         runtime.every(LOOK_S, lambda _: _end_if_displaced(switch))
         stack.enter_context(runtime.signals(lambda: _revoke(switch, config.revocations)))
         _revoke(switch, config.revocations)
+        if config.sandbox:
+            confine_switch(config, chosen.name)
         if config.metrics is not None:
             from gdp.telemetry.metrics import Metrics
 

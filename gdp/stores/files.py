@@ -2,11 +2,13 @@
 
 Place: I/O, the file system.
 A file appears under its name complete and synced, or not at all, so that a kill in the middle leaves nothing half
-written. A private file has mode 0600 from its first byte on, and is not read where group or others could have read it.
+written. A private file has mode 0600 from its first byte on. It is read, and written, only where no other user could
+have read or replaced it (``ownership``); a link in its place is not followed.
 """
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 import stat
@@ -16,14 +18,15 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.stores.ownership import refuse_foreign_file, refuse_shared_folder
 
-__all__ = ["FILE_MAX_BYTES", "NewFile", "private", "public", "read_private", "read_public", "write_all"]
+__all__ = ["FILE_MAX_BYTES", "NewFile", "private", "public", "read_private", "read_public", "refuse_existing"]
+__all__ += ["write_all"]
 
 FILE_MAX_BYTES: Final = 1 << 20
 _PRIVATE_MODE: Final = 0o600
 _PUBLIC_MODE: Final = 0o644  # less what the umask takes
 _DIRECTORY_MODE: Final = 0o700
-_OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,13 +56,16 @@ def write_all(directory: Path, files: Mapping[str, NewFile], *, force: bool = Fa
         force: replace what is there; otherwise nothing is written if one of them is.
 
     Raises:
-        LocalError: a file is there already, or the system refuses.
+        LocalError: a file is there already, one is private and others may write to the directory, or the system
+            refuses.
     """
     try:
         directory.mkdir(mode=_DIRECTORY_MODE, parents=True, exist_ok=True)
+        if any(not new.mode & (stat.S_IRWXG | stat.S_IRWXO) for new in files.values()):
+            refuse_shared_folder(directory)
         for name in files:
-            if not force and os.path.lexists(directory / name):
-                raise LocalError(f"{directory / name}: is there already; --force replaces it")
+            if not force:
+                refuse_existing(directory / name)
         for name, new in files.items():
             _write(directory / name, new, force=force)
     except OSError as error:
@@ -72,16 +78,27 @@ def read_public(path: Path) -> bytes:
     Raises:
         LocalError: it is not there, too long, or the system refuses.
     """
-    return _read(path, forbidden=0)
+    return _read(path)
 
 
 def read_private(path: Path) -> bytes:
     """Return what a private file holds.
 
     Raises:
-        LocalError: group or others may read it, or as for ``read_public``.
+        LocalError: it is a link, belongs to another user than this one and root, group or others may reach it or
+            write to its directory, or as for ``read_public``.
     """
-    return _read(path, forbidden=_OTHERS)
+    return _read(path, is_private=True)
+
+
+def refuse_existing(path: Path) -> None:
+    """Refuse to replace a file, or a link of its name.
+
+    Raises:
+        LocalError: it is there already.
+    """
+    if os.path.lexists(path):
+        raise LocalError(f"{path}: is there already; --force replaces it")
 
 
 def _write(path: Path, new: NewFile, *, force: bool) -> None:
@@ -102,15 +119,18 @@ def _write(path: Path, new: NewFile, *, force: bool) -> None:
         draft.unlink(missing_ok=True)
 
 
-def _read(path: Path, *, forbidden: int) -> bytes:
+def _read(path: Path, *, is_private: bool = False) -> bytes:
+    # O_NONBLOCK: a pipe in the file's place would hold up the open itself
+    guards = os.O_NOFOLLOW | os.O_NONBLOCK if is_private else 0
     try:
-        with path.open("rb") as file:
-            status = os.fstat(file.fileno())
-            if status.st_mode & forbidden:
-                mode = stat.S_IMODE(status.st_mode)
-                raise LocalError(f"{path}: mode {mode:04o} lets others read a private file; run: chmod 600 {path}")
+        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | guards)) as file:
+            if is_private:
+                refuse_foreign_file(path, os.fstat(file.fileno()))
+                refuse_shared_folder(path.parent)
             data = file.read(FILE_MAX_BYTES + 1)
     except OSError as error:
+        if is_private and error.errno == errno.ELOOP:
+            raise LocalError(f"{path}: is a link; name the private file itself") from error
         raise _translated(error, path) from error
     if len(data) > FILE_MAX_BYTES:
         raise LocalError(f"{path}: longer than {FILE_MAX_BYTES} bytes")

@@ -1,6 +1,7 @@
 """Making domains, nodes, owners and delegations in one call each: what the ``gdp`` command and the testbed both do.
 
-Place: I/O, through ``keyring``; reads the wall clock where no time is given.
+Place: I/O, through ``keyring``; reads the wall clock where no time is given. Every membership is in the domain's ledger
+before it is handed out.
 """
 
 from __future__ import annotations
@@ -19,8 +20,10 @@ from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
 from gdp.metadata import Metadata
 from gdp.names import Name
+from gdp.stores.files import refuse_existing
 from gdp.stores.keyring import (
     DELEGATIONS,
+    NODE_CERTIFICATE,
     load_card,
     load_domain,
     load_identity,
@@ -32,6 +35,7 @@ from gdp.stores.keyring import (
     save_node_keys,
     save_owner,
 )
+from gdp.stores.ledger import append_issued
 from gdp.trust.card import Card
 from gdp.trust.delegation import Delegation
 from gdp.trust.grants import SECRET_BYTES
@@ -120,10 +124,12 @@ def admit(domain: Path, request: bytes, *, days: float = MEMBER_DAYS, unix_s: fl
 
     Raises:
         StatementError: the request does not hold.
-        LocalError: no domain there.
+        LocalError: no domain there, or its ledger cannot be written.
     """
-    authority = load_domain(domain)
-    return authority.admit(request, _within(authority.root, _now(unix_s), days))
+    authority, now = load_domain(domain), _now(unix_s)
+    member = authority.admit(request, _within(authority.root, now, days))
+    append_issued(domain, member, now)
+    return member
 
 
 def admit_node(
@@ -132,10 +138,13 @@ def admit_node(
     """Admit the node whose directory is at hand, and complete that directory.
 
     Raises:
-        LocalError: no domain or no keys there, or it belongs to one already.
+        LocalError: no domain or no keys there, it belongs to one already, or the ledger cannot be written.
     """
-    authority = load_domain(domain)
-    identity = load_node_keys(node).join(authority, _within(authority.root, _now(unix_s), days))
+    authority, now = load_domain(domain), _now(unix_s)
+    if not force:
+        refuse_existing(node / NODE_CERTIFICATE)  # before anything is signed
+    identity = load_node_keys(node).join(authority, _within(authority.root, now, days))
+    append_issued(domain, identity.member, now)
     save_identity(node, identity, force=force)
     return identity
 

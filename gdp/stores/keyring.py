@@ -2,7 +2,7 @@
 
 Place: I/O, through ``files``. ``*`` marks what is private (mode 0600)::
 
-    domain/   root.key*  root.crt
+    domain/   root.key*  root.crt  issued.jsonl*                          the ledger: see ``ledger``
     owner/    owner.key*  owner.pub  master.key*
     node/     node.key*  kem.key*  node.json  node.csr                      before it belongs to a domain
               node.crt  root.crt  node.card                                 once it does

@@ -7,23 +7,21 @@ Source: Prometheus text exposition format, version 0.0.4.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator, Mapping
 from itertools import accumulate
 from typing import Final
-from wsgiref.simple_server import WSGIServer
 
-from prometheus_client import CollectorRegistry, generate_latest, start_http_server
+from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from gdp.errors import DropReason, LocalError
 from gdp.names import NAME_BYTES, Name
+from gdp.telemetry.scraping import ScrapeServer
 from gdp.telemetry.sources import Counts, EntryCounts, Gauge, Histogram, Sources
 
 __all__ = ["Metrics"]
 
-_LOOPBACK: Final = "127.0.0.1"
 _ANY: Final = "any"  # an entry for every source
 
 
@@ -34,7 +32,7 @@ class Metrics(Collector):
         self._sources = sources
         self._registry = CollectorRegistry(auto_describe=False)
         self._registry.register(self)
-        self._server: tuple[WSGIServer, threading.Thread] | None = None
+        self._server: ScrapeServer | None = None
 
     def describe(self) -> list[Metric]:
         """Return nothing, so that registering asks no source."""
@@ -76,7 +74,7 @@ class Metrics(Collector):
         return generate_latest(self._registry).decode()
 
     def serve(self, port: int) -> int:
-        """Answer scrapes on 127.0.0.1, in a thread; return the port (chosen by the system for 0).
+        """Answer scrapes on 127.0.0.1, within the bounds of ``scraping``; return the port (0: the system chooses).
 
         Raises:
             LocalError: it is served already, or the port is taken.
@@ -84,20 +82,17 @@ class Metrics(Collector):
         if self._server is not None:
             raise LocalError("metrics are served already")
         try:
-            self._server = start_http_server(port, _LOOPBACK, self._registry)
+            self._server = ScrapeServer(port, lambda: generate_latest(self._registry))
         except OSError as error:
             raise LocalError(f"metrics port {port}: {error.strerror}") from error
-        return int(self._server[0].server_port)
+        return self._server.port
 
     def close(self) -> None:
         """Stop answering, and return when the port is free again."""
         if self._server is None:
             return
-        server, thread = self._server
+        self._server.close()
         self._server = None
-        server.shutdown()
-        thread.join()
-        server.server_close()
 
 
 def _counter(name: str, text: str, label: str, source: Counts | None) -> Iterator[Metric]:

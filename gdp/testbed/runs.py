@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.stores.ownership import refuse_foreign_folder
 from gdp.testbed.cgroups import Cgroup
 from gdp.testbed.mounts import unmount
 from gdp.testbed.processes import Process, boot_id, end_all
@@ -175,9 +176,7 @@ class Runs:
     def __init__(self, directory: Path | None = None) -> None:
         self._directory = directory or _default_directory()
         self._directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-        status = self._directory.stat()
-        if status.st_uid != os.getuid() or status.st_mode & 0o022:
-            raise LocalError(f"{self._directory} must belong to this user alone, for it names what will be deleted")
+        refuse_foreign_folder(self._directory, "it names what will be deleted")
 
     def start(self) -> Run:
         """Begin a run with a new id and an empty scratch directory (in the directory for temporary files)."""

@@ -27,10 +27,11 @@ from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.nodes.schema import Section, relative
 from gdp.service.replication import Mode, Replication
+from gdp.stores.files import read_private
 from proxy.rules.pattern import NAME_FORM, NAME_MAX_CHARS, PATTERN_FORM, is_name, is_pattern, matches
 from proxy.serial.serializer import Encoding
 
-__all__ = ["DOMAIN_MAX", "Kind", "Rule", "fits_kind"]
+__all__ = ["DOMAIN_MAX", "SALT", "Kind", "Rule", "fits_kind"]
 
 Kind: TypeAlias = Literal["topic", "service", "action"]
 
@@ -48,6 +49,7 @@ _TYPES: Final[dict[Kind, tuple[str, str]]] = {
     "service": (f"{_WORD}/srv/{_WORD}", "std_srvs/srv/SetBool"),
     "action": (f"{_WORD}/action/{_WORD}", "test_msgs/action/Fibonacci"),
 }
+SALT: Final = "salt"  # the key of the unguessable part
 _OWN_KEYS: Final = ("kind", "name", "type")
 _OF_TOPICS: Final = ("reliable", "latched", "max_hz")
 _OF_CALLS: Final = ("timeout_s", "on_timeout", "replication")
@@ -82,7 +84,24 @@ def _owner_key(value: object, info: ValidationInfo) -> object:
         raise ValueError(f"expected an owner's public key file: {path}: {error}") from error
 
 
+def _salt(value: object, info: ValidationInfo) -> object:
+    """Read the private file that ``salt_file`` names; anything but a text goes on to be refused as such."""
+    if not isinstance(value, str):
+        return value
+    if SALT in info.data.get("metadata", {}):
+        raise ValueError("the salt stands under metadata as well: leave one of them out")
+    path = relative(Path(value), info)
+    try:
+        salt = read_private(path).decode().strip()
+    except (LocalError, UnicodeDecodeError) as error:
+        raise ValueError(f"expected a private file with the salt as text: {error}") from error
+    if not salt:
+        raise ValueError(f"expected a private file with the salt as text: {path}: empty")
+    return salt
+
+
 Owner = Annotated[PublicKey, BeforeValidator(_owner_key), WithJsonSchema({"type": "string", "minLength": 1})]
+Salt = Annotated[str | None, BeforeValidator(_salt), Field(max_length=4_096, repr=False)]
 ExtraMetadata = Annotated[dict[str, str | int], AfterValidator(_extra_metadata)]
 CallSeconds = Annotated[float, Field(gt=0, le=CALL_MAX_S)]
 
@@ -137,6 +156,11 @@ class Rule(Section):
         default_factory=dict,
         description="Whatever else the 256-bit name digests: text or whole numbers.",
         json_schema_extra={"propertyNames": {"not": {"enum": list(_OWN_KEYS)}}},
+    )
+    salt: Salt = Field(
+        default=None,
+        alias="salt_file",
+        description="A private file (mode 0600) with the unguessable part of the 256-bit name: `salt` of its metadata.",
     )
     owner: Owner = Field(description="Public key file of the name's owner (`owner.pub`).")
     encoding: Encoding = Field(
@@ -222,6 +246,11 @@ class Rule(Section):
     )
 
     @property
+    def extra(self) -> dict[str, str | int]:
+        """Return what the name digests beside kind, name and type."""
+        return self.metadata if self.salt is None else {**self.metadata, SALT: self.salt}
+
+    @property
     def is_pattern(self) -> bool:
         """Return whether it is about all names of a pattern."""
         return "*" in self.name
@@ -287,7 +316,7 @@ class Rule(Section):
     def metadata_of(self, local_name: str, type_name: str) -> Metadata:
         """Return what the overlay name of something that ``matches`` digests."""
         own = {"kind": self.kind, "name": self.global_name_of(local_name), "type": type_name}
-        return Metadata({**own, **self.metadata})
+        return Metadata({**own, **self.extra})
 
     def overlay_name_of(self, local_name: str, type_name: str) -> Name:
         """Return the 256-bit name of something that ``matches``."""
@@ -301,7 +330,7 @@ class Rule(Section):
         name, type_name = metadata.get("name"), metadata.get("type")
         if metadata["kind"] != self.kind or not isinstance(name, str) or not isinstance(type_name, str):
             return None
-        if {key: value for key, value in metadata.items() if key not in _OWN_KEYS} != self.metadata:
+        if {key: value for key, value in metadata.items() if key not in _OWN_KEYS} != self.extra:
             return None
         if not fits_kind(type_name, self.kind) or not self.fits_type(type_name):
             return None

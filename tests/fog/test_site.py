@@ -8,7 +8,8 @@ import pytest
 from fog.site import SiteConfig, open_site, save_topology, topology_now, with_gateway
 from gdp.errors import ConfigError, LocalError
 
-TUNNEL = "aws: {setup: {vxlan: {remote: 198.51.100.7}}}\n"
+WHEEL = f"https://example.org/gdp_ros.whl#sha256={'0a' * 32}"
+TUNNEL = f"aws: {{setup: {{requirements: ['{WHEEL}'], vxlan: {{remote: 198.51.100.7}}}}}}\n"
 
 
 def site(folder: Path, *lines: str) -> SiteConfig:
@@ -35,11 +36,12 @@ def test_a_device_that_is_not_the_tunnels_is_refused_before_anything_costs(tmp_p
 @pytest.mark.parametrize("provider", ["aws", "skypilot"])
 def test_machines_with_no_way_to_the_robot_are_refused(tmp_path: Path, provider: str) -> None:
     with pytest.raises(ConfigError, match=rf"{provider}\.setup\.vxlan"):
-        site(tmp_path, f"provider: {provider}")
+        site(tmp_path, f"provider: {provider}", f"{provider}: {{setup: {{requirements: ['{WHEEL}']}}}}")
 
 
 def test_a_tunnel_of_ones_own_is_named(tmp_path: Path) -> None:
-    assert site(tmp_path, "provider: skypilot", "machine_iface: tap0").device == "tap0"
+    installs = f"skypilot: {{setup: {{requirements: ['{WHEEL}']}}}}"
+    assert site(tmp_path, "provider: skypilot", "machine_iface: tap0", installs).device == "tap0"
 
 
 @pytest.mark.parametrize("topology", ["replica", "{gateway: edge, replica: true}"])

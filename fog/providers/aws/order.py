@@ -1,7 +1,8 @@
 """What is asked of EC2 for one machine.
 
 Place: pure.
-Source: EC2 API reference, RunInstances and "Ensuring idempotency".
+Source: EC2 API reference, RunInstances and "Ensuring idempotency"; EC2 user guide, "Configure the instance metadata
+service" (IMDSv2 and its hop limit) and "Amazon EBS encryption".
 """
 
 from __future__ import annotations
@@ -49,11 +50,21 @@ def order(spec: MachineSpec, ground: Ground, config: AwsConfig, data: bytes) -> 
         "ClientToken": token,
         "UserData": cast("str", data),  # boto3 takes bytes, which its stubs do not say
         "InstanceInitiatedShutdownBehavior": "terminate",
-        "MetadataOptions": {"HttpTokens": "required", "HttpEndpoint": "enabled", "InstanceMetadataTags": "enabled"},
+        "MetadataOptions": {
+            "HttpTokens": "required",
+            "HttpEndpoint": "enabled",
+            "HttpPutResponseHopLimit": 1,  # a container's or a forwarded request for a token gets no answer
+            "InstanceMetadataTags": "enabled",
+        },
         "BlockDeviceMappings": [
             {
                 "DeviceName": ground.root_device,
-                "Ebs": {"VolumeSize": config.disk_gib, "VolumeType": "gp3", "DeleteOnTermination": True},
+                "Ebs": {
+                    "VolumeSize": config.disk_gib,
+                    "VolumeType": "gp3",
+                    "DeleteOnTermination": True,
+                    "Encrypted": True,  # keys and delegations lie on it
+                },
             }
         ],
         "SecurityGroupIds": list(ground.security_groups),

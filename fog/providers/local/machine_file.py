@@ -53,5 +53,5 @@ class MachineFile:
             offer = told["spec"]["offer"]
             offer = Offer(**{**offer, "hardware": Hardware(**offer["hardware"])})
             return cls(**{**told, "spec": MachineSpec(**{**told["spec"], "offer": offer})})
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             return None

@@ -32,7 +32,7 @@ from fog.providers.local.wire import (
     space_path,
 )
 from fog.topology import Gateway
-from gdp.errors import LocalError
+from gdp.errors import LocalError, StoreError
 from gdp.testbed.processes import Process
 from gdp.testbed.runs import Record, Run, Runs
 
@@ -133,7 +133,11 @@ class Network:
                 told = (Path(record.files[0]) / _FILE).read_bytes()
             except OSError:
                 continue
-            return _Standing(record, Gateway.model_validate_json(told))
+            try:
+                topology = Gateway.model_validate_json(told)
+            except ValueError as error:  # pydantic's is one
+                raise StoreError(f"{record.files[0]}/{_FILE}: not the network that fog wrote: {error}") from error
+            return _Standing(record, topology)
         return None
 
     def _make(self) -> None:

@@ -36,8 +36,12 @@ FILES = pack(
         (Program("switch", ("gdp-switch", "--config", "{home}/switch.yaml"), ready="is up"),),
     )
 )
+HASH = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"
 TUNNEL = Setup(
-    requirements=("https://example.org/gdp_ros-0.1.0-py3-none-any.whl", "my nodes"),
+    requirements=(
+        f"https://example.org/gdp_ros-0.1.0-py3-none-any.whl#sha256={HASH}",
+        f"my-nodes==1.0 --hash=sha256:{HASH}",
+    ),
     packages=("libfcl-dev",),
     vxlan=Vxlan.model_validate({"remote": "198.51.100.7", "id": 42}),
 )
@@ -79,7 +83,8 @@ def test_it_is_a_cloud_config_that_installs_and_starts() -> None:
     assert {"python3-venv", "libfcl-dev"} <= set(config["packages"])
     assert config["runcmd"][-1][4:] == ["fog-tunnel", "fog-machine", "fog-log@switch"]
     install = read_back(text)["/usr/local/sbin/fog-install"][0].decode()
-    assert "https://example.org/gdp_ros-0.1.0-py3-none-any.whl 'my nodes'" in install
+    assert "--require-hashes --requirement /etc/fog-requirements.txt" in install
+    assert read_back(text)["/etc/fog-requirements.txt"][0].decode().splitlines() == list(TUNNEL.requirements)
 
 
 def test_user_data_is_small_and_the_same_each_time() -> None:

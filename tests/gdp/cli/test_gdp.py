@@ -52,7 +52,7 @@ def keys(gdp: Run) -> None:
     for line in (
         "domain init school --label school",
         "keygen node robot --role proxy --label robot --meta site=roof",
-        "cert issue --domain school --node robot",
+        "cert issue --domain school --node robot --role proxy --label robot",
         "keygen owner lab",
     ):
         assert gdp(line).code == 0
@@ -93,7 +93,7 @@ def test_the_way_from_nothing_to_a_delegation(gdp: Run, keys: None) -> None:
 
 def test_the_way_of_a_node_that_is_elsewhere(gdp: Run, keys: None) -> None:
     assert gdp("keygen node far --role switch --label far").code == 0
-    assert gdp("cert issue --domain school --request far/node.csr --out far.crt").code == 0
+    assert gdp("cert issue --domain school --request far/node.csr --role switch --label far --out far.crt").code == 0
     assert gdp("cert install far --cert far.crt --root school/root.crt").code == 0
     said = json.loads(gdp("cert show far/node.crt --root school/root.crt --json").out)
     assert (said["role"], said["label"]) == ("switch", "far")
@@ -117,7 +117,7 @@ def test_revocations_are_written_for_memberships_and_delegations(gdp: Run, keys:
 def test_files_with_secrets_are_private(gdp: Run, keys: None) -> None:
     gdp(DELEGATE)
     found = {path.name for path in Path().rglob("*") if path.is_file() and stat.S_IMODE(path.stat().st_mode) == 0o600}
-    assert found == {"root.key", "owner.key", "master.key", "node.key", "kem.key", "cam.delegation"}
+    assert found == {"root.key", "owner.key", "master.key", "node.key", "kem.key", "cam.delegation", "issued.jsonl"}
 
 
 @pytest.mark.parametrize(
@@ -133,11 +133,11 @@ def test_files_with_secrets_are_private(gdp: Run, keys: None) -> None:
         ("keygen owner lab", "--force"),
         ("keygen node robot --role proxy --label robot", "--force"),
         ("keygen node x --role proxy --label x --meta kind=rib", "role and label"),
-        ("cert issue --domain school --node robot", "--force"),
+        ("cert issue --domain school --node robot --role proxy --label robot", "--force"),
         ("cert issue --domain school", "--request"),
         ("cert issue --domain school --request robot/node.csr", "--out"),
         ("cert issue --domain school --request robot/node.crt --out x", "node.crt"),
-        ("cert issue --domain absent --node robot", "absent"),
+        ("cert issue --domain absent --node robot --role proxy --label robot", "absent"),
         ("cert show robot/node.key --root school/root.crt", "node.key"),
         ("cert show robot/node.crt --root robot/node.crt", "node.crt"),
         ("domain show robot/node.crt", "node.crt"),

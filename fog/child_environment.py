@@ -1,0 +1,37 @@
+"""Environment variables that programs of others inherit: ROS nodes, probes, and the programs of a machine.
+
+Place: pure. A node needs where ROS is installed and how it communicates. It does not need the operator's cloud
+credentials or agents (``AWS_SECRET_ACCESS_KEY``, ``SSH_AUTH_SOCK``), so only what is listed here is passed on.
+``FOG_PASS_ENVIRONMENT`` lists further names, separated by blanks or commas; ``PREFIX_*`` stands for all that begin so.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Final
+
+__all__ = ["PASS_MORE", "child_environment"]
+
+PASS_MORE: Final = "FOG_PASS_ENVIRONMENT"
+_NAMES: Final = (
+    *("PATH", "HOME", "USER", "LOGNAME", "SHELL", "LANG", "LANGUAGE", "LC_*", "TZ", "TERM", "COLORTERM", "NO_COLOR"),
+    *("TMPDIR", "XDG_RUNTIME_DIR", "PYTHON*", "VIRTUAL_ENV", "LD_LIBRARY_PATH", "CMAKE_PREFIX_PATH"),
+    *("ROS_*", "RMW_*", "RCL_*", "RCUTILS_*", "AMENT_*", "COLCON_*", "ROSCONSOLE_*", "FOG_*"),
+    *("CYCLONEDDS_*", "FASTDDS_*", "FASTRTPS_*", "ZENOH_*", "GZ_*", "IGN_*", "GAZEBO_*"),
+    *("CUDA_*", "NVIDIA_*", "OMP_*", "OPENBLAS_*", "MKL_*"),
+)
+_DESKTOP: Final = ("DISPLAY", "WAYLAND_DISPLAY", "XAUTHORITY", "XDG_SESSION_TYPE", "QT_*", "LIBGL_*")
+
+
+def child_environment(environment: Mapping[str, str], *, has_desktop: bool = False) -> dict[str, str]:
+    """Return the part of an environment that a child process inherits.
+
+    Args:
+        environment: of this process.
+        has_desktop: also what a window needs, for nodes beside the robot such as RViz.
+    """
+    more = re.split(r"[\s,]+", environment.get(PASS_MORE, ""))
+    wanted = {*_NAMES, *(_DESKTOP if has_desktop else ()), *(name for name in more if name.strip("*"))}
+    starts = tuple(name[:-1] for name in wanted if name.endswith("*"))
+    return {key: value for key, value in environment.items() if key in wanted or key.startswith(starts)}

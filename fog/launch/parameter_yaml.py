@@ -1,0 +1,71 @@
+"""YAML of parameters: one document, bounded, without aliases.
+
+Place: pure.
+Source: rcl_yaml_param_parser, which refuses aliases too ("Will not support aliasing"). An alias lets a few hundred
+bytes unroll into gigabytes. The events are looked at before anything is built.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import yaml
+
+from gdp.errors import LocalError
+
+__all__ = ["BYTES_MAX", "DEPTH_MAX", "read_parameters"]
+
+BYTES_MAX: Final = 1 << 20
+DEPTH_MAX: Final = 32
+_TUPLE: Final = "tag:yaml.org,2002:python/tuple"
+
+
+def read_parameters(text: str, where: str, *, has_tuples: bool = False) -> object:
+    """Return what a YAML text says.
+
+    Args:
+        where: for errors: a file, or what the text is about.
+        has_tuples: ``!!python/tuple`` is read as a list; anything else of Python is refused.
+
+    Raises:
+        LocalError: too long, too deep, with an alias, or not YAML; the text names the place and the line.
+    """
+    size = len(text.encode(errors="replace"))
+    if size > BYTES_MAX:
+        raise LocalError(f"{where}: {size} bytes; parameters have at most {BYTES_MAX}")
+    try:
+        _refuse_aliases(text, where)
+        document: object = yaml.load(text, _WithTuples if has_tuples else yaml.SafeLoader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = None if mark is None else mark.line
+        raise LocalError(f"{_at(where, line)}: YAML is expected: {error.problem or error.context}") from error
+    except (yaml.YAMLError, ValueError, OverflowError) as error:  # ValueError: a date such as 2001-99-99
+        raise LocalError(f"{where}: YAML is expected: {error}") from error
+    return document
+
+
+def _refuse_aliases(text: str, where: str) -> None:
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        line = event.start_mark.line if event.start_mark else None
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if isinstance(event, yaml.AliasEvent):
+            raise LocalError(f"{_at(where, line)}: aliases are not accepted; write the value out")
+        if depth > DEPTH_MAX:
+            raise LocalError(f"{_at(where, line)}: nested deeper than {DEPTH_MAX}")
+
+
+def _at(where: str, line: int | None) -> str:
+    return where if line is None else f"{where}:{line + 1}"
+
+
+def _list(loader: yaml.SafeLoader, node: yaml.SequenceNode) -> list[object]:
+    return list(loader.construct_sequence(node))
+
+
+class _WithTuples(yaml.SafeLoader):
+    """Reads ``!!python/tuple`` as a list."""
+
+
+_WithTuples.add_constructor(_TUPLE, _list)

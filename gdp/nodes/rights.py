@@ -1,0 +1,134 @@
+"""What each kind of node needs once it is up, and giving away the rest.
+
+Place: shell. A switch goes on to open ports that come back and to take its veth pairs down (CAP_NET_RAW,
+CAP_NET_ADMIN), and by the kernel data plane to load and attach its program there (CAP_BPF, CAP_PERFMON). A RIB or proxy
+opens its device again when it comes back. A node reads again, on SIGHUP, what the operator put into folders; where
+another user owns these, as in a shell of sudo, the capability to read or write past the owner is kept, and Landlock
+bounds it.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import site
+import stat
+import sys
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+from gdp.nodes.config import ClusterConfig, RibConfig, SwitchConfig
+from gdp.nodes.single_instance import lock_directory
+from gdp.ports.sandbox import Capability, Needs, confine
+
+__all__ = ["confine_proxy", "confine_rib", "confine_switch"]
+
+log = logging.getLogger(__name__)
+
+_DEVICE: Final = frozenset({Capability.NET_RAW, Capability.NET_ADMIN})
+_PROGRAMS: Final = frozenset({Capability.BPF, Capability.PERFMON})
+_SYSTEM: Final = tuple(map(Path, ("/usr", "/lib", "/lib64", "/lib32", "/etc", "/proc", "/sys", "/dev", "/opt")))
+_CHANGED: Final = (Path("/dev"),)  # null, and the terminal
+_WRITABLE_BY_ALL: Final = stat.S_IWOTH
+
+
+def confine_switch(config: SwitchConfig, plane: str) -> None:
+    """Give away what a switch does not need.
+
+    Args:
+        plane: the name of its data plane.
+    """
+    revocations = () if config.revocations is None else (config.revocations,)
+    is_kernel = plane == "kernel"
+    _confine(
+        Needs(
+            _DEVICE | (_PROGRAMS if is_kernel else frozenset()) | _past_owners(reads=revocations),
+            (*_CHANGED, lock_directory()),
+            (*_code(), *revocations),
+            () if config.metrics is None else (config.metrics.port,),
+            spared_calls=frozenset({"bpf"} if is_kernel else ()),
+        )
+    )
+
+
+def confine_rib(config: RibConfig) -> None:
+    """Give away what a RIB does not need."""
+    is_shared = config.store != "memory"
+    secrets = () if config.store == "memory" else _files_of(config.store.cluster)
+    snapshots = () if config.snapshot is None else (config.snapshot.parent,)
+    ports = () if config.metrics is None else (config.metrics.port,)
+    _confine(
+        Needs(
+            _DEVICE | _past_owners(secrets, snapshots),
+            (*_CHANGED, lock_directory(), *snapshots),
+            None if is_shared else _code(),
+            None if is_shared else ports,
+        )
+    )
+
+
+def confine_proxy(reads: Iterable[Path], writes: Iterable[Path], *, has_ros: bool) -> None:
+    """Give away what a proxy does not need.
+
+    Args:
+        reads: what it reads again on SIGHUP.
+        writes: folders of its recording.
+        has_ros: whether it takes part in a graph. ROS middleware writes logs and shared memory, which it shares with
+            nodes of other users: CAP_DAC_OVERRIDE is kept for that.
+    """
+    recordings = tuple(writes)
+    changed = [*_CHANGED, lock_directory(), Path(tempfile.gettempdir()), *recordings]
+    kept = _DEVICE | _past_owners(reads, recordings)
+    if has_ros:
+        changed += _ros_folders()
+        kept |= {Capability.DAC_OVERRIDE}
+    _confine(Needs(kept, tuple(changed), starts_programs=has_ros))
+
+
+def _confine(needs: Needs) -> None:
+    log.info("rights %s", confine(needs).to_text())
+
+
+def _past_owners(reads: Iterable[Path] = (), writes: Iterable[Path] = ()) -> frozenset[Capability]:
+    """Return the capabilities without which root could not read or change what another user has."""
+    kept = set()
+    if os.geteuid() == 0:
+        if any(_is_foreign(path) for path in reads):
+            kept.add(Capability.DAC_READ_SEARCH)
+        if any(_is_foreign(path) and not path.stat().st_mode & _WRITABLE_BY_ALL for path in writes):
+            kept.add(Capability.DAC_OVERRIDE)
+    return frozenset(kept)
+
+
+def _files_of(store: ClusterConfig) -> tuple[Path, ...]:
+    return tuple(each for each in (store.password_file, store.ca, store.cert, store.key) if each is not None)
+
+
+def _is_foreign(path: Path) -> bool:
+    """Return whether a folder, or one that it lies in, is another user's."""
+    try:
+        return any(each.stat().st_uid != os.geteuid() for each in (path.absolute(), *path.absolute().parents))
+    except OSError:
+        return False
+
+
+def _code() -> tuple[Path, ...]:
+    """Return where Python finds what it has not loaded yet."""
+    folders = {*sys.path, sys.prefix, sys.base_prefix, sys.exec_prefix, *site.getsitepackages()}
+    folders -= {"", "/", str(Path.cwd()), str(Path.home())}  # where people keep other things
+    own = Path(__file__).resolve().parents[1]
+    return (*_SYSTEM, own, *map(Path, sorted(folders)))
+
+
+def _ros_folders() -> list[Path]:
+    """Return where ROS writes logs; the folder must be there, or no rule can name it."""
+    home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
+    folders = [home, *(Path(given) for given in (os.environ.get("ROS_LOG_DIR"),) if given)]
+    for folder in folders:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            log.warning("folder of ROS logs not made path=%s reason=%s", folder, error.strerror)
+    return folders

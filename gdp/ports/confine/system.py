@@ -1,0 +1,47 @@
+"""System calls without a wrapper in the standard library, through ctypes.
+
+Place: I/O, the kernel's interface.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from typing import Final
+
+__all__ = ["LIBC", "call", "prctl"]
+
+LIBC: Final = ctypes.CDLL(None, use_errno=True)
+LIBC.syscall.restype = ctypes.c_long
+
+
+def call(number: int, *arguments: object) -> int:
+    """Return what a system call returns; integers are passed as 64 bits.
+
+    Raises:
+        OSError: it failed.
+    """
+    given = [ctypes.c_long(each) if isinstance(each, int) else each for each in arguments]
+    return checked(LIBC.syscall(ctypes.c_long(number), *given))
+
+
+def prctl(option: int, second: int = 0, third: int = 0) -> int:
+    """Return what prctl(2) returns.
+
+    Raises:
+        OSError: it failed.
+    """
+    zero = ctypes.c_ulong(0)
+    return checked(LIBC.prctl(option, ctypes.c_ulong(second), ctypes.c_ulong(third), zero, zero))
+
+
+def checked(result: int) -> int:
+    """Return a result that is not negative.
+
+    Raises:
+        OSError: it is, and why.
+    """
+    if result < 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+    return result

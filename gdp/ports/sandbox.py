@@ -1,0 +1,113 @@
+"""Least rights at run time: what a node gives away once its sockets and programs are open.
+
+Place: I/O. In this order: ``no_new_privs``, Landlock, seccomp, the bounding set, capabilities. Each step that this
+kernel or this user's rights do not allow is left out, and ``Rights`` says so: it is what the kernel reports afterwards.
+Capabilities and Landlock are a thread's own, so this comes before a node starts its threads.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from gdp.ports.confine import landlock, seccomp
+from gdp.ports.confine.capabilities import Capability, drop_bounding, keep_only
+from gdp.ports.confine.system import prctl
+
+__all__ = ["Capability", "Needs", "Rights", "confine"]
+
+log = logging.getLogger(__name__)
+
+_NO_NEW_PRIVS: Final = 38  # PR_SET_NO_NEW_PRIVS
+_STATUS: Final = Path("/proc/thread-self/status")
+_TASKS: Final = Path("/proc/self/task")
+
+
+@dataclass(frozen=True, slots=True)
+class Needs:
+    """What a process goes on to do.
+
+    Args:
+        capabilities: that it keeps, as far as it has them.
+        writes: files and folders that it changes.
+        reads: those that it reads beside them; None: any.
+        tcp_ports: on which it listens, and it connects to none by TCP; None: any.
+        starts_programs: whether it starts some; they get no capability.
+        spared_calls: system calls of ``seccomp.denied`` that it makes.
+    """
+
+    capabilities: frozenset[Capability] = frozenset()
+    writes: tuple[Path, ...] = ()
+    reads: tuple[Path, ...] | None = None
+    tcp_ports: tuple[int, ...] | None = None
+    starts_programs: bool = False
+    spared_calls: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class Rights:
+    """What this thread may still do, as the kernel says.
+
+    Args:
+        capabilities: in effect; ``CAP_`` left out, lower case, a number where it has no name here.
+        bounding: how many capabilities a program of root's that it starts could get.
+        landlock: the version in use; 0: none.
+        threads: of this process; more than one: the others keep capabilities and files.
+    """
+
+    capabilities: tuple[str, ...]
+    bounding: int
+    no_new_privs: bool
+    landlock: int
+    seccomp: bool
+    threads: int
+
+    def to_text(self) -> str:
+        """Return one line for a log."""
+        return (
+            f"capabilities={','.join(self.capabilities) or 'none'} bounding={self.bounding}"
+            f" no_new_privs={self.no_new_privs} landlock={self.landlock or 'none'} seccomp={self.seccomp}"
+            f" threads={self.threads}"
+        )
+
+
+def confine(needs: Needs) -> Rights:
+    """Give away what a process does not need; there is no way back. Return what is left."""
+    version = 0
+    has_filter = False
+    try:
+        prctl(_NO_NEW_PRIVS, 1)
+        version = landlock.restrict(needs.writes, needs.reads, needs.tcp_ports, may_execute=needs.starts_programs)
+        has_filter = seccomp.refuse(needs.spared_calls)
+    except OSError as error:
+        log.warning("rights kept reason=%s landlock=%d seccomp=%s", error.strerror, version, has_filter)
+    try:
+        drop_bounding()
+    except OSError as error:
+        log.debug("bounding set kept reason=%s", error.strerror)
+    try:
+        keep_only(needs.capabilities)
+    except OSError as error:
+        log.warning("capabilities kept reason=%s", error.strerror)
+    return _rights(version)
+
+
+def _rights(version: int) -> Rights:
+    lines = (line.partition(":") for line in _STATUS.read_text(encoding="ascii", errors="replace").splitlines())
+    status = {key: value.strip() for key, _, value in lines}
+    return Rights(
+        tuple(_names(int(status.get("CapEff", "0"), 16))),
+        int(status.get("CapBnd", "0"), 16).bit_count(),
+        status.get("NoNewPrivs") == "1",
+        version,
+        status.get("Seccomp") == "2",
+        sum(1 for _ in _TASKS.iterdir()),
+    )
+
+
+def _names(mask: int) -> Collection[str]:
+    known = {each.value: each.name.lower() for each in Capability}
+    return [known.get(number, str(number)) for number in range(mask.bit_length()) if mask >> number & 1]

@@ -1,0 +1,160 @@
+"""Ledger of a trust domain: every membership that its root key signed, beside the key, in ``issued.jsonl``.
+
+Place: I/O, the file system; times come in as arguments.
+One JSON object a line, appended and synced before the certificate is handed out. Each line holds the SHA-256 of the
+line before it, so that a changed, removed or inserted line is found. A ledger whose last lines were cut off still holds
+together: keep a copy of the last hash elsewhere to notice that. A line without its end was never handed out and is
+dropped by the next append.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from gdp.crypto.certificates import Membership
+from gdp.errors import LocalError
+from gdp.stores.ownership import refuse_foreign_file, refuse_shared_folder
+
+__all__ = ["LEDGER", "Issued", "append_issued", "read_ledger"]
+
+LEDGER: Final = "issued.jsonl"
+_BEGIN: Final = "0" * 64  # what the first line has in place of a hash
+_LINE_MAX_BYTES: Final = 16 * 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Issued:
+    """One membership that was signed.
+
+    Args:
+        at_unix_s: when it was signed.
+        name, domain: of the node and of the trust domain, 64 hex digits each.
+        fingerprint: SHA-256 of the certificate, hex.
+        from_unix_s, until_unix_s: its validity.
+        previous: SHA-256 of the line before, hex.
+    """
+
+    at_unix_s: int
+    name: str
+    role: str
+    label: str
+    domain: str
+    fingerprint: str
+    from_unix_s: int
+    until_unix_s: int
+    previous: str
+
+    def to_line(self) -> bytes:
+        """Return the line, without its end."""
+        return json.dumps(asdict(self), sort_keys=True).encode()
+
+
+def append_issued(directory: Path, member: Membership, unix_s: float) -> None:
+    """Write down a membership; it is on the disk when this returns.
+
+    Args:
+        directory: of the domain.
+        unix_s: when it was signed.
+
+    Raises:
+        LocalError: the ledger is another user's, does not hold together at its end, or cannot be written. The
+            membership must not be handed out then.
+    """
+    path = directory / LEDGER
+    validity = member.validity
+    with _opened(path, os.O_RDWR | os.O_CREAT) as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        previous = _last_hash(path, file)
+        line = Issued(
+            int(unix_s),
+            member.name.to_text(),
+            member.role.value,
+            member.label,
+            member.domain.to_text(),
+            member.fingerprint.hex(),
+            validity.not_before_unix_s,
+            validity.not_after_unix_s,
+            previous,
+        ).to_line()
+        file.write(line + b"\n")
+        file.flush()
+        os.fsync(file.fileno())
+    folder = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def read_ledger(directory: Path) -> list[Issued]:
+    """Return what a domain issued, the oldest first; empty: nothing was written down yet.
+
+    Raises:
+        LocalError: a line is malformed, or does not follow from the line before; the text names it.
+    """
+    path = directory / LEDGER
+    if not path.exists():
+        return []
+    found: list[Issued] = []
+    previous = _BEGIN
+    with _opened(path, os.O_RDONLY) as file:
+        fcntl.flock(file, fcntl.LOCK_SH)
+        for number, line in enumerate(iter(lambda: file.readline(_LINE_MAX_BYTES), b""), 1):
+            if not line.endswith(b"\n"):
+                break  # was never handed out
+            issued = _parsed(f"{path}:{number}", line)
+            if issued.previous != previous:
+                raise LocalError(f"{path}:{number}: does not follow from the line before: the ledger was changed")
+            found.append(issued)
+            previous = _hash(line)
+    return found
+
+
+@contextmanager
+def _opened(path: Path, flags: int) -> Iterator[BinaryIO]:
+    try:
+        handle = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
+        with os.fdopen(handle, "r+b" if flags & os.O_RDWR else "rb") as file:
+            refuse_foreign_file(path, os.fstat(file.fileno()))
+            refuse_shared_folder(path.parent)
+            yield file
+    except OSError as error:
+        raise LocalError(f"{path}: {error.strerror}") from error
+
+
+def _last_hash(path: Path, file: BinaryIO) -> str:
+    """Return the hash of the last whole line, and leave the file's position and end behind it."""
+    end = file.seek(0, os.SEEK_END)
+    begin = file.seek(max(end - 2 * _LINE_MAX_BYTES, 0))
+    tail = file.read()
+    whole = tail[: tail.rfind(b"\n") + 1]
+    file.truncate(file.seek(begin + len(whole)))
+    if not whole:
+        if begin:
+            raise LocalError(f"{path}: its last line has no end; restore the ledger from a copy")
+        return _BEGIN
+    line = whole[whole.rfind(b"\n", 0, -1) + 1 :]
+    _parsed(f"{path}: last line", line)
+    return _hash(line)
+
+
+def _parsed(where: str, line: bytes) -> Issued:
+    try:
+        issued = Issued(**json.loads(line))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise LocalError(f"{where}: not a line of a ledger: {error}") from error
+    if issued.to_line() != line.rstrip(b"\n"):
+        raise LocalError(f"{where}: not a line as the ledger writes it")
+    return issued
+
+
+def _hash(line: bytes) -> str:
+    return hashlib.sha256(line.rstrip(b"\n")).hexdigest()

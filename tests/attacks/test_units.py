@@ -1,0 +1,222 @@
+"""Fences of the services: what systemd says of the units, and users' code apart from the machine's keys."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import pwd
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+from fog.enrolment.boots import machine_boot
+from fog.host.bounded_log import BoundedLog
+from fog.host.bundle import pack, read_programs
+from fog.host.life import NODE_USER, Life
+from fog.machine import Boot, Program
+from fog.providers.cloud_init import HOME, Setup, cloud_config, placed
+from tests.fog.enrolment.test_enrolment import CLUSTER, authority
+from tests.pages import ROOT
+
+__all__ = ["authority"]
+
+UNITS = sorted((ROOT / "scripts" / "systemd").glob("*.service"))
+EXPOSURE_MAX = {"gdp-switch": 27, "gdp-rib": 27, "gdp-proxy": 32, "fog-machine": 50}  # tenths; 96 without fences
+FENCES = (
+    *("NoNewPrivileges=yes", "ProtectSystem=strict", "ProtectHome=yes", "PrivateTmp=yes", "CapabilityBoundingSet="),
+    *("RestrictAddressFamilies=", "SystemCallFilter=", "MemoryMax=", "LimitNOFILE="),
+)
+needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root may become another user")
+needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+LOOKS = """
+import json, os, pathlib, sys
+status = dict(l.split(":\\t", 1) for l in open("/proc/self/status").read().splitlines() if ":\\t" in l)
+def reads(path):
+    try:
+        return bool(pathlib.Path(path).read_bytes())
+    except OSError as error:
+        return error.errno
+print(json.dumps({
+    "uid": os.getuid(), "gid": os.getgid(), "home": os.environ["HOME"], "cwd": os.getcwd(),
+    "caps": [int(status[k], 16) for k in ("CapEff", "CapPrm", "CapBnd", "CapAmb")], "nnp": status["NoNewPrivs"],
+    "key": reads(sys.argv[1]),
+}), flush=True)
+"""
+
+
+def machine_unit() -> str:
+    (unit,) = (file for file in placed({}, Setup()) if file.path.endswith("fog-machine.service"))
+    return unit.content.decode()
+
+
+@pytest.fixture(params=[*UNITS, None], ids=lambda each: each.stem if each else "fog-machine")
+def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """A unit file, with a program that is there."""
+    text = machine_unit() if request.param is None else request.param.read_text()
+    path = tmp_path / ("fog-machine.service" if request.param is None else request.param.name)
+    path.write_text(re.sub(r"(?m)^(Exec\w+=\+?)/(?:opt|usr/local)/\S+", r"\1/bin/true", text))
+    return path
+
+
+@needs_systemd
+def test_a53_systemd_understands_the_unit(unit: Path) -> None:
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", str(unit)],
+        env={**os.environ, "SYSTEMD_UNIT_PATH": f"{unit.parent}:"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    ours = [line for line in done.stderr.splitlines() if unit.name in line and "gdp-switch.service" not in line]
+    assert ours == []
+
+
+@needs_systemd
+def test_a53_systemd_finds_the_unit_fenced(unit: Path) -> None:
+    words = ["systemd-analyze", "security", "--offline=true", "--no-pager", f"--threshold={EXPOSURE_MAX[unit.stem]}"]
+    done = subprocess.run([*words, str(unit)], capture_output=True, text=True, check=False)
+    if "unrecognized option" in done.stderr or "nknown" in done.stderr:
+        pytest.skip(done.stderr.strip())
+    assert done.returncode == 0, f"{done.stdout}{done.stderr}".splitlines()[-1]
+
+
+def test_a53_the_unit_has_every_fence(unit: Path) -> None:
+    lines = unit.read_text().splitlines()
+    lacking = [fence for fence in FENCES if not any(line.startswith(fence) for line in lines)]
+    assert lacking == (["PrivateTmp=yes"] if unit.stem == "gdp-proxy" else [])  # where ROS nodes of the host meet it
+    kept = set(re.findall(r"CAP_\w+", " ".join(line for line in lines if line.startswith("CapabilityBoundingSet="))))
+    assert not kept & {"CAP_SYS_ADMIN", "CAP_SYS_PTRACE", "CAP_SYS_MODULE", "CAP_DAC_READ_SEARCH", "CAP_SYS_RAWIO"}
+    assert "User=gdp" in lines or unit.stem == "fog-machine"
+
+
+def test_a53_nodes_of_a_machine_are_the_users_code(authority: object) -> None:
+    boot, _ = machine_boot(
+        authority,  # type: ignore[arg-type]
+        CLUSTER,
+        "m1",
+        lambda node: [node.executable],
+        iface="eth0",
+        days=1.0,
+        shares_host=False,
+    )
+    programs = read_programs(pack(boot)["boot.json"])
+    assert {each.name: each.is_users for each in programs if each.name in ("switch", "proxy")} == {
+        "switch": False,
+        "proxy": False,
+    }
+    assert all(each.is_users for each in programs if each.name.startswith("node"))
+    assert f"{NODE_USER}=fog-node" in machine_unit()
+
+
+def test_a53_only_the_middlewares_profile_is_open_to_the_nodes_user(tmp_path: Path) -> None:
+    home = tmp_path / "fog"
+    (home / "keys").mkdir(parents=True)
+    for name in ("keys/own.key", "keys/x.xml", "proxy.yaml", "fastdds.xml"):
+        (home / name).write_text("x")
+    text = cloud_config(pack(Boot({}, ())), Setup())
+    for words in yaml.safe_load(text)["runcmd"]:
+        if words[0] in ("chmod", "find"):
+            subprocess.run([word.replace(HOME, str(home)) for word in words], check=True)
+    modes = {str(path.relative_to(home)): path.stat().st_mode & 0o077 for path in home.rglob("*")}
+    assert modes == {"keys": 0, "keys/own.key": 0, "keys/x.xml": 0, "proxy.yaml": 0, "fastdds.xml": 0o044}
+    assert home.stat().st_mode & 0o777 == 0o711
+
+
+@pytest.fixture
+def home() -> Iterator[Path]:
+    """A machine's folder, as other users see one."""
+    with tempfile.TemporaryDirectory(prefix="gdp-test-") as folder:
+        Path(folder).chmod(0o711)
+        yield Path(folder)
+
+
+def looked(tmp_path: Path, *, is_users: bool) -> dict[str, object]:
+    """Return what a program of a machine finds of itself."""
+    key = tmp_path / "own.key"
+    key.write_text("secret")
+    key.chmod(0o600)
+
+    async def live() -> None:
+        log = BoundedLog(tmp_path / "log")
+        program = Program("node", ("/usr/bin/python3", "-c", LOOKS, str(key)), is_users=is_users)
+        life = Life(program, tmp_path, log, lambda: None)
+        await asyncio.wait_for(life.ended, 30)
+        log.close()
+
+    asyncio.run(live())
+    said: dict[str, object] = json.loads((tmp_path / "log").read_text())
+    return said
+
+
+@needs_root
+def test_a53_the_users_code_runs_as_another_user_without_rights(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(NODE_USER, "daemon")
+    daemon = pwd.getpwnam("daemon")
+    said = looked(home, is_users=True)
+    assert (said["uid"], said["gid"], said["home"]) == (daemon.pw_uid, daemon.pw_gid, daemon.pw_dir)
+    assert said["cwd"] == os.path.realpath(daemon.pw_dir)
+    assert said["caps"] == [0, 0, 0, 0]
+    assert said["nnp"] == "1"
+    assert said["key"] == 13  # EACCES
+
+
+@needs_root
+def test_a53_the_machines_own_programs_stay_who_they_are(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(NODE_USER, "daemon")
+    said = looked(home, is_users=False)
+    assert (said["uid"], said["key"]) == (0, True)
+
+
+def test_a53_a_user_that_is_not_there_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(NODE_USER, "nobody-of-this-name")
+
+    async def live() -> None:
+        with contextlib.closing(BoundedLog(tmp_path / "log")) as log:
+            Life(Program("node", ("true",), is_users=True), tmp_path, log, lambda: None)
+
+    with pytest.raises(OSError, match="nobody-of-this-name"):
+        asyncio.run(live())
+
+
+@needs_root
+def test_a53_the_users_code_ends_with_the_machine_although_it_is_another_user(tmp_path: Path) -> None:
+    code = (
+        "import asyncio, pathlib, sys\n"
+        "from fog.host.bounded_log import BoundedLog\nfrom fog.host.life import Life\nfrom fog.machine import Program\n"
+        "async def live():\n"
+        "    home = pathlib.Path(sys.argv[1])\n"
+        "    program = Program('n', ('sleep', '1000'), is_users=True)\n"
+        "    life = Life(program, home, BoundedLog(home / 'log'), lambda: None)\n"
+        "    await asyncio.sleep(1)\n"
+        "    print(life.pid, flush=True)\n"
+        "    await life.ended\n"
+        "asyncio.run(live())\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path)],
+        env={**os.environ, "PYTHONPATH": str(ROOT), NODE_USER: "daemon"},
+        stdout=subprocess.PIPE,
+    )
+    assert process.stdout is not None
+    with process.stdout:
+        node = int(process.stdout.readline())
+    assert Path(f"/proc/{node}").stat().st_uid == pwd.getpwnam("daemon").pw_uid
+    process.send_signal(signal.SIGKILL)
+    process.wait(20)
+    end_s = time.monotonic() + 20
+    while Path(f"/proc/{node}/exe").exists():
+        assert time.monotonic() < end_s
+        time.sleep(0.05)
