@@ -185,7 +185,10 @@ def _adjacencies(fields: Fields, key: str) -> tuple[Adjacency, ...]:
     for each in fields.list_(key, LINKS_MAX):
         match each:
             case [bytes(name), bytes(domain), int(cost), int(mtu)] if (
-                len(name) == len(domain) == 32 and ZERO not in (name, domain) and 0 < cost <= COST_MAX and 0 < mtu <= FRAME_MAX_BYTES
+                len(name) == len(domain) == 32
+                and ZERO not in (name, domain)
+                and 0 < cost <= COST_MAX
+                and 0 < mtu <= FRAME_MAX_BYTES
             ):
                 found.append(Adjacency(Name(name), Name(domain), cost, mtu))
             case _:

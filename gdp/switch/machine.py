@@ -137,8 +137,8 @@ class Switch:
 
     def drops(self) -> Mapping[DropReason, int]:
         """Return what the control plane dropped, by reason."""
-        joiners = self._joiner.drops + self._hellos.drops
-        return self._drops + joiners + self._flooding.drops + self.parked.drops + self.planter.drops + self.unicast.drops
+        own = self._drops + self._joiner.drops + self._hellos.drops
+        return own + self._flooding.drops + self.parked.drops + self.planter.drops + self.unicast.drops
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Instant) -> None:
         """Begin to use a port, or learn that the MTU or cost of one that is up has changed."""

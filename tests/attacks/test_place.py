@@ -15,7 +15,7 @@ from gdp.names import Name
 from gdp.testbed.world import World
 from gdp.trust.rtcert import RtCert
 from tests.journeys.flows import ROBOT, flowing, ring
-from tests.journeys.test_attacks import control, mac_of, still_flows
+from tests.journeys.test_attacks import mac_of, still_flows
 
 
 def liar_of(world: World, switch: str) -> LinkState:

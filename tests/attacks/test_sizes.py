@@ -12,8 +12,7 @@ from gdp.control.verdict import Verdict
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason
-from gdp.frame.codec import encode
-from gdp.frame.codec import Header
+from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import CLAIM_MAX_BYTES, CONTROL_MAX_BYTES, HOPS_MAX, WITHDRAWAL_MAX_BYTES
 from gdp.names import ZERO, Name
@@ -105,9 +104,8 @@ def test_a64_a_link_state_of_more_than_fits_is_cut_and_ends_no_switch() -> None:
         return [Name(bytes([1 + each % 255, each // 255]) * 16) for each in range(count)]
 
     links = tuple(Adjacency(name, nuc1.root.domain, 1 << 24, 9_000) for name in names(LINKS_MAX))
-    ribs = tuple(
-        AttachedRib(name, nuc1.root.domain, bytes(8), membership=bytes(700), rtcert=bytes(300)) for name in names(RIBS_MAX)
-    )
+    proof = {"membership": bytes(700), "rtcert": bytes(300)}
+    ribs = tuple(AttachedRib(name, nuc1.root.domain, bytes(8), **proof) for name in names(RIBS_MAX))
     state = LinkState(
         nuc1.name, nuc1.root.domain, Scope.BORDER, 1, links, links, ribs, tuple(names(MEMBERS_MAX)),
         refused=tuple(names(RIBS_MAX)),
