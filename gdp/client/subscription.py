@@ -188,13 +188,15 @@ class Subscriptions:
         """Take what the switch says of somebody: its claim, or that it is gone.
 
         Raises:
-            StatementError: the claim does not hold, or is about something else.
+            StatementError: the claim does not hold, is about something else, or newer than what is gone.
         """
         subscription, change = self._by_name.get(answer.name), Change([], [], [])
         if subscription is None or answer.advertiser == self._reader.name:
             return change
         feed = subscription.feeds.get(answer.advertiser)
         if not answer.claim:
+            if feed is not None and feed.claim_sequence > answer.sequence:
+                raise StatementError(DropReason.STALE, "gone, of an earlier claim")
             return change if feed is None else Change([], self._detach(subscription, answer.advertiser), [])
         claim = self._verifier.verify(answer.claim, now.unix_s)
         is_heard = HEARS[subscription.right] is claim.right

@@ -52,6 +52,7 @@ class Answer:
         domain: where it is attached.
         transit: domains through which that domain lets its traffic pass.
         lease_s: how long this may be believed.
+        sequence: of the newest claim that is gone; whoever knows a newer one has heard an old answer.
     """
 
     name: Name
@@ -60,6 +61,7 @@ class Answer:
     domain: Name
     transit: tuple[Name, ...]
     lease_s: float
+    sequence: int = 0
 
     @property
     def is_nobody(self) -> bool:
@@ -75,6 +77,7 @@ class Answer:
             "d": self.domain,
             "x": list(self.transit[:TRANSIT_MAX]),
             "l": float(self.lease_s),
+            "s": self.sequence,
             "c": membership,
         }
         return sign(StatementType.ANSWER, body, signer, key)
@@ -93,4 +96,5 @@ class Answer:
             fields.name("d"),
             tuple(fields.names("x", TRANSIT_MAX)),
             fields.number("l", 0, LEASE_MAX_S),
+            fields.uint("s"),
         )

@@ -466,7 +466,8 @@ class Rib:
             told |= self._bringer(route)
         for asker in told:
             if self._may_tell(route, asker):
-                self._send(Answer(route.name, route.advertiser, b"", route.domain, (), 0.0), asker.name)
+                gone = Answer(route.name, route.advertiser, b"", route.domain, (), 0.0, route.sequence)
+                self._send(gone, asker.name)
 
     # -- the tier above
 
@@ -541,7 +542,7 @@ class Rib:
             return
         known = self._store.get(answer.name, answer.advertiser)
         if not answer.claim:
-            if isinstance(known, Route) and known.is_from_above:
+            if isinstance(known, Route) and known.is_from_above and known.sequence <= answer.sequence:
                 self._store.withdraw(answer.name, answer.advertiser)
                 self._tell_gone(known, now.mono_s)
             return

@@ -300,6 +300,9 @@ class Inquirer:
         return answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)
 
     def _gone(self, answer: Answer, now_s: float) -> None:
+        known = self._places.get(answer.name, answer.advertiser)
+        if known is not None and known.sequence > answer.sequence:
+            raise StatementError(DropReason.STALE, "gone, of an earlier claim")
         self._places.remove(answer.name, answer.advertiser, now_s)
         self._planter.publisher_gone(answer.name, answer.advertiser)
         self._unicast.forget(answer.name)

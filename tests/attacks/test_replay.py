@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gdp.client.feed import FeedState
+from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
 from gdp.trust.right import Right
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
@@ -70,3 +71,30 @@ def test_a11_a_request_of_ten_minutes_ago_is_not_handed_to_a_restarted_server() 
     assert server.bodies() == []
     world.network.thaw(ROBOT)
     outlive(world, client, server)
+
+
+def test_a09_an_old_gone_of_a_publisher_that_came_back_silences_no_topic() -> None:
+    world = ring()
+    tap = Tap("nuc4", "nuc5")
+    world.network.taps.append(tap)
+    flow = flowing(world)
+    world.members[ROBOT].leave()
+    world.network.touch(ROBOT)
+    world.network.run(3)
+    gone = [frame for frame in tap.frames if frame[1] == Kind.RIB_ANSWER]
+    assert gone
+    member = world.restart_member(ROBOT)
+    flow = Flow(world, flow.name, ROBOT, flow.topic, member.advertise(flow.topic, b"", reliable=True), flow.got)
+    world.network.touch(ROBOT)
+    assert world.network.run(20, lambda: flow.is_read_by(1))
+    flow.collect()
+    before = len(flow.got[SERVER])
+    for number in range(50):
+        flow.publish(b"message %d" % number)
+        for frame in gone:
+            world.network.inject("nuc5", 0, frame, mac_of(world, "nuc5"))
+        world.network.run(0.05)
+    assert world.network.run(5, lambda: flow.has(SERVER, before + 50))
+    assert sum(switch.drops()[DropReason.STALE] for switch in world.switches.values()) >= 50
+    assert sum(world.members[SERVER].lost().values()) == 0
+    flow.outlive()
