@@ -111,7 +111,7 @@ def _note_seed() -> bytes:
 
 
 _REPORT: Final = Report(ReportFlag.NONE, 5, 1, (Missing(5, 1, 2),))
-_STATUS: Final = Status(1, 5, 0, {bytes(32): Start(1, 1)}, b"description")
+_STATUS: Final = Status(1, 5, 0, {bytes(32): Start(1, 1, 1)}, b"description")
 
 DECODERS: Final = (
     Decoder("frame", codec.decode, tuple(_FRAMES[:2]), (FrameError,)),
