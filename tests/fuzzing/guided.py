@@ -66,7 +66,7 @@ def guided(decoder: Decoder, seconds: float, seed: int) -> Outcome:
         outcome.slowest_ms, outcome.memory_ratio = rest
         for path in sorted((folder / "findings").glob("*.json")):
             told = json.loads(path.read_text())
-            outcome.findings[told["place"]] = Finding(bytes.fromhex(told["data"]), told["error"])
+            outcome.findings[told["place"]] = Finding(bytes.fromhex(told["data"]), told["error"], told["excess"])
         if status != 0:
             log = (folder / "log").read_text(errors="replace")[-400:]
             crash = next(iter(folder.glob("crash-*")), None)
@@ -132,10 +132,10 @@ class _Tried:
             if spent_ms > decoder.time_max_ms:
                 spent_ms = min(spent_ms, *(self._timed(data) for _ in range(_REPEATS)))
                 if spent_ms > decoder.time_max_ms:
-                    self._find(f"time {len(data) // 1_024} KiB", data, f"{spent_ms:.0f} ms")
+                    self._find("time", Finding(data, f"{spent_ms:.0f} ms", True))
             outcome.slowest_ms = max(outcome.slowest_ms, spent_ms)
         for place, finding in outcome.findings.items():
-            self._find(place, finding.data, finding.error)
+            self._find(place, finding)
         numbers = outcome.executions, outcome.refused, outcome.foreign, outcome.slowest_ms, outcome.memory_ratio
         _NUMBERS.pack_into(self._shared, 0, *numbers)
 
@@ -154,11 +154,13 @@ class _Tried:
         ratio = peak / max(len(data), _MEMORY_LEAST_BYTES)
         self._outcome.memory_ratio = max(self._outcome.memory_ratio, ratio)
         if ratio > self._outcome.decoder.memory_max:
-            self._find("memory", data, f"{ratio:.1f} times {max(len(data), _MEMORY_LEAST_BYTES)} bytes")
+            size = max(len(data), _MEMORY_LEAST_BYTES)
+            self._find("memory", Finding(data, f"{ratio:.1f} times {size} bytes", True))
 
-    def _find(self, place: str, data: bytes, error: str) -> None:
+    def _find(self, place: str, finding: Finding) -> None:
         """Write a finding down, the first of each place."""
         path = self._folder / (hashlib.sha256(place.encode()).hexdigest()[:16] + ".json")
         if not path.exists():
-            path.write_text(json.dumps({"place": place, "data": data.hex(), "error": error}))
+            told = {"data": finding.data.hex(), "error": finding.error, "excess": finding.is_excess}
+            path.write_text(json.dumps({"place": place, **told}))
 

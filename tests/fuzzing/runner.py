@@ -44,10 +44,11 @@ class HangError(BaseException):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """An input for which a decoder raised what it may not."""
+    """An input for which a decoder raised what it may not; ``is_excess``: or took too much time or memory."""
 
     data: bytes
     error: str
+    is_excess: bool = False
 
 
 @dataclass(slots=True)

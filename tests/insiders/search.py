@@ -89,9 +89,9 @@ def run_plan(plan: Plan) -> tuple[Figures, Found | None]:
 def searched(statements: int, processes: int, seed: int, seconds: float | None = None) -> Iterator[Search]:
     """Run trials until so many statements were tried, or the time is over; yield what there is after each."""
     search, begun_s = Search(), time.monotonic()
-    seeds = iter(range(seed, seed + 1_000_000_000))
+    seeds, words = iter(range(seed, seed + 1_000_000_000)), min(statements, WORDS)
     with ProcessPoolExecutor(processes, mp_context=get_context("fork"), max_tasks_per_child=None) as pool:
-        under_way = {pool.submit(run_plan, plan_of(next(seeds))) for _ in range(processes)}
+        under_way = {pool.submit(run_plan, plan_of(next(seeds), words)) for _ in range(processes)}
         while under_way:
             done, under_way = wait(under_way, return_when=FIRST_COMPLETED)
             for each in done:
@@ -99,8 +99,8 @@ def searched(statements: int, processes: int, seed: int, seconds: float | None =
                 search.seconds = time.monotonic() - begun_s
                 yield search
                 has_time = seconds is None or search.seconds < seconds
-                if search.statements + len(under_way) * WORDS < statements and has_time:
-                    under_way.add(pool.submit(run_plan, plan_of(next(seeds))))
+                if search.statements + len(under_way) * words < statements and has_time:
+                    under_way.add(pool.submit(run_plan, plan_of(next(seeds), words)))
 
 
 def _found(trial: Trial, error: Exception) -> Found:

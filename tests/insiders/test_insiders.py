@@ -24,7 +24,7 @@ def plans(draw: st.DrawFn) -> Plan:
     return Plan(
         draw(st.integers(1, 8)),
         tuple(draw(st.lists(numbers, max_size=3))),
-        tuple(draw(st.lists(numbers, min_size=WORDS, max_size=WORDS if not IS_LONG else 20 * WORDS))),
+        tuple(draw(st.lists(numbers, min_size=WORDS, max_size=4 * WORDS if IS_LONG else WORDS))),
         draw(st.booleans()),
     )
 

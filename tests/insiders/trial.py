@@ -47,7 +47,7 @@ class Plan:
         seed: of keys and network.
         acts: of the journey; each draws one event.
         words: each draws one utterance.
-        is_stormy: acts may hit any node, and go on between utterances; the good flow must then only come back.
+        is_stormy: acts may hit any node, and go on between utterances; the good flow is then not watched.
     """
 
     seed: int
@@ -217,7 +217,7 @@ class Trial:
             self._look_at_good()
 
     def _heal(self) -> None:
-        """Repair everything; the good flow works again, in the lives that its ends now have."""
+        """Repair every cable and let leases end, so that all timers that were armed fire."""
         world, network = self.stage.world, self.stage.world.network
         for cable in [*world.cables.values(), *world.leads.values()]:
             if not cable.is_up:
