@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from gdp.cli import options
+from gdp.cli.key import asked_passphrase, token_key
 from gdp.cli.output import show, span
 from gdp.crypto.certificates import Root
 from gdp.stores.issue import ROOT_DAYS, make_domain
@@ -28,16 +29,20 @@ def init(
     directory: options.Directory,
     label: options.Label,
     days: options.Days = ROOT_DAYS,
+    protect: options.Protect = False,
+    key: options.KeyUri = None,
     force: options.Force = False,
     as_json: options.Json = False,
 ) -> None:
     """Found a domain: a root key, and the certificate that others put among those they trust.
 
     \b
-    Example:
+    Examples:
       gdp domain init keys/school --label school
+      gdp domain init keys/school --label school --protect
     """
-    root = make_domain(directory, label, days=days, force=force).root
+    guard = asked_passphrase(protect)
+    root = make_domain(directory, label, days=days, key=token_key(key), passphrase=guard, force=force).root
     show({**_described(root), "root": str(directory / ROOT_CERTIFICATE)}, as_json=as_json)
 
 

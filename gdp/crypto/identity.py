@@ -41,14 +41,19 @@ class NodeKeys:
     kem: KemPrivateKey
 
     @classmethod
-    def generate(cls, role: Role, label: str, more: Mapping[str, str | int] | None = None) -> NodeKeys:
+    def generate(
+        cls, role: Role, label: str, more: Mapping[str, str | int] | None = None, key: SigningKey | None = None
+    ) -> NodeKeys:
         """Return new keys from the system's randomness; ``more`` is added to the node's metadata.
+
+        Args:
+            key: its signing key, if there is one already, as in a token.
 
         Raises:
             LocalError: metadata of the wrong form, or a library without the KEM.
         """
         digest = node_metadata(role, label, more).digest()
-        return cls(role, label, digest, SigningKey.generate(), KemPrivateKey.generate())
+        return cls(role, label, digest, key or SigningKey.generate(), KemPrivateKey.generate())
 
     @property
     def subject(self) -> Subject:

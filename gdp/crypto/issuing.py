@@ -12,8 +12,6 @@ from datetime import datetime, timezone
 from typing import Final
 
 from cryptography import x509
-from cryptography.hazmat.primitives import hashes
-from cryptography.hazmat.primitives.serialization import Encoding
 
 from gdp.crypto.certificates import Membership, Role, Root
 from gdp.crypto.keys import PublicKey, SigningKey
@@ -26,6 +24,7 @@ from gdp.crypto.x509_form import (
     distinguished_name,
     read_request,
 )
+from gdp.crypto.x509_sign import signed_certificate, signed_request
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.metadata import Metadata
 
@@ -60,7 +59,7 @@ class DomainAuthority:
             .add_extension(_key_usage(is_authority=True), critical=True)
             .add_extension(x509.SubjectKeyIdentifier(subject.name[:_KEY_ID_BYTES]), critical=False)
         )
-        return cls(key, Root.from_wire(_signed(builder, key)))
+        return cls(key, Root.from_wire(signed_certificate(builder, key)))
 
     def admit(self, request: bytes, validity: Validity) -> Membership:
         """Issue the membership that a request asks for.
@@ -93,7 +92,7 @@ class DomainAuthority:
             .add_extension(x509.SubjectKeyIdentifier(holder.subject.name[:_KEY_ID_BYTES]), critical=False)
             .add_extension(key_id, critical=False)
         )
-        return Membership.from_wire(_signed(builder, self.key), self.root, validity.not_before_unix_s)
+        return Membership.from_wire(signed_certificate(builder, self.key), self.root, validity.not_before_unix_s)
 
 
 def request_membership(key: SigningKey, role: Role, label: str, digest: bytes) -> bytes:
@@ -113,7 +112,7 @@ def request_membership(key: SigningKey, role: Role, label: str, digest: bytes) -
         .subject_name(distinguished_name(role.value, label))
         .add_extension(alternative_names(Subject(digest, key.public.compressed)), critical=False)
     )
-    return builder.sign(key.private, hashes.SHA256()).public_bytes(Encoding.PEM)
+    return signed_request(builder, key)
 
 
 def _builder(
@@ -136,10 +135,6 @@ def _moment(unix_s: int) -> datetime:
         return datetime.fromtimestamp(unix_s, timezone.utc)
     except (ValueError, OverflowError, OSError) as error:
         raise LocalError(f"no calendar reaches second {unix_s}") from error
-
-
-def _signed(builder: x509.CertificateBuilder, key: SigningKey) -> bytes:
-    return builder.sign(key.private, hashes.SHA256()).public_bytes(Encoding.DER)
 
 
 def _key_usage(*, is_authority: bool) -> x509.KeyUsage:

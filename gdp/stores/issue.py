@@ -63,39 +63,62 @@ DELEGATION_DAYS: Final = 365.0
 
 
 def make_domain(
-    directory: Path, label: str, *, days: float = ROOT_DAYS, force: bool = False, unix_s: float | None = None
+    directory: Path,
+    label: str,
+    *,
+    days: float = ROOT_DAYS,
+    key: SigningKey | None = None,
+    passphrase: bytes | None = None,
+    force: bool = False,
+    unix_s: float | None = None,
 ) -> DomainAuthority:
     """Found a trust domain and keep its root in ``directory``.
+
+    Args:
+        key: the root's, if there is one already, as in a token.
+        passphrase: guards the key's file.
 
     Raises:
         LocalError: a wrong label, or there is one already.
     """
-    authority = DomainAuthority.found(label, SigningKey.generate(), Validity.lasting(_now(unix_s), days * DAY_S))
-    save_domain(directory, authority, force=force)
+    validity = Validity.lasting(_now(unix_s), days * DAY_S)
+    authority = DomainAuthority.found(label, key or SigningKey.generate(), validity)
+    save_domain(directory, authority, passphrase=passphrase, force=force)
     return authority
 
 
-def make_owner(directory: Path, *, force: bool = False) -> Owner:
-    """Make an owner's keys and keep them in ``directory``.
+def make_owner(
+    directory: Path, *, key: SigningKey | None = None, passphrase: bytes | None = None, force: bool = False
+) -> Owner:
+    """Make an owner's keys and keep them in ``directory``; ``key`` and ``passphrase`` as for ``make_domain``.
 
     Raises:
         LocalError: there are some already.
     """
-    owner = Owner(SigningKey.generate(), secrets.token_bytes(SECRET_BYTES))
-    save_owner(directory, owner, force=force)
+    owner = Owner(key or SigningKey.generate(), secrets.token_bytes(SECRET_BYTES))
+    save_owner(directory, owner, passphrase=passphrase, force=force)
     return owner
 
 
 def make_node_keys(
-    directory: Path, role: Role, label: str, *, more: Mapping[str, str | int] | None = None, force: bool = False
+    directory: Path,
+    role: Role,
+    label: str,
+    *,
+    more: Mapping[str, str | int] | None = None,
+    key: SigningKey | None = None,
+    passphrase: bytes | None = None,
+    force: bool = False,
 ) -> NodeKeys:
     """Make a node's keys and its request for a membership, and keep them in ``directory``.
+
+    ``key`` and ``passphrase`` as for ``make_domain``.
 
     Raises:
         LocalError: wrong metadata, a library without the KEM, or there are some already.
     """
-    keys = NodeKeys.generate(role, label, more)
-    save_node_keys(directory, keys, node_metadata(role, label, more), force=force)
+    keys = NodeKeys.generate(role, label, more, key)
+    save_node_keys(directory, keys, node_metadata(role, label, more), passphrase=passphrase, force=force)
     return keys
 
 

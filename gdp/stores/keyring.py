@@ -1,6 +1,7 @@
 """Where a domain, an owner and a node keep their keys and proofs: one directory each.
 
-Place: I/O, through ``files``. ``*`` marks what is private (mode 0600)::
+Place: I/O, through ``files`` and ``private_keys``. ``*`` marks what is private (mode 0600); keys may also be under a
+passphrase, or in a token that the file names::
 
     domain/   root.key*  root.crt  issued.jsonl*                          the ledger: see ``ledger``
     owner/    owner.key*  owner.pub  master.key*
@@ -20,11 +21,12 @@ from gdp.crypto.certificates import Membership, Role, Root
 from gdp.crypto.identity import Identity, NodeKeys, node_metadata
 from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.kem import KemPrivateKey
-from gdp.crypto.keys import PublicKey, SigningKey
+from gdp.crypto.keys import PublicKey
 from gdp.crypto.x509_form import to_pem
 from gdp.errors import GdpError, LocalError
 from gdp.metadata import Metadata
-from gdp.stores.files import private, public, read_private, read_public, write_all
+from gdp.stores.files import NewFile, private, public, read_private, read_public, write_all
+from gdp.stores.private_keys import Storage, key_file, read_secret, read_signing_key, secret_file, storage_of
 from gdp.trust.card import Card
 from gdp.trust.delegation import Delegation
 from gdp.trust.owner import Owner
@@ -51,6 +53,8 @@ __all__ = [
     "save_identity",
     "save_node_keys",
     "save_owner",
+    "storage",
+    "store_again",
 ]
 
 ROOT_KEY: Final = "root.key"
@@ -65,6 +69,8 @@ NODE_CERTIFICATE: Final = "node.crt"
 REQUEST: Final = "node.csr"
 CARD: Final = "node.card"
 DELEGATIONS: Final = "delegations"
+_SECRETS: Final = (OWNER_MASTER, NODE_KEM)
+_KEYS: Final = (ROOT_KEY, OWNER_KEY, NODE_KEY, *_SECRETS)
 _DELEGATION_SUFFIX: Final = ".delegation"
 
 _T = TypeVar("_T")
@@ -109,14 +115,16 @@ def load_card(path: Path) -> Card:
     return parsed(path, Card.from_wire, read_public(path))
 
 
-def save_domain(directory: Path, authority: DomainAuthority, *, force: bool = False) -> None:
-    """Write a domain's root key and certificate.
+def save_domain(
+    directory: Path, authority: DomainAuthority, *, passphrase: bytes | None = None, force: bool = False
+) -> None:
+    """Write a domain's root key and certificate; the key under a passphrase, if there is one.
 
     Raises:
         LocalError: they are there already, or the system refuses.
     """
     files = {
-        ROOT_KEY: private(authority.key.to_pem()),
+        ROOT_KEY: key_file(authority.key, passphrase),
         ROOT_CERTIFICATE: public(to_pem(authority.root.wire)),
     }
     write_all(directory, files, force=force)
@@ -128,20 +136,20 @@ def load_domain(directory: Path) -> DomainAuthority:
     Raises:
         LocalError: something is missing, wrong, or readable for others.
     """
-    key = parsed(directory / ROOT_KEY, SigningKey.from_pem, read_private(directory / ROOT_KEY))
+    key = read_signing_key(directory / ROOT_KEY)
     root = load_root(directory / ROOT_CERTIFICATE)
     return parsed(directory, lambda _: DomainAuthority(key, root), b"")
 
 
-def save_owner(directory: Path, owner: Owner, *, force: bool = False) -> None:
-    """Write an owner's keys.
+def save_owner(directory: Path, owner: Owner, *, passphrase: bytes | None = None, force: bool = False) -> None:
+    """Write an owner's keys, under a passphrase, if there is one.
 
     Raises:
         LocalError: they are there already, or the system refuses.
     """
     files = {
-        OWNER_KEY: private(owner.key.to_pem()),
-        OWNER_MASTER: private(owner.master),
+        OWNER_KEY: key_file(owner.key, passphrase),
+        OWNER_MASTER: secret_file(owner.master, passphrase),
         OWNER_PUBLIC: public(owner.key.public.to_pem()),
     }
     write_all(directory, files, force=force)
@@ -153,13 +161,15 @@ def load_owner(directory: Path) -> Owner:
     Raises:
         LocalError: something is missing, wrong, or readable for others.
     """
-    key = parsed(directory / OWNER_KEY, SigningKey.from_pem, read_private(directory / OWNER_KEY))
+    key = read_signing_key(directory / OWNER_KEY)
     path = directory / OWNER_MASTER
-    return parsed(path, lambda master: Owner(key, master), read_private(path))
+    return parsed(path, lambda master: Owner(key, master), read_secret(path))
 
 
-def save_node_keys(directory: Path, keys: NodeKeys, metadata: Metadata, *, force: bool = False) -> None:
-    """Write a node's keys, its metadata and its request for a membership.
+def save_node_keys(
+    directory: Path, keys: NodeKeys, metadata: Metadata, *, passphrase: bytes | None = None, force: bool = False
+) -> None:
+    """Write a node's keys, its metadata and its request for a membership; keys under a passphrase, if there is one.
 
     Raises:
         LocalError: they are there already, the metadata are of another node, or the system refuses.
@@ -168,8 +178,8 @@ def save_node_keys(directory: Path, keys: NodeKeys, metadata: Metadata, *, force
         raise LocalError("the metadata are not those of this node")
     text = json.dumps(dict(metadata), ensure_ascii=False, indent=2, sort_keys=True) + "\n"
     files = {
-        NODE_KEY: private(keys.key.to_pem()),
-        NODE_KEM: private(keys.kem.wire),
+        NODE_KEY: key_file(keys.key, passphrase),
+        NODE_KEM: secret_file(keys.kem.wire, passphrase),
         NODE_METADATA: public(text.encode()),
         REQUEST: public(keys.request()),
     }
@@ -184,8 +194,8 @@ def load_node_keys(directory: Path) -> NodeKeys:
     """
     path = directory / NODE_METADATA
     role, label, digest = parsed(path, _node_metadata, read_public(path))
-    key = parsed(directory / NODE_KEY, SigningKey.from_pem, read_private(directory / NODE_KEY))
-    kem = parsed(directory / NODE_KEM, KemPrivateKey.from_wire, read_private(directory / NODE_KEM))
+    key = read_signing_key(directory / NODE_KEY)
+    kem = parsed(directory / NODE_KEM, KemPrivateKey.from_wire, read_secret(directory / NODE_KEM))
     return NodeKeys(role, label, digest, key, kem)
 
 
@@ -252,6 +262,39 @@ def load_delegations(directory: Path) -> list[Delegation]:
         LocalError: one is malformed or readable for others; the text names the file.
     """
     return [load_delegation(path) for path in sorted(directory.glob(f"[!.]*{_DELEGATION_SUFFIX}"))]
+
+
+def storage(directory: Path) -> dict[Path, Storage]:
+    """Return how each private key of a domain, an owner or a node is guarded, by file.
+
+    Raises:
+        LocalError: there is none, or one is readable for others.
+    """
+    found = {directory / name: storage_of(directory / name) for name in _KEYS if (directory / name).exists()}
+    if not found:
+        raise LocalError(f"{directory}: no private key of a domain, an owner or a node is here")
+    return found
+
+
+def store_again(directory: Path, passphrase: bytes | None) -> dict[Path, Storage]:
+    """Put the private keys of a directory under a passphrase, or take it away; return how each is guarded then.
+
+    Each file is replaced as a whole, so that a kill in between leaves each one as it was or as it is to be. What
+    is in a token stays there.
+
+    Raises:
+        LocalError: one does not open with the present passphrase (then nothing is written), or the system refuses.
+    """
+    files: dict[str, NewFile] = {}
+    for path, found in storage(directory).items():
+        if found is Storage.TOKEN:
+            continue
+        if path.name in _SECRETS:
+            files[path.name] = secret_file(read_secret(path), passphrase)
+        else:
+            files[path.name] = key_file(read_signing_key(path), passphrase)
+    write_all(directory, files, force=True)
+    return storage(directory)
 
 
 def _node_metadata(data: bytes) -> tuple[Role, str, bytes]:
