@@ -40,7 +40,7 @@ def take_back(domain: Path, folder: Path, fingerprints: Iterable[str], *, until_
         name = fingerprint[:_TITLE_CHARS] + _SUFFIX
         if not (folder / name).exists():
             body = bytes.fromhex(fingerprint)
-            files[name] = public(Revocation.make(authority.key, authority.root.subject, body, int(until_unix_s)))
+            files[name] = public(Revocation.make(authority.key, authority.root.signer, body, int(until_unix_s)))
     write_all(folder, files)
     for path in folder.glob(f"[!.]*{_SUFFIX}"):
         with suppress(StatementError):  # somebody else's: left alone

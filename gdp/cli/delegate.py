@@ -162,8 +162,9 @@ def revoke(
     given = load_delegation(file)
     if not given.chain:
         raise LocalError(f"{file}: nothing was delegated: the node owns the name itself")
-    link = AdCert.from_statement(parse(given.chain[0]))
-    statement = load_owner(owner).revoke(given.subject, link.fingerprint, link.validity.not_after_unix_s)
+    holder = load_owner(owner)
+    link = AdCert.from_statement(parse(given.chain[0 if holder.founder is None else -1]))
+    statement = holder.revoke(given.subject, link.fingerprint, link.validity.not_after_unix_s)
     write_all(out.parent, {out.name: public(statement)}, force=force)
     show({**_described(given), "revocation": str(out)}, as_json=as_json)
 

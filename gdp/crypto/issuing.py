@@ -7,6 +7,7 @@ read; what ``openssl x509 -req -copy_extensions copy`` issues from such a reques
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from typing import Final
@@ -60,6 +61,39 @@ class DomainAuthority:
             .add_extension(x509.SubjectKeyIdentifier(subject.name[:_KEY_ID_BYTES]), critical=False)
         )
         return cls(key, Root.from_wire(signed_certificate(builder, key)))
+
+    def succeed(self, key: SigningKey, validity: Validity, retires_unix_s: int) -> DomainAuthority:
+        """Return the domain under another root key, which this one vouches for; the domain keeps its name.
+
+        Args:
+            key: the successor's.
+            validity: of the successor.
+            retires_unix_s: until when what this key signed is believed, by whoever has the successor's root.
+
+        Raises:
+            LocalError: it is the same key.
+        """
+        if key.public == self.root.key:
+            raise LocalError("a successor has another key")
+        name = x509.load_der_x509_certificate(self.root.wire).subject
+        builder = (
+            _builder(name, name, self.root.subject, key.public, validity, retires_unix_s)
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(_key_usage(is_authority=True), critical=True)
+            .add_extension(x509.SubjectKeyIdentifier(_key_id(key.public)), critical=False)
+            .add_extension(x509.AuthorityKeyIdentifier(self.root.key_id, None, None), critical=False)
+        )
+        return DomainAuthority(key, self.root.succeeded_by(signed_certificate(builder, self.key)))
+
+    def renew(self, member: Membership, validity: Validity) -> Membership:
+        """Issue a membership again, with the same key, role and label.
+
+        Raises:
+            LocalError: it is of another domain, it would outlive the root, or the root has run out.
+        """
+        if member.domain != self.root.domain:
+            raise LocalError("a membership of another domain")
+        return self._issue(Holder(member.subject, member.role.value, member.label, member.key), validity)
 
     def admit(self, request: bytes, validity: Validity) -> Membership:
         """Issue the membership that a request asks for.
@@ -116,7 +150,12 @@ def request_membership(key: SigningKey, role: Role, label: str, digest: bytes) -
 
 
 def _builder(
-    issuer: x509.Name, holder: x509.Name, subject: Subject, key: PublicKey, validity: Validity
+    issuer: x509.Name,
+    holder: x509.Name,
+    subject: Subject,
+    key: PublicKey,
+    validity: Validity,
+    retires_unix_s: int | None = None,
 ) -> x509.CertificateBuilder:
     return (
         x509.CertificateBuilder()
@@ -126,8 +165,13 @@ def _builder(
         .public_key(key.point)
         .not_valid_before(_moment(validity.not_before_unix_s))
         .not_valid_after(_moment(validity.not_after_unix_s))
-        .add_extension(alternative_names(subject), critical=False)
+        .add_extension(alternative_names(subject, retires_unix_s), critical=False)
     )
+
+
+def _key_id(key: PublicKey) -> bytes:
+    """Return a successor's key id: another than the founder's, which is the domain's name."""
+    return hashlib.sha256(key.compressed).digest()[:_KEY_ID_BYTES]
 
 
 def _moment(unix_s: int) -> datetime:

@@ -17,6 +17,7 @@ from gdp.crypto.certificates import Role
 from gdp.names import Name
 from gdp.nodes.config import RibConfig
 from gdp.nodes.counts import count_list
+from gdp.nodes.credentials import Credentials
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.rib_upkeep import MemoryUpkeep, Upkeep
@@ -71,7 +72,9 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
             on_wait=on_wait,
         )
         runtime.every(LOOK_S, node_log.look)
-        stack.enter_context(runtime.signals())
+        credentials = Credentials(config.identity, config.domain, identity, policy)
+        runtime.every(LOOK_S, credentials.look)
+        stack.enter_context(runtime.signals(lambda: credentials.look(now())))
         for source in upkeep.sources():
             runtime.watch(source, lambda: upkeep.work(now()))
         if config.metrics is not None:

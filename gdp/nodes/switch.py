@@ -17,6 +17,7 @@ from gdp.errors import LocalError, StatementError
 from gdp.names import Name
 from gdp.nodes.config import SwitchConfig
 from gdp.nodes.counts import count_list
+from gdp.nodes.credentials import Credentials
 from gdp.nodes.data_plane import Chosen, choose_plane
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
@@ -98,7 +99,14 @@ def run_switch(
         )
         runtime.every(LOOK_S, node_log.look)
         runtime.every(LOOK_S, lambda _: _end_if_displaced(switch))
-        stack.enter_context(runtime.signals(lambda: _revoke(switch, config.revocations)))
+        credentials = Credentials(config.identity, config.domain, identity, policy)
+        runtime.every(LOOK_S, credentials.look)
+
+        def reload() -> None:
+            credentials.look(now())
+            _revoke(switch, config.revocations)
+
+        stack.enter_context(runtime.signals(reload))
         _revoke(switch, config.revocations)
         if config.sandbox:
             confine_switch(config, chosen.name)

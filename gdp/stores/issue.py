@@ -12,30 +12,39 @@ from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
-from gdp.crypto.certificates import Membership, Role, Root
+from gdp.crypto.certificates import Membership, Role, Root, Unverified
 from gdp.crypto.identity import Identity, NodeKeys, node_metadata
 from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
+from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.stores.files import refuse_existing
+from gdp.stores.files import read_public, refuse_existing
 from gdp.stores.keyring import (
     DELEGATIONS,
     NODE_CERTIFICATE,
+    OWNER_KEY,
+    ROOT_CERTIFICATE,
+    SUCCESSION,
     load_card,
     load_domain,
     load_identity,
     load_node_keys,
     load_owner,
+    load_root,
+    parsed,
     save_delegation,
     save_domain,
     save_identity,
+    save_membership,
     save_node_keys,
     save_owner,
+    storage,
 )
 from gdp.stores.ledger import append_issued
+from gdp.stores.private_keys import Storage
 from gdp.trust.card import Card
 from gdp.trust.delegation import Delegation
 from gdp.trust.grants import SECRET_BYTES
@@ -54,6 +63,9 @@ __all__ = [
     "make_node",
     "make_node_keys",
     "make_owner",
+    "renew",
+    "renew_node",
+    "succeed_owner",
 ]
 
 DAY_S: Final = 86_400
@@ -98,6 +110,42 @@ def make_owner(
     owner = Owner(key or SigningKey.generate(), secrets.token_bytes(SECRET_BYTES))
     save_owner(directory, owner, passphrase=passphrase, force=force)
     return owner
+
+
+def succeed_owner(
+    owner: Path,
+    successor: Path,
+    names: Iterable[Subject],
+    *,
+    days: float,
+    key: SigningKey | None = None,
+    passphrase: bytes | None = None,
+    unix_s: float | None = None,
+) -> Owner:
+    """Let a successor's key delegate names in an owner's place; it is made where there is none.
+
+    The successor has the owner's master secret, so that the topics' secrets stay as they are.
+
+    Args:
+        names: to which it succeeds, in addition to those to which it did before.
+        days: how long; whatever the successor delegates ends then.
+        key, passphrase: of a new successor, as for ``make_domain``.
+
+    Raises:
+        LocalError: no owner there, another owner's name, or a successor of another owner.
+    """
+    present = load_owner(owner)
+    if not (successor / OWNER_KEY).exists():
+        save_owner(
+            successor, Owner(key or SigningKey.generate(), present.master, present.public), passphrase=passphrase
+        )
+    heir = load_owner(successor)
+    if heir.public != present.public or heir.key.public == present.key.public:
+        raise LocalError(f"{successor}: not a successor of {owner}")
+    validity = Validity.lasting(_now(unix_s), days * DAY_S)
+    for given in [present.succeed(heir.key.public, each, validity) for each in names]:
+        save_delegation(successor / SUCCESSION, given, force=True)
+    return load_owner(successor)
 
 
 def make_node_keys(
@@ -170,6 +218,57 @@ def admit_node(
     append_issued(domain, identity.member, now)
     save_identity(node, identity, force=force)
     return identity
+
+
+def renew(
+    domain: Path, certificate: bytes, *, days: float = MEMBER_DAYS, unix_s: float | None = None
+) -> Membership:
+    """Return a membership anew, for the same key, role and label; the one that it replaces may have run out.
+
+    Raises:
+        StatementError: it is not one that this domain issued.
+        LocalError: no domain there, or its ledger cannot be written.
+    """
+    authority, now = load_domain(domain), _now(unix_s)
+    stranger = Unverified.from_wire(certificate)
+    present = stranger.verify(authority.root, min(now, stranger.validity.not_after_unix_s))
+    member = authority.renew(present, _within(authority.root, now, days))
+    append_issued(domain, member, now)
+    return member
+
+
+def renew_node(
+    domain: Path, node: Path, *, days: float = MEMBER_DAYS, before_days: float | None = None,
+    unix_s: float | None = None,
+) -> Membership | None:
+    """Renew the membership of a node whose directory is at hand; a running node takes it up.
+
+    The node's key is needed for its card alone: a card stays as it was where the key is under a passphrase or in a
+    token.
+
+    Args:
+        before_days: only if it ends within so many days; None: in any case.
+
+    Returns:
+        The new membership, or None: the present one lasts longer.
+
+    Raises:
+        StatementError: it is not one that this domain issued.
+        LocalError: as ``renew``.
+    """
+    now, path = _now(unix_s), node / NODE_CERTIFICATE
+    wire = read_public(path)
+    if before_days is not None:
+        ends_unix_s = parsed(path, Unverified.from_wire, wire).validity.not_after_unix_s
+        if ends_unix_s - now > before_days * DAY_S:
+            return None
+    member = parsed(path, lambda data: renew(domain, data, days=days, unix_s=now), wire)
+    root = load_root(domain / ROOT_CERTIFICATE)
+    if all(each is Storage.PLAIN for each in storage(node).values()):
+        save_identity(node, load_node_keys(node).admitted(member, root), force=True)
+    else:
+        save_membership(node, member, root)
+    return member
 
 
 def install_membership(

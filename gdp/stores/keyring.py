@@ -5,6 +5,7 @@ passphrase, or in a token that the file names::
 
     domain/   root.key*  root.crt  issued.jsonl*                          the ledger: see ``ledger``
     owner/    owner.key*  owner.pub  master.key*
+              succession/<name>.delegation*                                of a successor: who let it delegate the name
     node/     node.key*  kem.key*  node.json  node.csr                      before it belongs to a domain
               node.crt  root.crt  node.card                                 once it does
               delegations/<name>.delegation*                                one for each name that it may act on
@@ -35,9 +36,12 @@ __all__ = [
     "CARD",
     "DELEGATIONS",
     "NODE_CERTIFICATE",
+    "OWNER_KEY",
     "OWNER_PUBLIC",
     "REQUEST",
     "ROOT_CERTIFICATE",
+    "ROOT_KEY",
+    "SUCCESSION",
     "load_card",
     "load_delegation",
     "load_delegations",
@@ -51,6 +55,7 @@ __all__ = [
     "save_delegation",
     "save_domain",
     "save_identity",
+    "save_membership",
     "save_node_keys",
     "save_owner",
     "storage",
@@ -69,6 +74,7 @@ NODE_CERTIFICATE: Final = "node.crt"
 REQUEST: Final = "node.csr"
 CARD: Final = "node.card"
 DELEGATIONS: Final = "delegations"
+SUCCESSION: Final = "succession"
 _SECRETS: Final = (OWNER_MASTER, NODE_KEM)
 _KEYS: Final = (ROOT_KEY, OWNER_KEY, NODE_KEY, *_SECRETS)
 _DELEGATION_SUFFIX: Final = ".delegation"
@@ -125,7 +131,7 @@ def save_domain(
     """
     files = {
         ROOT_KEY: key_file(authority.key, passphrase),
-        ROOT_CERTIFICATE: public(to_pem(authority.root.wire)),
+        ROOT_CERTIFICATE: public(authority.root.to_pem()),
     }
     write_all(directory, files, force=force)
 
@@ -150,7 +156,7 @@ def save_owner(directory: Path, owner: Owner, *, passphrase: bytes | None = None
     files = {
         OWNER_KEY: key_file(owner.key, passphrase),
         OWNER_MASTER: secret_file(owner.master, passphrase),
-        OWNER_PUBLIC: public(owner.key.public.to_pem()),
+        OWNER_PUBLIC: public(owner.public.to_pem()),
     }
     write_all(directory, files, force=force)
 
@@ -162,8 +168,12 @@ def load_owner(directory: Path) -> Owner:
         LocalError: something is missing, wrong, or readable for others.
     """
     key = read_signing_key(directory / OWNER_KEY)
-    path = directory / OWNER_MASTER
-    return parsed(path, lambda master: Owner(key, master), read_secret(path))
+    public_path, path = directory / OWNER_PUBLIC, directory / OWNER_MASTER
+    founder = load_public_key(public_path) if public_path.exists() else key.public
+    if founder == key.public:
+        return parsed(path, lambda master: Owner(key, master), read_secret(path))
+    links = {each.name: each.chain for each in load_delegations(directory / SUCCESSION)}
+    return parsed(path, lambda master: Owner(key, master, founder, links), read_secret(path))
 
 
 def save_node_keys(
@@ -206,11 +216,21 @@ def save_identity(directory: Path, identity: Identity, *, force: bool = False) -
         LocalError: they are there already, or the system refuses.
     """
     files = {
+        ROOT_CERTIFICATE: public(identity.root.to_pem()),
         NODE_CERTIFICATE: public(to_pem(identity.membership)),
-        ROOT_CERTIFICATE: public(to_pem(identity.root.wire)),
         CARD: public(Card.make(identity)),
     }
     write_all(directory, files, force=force)
+
+
+def save_membership(directory: Path, member: Membership, root: Root) -> None:
+    """Replace a node's membership and root; its card stays, which only its key could make anew.
+
+    Raises:
+        LocalError: the system refuses.
+    """
+    files = {ROOT_CERTIFICATE: public(root.to_pem()), NODE_CERTIFICATE: public(to_pem(member.wire))}
+    write_all(directory, files, force=True)
 
 
 def load_identity(directory: Path, unix_s: float) -> Identity:

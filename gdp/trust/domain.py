@@ -46,19 +46,36 @@ class Policy:
     ) -> None:
         roots = {root.domain: root for root in (own, *trusted)}
         self.own: Final = own.domain
-        self.roots: Final[Mapping[Name, Root]] = MappingProxyType(roots)
+        self.roots: Mapping[Name, Root] = MappingProxyType(roots)
         self.transit: Final = frozenset(roots if transit is None else {own.domain, *transit})
         if not self.transit <= roots.keys():
             raise LocalError("transit goes through trusted domains only")
-        self.revoked: Final = Revocations(frozenset(root.key.compressed for root in roots.values()))
-        self._by_issuer: dict[bytes, list[Root]] = {}
-        for root in roots.values():
-            self._by_issuer.setdefault(root.distinguished_name, []).append(root)
+        self.revoked: Final = Revocations(_keys_of(roots.values()))
+        self._by_issuer = _by_issuer(roots.values())
         self._members: Lru[Membership] = Lru(remembered)
 
     def trusts(self, domain: Name) -> bool:
         """Return whether members of ``domain`` are believed here."""
         return domain in self.roots
+
+    def renew_roots(self, roots: Iterable[Root]) -> None:
+        """Take on newer roots of the domains that are trusted already, such as those with a successor.
+
+        Raises:
+            LocalError: a domain that is not trusted, or a root that does not descend from the one that is; nothing has
+                changed then.
+        """
+        renewed = dict(self.roots)
+        for root in roots:
+            known = renewed.get(root.domain)
+            if known is None:
+                raise LocalError(f"{root.label}: another domain than those trusted so far: restart the node")
+            if known.key not in [each.key for each in root.lineage]:
+                raise LocalError(f"{root.label}: a root that the present one did not vouch for")
+            renewed[root.domain] = root
+        self.roots = MappingProxyType(renewed)
+        self.revoked.trust(_keys_of(renewed.values()))
+        self._by_issuer = _by_issuer(renewed.values())
 
     def verify_membership(self, wire: bytes, unix_s: float) -> Membership:
         """Return the membership if a trusted domain issued it and it holds now; costs 0.2 ms once, then 2 us.
@@ -87,16 +104,17 @@ class Policy:
         root = self.roots.get(member.domain)
         if root is None:
             raise StatementError(DropReason.WRONG_DOMAIN, "a domain that is not trusted here")
-        root.validity.check(unix_s, "domain root")
+        issuers = _issuers(root, member.issuer_key)
+        issuers[0].validity.check(unix_s, "domain root")
         member.validity.check(unix_s, "membership")
-        if self.revoked.has(member.fingerprint, root.key.compressed):
+        if any(self.revoked.has(member.fingerprint, each.key.compressed) for each in issuers):
             raise StatementError(DropReason.REVOKED, "membership")
 
     def _verified(self, stranger: Unverified, unix_s: float) -> Membership:
         candidates = [
             root
             for root in self._by_issuer.get(stranger.certificate.issuer, ())
-            if stranger.certificate.issuer_key_id in (b"", root.key_id)
+            if stranger.certificate.issuer_key_id in (b"", *(each.key_id for each in root.lineage))
         ]
         refusal = StatementError(DropReason.WRONG_DOMAIN, "a domain that is not trusted here")
         for root in candidates:  # more than one only where labels are equal and a tool left the key id out
@@ -105,3 +123,24 @@ class Policy:
             except StatementError as error:
                 refusal = error
         raise refusal
+
+
+def _issuers(root: Root, issuer_key: bytes) -> tuple[Root, ...]:
+    """Return the root that issued a membership, and those that succeeded it: each of them may take it back."""
+    if root.key.compressed == issuer_key:
+        return (root,)
+    for index, each in enumerate(root.predecessors):
+        if each.key.compressed == issuer_key:
+            return root.lineage[index:]
+    raise StatementError(DropReason.WRONG_DOMAIN, "issued by a root that is not trusted here")
+
+
+def _keys_of(roots: Iterable[Root]) -> frozenset[bytes]:
+    return frozenset(each.key.compressed for root in roots for each in root.lineage)
+
+
+def _by_issuer(roots: Iterable[Root]) -> dict[bytes, list[Root]]:
+    found: dict[bytes, list[Root]] = {}
+    for root in roots:
+        found.setdefault(root.distinguished_name, []).append(root)
+    return found
