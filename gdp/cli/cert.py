@@ -23,6 +23,7 @@ from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.x509_form import read_request, to_pem
 from gdp.errors import LocalError
 from gdp.names import Name
+from gdp.stores.audit_log import note_once
 from gdp.stores.files import public, read_public, refuse_existing, write_all
 from gdp.stores.issue import (
     MEMBER_DAYS,
@@ -37,6 +38,7 @@ from gdp.stores.issue import (
 from gdp.stores.keyring import CARD, NODE_CERTIFICATE, load_delegation, load_domain, load_node_keys, load_root, parsed
 from gdp.stores.ledger import LEDGER, read_ledger
 from gdp.stores.rollover import trust_successor
+from gdp.trust.audit import Action
 from gdp.trust.revocation import Revocation
 
 __all__ = ["app"]
@@ -96,7 +98,7 @@ def issue(
     """
     if node is not None and request is None and out is None:
         keys = load_node_keys(node)
-        _state(keys.subject.name, keys.role.value, keys.label, days, role, label)
+        _state(domain, keys.subject.name, keys.role.value, keys.label, days, role, label)
         member = admit_node(domain, node, days=days, force=force).member
         written = {"certificate": str(node / NODE_CERTIFICATE), "card": str(node / CARD)}
     elif node is None and request is not None and out is not None:
@@ -104,7 +106,7 @@ def issue(
             refuse_existing(out)
         asked = read_public(request)
         holder = parsed(request, read_request, asked)
-        _state(holder.subject.name, holder.unit, holder.label, days, role, label)
+        _state(domain, holder.subject.name, holder.unit, holder.label, days, role, label)
         member = parsed(request, lambda wire: admit(domain, wire, days=days), asked)
         write_all(out.parent, {out.name: public(to_pem(member.wire))}, force=force)
         written = {"certificate": str(out)}
@@ -251,20 +253,28 @@ def revoke(
     authority = load_domain(domain)
     member = parsed(file, lambda wire: Membership.from_wire(wire, authority.root, time.time()), read_public(file))
     statement = Revocation.make(authority.key, authority.root.signer, member.fingerprint, member.not_after_unix_s)
+    who, about = member.name.to_text(), member.fingerprint.hex()
+    note_once(domain, Action.REVOKED, "membership", who=who, about=about, unix_s=time.time())
     write_all(out.parent, {out.name: public(statement)}, force=force)
     show({**_described(member), "revocation": str(out)}, as_json=as_json)
 
 
-def _state(name: Name, role: str, label: str, days: float, wanted: Role | None, called: str | None) -> None:
+def _state(
+    domain: Path, name: Name, role: str, label: str, days: float, wanted: Role | None, called: str | None
+) -> None:
     """Say what is about to be signed, and see that it is what was meant.
 
     Args:
+        domain: whose audit log notes a request for something else.
         name, role, label: as the request says.
         wanted, called: as the caller says; None: a person at the terminal confirms.
 
     Raises:
         LocalError: the request asks for something else, or nobody can be asked.
     """
+    if (wanted is not None and wanted.value != role) or (called is not None and called != label):
+        why = "another role or label than was meant"
+        note_once(domain, Action.REFUSED, "membership", who=name.to_text(), reason=why, unix_s=time.time())
     if wanted is not None and wanted.value != role:
         raise LocalError(f"the request asks for the role {role}, not {wanted.value}: nothing was signed")
     if called is not None and called != label:

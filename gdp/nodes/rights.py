@@ -19,6 +19,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
+from gdp.nodes.audit import audit_folder
 from gdp.nodes.config import ClusterConfig, RibConfig, SwitchConfig
 from gdp.nodes.credentials import watched_folders
 from gdp.nodes.single_instance import lock_directory
@@ -43,11 +44,12 @@ def confine_switch(config: SwitchConfig, plane: str) -> None:
     """
     again = watched_folders(config.identity, config.domain)
     again += () if config.revocations is None else (config.revocations,)
+    audits = _audits(config.audit)
     is_kernel = plane == "kernel"
     _confine(
         Needs(
-            _DEVICE | (_PROGRAMS if is_kernel else frozenset()) | _past_owners(reads=again),
-            (*_CHANGED, lock_directory()),
+            _DEVICE | (_PROGRAMS if is_kernel else frozenset()) | _past_owners(again, audits),
+            (*_CHANGED, lock_directory(), *audits),
             (*_code(), *again),
             () if config.metrics is None else (config.metrics.port,),
             spared_calls=frozenset({"bpf"} if is_kernel else ()),
@@ -60,12 +62,12 @@ def confine_rib(config: RibConfig) -> None:
     is_shared = config.store != "memory"
     again = watched_folders(config.identity, config.domain)
     secrets = () if config.store == "memory" else _files_of(config.store.cluster)
-    snapshots = () if config.snapshot is None else (config.snapshot.parent,)
+    kept = (*(() if config.snapshot is None else (config.snapshot.parent,)), *_audits(config.audit))
     ports = () if config.metrics is None else (config.metrics.port,)
     _confine(
         Needs(
-            _DEVICE | _past_owners((*again, *secrets), snapshots),
-            (*_CHANGED, lock_directory(), *snapshots),
+            _DEVICE | _past_owners((*again, *secrets), kept),
+            (*_CHANGED, lock_directory(), *kept),
             None if is_shared else (*_code(), *again),
             None if is_shared else ports,
         )
@@ -103,6 +105,11 @@ def _past_owners(reads: Iterable[Path] = (), writes: Iterable[Path] = ()) -> fro
         if any(_is_foreign(path) and not path.stat().st_mode & _WRITABLE_BY_ALL for path in writes):
             kept.add(Capability.DAC_OVERRIDE)
     return frozenset(kept)
+
+
+def _audits(configured: Path | None) -> tuple[Path, ...]:
+    folder = audit_folder(configured)
+    return () if folder is None else (folder,)
 
 
 def _files_of(store: ClusterConfig) -> tuple[Path, ...]:

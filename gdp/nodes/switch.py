@@ -15,6 +15,7 @@ from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError, StatementError
 from gdp.names import Name
+from gdp.nodes.audit import keep_audit
 from gdp.nodes.config import SwitchConfig
 from gdp.nodes.counts import count_list
 from gdp.nodes.credentials import Credentials
@@ -108,6 +109,7 @@ def run_switch(
 
         stack.enter_context(runtime.signals(reload))
         _revoke(switch, config.revocations)
+        keep_audit(config.audit, policy.audit, switch.drops, runtime, stack)
         if config.sandbox:
             confine_switch(config, chosen.name)
         if config.metrics is not None:

@@ -21,6 +21,7 @@ from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
 from gdp.metadata import Metadata
 from gdp.names import Name
+from gdp.stores.audit_log import note_once
 from gdp.stores.files import read_public, refuse_existing
 from gdp.stores.keyring import (
     DELEGATIONS,
@@ -45,6 +46,7 @@ from gdp.stores.keyring import (
 )
 from gdp.stores.ledger import append_issued
 from gdp.stores.private_keys import Storage
+from gdp.trust.audit import Action
 from gdp.trust.card import Card
 from gdp.trust.delegation import Delegation
 from gdp.trust.grants import SECRET_BYTES
@@ -145,6 +147,8 @@ def succeed_owner(
     validity = Validity.lasting(_now(unix_s), days * DAY_S)
     for given in [present.succeed(heir.key.public, each, validity) for each in names]:
         save_delegation(successor / SUCCESSION, given, force=True)
+        about = given.name.to_text()
+        note_once(owner, Action.ACCEPTED, "succession", who=given.node.to_text(), about=about, unix_s=_now(unix_s))
     return load_owner(successor)
 
 
@@ -199,7 +203,7 @@ def admit(domain: Path, request: bytes, *, days: float = MEMBER_DAYS, unix_s: fl
     """
     authority, now = load_domain(domain), _now(unix_s)
     member = authority.admit(request, _within(authority.root, now, days))
-    append_issued(domain, member, now)
+    _issued(domain, member, now)
     return member
 
 
@@ -215,7 +219,7 @@ def admit_node(
     if not force:
         refuse_existing(node / NODE_CERTIFICATE)  # before anything is signed
     identity = load_node_keys(node).join(authority, _within(authority.root, now, days))
-    append_issued(domain, identity.member, now)
+    _issued(domain, identity.member, now)
     save_identity(node, identity, force=force)
     return identity
 
@@ -233,7 +237,7 @@ def renew(
     stranger = Unverified.from_wire(certificate)
     present = stranger.verify(authority.root, min(now, stranger.validity.not_after_unix_s))
     member = authority.renew(present, _within(authority.root, now, days))
-    append_issued(domain, member, now)
+    _issued(domain, member, now)
     return member
 
 
@@ -304,7 +308,10 @@ def delegate(
     """
     face = card if isinstance(card, Card) else load_card(card)
     validity = Validity.lasting(_now(unix_s), days * DAY_S)
-    return load_owner(owner).delegate(face, metadata, rights, epochs, validity, may_delegate=may_delegate)
+    given = load_owner(owner).delegate(face, metadata, rights, epochs, validity, may_delegate=may_delegate)
+    who, about = given.node.to_text(), given.name.to_text()
+    note_once(owner, Action.ACCEPTED, "delegation", who=who, about=about, unix_s=_now(unix_s))
+    return given
 
 
 def install_delegation(node: Path, delegation: Delegation, *, force: bool = False, unix_s: float | None = None) -> Path:
@@ -329,6 +336,13 @@ def delegate_route(node: Path, switch: Name, *, days: float, unix_s: float | Non
     """
     now = _now(unix_s)
     return RtCert.make(load_identity(node, now), switch, Validity.lasting(now, days * DAY_S))
+
+
+def _issued(domain: Path, member: Membership, unix_s: float) -> None:
+    """Write a membership into the ledger, without which it is not handed out, and into the audit log."""
+    append_issued(domain, member, unix_s)
+    who, about = member.name.to_text(), member.fingerprint.hex()
+    note_once(domain, Action.ACCEPTED, f"membership {member.role.value}", who=who, about=about, unix_s=unix_s)
 
 
 def _now(unix_s: float | None) -> float:

@@ -18,8 +18,10 @@ from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
+from gdp.stores.audit_log import note_once
 from gdp.stores.files import private, public, read_private, read_public, refuse_existing, write_all
 from gdp.stores.keyring import ROOT_CERTIFICATE, ROOT_KEY, load_domain, load_root, save_domain
+from gdp.trust.audit import Action
 
 __all__ = ["NEXT", "RETIRED", "begin_rollover", "finish_rollover", "trust_successor"]
 
@@ -54,6 +56,7 @@ def begin_rollover(
     retires_unix_s = int(now + overlap_days * _DAY_S)
     successor = authority.succeed(key or SigningKey.generate(), Validity.lasting(now, days * _DAY_S), retires_unix_s)
     save_domain(domain / NEXT, successor, passphrase=passphrase)
+    _note(domain, "root that succeeds", successor.root, now)
     return successor
 
 
@@ -77,7 +80,13 @@ def finish_rollover(domain: Path) -> Root:
     for path in (successor / ROOT_CERTIFICATE, successor / ROOT_KEY):
         path.unlink()
     successor.rmdir()
+    _note(domain, "root that issues", root, time.time())
     return root
+
+
+def _note(domain: Path, what: str, root: Root, unix_s: float) -> None:
+    who, about = root.key.compressed.hex(), root.domain.to_text()
+    note_once(domain, Action.ACCEPTED, what, who=who, about=about, unix_s=unix_s)
 
 
 def trust_successor(file: Path, root: Path) -> Root:

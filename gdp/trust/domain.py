@@ -15,6 +15,7 @@ from typing import Final
 from gdp.crypto.certificates import Membership, Root, Unverified
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.names import Name
+from gdp.trust.audit import AuditTrail
 from gdp.trust.lru import Lru
 from gdp.trust.revocation import Revocations
 
@@ -46,6 +47,7 @@ class Policy:
     ) -> None:
         roots = {root.domain: root for root in (own, *trusted)}
         self.own: Final = own.domain
+        self.audit: Final = AuditTrail()  # of the node whose policy this is
         self.roots: Mapping[Name, Root] = MappingProxyType(roots)
         self.transit: Final = frozenset(roots if transit is None else {own.domain, *transit})
         if not self.transit <= roots.keys():
