@@ -44,12 +44,12 @@ def confine_switch(config: SwitchConfig, plane: str) -> None:
     """
     again = watched_folders(config.identity, config.domain)
     again += () if config.revocations is None else (config.revocations,)
-    audits = _audits(config.audit)
+    kept = (*_audits(config.audit), *config.token_folders)
     is_kernel = plane == "kernel"
     _confine(
         Needs(
-            _DEVICE | (_PROGRAMS if is_kernel else frozenset()) | _past_owners(again, audits),
-            (*_CHANGED, lock_directory(), *audits),
+            _DEVICE | (_PROGRAMS if is_kernel else frozenset()) | _past_owners(again, kept),
+            (*_CHANGED, lock_directory(), *kept),
             (*_code(), *again),
             () if config.metrics is None else (config.metrics.port,),
             spared_calls=frozenset({"bpf"} if is_kernel else ()),
@@ -62,7 +62,8 @@ def confine_rib(config: RibConfig) -> None:
     is_shared = config.store != "memory"
     again = watched_folders(config.identity, config.domain)
     secrets = () if config.store == "memory" else _files_of(config.store.cluster)
-    kept = (*(() if config.snapshot is None else (config.snapshot.parent,)), *_audits(config.audit))
+    snapshots = () if config.snapshot is None else (config.snapshot.parent,)
+    kept = (*snapshots, *_audits(config.audit), *config.token_folders)
     ports = () if config.metrics is None else (config.metrics.port,)
     _confine(
         Needs(

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, cast
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from gdp.crypto.keys import SIGNATURE_BYTES, PublicKey, SigningKey
-from gdp.errors import GdpError, LocalError
+from gdp.errors import GdpError, LocalError, StatementError
 from gdp.stores.files import read_private
 from gdp.stores.passphrase import passphrase_for
 from gdp.stores.token_uri import SCHEME, TokenUri
@@ -28,6 +28,7 @@ __all__ = ["SCHEME", "TokenKey", "generate_token_key", "open_token_key"]
 
 _DIGEST_BYTES: Final = 32
 _POINT_BYTES: Final = 65
+_TRIAL: Final = b"gdp-token-trial-1"  # no statement begins so
 _MISSING: Final = "keys in tokens need the package python-pkcs11: pip install 'gdp-ros[pkcs11]'"
 
 
@@ -113,9 +114,14 @@ def open_token_key(text: str, file: Path) -> TokenKey:
 
     try:
         key = opened()
-        return TokenKey(text, _public_key(uri, key), opened, key)
+        made = TokenKey(text, _public_key(uri, key), opened, key)
     except library.PKCS11Error as error:
         raise LocalError(f"the token does not open the key ({_said(error)}): {text}") from error
+    try:  # while all rights are there: a library may read files at its first signature
+        made.public.verify(made.sign(_TRIAL), _TRIAL)
+    except StatementError as error:
+        raise LocalError(f"the public key beside the token's private key is another key's: {text}") from error
+    return made
 
 
 def generate_token_key(text: str) -> TokenKey:
