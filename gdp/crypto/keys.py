@@ -149,9 +149,20 @@ class SigningKey(ABC):
             if is_encrypted(pem):
                 raise LocalError(WRONG_PASSPHRASE) from error
             raise LocalError("not a private key in PEM") from error
-        if not isinstance(private, ec.EllipticCurvePrivateKey) or not isinstance(private.curve, ec.SECP256R1):
-            raise LocalError("a private key that is not ECDSA P-256")
-        return SoftwareKey.of(private)
+        return _software_key(private)
+
+    @staticmethod
+    def from_der(der: bytes) -> SoftwareKey:
+        """Read a private key in PKCS #8, DER, unencrypted.
+
+        Raises:
+            LocalError: not a P-256 private key.
+        """
+        try:
+            private = serialization.load_der_private_key(der, password=None)
+        except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+            raise LocalError("not a private key in DER") from error
+        return _software_key(private)
 
     @abstractmethod
     def sign(self, data: bytes) -> bytes:
@@ -209,6 +220,12 @@ class SoftwareKey(SigningKey):
         if len(digest) != _HALF:
             raise LocalError("a SHA-256 digest has 32 bytes")
         return _from_der(self.private.sign(digest, _ECDSA_DIGEST))
+
+
+def _software_key(private: object) -> SoftwareKey:
+    if not isinstance(private, ec.EllipticCurvePrivateKey) or not isinstance(private.curve, ec.SECP256R1):
+        raise LocalError("a private key that is not ECDSA P-256")
+    return SoftwareKey.of(private)
 
 
 def is_encrypted(pem: bytes) -> bool:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+from functools import lru_cache
 from typing import Final
 
 from cryptography.hazmat.primitives import padding
@@ -20,7 +21,8 @@ from cryptography.hazmat.primitives.kdf.scrypt import Scrypt
 from gdp.crypto.keys import WRONG_PASSPHRASE
 from gdp.errors import LocalError
 
-__all__ = ["KEY_LABEL", "RANDOM_BYTES", "SECRET_LABEL", "der_element", "is_secret", "open_secret", "protect"]
+__all__ = ["KEY_LABEL", "RANDOM_BYTES", "SECRET_LABEL", "der_element", "is_own_form", "is_secret", "open_secret"]
+__all__ += ["protect"]
 
 KEY_LABEL: Final = "ENCRYPTED PRIVATE KEY"  # RFC 7468, section 11
 SECRET_LABEL: Final = "ENCRYPTED GDP SECRET"
@@ -33,6 +35,7 @@ _BLOCK: Final = 8
 _PARALLEL: Final = 5
 _KEY_BYTES: Final = 32
 _LINE_CHARS: Final = 64
+_DERIVED_KEPT: Final = 16  # whoever reads this process's memory finds the keys themselves
 
 _PBES2: Final = bytes.fromhex("06092a864886f70d01050d")  # 1.2.840.113549.1.5.13
 _SCRYPT: Final = bytes.fromhex("06092b06010401da47040b")  # 1.3.6.1.4.1.11591.4.11
@@ -64,13 +67,22 @@ def protect(plain: bytes, passphrase: bytes, random: bytes, label: str) -> bytes
     return "\n".join([f"-----BEGIN {label}-----", *lines, f"-----END {label}-----", ""]).encode()
 
 
+def is_own_form(pem: bytes) -> bool:
+    """Return whether ``open_secret`` can open a file, whatever its label; another tool may protect keys otherwise."""
+    try:
+        _parts(pem)
+    except LocalError:
+        return False
+    return True
+
+
 def is_secret(data: bytes) -> bool:
     """Return whether a file holds a secret under a passphrase."""
     return data.startswith(f"-----BEGIN {SECRET_LABEL}-----".encode())
 
 
 def open_secret(pem: bytes, passphrase: bytes) -> bytes:
-    """Return what ``protect`` put under ``SECRET_LABEL``; costs about 0.3 s.
+    """Return what ``protect`` took; costs about 0.3 s the first time in a process.
 
     Raises:
         LocalError: a wrong passphrase, or an altered file.
@@ -139,5 +151,6 @@ def _unsigned(number: int) -> bytes:
     return number.to_bytes(number.bit_length() // 8 + 1, "big")
 
 
+@lru_cache(maxsize=_DERIVED_KEPT)
 def _derived(passphrase: bytes, salt: bytes) -> bytes:
     return Scrypt(salt, _KEY_BYTES, _COST, _BLOCK, _PARALLEL).derive(passphrase)

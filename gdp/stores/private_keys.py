@@ -15,8 +15,8 @@ import secrets
 from enum import Enum
 from pathlib import Path
 
-from gdp.crypto.keys import SigningKey, is_encrypted
-from gdp.crypto.pbes2 import KEY_LABEL, RANDOM_BYTES, SECRET_LABEL, is_secret, open_secret, protect
+from gdp.crypto.keys import WRONG_PASSPHRASE, SigningKey, is_encrypted
+from gdp.crypto.pbes2 import KEY_LABEL, RANDOM_BYTES, SECRET_LABEL, is_own_form, is_secret, open_secret, protect
 from gdp.errors import GdpError, LocalError
 from gdp.stores.files import NewFile, private, read_private
 from gdp.stores.passphrase import passphrase_for
@@ -53,9 +53,18 @@ def read_signing_key(path: Path) -> SigningKey:
     try:
         if storage is Storage.TOKEN:
             return open_token_key(data.decode("utf-8", "replace").strip(), path)
+        if storage is Storage.PASSPHRASE and is_own_form(data):
+            return _opened_key(open_secret(data, passphrase_for(path)))
         return SigningKey.from_pem(data, passphrase_for(path) if storage is Storage.PASSPHRASE else None)
     except GdpError as error:
         raise _naming(path, error) from error
+
+
+def _opened_key(plain: bytes) -> SigningKey:
+    try:
+        return SigningKey.from_der(plain)
+    except LocalError as error:  # one wrong passphrase in 256 leaves a padding that is none
+        raise LocalError(WRONG_PASSPHRASE) from error
 
 
 def read_secret(path: Path) -> bytes:

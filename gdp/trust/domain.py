@@ -106,11 +106,21 @@ class Policy:
         root = self.roots.get(member.domain)
         if root is None:
             raise StatementError(DropReason.WRONG_DOMAIN, "a domain that is not trusted here")
-        issuers = _issuers(root, member.issuer_key)
-        issuers[0].validity.check(unix_s, "domain root")
+        if root.key.compressed != member.issuer_key:
+            root = self._predecessor(root, member)
+        root.validity.check(unix_s, "domain root")
         member.validity.check(unix_s, "membership")
-        if any(self.revoked.has(member.fingerprint, each.key.compressed) for each in issuers):
+        if self.revoked.has(member.fingerprint, root.key.compressed):
             raise StatementError(DropReason.REVOKED, "membership")
+
+    def _predecessor(self, root: Root, member: Membership) -> Root:
+        """Return the root that issued a membership before ``root``; each one after it may take the membership back."""
+        for each in reversed(root.lineage):
+            if each.key.compressed == member.issuer_key:
+                return each
+            if self.revoked.has(member.fingerprint, each.key.compressed):
+                raise StatementError(DropReason.REVOKED, "membership")
+        raise StatementError(DropReason.WRONG_DOMAIN, "issued by a root that is not trusted here")
 
     def _verified(self, stranger: Unverified, unix_s: float) -> Membership:
         candidates = [
@@ -125,16 +135,6 @@ class Policy:
             except StatementError as error:
                 refusal = error
         raise refusal
-
-
-def _issuers(root: Root, issuer_key: bytes) -> tuple[Root, ...]:
-    """Return the root that issued a membership, and those that succeeded it: each of them may take it back."""
-    if root.key.compressed == issuer_key:
-        return (root,)
-    for index, each in enumerate(root.predecessors):
-        if each.key.compressed == issuer_key:
-            return root.lineage[index:]
-    raise StatementError(DropReason.WRONG_DOMAIN, "issued by a root that is not trusted here")
 
 
 def _keys_of(roots: Iterable[Root]) -> frozenset[bytes]:

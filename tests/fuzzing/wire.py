@@ -29,6 +29,7 @@ from gdp.message.report import Missing, Report, ReportFlag
 from gdp.message.status import Start, Status
 from gdp.names import Name
 from gdp.trust.adcert import AdCert
+from gdp.trust.audit import BEGIN, AuditLine
 from gdp.trust.card import Card
 from gdp.trust.claim import ClaimBody
 from gdp.trust.delegation import Delegation
@@ -42,6 +43,8 @@ __all__ = ["DECODERS"]
 
 _A: Final = Name(b"a" * 32)
 _NODE: Final = ROBOT
+_HEIR: Final = SCHOOL.succeed(LAB.key, DAY, NOW)
+_AUDIT: Final = AuditLine(1, NOW, "accepted", "name", "ab", "cd", "", 1, BEGIN).to_line()
 _ENTRY: Final = Entry(b"claim", b"cert", _A, _A, _A, (_A,), 9.0, is_from_above=False)
 _READS: Final[dict[str, tuple[bytes, Callable[[Fields], object]]]] = {
     **{name.replace(" ", "-"): (wire, read) for name, (wire, _, read) in BODIES.items()},
