@@ -311,10 +311,21 @@ class Rib:
             is_repeated = isinstance(known, Route) and (known.claim, known.via) == (claim.wire, member.domain)
             if not is_repeated:
                 raise StatementError(DropReason.STALE, str(known.sequence))
-        is_new = known is None or known.sender != member.name
-        if is_new and self._store.count_of(member.name) >= self._settings.names_per_sender:
-            raise StatementError(DropReason.QUOTA, "names of one sender")
+        if known is None or known.sender != member.name:
+            self._check_quota(member.name, claim.node)
         return known
+
+    def _check_quota(self, sender: Name, node: Name) -> None:
+        """Return if a sender may bring another name, and a node have one: as many as the sender has left, at most.
+
+        Raises:
+            StatementError: QUOTA.
+        """
+        free = self._settings.names_per_sender - self._store.count_of(sender)
+        if free <= 0:
+            raise StatementError(DropReason.QUOTA, "names of one sender")
+        if self._store.count_of(node) >= free:
+            raise StatementError(DropReason.QUOTA, "names of one node")
 
     def _route(self, claim: Claim, transit: tuple[Name, ...], member: Membership, now: Instant) -> Route:
         left_s = max(claim.valid_until_unix_s - now.unix_s, 1.0)
@@ -382,6 +393,8 @@ class Rib:
     def _take_query(self, statement: Statement, now: Instant) -> None:
         fields = statement.fields
         member = self._sender(fields.bytes_("c"), statement, now)
+        if member.role not in (Role.SWITCH, Role.RIB):
+            raise StatementError(DropReason.NOT_DELEGATED, "only switches and RIBs ask")
         statement.verify(member.key)
         query = Query.from_fields(fields)
         if query.name == self._identity.name:
@@ -635,8 +648,8 @@ class Rib:
             return
         if entry.is_from_above and (not isinstance(known, Route) or known.is_from_above):
             return  # nothing here that it corrects
-        if known is None and self._store.count_of(entry.sender) >= self._settings.names_per_sender:
-            raise StatementError(DropReason.QUOTA, "names of one sender")
+        if known is None:
+            self._check_quota(entry.sender, claim.node)
         route = Route.of(
             claim,
             sender=entry.sender,
@@ -669,8 +682,8 @@ class Rib:
             until_unix_s = max(until_unix_s, known.valid_until_unix_s)
         if until_unix_s <= now.unix_s:
             return  # forgotten here already
-        if known is None and self._store.count_of(entry.sender) >= self._settings.names_per_sender:
-            raise StatementError(DropReason.QUOTA, "names of one sender")
+        if known is None:
+            self._check_quota(entry.sender, withdrawal.signer)
         gone = Withdrawn(entry.sender, sequence, until_unix_s, withdrawal.wire, entry.membership)
         route = self._store.withdraw(name, withdrawal.signer, gone)
         if route is not None:
