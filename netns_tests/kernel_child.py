@@ -16,6 +16,6 @@ if __name__ == "__main__":
     table = Table()
     table.install_many(ENTRIES.items(), float("inf"))
     plane = KernelPlane(sys.argv[2:], table, clsact=sys.argv[1] == "filter")
-    print(program_id(plane._loaded.program), flush=True)
+    print(program_id(plane._loaded.program_of(0)), flush=True)
     while True:
         plane.poll(None)

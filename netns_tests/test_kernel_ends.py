@@ -120,7 +120,7 @@ def test_opening_and_closing_again_and_again_leaves_nothing(ports: list[str], cl
     descriptors = os.listdir("/proc/self/fd")
     for _ in range(3):
         plane = KernelPlane(ports, table(), clsact=clsact)
-        mine = program_id(plane._loaded.program)
+        mine = program_id(plane._loaded.program_of(0))
         assert loaded()[mine] == PROGRAM
         assert links_of(mine) == (0 if clsact else len(ports))
         plane.close()

@@ -251,7 +251,7 @@ class Rib:
                 raise StatementError(DropReason.WRONG_DOMAIN, "a claim of a domain that is not trusted")
             if member.domain != self._policy.own and not claim.is_global:
                 raise StatementError(DropReason.WRONG_DOMAIN, "a local name of another domain")
-            self._check_identity(claim, now.mono_s)
+            self._check_identity(claim, now)
             if claim.right is Right.ATTACH and self.identities.is_refused_above(
                 claim.node, claim.incarnation, now.mono_s
             ):
@@ -273,7 +273,7 @@ class Rib:
         if claim.is_global and not self._upstream.has(member.name):
             self._pass_up(route, relay.statement, route.sequence, now.mono_s)
 
-    def _check_identity(self, claim: Claim, now_s: float) -> None:
+    def _check_identity(self, claim: Claim, now: Instant) -> None:
         """Refuse a node's own name in another incarnation while the older node lives at another switch.
 
         Raises:
@@ -283,10 +283,11 @@ class Rib:
         if not isinstance(held, Route) or held.switch == claim.switch:
             return
         older = ClaimBody.from_statement(parse(held.claim)).incarnation
-        if older == claim.incarnation or self.identities.is_free(claim.node, older, held.switch, now_s):
+        if older == claim.incarnation or self.identities.is_free(claim.node, older, held.switch, now.mono_s):
             return
-        if self.identities.must_ask(claim.node, older, held.switch, now_s):
-            question = Presence(claim.node, older, claim.switch)
+        number = int(now.unix_s * 1_000)
+        if self.identities.must_ask(claim.node, older, held.switch, number, now.mono_s):
+            question = Presence(claim.node, older, claim.switch, number)
             wire = question.to_wire(self._identity.name, self._identity.key, self._identity.membership)
             self._letters.append(Letter(held.switch, Kind.RIB_ANSWER, wire))
         raise StatementError(DropReason.IN_USE, "another node with this identity")

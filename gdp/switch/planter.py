@@ -323,7 +323,7 @@ class Planter:
 
     def _plant(self, tree: Tree) -> None:
         tree.protection = self._backups.protection(tree)
-        if not self._table.install(tree.key, tree.hops(self._outbox.mac_of()), tree.expires_s()):
+        if not self._table.install(tree.key, tree.hops(self._outbox.mac_of()), tree.expires_s(), tree.sides):
             self.drops[DropReason.QUOTA] += 1
 
     def _put_branch(self, tree: Tree, at: At, branch: Branch) -> bool:
@@ -388,6 +388,9 @@ class Planter:
         self._show(tree)
         if has_settled and self._paths.has_alternates:
             self._ask_for_backup(tree)
+        if has_settled and tree.left:
+            tree.left.clear()
+            self._plant(tree)
 
     def _restate(self, tree: Tree) -> None:
         """Say at once, to the one above, that what fits this tree, or whether anybody wants copies, has changed."""
@@ -403,7 +406,8 @@ class Planter:
         other = self._backups.above(tree)
         if other != tree.backup:
             self._leave_backup(tree)
-        tree.backup = other
+            tree.backup = other
+            self._plant(tree)
         if other is not None:
             (port, _), _ = other
             mtu = min(tree.mtu, self._outbox.mtu_of(port))
@@ -412,6 +416,7 @@ class Planter:
     def _leave_backup(self, tree: Tree) -> None:
         if tree.backup is not None:
             (at, name), tree.backup = tree.backup, None
+            tree.left.add(at[0])
             if at != tree.above:
                 self._say(tree, at, name, 1, 0.0, b"")
 
@@ -459,11 +464,13 @@ class Planter:
     def _leave_former(self, tree: Tree) -> None:
         if tree.former is not None:
             (at, name), tree.former = tree.former, None
+            tree.left.add(at[0])
             if at != tree.above:
                 self._say(tree, at, name, 1, 0.0, b"")
 
     def _leave(self, tree: Tree) -> None:
         if tree.above is not None and tree.above_name is not None:
+            tree.left.add(tree.above[0])
             self._say(tree, tree.above, tree.above_name, 1, 0.0, b"")
         tree.above = tree.above_name = None
 

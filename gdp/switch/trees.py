@@ -15,7 +15,7 @@ from typing import Final
 
 from gdp.limits import FRAME_MAX_BYTES
 from gdp.names import Name
-from gdp.switch.table import Hop, Hops, ProtectedHop
+from gdp.switch.table import Hop, Hops, ProtectedHop, sides_of
 
 __all__ = ["Branch", "Tree", "Trees"]
 
@@ -69,6 +69,7 @@ class Tree:
     is_doubted: bool = False  # that proves nothing any more
     asked_backup_for: Name | None = None  # what the last join said
     backup: tuple[At, Name] | None = None  # whom a backup branch was asked of
+    left: set[int] = field(default_factory=set)  # ports that copies may still come from, until the tree has settled
     protection: dict[At, At] = field(default_factory=dict)  # branch to the backup that takes its place
 
     @property
@@ -104,6 +105,16 @@ class Tree:
     def expires_s(self) -> float:
         """Return when the last branch ends."""
         return max(branch.expires_s for branch in self.branches.values())
+
+    @property
+    def sides(self) -> int:
+        """Return the ports that copies may come from: of whoever was asked for them, or was until a moment ago.
+
+        Nobody was asked: the mask is empty.
+        """
+        asked = [self.above] if self.above is not None else []
+        asked += [each[0] for each in (self.former, self.backup) if each is not None]
+        return sides_of([*(port for port, _ in asked), *self.left])
 
     def next_s(self) -> float:
         """Return when something is due: a renewal, the end of a lease, of an overlap, of a backup's turn."""
