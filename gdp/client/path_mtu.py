@@ -1,8 +1,8 @@
-"""The MTU of a tree as its publisher uses it: what joins say, as long as they do not change it too often.
+"""The MTU of a tree as its publisher uses it: what joins say, as long as following them does not cost too much.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). What is kept for repairs is sealed anew when the path becomes
-too narrow for it. So a path may become narrower ``MTU_NARROWINGS`` times, and once more every ``MTU_HOLD_S``. Until
-then it is not believed to be wider, and falls from plateau to plateau (RFC 1191, section 7.1), of which there are few.
+too narrow for it: at most ``MTU_NARROWINGS`` times, and once more every ``MTU_HOLD_S``. Until then the path is not
+believed to be wider, and falls from plateau to plateau (RFC 1191, section 7.1), of which there are few.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class PathMtu:
 
     def __init__(self) -> None:
         self._mtu: int | None = None
-        self._narrowings = float(MTU_NARROWINGS)  # that may still come
+        self._narrowings = float(MTU_NARROWINGS)  # with something sealed anew, that may still come
         self._counted_s = 0.0
 
     def take(self, mtu: int, now_s: float) -> int:
@@ -30,8 +30,11 @@ class PathMtu:
         self._narrowings, self._counted_s = min(self._narrowings + more, MTU_NARROWINGS), now_s
         may_narrow = self._narrowings >= 1
         if self._mtu is not None and mtu < self._mtu:
-            self._narrowings -= may_narrow
             self._mtu = mtu if may_narrow else next((each for each in PLATEAUS if each <= mtu), mtu)
         elif self._mtu is None or may_narrow:
             self._mtu = mtu
         return self._mtu
+
+    def count(self) -> None:
+        """Note that something had to be sealed anew."""
+        self._narrowings = max(self._narrowings - 1, 0.0)

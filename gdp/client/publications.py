@@ -157,10 +157,13 @@ class Publications:
         """Learn that a tree stands, and how wide it is."""
         publisher = self._publishers.get(join.topic)
         if publisher is not None and join.publisher == self._source.name and join.lease_s > 0:
-            mtu = self._paths.setdefault(join.topic, PathMtu()).take(join.mtu, now_s)
+            path = self._paths.setdefault(join.topic, PathMtu())
+            mtu, is_split = path.take(join.mtu, now_s), False
             for each in (publisher, *self._private.get(join.topic, ())):
-                each.tree_stands(mtu)
+                is_split |= each.tree_stands(mtu)
                 self.turns.add(each)
+            if is_split:
+                path.count()
 
     def timeout(self, now_s: float) -> None:
         """Do what is due."""

@@ -222,10 +222,14 @@ class Publisher:
         self.published(self)  # the last time: who waits for its frames finds none
         self.published = lambda _: None
 
-    def tree_stands(self, mtu: int) -> None:
-        """Learn that a tree reaches this publisher, and the smallest MTU on it (bytes after the Ethernet header)."""
+    def tree_stands(self, mtu: int) -> bool:
+        """Learn that a tree reaches this publisher, and the smallest MTU on it (bytes after the Ethernet header).
+
+        Returns:
+            whether something has to be sealed anew for it.
+        """
         self.mtu = max(mtu, MTU_MIN_BYTES)
-        self._split_anew(self.mtu)
+        return self._split_anew(self.mtu)
 
     def publish(self, message: bytes) -> int | None:
         """Queue a message; return how many that makes, or None when nobody is there to read it.
@@ -430,13 +434,14 @@ class Publisher:
     def _seal(self, number: int, body: bytes | Sealed, mtu: int, *, is_bundle: bool) -> Sealed:
         return self._data.seal(number, self._flags | _BUNDLE * is_bundle, body, mtu)
 
-    def _split_anew(self, mtu: int) -> None:
-        """Seal anew what has become too large for its path."""
-        for body, carried in self._unsent.take_back(mtu):
+    def _split_anew(self, mtu: int) -> bool:
+        """Seal anew what has become too large for its path; return whether there is any."""
+        unsent = self._unsent.take_back(mtu)
+        for body, carried in unsent:
             self._queue(body, carried.sequence, carried.messages)
         kept = [(number, each) for number, each in self._window.kept() if isinstance(each, Sealed)]
         if not any(each.largest > mtu for _, each in kept):
-            return
+            return bool(unsent)
         first, end = kept[0][0], self._next_number
         move = Move(first, end - first, end + 1)
         is_bundle = self._ledger.is_bundle
@@ -456,6 +461,7 @@ class Publisher:
             if reader.start is not None:
                 reader.start = reader.start._replace(number=move.of(reader.start.number))
         self._statuses.wanted = True
+        return True
 
     def _follow_moves(self, report: Report) -> Report:
         """Return a report as it would be under the present numbers; a reader that does not know them is told."""
