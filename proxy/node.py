@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import secrets
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -25,7 +24,7 @@ from gdp.message.loss import by_label
 from gdp.names import Name
 from gdp.nodes.counts import count_list
 from gdp.nodes.credentials import Credentials, watched_folders
-from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
+from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.rights import confine_proxy
 from gdp.nodes.runtime import Runtime, now
@@ -121,7 +120,7 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
         LocalError: keys, delegations or the device are not as the configuration says, or this proxy already runs.
     """
     identity, policy = load_member(config.identity, config.domain, Role.PROXY)
-    settings = NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes, lease_s=config.lease_s)
+    settings = NodeSettings(incarnation(), wall_clock_ms(), fresh_bytes, lease_s=config.lease_s)
     member = Member(identity, policy, settings)
     with contextlib.ExitStack() as stack:
         stack.enter_context(run_alone("proxy", identity.name))

@@ -72,14 +72,20 @@ class Claimed:
 
 
 class Attachment:
-    """One node's hold on the overlay."""
+    """One node's hold on the overlay.
 
-    def __init__(self, identity: Identity, policy: Policy, settings: NodeSettings) -> None:
+    Args:
+        exchange: X25519 key of this life, for notes to what it claims to publish, serve or call; empty: it takes none.
+    """
+
+    def __init__(self, identity: Identity, policy: Policy, settings: NodeSettings, exchange: bytes = b"") -> None:
         self._identity = identity
+        self._exchange = exchange
         self._policy = policy
         self._incarnation = settings.incarnation
         self._lease_s = settings.lease_s
         self._sequence = settings.first_sequence
+        self.started = settings.first_sequence  # above what earlier lives said here, as far as is known
         self.splitter = ControlSplitter(identity.name, settings.incarnation)
         self.joiner = ControlJoiner()
         is_rib = identity.member.role is Role.RIB
@@ -259,6 +265,7 @@ class Attachment:
             is_global=each.is_global,
             chain=each.chain,
             previous=self._former if now.mono_s - self._moved_s < _MOVED_S else ZERO,
+            exchange=self._exchange if each.right in HEARS.values() else b"",
         )
 
     def _rtcert_for(self, switch: Name) -> bytes:
@@ -322,7 +329,7 @@ class Attachment:
         self.refusals[verdict.refused] += 1
         each.is_taken = False
         if verdict.refused is DropReason.STALE:
-            self._sequence = max(self._sequence, verdict.sequence)
+            self._sequence = self.started = max(self._sequence, verdict.sequence)
             each.claim_at_s = now_s  # an earlier life of ours was ahead: try again above it
         elif verdict.refused is DropReason.IN_USE and each.right is Right.ATTACH:
             if each.refused is not verdict.refused:

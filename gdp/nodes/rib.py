@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import secrets
 from collections.abc import Callable
 
 from gdp.client.rib_host import RibHost
@@ -19,7 +18,7 @@ from gdp.nodes.audit import audit_folder, keep_audit
 from gdp.nodes.config import RibConfig
 from gdp.nodes.counts import count_list
 from gdp.nodes.credentials import Credentials
-from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
+from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.rib_upkeep import MemoryUpkeep, Upkeep
 from gdp.nodes.rights import confine_rib
@@ -52,7 +51,7 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
     settings = RibSettings(
         config.upper, config.peers, config.allow_unowned, quotas.names_per_sender, quotas.watches, quotas.lease_max_s
     )
-    attachment = NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes, lease_s=config.lease_s)
+    attachment = NodeSettings(incarnation(), wall_clock_ms(), fresh_bytes, lease_s=config.lease_s)
     with contextlib.ExitStack() as stack:
         stack.enter_context(run_alone("RIB", identity.name))
         folder = audit_folder(config.audit)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import secrets
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from gdp.nodes.config import SwitchConfig
 from gdp.nodes.counts import count_list
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.data_plane import Chosen, choose_plane
-from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
+from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.pairs import attach_pairs, switch_end
 from gdp.nodes.rights import confine_switch
@@ -63,7 +62,7 @@ def run_switch(
     settings = NodeSettings(
         incarnation(),
         wall_clock_ms(),
-        secrets.token_bytes,
+        fresh_bytes,
         config.hello_s,
         config.dead_s,
         config.lease_s,

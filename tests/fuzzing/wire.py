@@ -14,6 +14,7 @@ from gdp.control.replica import Digest, Entry, Fetch, Inventory, Item, Replicas
 from gdp.crypto import cbor
 from gdp.crypto.certificates import Root, Unverified
 from gdp.crypto.envelope import Opener
+from gdp.crypto.introduction import Introduction
 from gdp.crypto.kem import KemPublicKey
 from gdp.crypto.keys import PublicKey
 from gdp.crypto.note import NoteOpener, NoteSealer
@@ -106,11 +107,15 @@ def _envelope(data: bytes) -> object:
 
 
 def _note(data: bytes) -> object:
-    return NoteOpener(SECRET, Kind.REPORT, SOURCE, 5, TOPIC, TOPIC, 9).open(codec.decode(data), data)
+    return NoteOpener(_KEY, TOPIC, 9).open(codec.decode(data), data)
 
 
 def _note_seed() -> bytes:
-    return NoteSealer(SECRET, 1, Kind.REPORT, SOURCE, 5, TOPIC, TOPIC, 9, count(1)).seal(b"body")
+    return NoteSealer(_KEY, 1, Kind.REPORT, SOURCE, 5, TOPIC, TOPIC, 9, count(1)).seal(b"body")
+
+
+def _introduction() -> bytes:
+    return Introduction.make(_NODE.subject, _NODE.key, 5, 1, _KEY)
 
 
 _REPORT: Final = Report(ReportFlag.NONE, 5, 1, (Missing(5, 1, 2),))
@@ -150,6 +155,12 @@ DECODERS: Final = (
     Decoder("public-pem", PublicKey.from_pem, (LAB.key.public.to_pem(),), (LocalError, StatementError)),
     Decoder("envelope", _envelope, tuple(_FRAMES), (RemoteError,)),
     Decoder("note", _note, (_note_seed(),), (RemoteError,)),
+    Decoder(
+        "introduction",
+        lambda data: Introduction.from_wire(data, _NODE.name, 5),
+        (_introduction(),),
+        (StatementError,),
+    ),
     Decoder(
         "keepalive",
         lambda data: open_keepalive(_KEY, data),
