@@ -43,7 +43,7 @@ class RibHost:
 
     def drops(self) -> Mapping[DropReason, int]:
         """Return what was dropped or refused, by reason."""
-        return self._drops + self._joiner.drops + self.attachment.joiner.drops + self.rib.refusals
+        return self._drops + self._joiner.drops + self.attachment.drops + self.rib.refusals
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Instant) -> None:
         """Begin to look for a switch on a port."""
@@ -80,6 +80,10 @@ class RibHost:
         """Return the monotonic second of the next timer, or None."""
         times = [self.attachment.next_timeout(), self.rib.next_timeout()]
         return min((time for time in times if time is not None), default=None)
+
+    def take_neighbours(self) -> Mapping[int, frozenset[bytes]]:
+        """Return, once, the addresses of the neighbours at each port where they have changed."""
+        return self.attachment.greeter.take_addresses()
 
     def take(self) -> list[Transmit]:
         """Return, once, what is to be sent."""
