@@ -66,7 +66,7 @@ class Machine(Protocol):
         """Return the monotonic second of the next timer, or None."""
 
     def take_neighbours(self) -> Mapping[int, frozenset[bytes]]:
-        """Return, once, the addresses of the neighbours at each port where they have changed."""
+        """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
 
     def take(self) -> list[Transmit]:
         """Return, once, what is to be sent; more may come at the next call, until nothing does."""

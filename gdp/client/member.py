@@ -316,7 +316,7 @@ class Member:
         return min((time for time in times if time is not None), default=None)
 
     def take_neighbours(self) -> Mapping[int, frozenset[bytes]]:
-        """Return, once, the addresses of the neighbours at each port where they have changed."""
+        """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
         return self.attachment.greeter.take_addresses()
 
     def take(self) -> list[Transmit]:

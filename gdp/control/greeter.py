@@ -70,6 +70,7 @@ NEIGHBOURS_MAX: Final = 64  # on one port
 CANDIDATES_MAX: Final = 32  # on one port, who have not echoed our nonce; the one silent for longest makes room
 PADDED_BYTES: Final = 1_400  # of a hello with its header; what it draws from who does not know us is not longer
 _PARTS_MAX: Final = -(-HELLO_MAX_BYTES // (MTU_MIN_BYTES - HEADER_BYTES))
+_ADDRESSES_MAX: Final = 96  # of neighbours and former ones, whose frames the data plane keeps apart from strangers'
 _CREDIT_MAX_BYTES: Final = 16 << 10
 _UNHEARD: Final = (-1, -1)
 _NOTHING: Final[Mapping[int, frozenset[bytes]]] = MappingProxyType({})
@@ -113,6 +114,7 @@ class LinkPort:
     ended: dict[bytes, tuple[int, int]] = field(default_factory=dict)  # nonce to last hello and keepalive
     joins: dict[bytes, ReplayWindow] = field(default_factory=dict)  # which were taken, by session of the far end
     said_mtus: dict[Name, int] = field(default_factory=dict)  # what each neighbour's end takes
+    addresses: dict[bytes, None] = field(default_factory=dict)  # of neighbours, former ones too; the last proven last
     strangers: Strangers = field(default_factory=Strangers)  # whose hellos were refused
 
     @property
@@ -147,6 +149,15 @@ class LinkPort:
         """Say hello soon to who has not proved itself, with at most as many bytes as came of such."""
         self.credit_bytes = min(self.credit_bytes + received_bytes, _CREDIT_MAX_BYTES)
         self.answer_at_s = min(self.answer_at_s, max(now_s, self.said_s + _ANSWER_S))
+
+    def note_address(self, mac: bytes) -> bool:
+        """Note that a neighbour has this address; return whether that is news."""
+        is_new = mac not in self.addresses
+        self.addresses.pop(mac, None)
+        self.addresses[mac] = None
+        if len(self.addresses) > _ADDRESSES_MAX:
+            del self.addresses[next(iter(self.addresses))]
+        return is_new
 
     def candidates(self) -> list[Neighbour]:
         """Return who was heard, and has not echoed our nonce."""
@@ -246,7 +257,7 @@ class Greeter:
         self._cookies = Cookies(random_bytes)
         self._replies: list[Transmit] = []
         self._reply_at_s = float("inf")
-        self._has_moved = False  # a neighbour came, went, or has another address
+        self._has_moved = False  # there is a new address
         self._told_addresses: dict[int, frozenset[bytes]] = {}
         self._joiner = ControlJoiner()  # of neighbours' hellos
         self._strangers_joiner = ControlJoiner()
@@ -298,7 +309,10 @@ class Greeter:
         if port is None or not port.is_up or port.mac != mac:
             lost = [] if port is None else self._lose(port, list(port.neighbours.values()), NeighbourEvent.LINK_LOST)
             nonce, key = self._session()
-            self.ports[index] = LinkPort(index, mac, own_mtu, cost, nonce, key, Admission(now_s), hello_at_s=now_s)
+            self.ports[index] = LinkPort(
+                index, mac, own_mtu, cost, nonce, key, Admission(now_s), hello_at_s=now_s,
+                addresses={} if port is None else port.addresses,
+            )  # fmt: skip
             return lost
         if (port.own_mtu, port.cost) == (own_mtu, cost):
             return []
@@ -315,13 +329,13 @@ class Greeter:
         return found if found is not None and found.state is NeighbourState.UP else None
 
     def take_addresses(self) -> Mapping[int, frozenset[bytes]]:
-        """Return, once, the addresses of the neighbours that are up at each port where they have changed."""
+        """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
         if not self._has_moved:
             return _NOTHING
         self._has_moved = False
         changed = {}
         for index, port in self.ports.items():
-            macs = frozenset(each.mac for each in port.neighbours.values() if each.state is NeighbourState.UP)
+            macs = frozenset(port.addresses)
             if macs != self._told_addresses.get(index, frozenset()):
                 changed[index] = self._told_addresses[index] = macs
         return changed
@@ -410,9 +424,10 @@ class Greeter:
         said_mtu = port.said_mtus[known.name] = max(hello.mtu, MTU_MIN_BYTES)
         mtu = min(said_mtu, port.own_mtu)
         is_resized = known.mtu != mtu
-        self._has_moved = self._has_moved or known.mac != arrival.mac
         known.mac, known.mtu, known.nonce, known.candidate = arrival.mac, mtu, hello.nonce, b""
         known.is_proven = is_two_way or (known.is_proven and not is_new_session)
+        if known.is_proven:
+            self._has_moved = port.note_address(arrival.mac) or self._has_moved
         known.cookie = b"" if is_new_session else known.cookie
         known.sequence, known.digest, known.greeted_s = hello.sequence, hello.digest, now.mono_s
         known.member, known.checked_s, known.life = member, now.mono_s, hello.life
@@ -761,8 +776,8 @@ class Greeter:
             port.end(neighbour)
         return [change for neighbour in lost if (change := self._step(neighbour, event)) is not None]
 
-    def _step(self, neighbour: Neighbour, event: NeighbourEvent) -> Change | None:
+    @staticmethod
+    def _step(neighbour: Neighbour, event: NeighbourEvent) -> Change | None:
         before = neighbour.state
         neighbour.state = TRANSITIONS[before, event]
-        self._has_moved = self._has_moved or neighbour.state is not before
         return None if neighbour.state is before else (neighbour, before)

@@ -247,7 +247,7 @@ class Switch:
         return min(time for time in times if time is not None)
 
     def take_neighbours(self) -> Mapping[int, frozenset[bytes]]:
-        """Return, once, the addresses of the neighbours at each port where they have changed."""
+        """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
         return self.greeter.take_addresses()
 
     def take(self) -> list[Transmit]:
