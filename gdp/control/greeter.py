@@ -396,7 +396,8 @@ class Greeter:
             return None
         hello, member = self._verified(port, arrival, statement, now)
         proof = self._proof_of_place(hello, member)
-        self._refuse_rival(port, hello, member.name, arrival.mac, now.mono_s)
+        received_bytes = max(len(arrival.frame), HEADER_BYTES + len(statement.wire))
+        self._refuse_rival(port, hello, member.name, (arrival.mac, received_bytes), now.mono_s)
         self.rivals.take(member.name, hello.life)
         is_two_way = port.nonce in hello.heard
         known = port.neighbours.get(member.name)
@@ -407,11 +408,11 @@ class Greeter:
             )
         is_new_session = known.nonce != hello.nonce
         if is_two_way:
-            has_news = is_new_session or port.owes_answer
+            has_news = is_new_session or (port.owes_answer and not known.is_proven)
         else:
             has_news = known.is_proven and not is_new_session  # it does not hear us any more
             if not has_news:
-                port.answer(max(len(arrival.frame), HEADER_BYTES + len(statement.wire)), now.mono_s)
+                port.answer(received_bytes, now.mono_s)
         if has_news:
             port.hurry(max(now.mono_s, port.said_s + _ANSWER_S))
         if is_new_session and not is_two_way and known.is_proven:
@@ -529,8 +530,13 @@ class Greeter:
                 return hello.membership, wire
         return None
 
-    def _refuse_rival(self, port: LinkPort, hello: Hello, name: Name, mac: bytes, now_s: float) -> None:
+    def _refuse_rival(
+        self, port: LinkPort, hello: Hello, name: Name, arrived: tuple[bytes, int], now_s: float
+    ) -> None:
         """Take a hello's word only if no older node with its identity is alive; a younger one is let go.
+
+        Args:
+            arrived: from which address, and how many bytes.
 
         Raises:
             StatementError: IN_USE.
@@ -543,19 +549,24 @@ class Greeter:
             and other.life != hello.life
             and now_s < self._gone_at_s(other)
         ]
+        mac, received_bytes = arrived
         if any((other.port, other.mac) == (port.index, mac) for other in others):
             return  # it was restarted there
         elsewhere = self._life_elsewhere(name)
         is_outlived_here = any(other.life < hello.life for other in others)
+        is_proven = port.nonce in hello.heard  # else it may be an old one played back
+        tell = self._tell_rival if is_proven else self.rivals.tell
         for other in others:
             if is_outlived_here:
-                self._tell_rival(other.port, other.nonce, name, now_s)
-            elif port.nonce in hello.heard:  # else it may be an old one played back
+                tell(other.port, other.nonce, name, now_s)
+            elif is_proven:
                 self.let_go(other, now_s)
         if not is_outlived_here and (elsewhere is None or hello.life <= elsewhere):
             return
         self.rivals.refuse(name, hello.life, now_s)
-        self._tell_rival(port.index, hello.nonce, name, now_s)
+        tell(port.index, hello.nonce, name, now_s)
+        if not is_proven:
+            port.answer(received_bytes, now_s)
         raise StatementError(DropReason.IN_USE, "an older node with this identity is alive")
 
     def let_go(self, neighbour: Neighbour, now_s: float) -> None:

@@ -262,3 +262,19 @@ def test_a22_a_hello_of_an_earlier_life_played_at_another_port_lets_no_neighbour
     one.expire(link.now_s)
     (known,) = (each for each in one.ports[0].neighbours.values())
     assert known.state is NeighbourState.UP
+
+
+def test_a20_a_rival_that_has_not_proved_itself_draws_no_more_than_it_sent() -> None:
+    calm, link = pair(FAST), pair(FAST)
+    for each in (calm, link):
+        each.run(4.0)
+        each.sent = 0
+    received = 0
+    for number in range(16):  # younger lives of the neighbour, at another address
+        hello = Hello(number.to_bytes(8, "big"), 1, (), 1_500, bytes(8), B.membership, life=bytes(15) + b"\x09")
+        received += link.inject(hello.to_wire(B.name, B.key), mac_of(number))
+        link.run(1.0)
+    calm.run(16.0)
+    assert bytes(B.name) in link.up()
+    assert link.drops.count(DropReason.IN_USE) == 16
+    assert link.sent - calm.sent <= received
