@@ -28,7 +28,14 @@ from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.effects import Instant
 from gdp.errors import DropReason, RemoteError, StatementError, StoreError
 from gdp.frame.kinds import Kind
-from gdp.limits import LEASE_MAX_S, NEGATIVE_LEASE_S, RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX, WITHDRAWAL_MAX_BYTES
+from gdp.limits import (
+    CLOCK_SKEW_S,
+    LEASE_MAX_S,
+    NEGATIVE_LEASE_S,
+    RIB_NAMES_PER_SENDER,
+    RIB_WATCHES_MAX,
+    WITHDRAWAL_MAX_BYTES,
+)
 from gdp.names import Name
 from gdp.rib.above import Above
 from gdp.rib.digest_tree import DigestTree
@@ -686,7 +693,7 @@ class Rib:
             return
         member = self._sender(entry.membership, withdrawal, now)
         withdrawal.verify(member.key)
-        until_unix_s = min(entry.until_unix_s, member.not_after_unix_s)
+        until_unix_s = min(entry.until_unix_s, member.not_after_unix_s + int(CLOCK_SKEW_S))
         if known is not None:  # a peer cannot have us forget sooner what we know
             until_unix_s = max(until_unix_s, known.valid_until_unix_s)
         if until_unix_s <= now.unix_s:
