@@ -14,16 +14,16 @@ from dataclasses import dataclass
 from itertools import count
 from typing import Any, Final
 
+from gdp.client.feed import FeedState
 from gdp.client.rib_host import RibHost
 from gdp.control.frames import ControlSplitter
-from gdp.control.hello import HEARD_MAX, RTCERTS_MAX
+from gdp.control.hello import COOKIE_BYTES, COOKIES_MAX, HEARD_MAX, RIVALS_MAX, RTCERTS_MAX
 from gdp.control.keepalive import seal_keepalive
 from gdp.control.link_state import COST_MAX, LINKS_MAX, MEMBERS_MAX, RIBS_MAX
 from gdp.control.query import TRANSIT_MAX
 from gdp.control.replica import ENTRIES_MAX, FETCH_KEYS_MAX, FETCH_PREFIXES_MAX, INVENTORY_MAX
 from gdp.crypto.envelope import Sealer
 from gdp.crypto.identity import Identity
-from gdp.crypto.note import NoteSealer
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, LocalError, StatementError
@@ -50,7 +50,8 @@ _NUMBERS: Final = (0.0, -0.0, -1.0, 1e-9, 0.5, 1.0, 24.0, 3_599.5, 3_600.0, 3_60
 _TEXTS: Final = ("", "publish", "serve", "call", "read", "attach", "domain", "border", "x" * 300)
 _SIZES: Final = (900, 1_024, 1_025, 8_900, 9_216, 9_217, 12_000, 16_000, 16_300)
 _MAXIMA: Final = {
-    "h": HEARD_MAX, "u": HEARD_MAX, "l": LINKS_MAX, "i": LINKS_MAX, "m": MEMBERS_MAX, "x": TRANSIT_MAX, "r": RIBS_MAX,
+    "h": HEARD_MAX, "u": RIVALS_MAX, "y": COOKIES_MAX,
+    "l": LINKS_MAX, "i": LINKS_MAX, "m": MEMBERS_MAX, "x": TRANSIT_MAX, "r": RIBS_MAX,
     "chain": CHAIN_MAX, "p": FETCH_PREFIXES_MAX, "k": FETCH_KEYS_MAX, "e": ENTRIES_MAX, "rights": 4,
 }  # fmt: skip
 _RIGHTS: Final = tuple(Right)
@@ -119,12 +120,31 @@ class Forge:
         wire = self._statement(rng, type_, persona, place)
         if wire is None:
             return None
+        if kind in (Kind.RIB_REQUEST, Kind.RIB_ANSWER) and rng.random() < 0.8:
+            return self._in_channel(persona, type_, place, destination, wire)
         try:
             frames = self._splitters[persona.node].split(kind, wire, 1_500, destination)
         except LocalError:
             return None
         self._old.append(wire)
         return Utterance(persona, type_.value, place, tuple(frames))
+
+    def _in_channel(
+        self, persona: Persona, type_: StatementType, place: Place, to: Name, wire: bytes
+    ) -> Utterance | None:
+        """Say a statement over the channel of the persona's own machine, or what opens one."""
+        machine = self._stage.machines().get(persona.node)
+        channels = getattr(machine, "_channels", None)
+        if channels is None or to == ZERO:
+            return None
+        if not channels.answer(to, wire):
+            channels.ask(to, wire, self._stage.world.network.now.mono_s)
+        frames: list[bytes] = []
+        for each in channels.take():
+            kind = Kind.RIB_ANSWER if each.is_answer else Kind.RIB_REQUEST
+            frames += self._splitters[persona.node].split(kind, each.wire, 1_500, each.to)
+        self._old.append(wire)
+        return Utterance(persona, type_.value, place, tuple(frames)) if frames else None
 
     # -- statements
 
@@ -254,6 +274,10 @@ class Forge:
     def _nonce(self, place: Place) -> bytes:
         return self._stage.nonce_at(place)
 
+    def _own_nonce(self, identity: Identity, place: Place) -> bytes:
+        persona = next(each for each in PERSONAS if self._stage.identity(each).name == identity.name)
+        return self._stage.own_nonce(persona, place)
+
     def _own_life(self, identity: Identity, rng: random.Random) -> bytes:
         """Return the life of the persona's machine most of the time, or an older or a newer one."""
         machine = next((each for each in self._stage.machines().values() if each.name == identity.name), None)
@@ -272,6 +296,7 @@ class Forge:
             "k": rng.choice(([1_000, 1_000, 3], [0, 0, 1], [1, 1, 1], [60_000, 60_000, 255])),
             "x": rng.choice((b"", bytes(32), b"\xff" * 32, rng.randbytes(32))), "b": self._own_life(identity, rng),
             "u": [self._nonce(place)] if rng.random() < 0.1 else [], "r": rtcerts[:RTCERTS_MAX],
+            "y": [self._nonce(place) + rng.randbytes(COOKIE_BYTES)] if rng.random() < 0.2 else [],
         }  # fmt: skip
 
     def _link_state(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
@@ -296,6 +321,7 @@ class Forge:
             "r": [rib() for _ in range(rng.choice((0, 1, 2)))],
             "m": [rng.choice(self._nodes) for _ in range(rng.choice((0, 1, 4)))],
             "z": rng.random() < 0.2, "b": self._own_life(identity, rng),
+            "e": int(world.network.now.unix_s),
             "u": [rng.choice(self._nodes)] if rng.random() < 0.2 else [], "c": identity.membership,
             **({"d": own} if rng.random() < 0.01 else {}),
         }  # fmt: skip
@@ -313,7 +339,7 @@ class Forge:
             "x": sorted({*self._domains, identity.root.domain}), "m": rng.choice((1_500, 576, 1, 9_000)),
             "l": rng.choice((0.0, 1.0, 7.0, 3_600.0)), "e": evidence, "i": self._nonce(place),
             "s": next(self._numbers), "v": rng.choice((0, int(world.network.now.unix_s * 1_000), next(self._numbers))),
-            "b": rng.choice((ZERO, ZERO, rng.choice(self._nodes))),
+            "b": rng.choice((ZERO, ZERO, rng.choice(self._nodes))), "o": self._own_nonce(identity, place),
         }  # fmt: skip
 
     def _claim(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
@@ -343,7 +369,8 @@ class Forge:
                 ] if Right.ATTACH not in list(_RIGHTS)[:3] else []
         return {
             **subject.to_fields(), "name": subject.name, "right": right.value, "seq": next(self._numbers),
-            "inc": rng.choice((1, 7, next(self._counters))), "lease": rng.choice((1_000, 6_000, 24_000, 3_600_000)),
+            "inc": rng.choice((1, 7, next(self._counters))), "x": rng.choice((b"", bytes(32), rng.randbytes(32))),
+            "lease": rng.choice((1_000, 6_000, 24_000, 3_600_000)),
             "global": rng.random() < 0.5, "member": identity.membership, "chain": chain,
             "rt": RtCert.make(identity, switch, self._lasting()),
             **({"prev": self._switch_at(rng, None)} if rng.random() < 0.2 else {}),
@@ -468,6 +495,16 @@ class Forge:
             **identity.subject.to_fields(), "cert": rng.choice((rng.randbytes(32), member.fingerprint)), "until": until
         }
 
+    def _open(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        to = rng.choice([host.name for host in self._stage.world.ribs.values()])
+        return {"k": rng.randbytes(32), "w": to, "c": identity.membership, "p": bytes(rng.choice((0, 700, 8_000)))}
+
+    def _accept(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        to = rng.choice(self._nodes)
+        return {
+            "o": rng.randbytes(32), "i": rng.randbytes(8), "k": rng.randbytes(32), "w": to, "c": identity.membership
+        }
+
     def _adcert(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         return dict(parse(AdCert.make(
             identity.key, identity.name, identity.subject, rng.choice(self._identities()).subject,
@@ -537,16 +574,11 @@ class Forge:
         return [encode(self._header(rng, Kind.ECHO_REQUEST, to, source, len(payload))) + payload]
 
     def _report(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
-        """Return a reader's note to a party of a name that the persona may use, in its own or another's name."""
-        identity = self._stage.identity(persona)
-        found = self._secret(rng, identity)
-        if found is None:
+        """Return a hostile note of a reader's own feed, by the key that it agreed with its publisher."""
+        member = self._stage.world.members.get(persona.node)
+        feeds = [] if member is None else [each for each in member.feeds() if each.state is FeedState.LIVE]
+        if not feeds:
             return []
-        topic, epoch, secret = found
-        label = rng.choice(("nuc1/insider", "nuc4/alien", "evil/guest"))
-        member = self._stage.world.members[label]
-        incarnation = rng.choice((member.attachment._incarnation, 1))
-        source = identity.name if rng.random() < 0.8 else rng.choice((*self._nodes, Name(rng.randbytes(32))))
         missing = tuple(
             Missing(self._number(rng), *(rng.choice((0, 1, 1 << 17, 0xFFFF_FFFF)) for _ in range(2)))
             for _ in range(rng.choice((0, 1, NACKS_PER_REPORT)))
@@ -555,10 +587,8 @@ class Forge:
             rng.choice(tuple(ReportFlag)), self._number(rng), rng.choice((0, 1, 0xFFFF_FFFF)), missing,
             self._number(rng), self._number(rng),
         )  # fmt: skip
-        life = rng.choice((3, 4, rng.randrange(1 << 64)))
-        numbers = iter((next(self._counters),))
-        sealer = NoteSealer(secret, epoch, Kind.REPORT, source, life, member.name, topic, incarnation, numbers)
-        return [sealer.seal(report.to_wire())]
+        feed = rng.choice(feeds)
+        return [feed._note(feed._epoch).seal(report.to_wire())]
 
     def _status(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
         """Return what a publisher or a server says of its stream."""
@@ -605,7 +635,7 @@ class Forge:
         own = next((each for each in members if each.name == identity.name), None)
         incarnation = 1 if own is None else own.attachment._incarnation
         number = self._number(rng) if rng.random() < 0.2 else next(self._numbers)
-        sealer = Sealer(secret, epoch, kind, identity.name, incarnation, topic, identity.key)
+        sealer = Sealer(secret, epoch, kind, identity.name, incarnation, topic, identity.key, rng.randbytes)
         flags = rng.choice((0, Flag.RELIABLE, Flag.RELIABLE | Flag.LATCHED, Flag.BUNDLE | Flag.RELIABLE, 0xFE))
         try:
             frames = list(sealer.seal(min(number, _U64 - 1), int(flags), body, 1_400))
@@ -634,6 +664,7 @@ _BODIES: Final[dict[StatementType, _Make]] = {
     _T.WITHDRAW: Forge._withdraw, _T.RELAY: Forge._relay, _T.QUERY: Forge._query, _T.ANSWER: Forge._answer,
     _T.VERDICT: Forge._verdict, _T.PRESENCE: Forge._presence, _T.DIGEST: Forge._digest, _T.FETCH: Forge._fetch,
     _T.INVENTORY: Forge._inventory, _T.REPLICAS: Forge._replicas, _T.REVOKE: Forge._revoke,
+    _T.OPEN: Forge._open, _T.ACCEPT: Forge._accept,
     _T.ADCERT: Forge._adcert, _T.RTCERT: Forge._rtcert, _T.CARD: Forge._card, _T.GRANT: Forge._grant,
 }  # fmt: skip
 _K = Kind
@@ -645,7 +676,7 @@ _KINDS: Final[dict[StatementType, tuple[Kind, ...]]] = {
     _T.PRESENCE: (_K.RIB_ANSWER, _K.RIB_REQUEST, _K.VERDICT), _T.DIGEST: (_K.RIB_REQUEST,),
     _T.FETCH: (_K.RIB_REQUEST,), _T.INVENTORY: (_K.RIB_REQUEST,), _T.REPLICAS: (_K.RIB_REQUEST,),
     _T.REVOKE: (_K.REVOKE,), _T.ADCERT: (_K.ADVERTISE,), _T.RTCERT: (_K.ADVERTISE,), _T.CARD: (_K.ADVERTISE,),
-    _T.GRANT: (_K.VERDICT,),
+    _T.GRANT: (_K.VERDICT,), _T.OPEN: (_K.RIB_REQUEST,), _T.ACCEPT: (_K.RIB_ANSWER,),
 }  # fmt: skip
 _RARE: Final = {_T.ADCERT, _T.RTCERT, _T.CARD, _T.GRANT}
 _SPOKEN: Final = tuple(each for each in _BODIES for _ in range(1 if each in _RARE else 6))

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from unittest import mock
 
-from gdp.crypto.keys import SIGNATURE_BYTES, PublicKey, SigningKey
+from gdp.crypto.keys import SIGNATURE_BYTES, PublicKey, SigningKey, SoftwareKey
 from gdp.errors import DropReason, StatementError
 
 __all__ = ["signing_oracle"]
@@ -43,8 +43,8 @@ def _verify_digest(self: PublicKey, signature: bytes, digest: bytes) -> None:
 def signing_oracle() -> Iterator[None]:
     """Replace ECDSA of statements and messages, in this process, for as long as this lasts."""
     with (
-        mock.patch.object(SigningKey, "sign", _sign),
-        mock.patch.object(SigningKey, "sign_digest", _sign_digest),
+        mock.patch.object(SoftwareKey, "sign", _sign),
+        mock.patch.object(SoftwareKey, "sign_digest", _sign_digest),
         mock.patch.object(PublicKey, "verify", _verify),
         mock.patch.object(PublicKey, "verify_digest", _verify_digest),
     ):

@@ -230,6 +230,13 @@ class Stage:
         port = self._port_at(place)
         return bytes(8) if port is None else port.nonce
 
+    def own_nonce(self, persona: Persona, place: Place) -> bytes:
+        """Return the nonce of the persona's own port that leads to a place."""
+        ports = self.world.network._nodes[persona.node].ports
+        index = next((i for i, (_, _, far) in ports.items() if (far.node, far.port) == (place.node, place.port)), -1)
+        port = self._port_at(Place(persona.node, index, b""))
+        return bytes(8) if port is None else port.nonce
+
     def believes(self, persona: Persona, place: Place) -> bool:
         """Return whether a node believes a persona: its domain is trusted there, and it is not revoked."""
         domain = self.identity(persona).root.domain

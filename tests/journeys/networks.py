@@ -18,7 +18,7 @@ import networkx as nx
 from cryptography.hazmat.primitives.asymmetric import ec
 from hypothesis import strategies as st
 
-from gdp.crypto.keys import SigningKey
+from gdp.crypto.keys import SigningKey, SoftwareKey
 from gdp.limits import DEAD_S, HELLO_S, JOIN_LEASE_S
 from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
 from gdp.testbed.world import World
@@ -166,7 +166,7 @@ def reproducible_keys(seed: int) -> Iterator[None]:
 
     def generate() -> SigningKey:
         digest = hashlib.sha256(b"%d %d" % (seed, next(made))).digest()
-        return SigningKey._of(ec.derive_private_key(int.from_bytes(digest, "big") % (_P256_ORDER - 1) + 1, _CURVE))
+        return SoftwareKey.of(ec.derive_private_key(int.from_bytes(digest, "big") % (_P256_ORDER - 1) + 1, _CURVE))
 
     with mock.patch.object(SigningKey, "generate", generate):
         yield
