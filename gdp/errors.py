@@ -75,8 +75,10 @@ class DropReason(IntEnum):
     INTERNAL = 37  # it drew an error of this program's own
     QUARANTINED = 38  # from a sender whose statements drew such errors
     MISPLACED = 39  # no proof that a node is attached where this says
-    RATE_LIMITED = 41  # more hellos than are verified
-    COOKIE_REQUIRED = 42  # a stranger's hello under load, without proof that it receives at its address
+    NO_CHANNEL = 40  # what must come in a channel came outside, or in one that is not known
+    WRONG_SIDE = 41  # a topic's frame from a port on the way to which its publisher is not
+    RATE_LIMITED = 42  # more hellos than are verified
+    COOKIE_REQUIRED = 43  # a stranger's hello under load, without proof that it receives at its address
 
     @property
     def label(self) -> str:
