@@ -73,6 +73,8 @@ class DropReason(IntEnum):
     INTERNAL = 37  # it drew an error of this program's own
     QUARANTINED = 38  # from a sender whose statements drew such errors
     MISPLACED = 39  # no proof that a node is attached where this says
+    NO_CHANNEL = 40  # what must come in a channel came outside, or in one that is not known
+    WRONG_SIDE = 41  # a topic's frame from a port on the way to which its publisher is not
 
     @property
     def label(self) -> str:

@@ -54,6 +54,7 @@ class LinkedPlane(ABC):
 
     def __init__(self, ifnames: Sequence[str] = (), table: Table | None = None) -> None:
         self._entries: Mapping[bytes, Hops] | None = None if table is None else table.entries
+        self._sides: Mapping[bytes, int] = {} if table is None else table.sides
         self._ports: dict[int, Port] = {}
         self._mtus: dict[int, int] = {}  # of the ports that are up
         self._devices: dict[int, int] = {}  # ifindex of an open device -> port index

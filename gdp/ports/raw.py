@@ -25,7 +25,7 @@ from gdp.ports.linked import LinkedPlane
 from gdp.ports.plane import MAC_BYTES, Arrival, Port
 from gdp.ports.sockets import Lane, hear_nothing, kernel_drops, open_port
 from gdp.switch.forwarder import Drop, Forward, decide
-from gdp.switch.table import NOWHERE, Hops, Table
+from gdp.switch.table import NOWHERE, Hops, Table, is_side
 
 __all__ = ["RawPlane"]
 
@@ -84,7 +84,7 @@ class RawPlane(LinkedPlane):
         if self._entries is None:
             ready = partial(self._hand_up_all, port.index, opened)
         else:
-            ready = partial(self._forward_all, self._entries, port.index, opened, sockets)
+            ready = partial(self._forward_all, self._entries, self._sides, port.index, opened, sockets)
         self.watch(opened, ready, rank=rank)
 
     def _widen(self, port: Port) -> None:
@@ -149,7 +149,12 @@ class RawPlane(LinkedPlane):
         return Arrival(port, *_shape(size).unpack_from(self._batch.pool, slot))
 
     def _forward_all(
-        self, entries: Mapping[bytes, Hops], port: int, source: socket.socket, sinks: Mapping[int, socket.socket]
+        self,
+        entries: Mapping[bytes, Hops],
+        sides: Mapping[bytes, int],
+        port: int,
+        source: socket.socket,
+        sinks: Mapping[int, socket.socket],
     ) -> None:
         """Take one batch from a port and forward it by ``sinks``, handing up what is for the node."""
         batch, get = self._batch, entries.get
@@ -166,14 +171,14 @@ class RawPlane(LinkedPlane):
                 if hops is None:
                     hops = get(key[:NAME_BYTES])
                 run_key, run_hops, run_start = key, hops or NOWHERE, slot
-                fits = self._narrowest(run_hops)
+                fits = self._narrowest(run_hops) if key not in sides or is_side(sides[key], port) else 0
             if HEADER_BYTES + length <= size <= fits and hops_left > 1 and _FIRST <= first < _FIRST_CONTROL:
                 pool[at + HOPS_AT] = hops_left - 1
             else:
                 slot = at // step
                 self._send(sinks, run_hops, run_start, slot - run_start)
                 run_start = slot + 1
-                self._consider(entries, port, sinks, slot, size)
+                self._consider(entries, sides, port, sinks, slot, size)
         self._send(sinks, run_hops, run_start, len(sizes) - run_start)
 
     def _narrowest(self, hops: Hops) -> int:
@@ -181,12 +186,18 @@ class RawPlane(LinkedPlane):
         return min((self._mtus.get(hop[0], 0) for hop in hops), default=0)
 
     def _consider(
-        self, entries: Mapping[bytes, Hops], port: int, sinks: Mapping[int, socket.socket], slot: int, size: int
+        self,
+        entries: Mapping[bytes, Hops],
+        sides: Mapping[bytes, int],
+        port: int,
+        sinks: Mapping[int, socket.socket],
+        slot: int,
+        size: int,
     ) -> None:
         """Decide on the one frame in a slot by the reference, and do what it says."""
         batch, drops = self._batch, self._counters.drops
         at = slot * batch.slot_bytes
-        verdict = decide(batch.pool[at : at + ETHER_BYTES + size], entries, self._mtus)
+        verdict = decide(batch.pool[at : at + ETHER_BYTES + size], entries, self._mtus, sides, port)
         if isinstance(verdict, Drop):
             drops[verdict.reason] += 1
         elif isinstance(verdict, Forward):

@@ -119,7 +119,7 @@ class ScapyPlane(LinkedPlane):
         if self._entries is None:
             self._hand_up(index, frame)
             return
-        verdict = decide(frame, self._entries, self._mtus)
+        verdict = decide(frame, self._entries, self._mtus, self._sides, index)
         if isinstance(verdict, Drop):
             counters.drops[verdict.reason] += 1
         elif isinstance(verdict, Forward):

@@ -251,7 +251,7 @@ class Rib:
                 raise StatementError(DropReason.WRONG_DOMAIN, "a claim of a domain that is not trusted")
             if member.domain != self._policy.own and not claim.is_global:
                 raise StatementError(DropReason.WRONG_DOMAIN, "a local name of another domain")
-            self._check_identity(claim, now.mono_s)
+            self._check_identity(claim, now)
             if claim.right is Right.ATTACH and self.identities.is_refused_above(
                 claim.node, claim.incarnation, now.mono_s
             ):
@@ -273,7 +273,7 @@ class Rib:
         if claim.is_global and not self._upstream.has(member.name):
             self._pass_up(route, relay.statement, route.sequence, now.mono_s)
 
-    def _check_identity(self, claim: Claim, now_s: float) -> None:
+    def _check_identity(self, claim: Claim, now: Instant) -> None:
         """Refuse a node's own name in another incarnation while the older node lives at another switch.
 
         Raises:
@@ -283,10 +283,11 @@ class Rib:
         if not isinstance(held, Route) or held.switch == claim.switch:
             return
         older = ClaimBody.from_statement(parse(held.claim)).incarnation
-        if older == claim.incarnation or self.identities.is_free(claim.node, older, held.switch, now_s):
+        if older == claim.incarnation or self.identities.is_free(claim.node, older, held.switch, now.mono_s):
             return
-        if self.identities.must_ask(claim.node, older, held.switch, now_s):
-            question = Presence(claim.node, older, claim.switch)
+        number = int(now.unix_s * 1_000)
+        if self.identities.must_ask(claim.node, older, held.switch, number, now.mono_s):
+            question = Presence(claim.node, older, claim.switch, number)
             wire = question.to_wire(self._identity.name, self._identity.key, self._identity.membership)
             self._letters.append(Letter(held.switch, Kind.RIB_ANSWER, wire))
         raise StatementError(DropReason.IN_USE, "another node with this identity")
@@ -311,10 +312,21 @@ class Rib:
             is_repeated = isinstance(known, Route) and (known.claim, known.via) == (claim.wire, member.domain)
             if not is_repeated:
                 raise StatementError(DropReason.STALE, str(known.sequence))
-        is_new = known is None or known.sender != member.name
-        if is_new and self._store.count_of(member.name) >= self._settings.names_per_sender:
-            raise StatementError(DropReason.QUOTA, "names of one sender")
+        if known is None or known.sender != member.name:
+            self._check_quota(member.name, claim.node)
         return known
+
+    def _check_quota(self, sender: Name, node: Name) -> None:
+        """Return if a sender may bring another name, and a node have one: as many as the sender has left, at most.
+
+        Raises:
+            StatementError: QUOTA.
+        """
+        free = self._settings.names_per_sender - self._store.count_of(sender)
+        if free <= 0:
+            raise StatementError(DropReason.QUOTA, "names of one sender")
+        if self._store.count_of(node) >= free:
+            raise StatementError(DropReason.QUOTA, "names of one node")
 
     def _route(self, claim: Claim, transit: tuple[Name, ...], member: Membership, now: Instant) -> Route:
         left_s = max(claim.valid_until_unix_s - now.unix_s, 1.0)
@@ -382,6 +394,8 @@ class Rib:
     def _take_query(self, statement: Statement, now: Instant) -> None:
         fields = statement.fields
         member = self._sender(fields.bytes_("c"), statement, now)
+        if member.role not in (Role.SWITCH, Role.RIB):
+            raise StatementError(DropReason.NOT_DELEGATED, "only switches and RIBs ask")
         statement.verify(member.key)
         query = Query.from_fields(fields)
         if query.name == self._identity.name:
@@ -635,8 +649,8 @@ class Rib:
             return
         if entry.is_from_above and (not isinstance(known, Route) or known.is_from_above):
             return  # nothing here that it corrects
-        if known is None and self._store.count_of(entry.sender) >= self._settings.names_per_sender:
-            raise StatementError(DropReason.QUOTA, "names of one sender")
+        if known is None:
+            self._check_quota(entry.sender, claim.node)
         route = Route.of(
             claim,
             sender=entry.sender,
@@ -669,8 +683,8 @@ class Rib:
             until_unix_s = max(until_unix_s, known.valid_until_unix_s)
         if until_unix_s <= now.unix_s:
             return  # forgotten here already
-        if known is None and self._store.count_of(entry.sender) >= self._settings.names_per_sender:
-            raise StatementError(DropReason.QUOTA, "names of one sender")
+        if known is None:
+            self._check_quota(entry.sender, withdrawal.signer)
         gone = Withdrawn(entry.sender, sequence, until_unix_s, withdrawal.wire, entry.membership)
         route = self._store.withdraw(name, withdrawal.signer, gone)
         if route is not None:

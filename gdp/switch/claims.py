@@ -76,7 +76,12 @@ class Claims:
             self._judge(neighbour, claim.name, DropReason.STALE, newest)
             raise StatementError(DropReason.STALE, "a claim that its maker has renewed")
         if claim.right in HEARS:
-            if self._planter.add_reader(claim, at, self._places.of(claim.name, now.mono_s), now.mono_s):
+            try:
+                is_first = self._planter.add_reader(claim, at, self._places.of(claim.name, now.mono_s), now.mono_s)
+            except StatementError as error:
+                self._refuse(neighbour, statement, error)
+                raise
+            if is_first:
                 self._places.want(claim.name, now.mono_s, watch=True)
             for place in self._places.of(claim.name, now.mono_s):
                 self._inquirer.tell_reader(at, claim.right, place, now.mono_s)
@@ -85,7 +90,11 @@ class Claims:
             self._judge(neighbour, claim.name, None, claim.sequence)
         if claim.right is not Right.READ:
             known = self._attached.get(claim.name, claim.node)
-            self._attached.put(claim, *at, now.mono_s)
+            try:
+                self._attached.put(claim, *at, now.mono_s)
+            except StatementError as error:
+                self._refuse(neighbour, statement, error)
+                raise
             if known is None or (known.port, known.mac) != at:
                 self._unicast.forget(claim.name)
             self._unicast.release(claim.name, now.mono_s)

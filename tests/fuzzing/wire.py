@@ -46,7 +46,7 @@ _NODE: Final = ROBOT
 _ENTRY: Final = Entry(b"claim", b"cert", _A, _A, _A, (_A,), 9.0, is_from_above=False)
 _READS: Final[dict[str, tuple[bytes, Callable[[Fields], object]]]] = {
     **{name.replace(" ", "-"): (wire, read) for name, (wire, _, read) in BODIES.items()},
-    "presence": (Presence(_A, 1, _A).to_wire(_NODE.name, _NODE.key, b"cert"), Presence.from_fields),
+    "presence": (Presence(_A, 1, _A, 7).to_wire(_NODE.name, _NODE.key, b"cert"), Presence.from_fields),
     "digest": (Digest(b"", bytes(8), is_last=True).to_wire(_NODE.name, _NODE.key, b"cert"), Digest.from_fields),
     "fetch": (Fetch((b"a",), ((_A, _A),)).to_wire(_NODE.name, _NODE.key, b"cert"), Fetch.from_fields),
     "inventory": (

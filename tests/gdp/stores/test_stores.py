@@ -329,9 +329,9 @@ def write_generations(path: Path, said: Connection) -> None:
 
 
 def slice_of(generation: int) -> list[tuple[Key, Entry | None]]:
-    name = Name(bytes(32))
+    name = Name(b"n" * 32)
     entry = Entry(generation.to_bytes(8, "big") * 64, b"", name, name, name, (), 60.0, is_from_above=False)
-    return [((Name(at.to_bytes(32, "big")), name), entry) for at in range(SLICE)]
+    return [((Name(at.to_bytes(32, "big")), name), entry) for at in range(1, SLICE + 1)]
 
 
 @pytest.mark.parametrize("generations", [10, 25, 50])
