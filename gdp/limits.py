@@ -60,7 +60,8 @@ CONTROL_PATIENCE_S: Final = 2.0
 CBOR_DEPTH_MAX: Final = 16
 CHAIN_MAX: Final = 4  # delegations between an owner's key and a node
 CLOCK_EARLY_S: Final = 3_600.0  # so long before it begins a certificate is believed
-CLOCK_SKEW_S: Final = 120.0
+CLOCK_SKEW_S: Final = 3_600.0  # so long after it has ended
+CLOCKS_APART_S: Final = 7_200.0  # two clocks, each an hour off at most
 
 # Leases
 LEASE_MIN_S: Final = 1.0
@@ -76,6 +77,7 @@ KEEPALIVE_MS: Final = 70  # between keepalives to a neighbour that is up
 DETECT_MULTIPLIER: Final = 3  # of which it is gone
 LINK_STATE_REFRESH_S: Final = 30.0
 LINK_STATE_LEASE_S: Final = 100.0
+LINK_STATE_AGE_MAX_S: Final = CLOCKS_APART_S + LINK_STATE_LEASE_S  # by two clocks
 JOIN_REFRESH_S: Final = 2.0
 JOIN_LEASE_S: Final = 7.0
 

@@ -18,7 +18,9 @@ from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.errors import GdpError
 from gdp.names import Name
+from gdp.nodes.credentials import Credentials
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
+from gdp.nodes.node_log import LOOK_S
 from gdp.nodes.runtime import Runtime
 from gdp.nodes.schema import Domain
 from gdp.ports.raw import RawPlane
@@ -88,6 +90,7 @@ class Watch:
         plane = RawPlane([self._iface])
         try:
             runtime = Runtime(member, plane)
+            runtime.every(LOOK_S, Credentials(self._identity, domain, identity, policy).look)
             called = self._call(member, Held(self._identity / DELEGATIONS, identity), [])
             attached_s: float | None = None
             while not self._ended.is_set() and any(port.up for port in plane.ports.values()):

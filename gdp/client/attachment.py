@@ -49,7 +49,7 @@ _IN_USE_S: Final = 2.0  # ... and after so long this seldom
 _RTCERT_S: Final = 7_200
 _RTCERT_RENEW_S: Final = 1_800  # so that it holds at clocks that are an hour ahead, too
 _RTCERTS_MAX: Final = 32
-_RTCERT_BEFORE_S: Final = 900  # it is dated back by so much, for clocks that lag
+_RTCERT_BEFORE_S: Final = 4_500  # it is dated back by so much: CLOCK_EARLY_S is for one clock, this is for the other
 
 
 @dataclass(slots=True)
@@ -133,6 +133,11 @@ class Attachment:
         return list(self._claims.values())
 
     @property
+    def drops(self) -> Counter[DropReason]:
+        """Return which unfinished statements were given up."""
+        return self.joiner.drops + self.greeter.drops
+
+    @property
     def mtu(self) -> int:
         """Return the MTU of the port to the switch, in bytes after the Ethernet header."""
         assert self._switch is not None
@@ -176,7 +181,16 @@ class Attachment:
         if header.kind == Kind.KEEPALIVE:
             self.greeter.receive_keepalive(arrival, header, now)
             return None
-        wire = self.joiner.add(header, arrival.frame, now.mono_s, arrival.via)
+        if header.kind == Kind.COOKIE:
+            self.greeter.receive_cookie(arrival, header)
+            return None
+        switch = self._switch
+        if header.kind == Kind.HELLO:
+            wire = self.greeter.join(arrival, header, now.mono_s)
+        elif switch is None or (arrival.port, arrival.mac) != (switch.port, switch.mac):
+            raise FrameError(DropReason.UNKNOWN_SENDER, "not our switch")
+        else:
+            wire = self.joiner.add(header, arrival.frame, now.mono_s, arrival.via)
         if wire is None:
             return None
         statement = parse(wire)
@@ -184,15 +198,13 @@ class Attachment:
             if self.greeter.receive(arrival, statement, now) is not None:
                 self._choose_switch(now.mono_s)
             return None
-        switch = self._switch
-        if switch is None or (arrival.port, arrival.mac) != (switch.port, switch.mac):
-            raise FrameError(DropReason.UNKNOWN_SENDER, "not our switch")
+        assert switch is not None  # seen above
         if header.kind == Kind.VERDICT:
             return self._take_verdict(statement, switch, now)
         if header.kind in (Kind.JOIN, Kind.LEAVE):
             join = Join.from_fields(statement.expect(StatementType.JOIN))
             statement.verify(switch.key)
-            self.greeter.ports[switch.port].take_join(join, switch.name)
+            self.greeter.ports[switch.port].take_join(join, switch)
             self._note_newest(join)
             return statement
         if header.kind == Kind.REVOKE:

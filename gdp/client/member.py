@@ -87,7 +87,7 @@ class Member:
     def drops(self) -> Mapping[DropReason, int]:
         """Return what was dropped, by reason."""
         attachment = self.attachment
-        total = self._drops + self._subscriptions.drops + attachment.joiner.drops + attachment.refusals
+        total = self._drops + self._subscriptions.drops + attachment.drops + attachment.refusals
         total += self._publications.drops
         for feed in self.feeds():
             total += feed.drops
@@ -321,6 +321,10 @@ class Member:
         if self.attachment.switch is not None:  # alone, nothing can be sent: hellos alone are due
             times += [self._publications.next_due(), self._feeds_due.next_due()]
         return min((time for time in times if time is not None), default=None)
+
+    def take_neighbours(self) -> Mapping[int, frozenset[bytes]]:
+        """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
+        return self.attachment.greeter.take_addresses()
 
     def take(self) -> list[Transmit]:
         """Return, once, what is to be sent; more comes at the next call, until nothing does.

@@ -47,7 +47,7 @@ class RibHost:
     def drops(self) -> Mapping[DropReason, int]:
         """Return what was dropped or refused, by reason."""
         own = self._drops + self._joiner.drops + self._channels.drops
-        return own + self.attachment.joiner.drops + self.rib.refusals
+        return own + self.attachment.drops + self.rib.refusals
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Instant) -> None:
         """Begin to look for a switch on a port."""
@@ -87,6 +87,10 @@ class RibHost:
         """Return the monotonic second of the next timer, or None."""
         times = [self.attachment.next_timeout(), self.rib.next_timeout(), self._channels.next_timeout()]
         return min((time for time in times if time is not None), default=None)
+
+    def take_neighbours(self) -> Mapping[int, frozenset[bytes]]:
+        """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
+        return self.attachment.greeter.take_addresses()
 
     def take(self) -> list[Transmit]:
         """Return, once, what is to be sent."""

@@ -39,6 +39,7 @@ class Kind(IntEnum):
     KEEPALIVE = 0x88  # to a neighbour that is up: I am still here; no statement, but a tag by a key of both sessions
     REDIRECT = 0x89  # to the neighbour whose frames came here: where the node is now
     WHERE = 0x8A  # to the neighbour whose frame came here, while no RIB answers: where is that node?
+    COOKIE = 0x8B  # to whoever said hello: too many do, show this before your signature is verified; no statement
 
 
 class Flag(IntFlag):

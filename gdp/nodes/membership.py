@@ -6,6 +6,7 @@ Place: shell; reads files.
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import time
 from contextlib import suppress
@@ -16,12 +17,14 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import LocalError
 from gdp.nodes.schema import Directory, Domain
-from gdp.stores.keyring import load_identity, load_root
+from gdp.stores.keyring import load_identity, load_root, storage
 from gdp.trust.domain import Policy
 
 __all__ = ["fresh_bytes", "incarnation", "load_member", "load_policy", "wall_clock_ms"]
 
 _MACHINE_IDS: Final = (Path("/proc/sys/kernel/random/boot_id"), Path("/sys/class/dmi/id/product_uuid"))
+
+log = logging.getLogger(__name__)
 
 
 def load_member(directory: Directory, domain: Domain, role: Role) -> tuple[Identity, Policy]:
@@ -36,6 +39,8 @@ def load_member(directory: Directory, domain: Domain, role: Role) -> tuple[Ident
         raise LocalError(f"{directory}: the identity of a {identity.role.value}, where a {role.value}'s was expected")
     if identity.member.domain != policy.own:
         raise LocalError(f"{directory}: the identity is of another domain than {domain.root}")
+    guards = " ".join(f"{path.name}={found.value}" for path, found in storage(directory).items())
+    log.info("keys opened name=%s %s", identity.name.short, guards)
     return identity, policy
 
 

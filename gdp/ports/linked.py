@@ -17,7 +17,7 @@ import logging
 import select
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -182,6 +182,9 @@ class LinkedPlane(ABC):
 
     def on_link(self, callback: LinkCallback) -> None:
         self._on_link.append(callback)
+
+    @abstractmethod
+    def set_neighbours(self, port: int, macs: Collection[bytes]) -> None: ...
 
     def close(self) -> None:
         for index in list(self._ports):

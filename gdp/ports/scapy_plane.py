@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import select
 import socket
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import partial
 from typing import Final
 
@@ -94,6 +94,9 @@ class ScapyPlane(LinkedPlane):
                 ether = Ether(dst=str2mac(destination_mac), src=str2mac(facts.mac), type=ETHERTYPE)
                 left += self._send(port, ether / GDP(frame))
         return left
+
+    def set_neighbours(self, port: int, macs: Collection[bytes]) -> None:
+        """Do nothing: one socket a port takes frames as they come."""
 
     def _sniff(self, index: int) -> None:
         """Read a burst from one port that is ready; return when it is empty."""

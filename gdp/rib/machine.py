@@ -28,7 +28,14 @@ from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.effects import Instant
 from gdp.errors import DropReason, RemoteError, StatementError, StoreError
 from gdp.frame.kinds import Kind
-from gdp.limits import LEASE_MAX_S, NEGATIVE_LEASE_S, RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX, WITHDRAWAL_MAX_BYTES
+from gdp.limits import (
+    CLOCK_SKEW_S,
+    LEASE_MAX_S,
+    NEGATIVE_LEASE_S,
+    RIB_NAMES_PER_SENDER,
+    RIB_WATCHES_MAX,
+    WITHDRAWAL_MAX_BYTES,
+)
 from gdp.names import Name
 from gdp.rib.above import Above
 from gdp.rib.digest_tree import DigestTree
@@ -37,6 +44,7 @@ from gdp.rib.route import Route, Withdrawn
 from gdp.rib.store import Store
 from gdp.rib.upstream import PROBE_S, Passed, Upstream
 from gdp.rib.watches import Asker, Watches
+from gdp.trust.audit import Action
 from gdp.trust.claim import Claim, ClaimBody
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
@@ -86,6 +94,7 @@ class Rib:
 
     def __init__(self, identity: Identity, policy: Policy, store: Store, settings: RibSettings) -> None:
         self._identity = identity
+        self._audit = policy.audit
         self._policy = policy
         self._store = store
         self._settings = settings
@@ -189,6 +198,8 @@ class Rib:
             return
         if revocation is None:
             return
+        who, about = revocation.issuer.name.to_text(), revocation.fingerprint.hex()
+        self._audit.note(Action.REVOKED, "certificate", who=who, about=about)
         for route in self._store.resting_on(revocation.fingerprint):
             try:
                 self._verifier.verify(route.claim, now.unix_s)
@@ -267,6 +278,8 @@ class Rib:
             route = replace(route, domain=relay.domain)
         self._store.put(route)
         self.accepted += 1
+        if not isinstance(known, Route):
+            self._audit.note(Action.ACCEPTED, "name", who=route.advertiser.to_text(), about=route.name.to_text())
         self._judge(route.name, route.advertiser, None, route.sequence, member.name)
         self._tell(route, known, now.mono_s)
         self._replicate(route.name, route.advertiser)
@@ -377,6 +390,8 @@ class Rib:
             name = ClaimBody.from_statement(passed_on).subject.name
         except StatementError:
             return  # not even a claim: nothing to name in an answer; the caller counts it
+        who, reason = passed_on.signer.to_text(), error.reason.label
+        self._audit.note(Action.REFUSED, "name", who=who, about=name.to_text(), reason=reason)
         known = self._store.get(name, passed_on.signer)
         self._judge(name, passed_on.signer, error.reason, 0 if known is None else known.sequence, member.name)
         has_moved = error.reason is DropReason.STALE and isinstance(known, Route) and known.sender != member.name
@@ -678,7 +693,7 @@ class Rib:
             return
         member = self._sender(entry.membership, withdrawal, now)
         withdrawal.verify(member.key)
-        until_unix_s = min(entry.until_unix_s, member.not_after_unix_s)
+        until_unix_s = min(entry.until_unix_s, member.not_after_unix_s + int(CLOCK_SKEW_S))
         if known is not None:  # a peer cannot have us forget sooner what we know
             until_unix_s = max(until_unix_s, known.valid_until_unix_s)
         if until_unix_s <= now.unix_s:

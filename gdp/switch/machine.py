@@ -72,7 +72,6 @@ class Switch:
         self.table = table
         self._splitter = ControlSplitter(identity.name, settings.incarnation)
         self._joiner = ControlJoiner()
-        self._hellos = ControlJoiner()
         self.greeter = Greeter.of_node(
             identity, policy, self._splitter, settings,
             digest_for=self._digest_for, life_elsewhere=self._life_elsewhere,
@@ -141,12 +140,13 @@ class Switch:
 
     def drops(self) -> Mapping[DropReason, int]:
         """Return what the control plane dropped, by reason."""
-        own = self._drops + self._joiner.drops + self._hellos.drops + self._channels.drops
+        own = self._drops + self._joiner.drops + self.greeter.drops + self._channels.drops
         return own + self._flooding.drops + self.parked.drops + self.planter.drops + self.unicast.drops
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Instant) -> None:
         """Begin to use a port, or learn that the MTU or cost of one that is up has changed."""
         self._rest_due_s = None
+        self._flooding.look_at_clock(now)
         changes = self.greeter.add_port(index, mac, mtu, cost, now.mono_s)
         for change in changes:
             self._neighbour_changed(change, now.mono_s)
@@ -156,6 +156,7 @@ class Switch:
     def port_changed(self, port: int, up: bool, now: Instant) -> None:
         """Learn that a port's link came or went."""
         self._rest_due_s = None
+        self._flooding.look_at_clock(now)
         for change in self.greeter.port_changed(port, up, now.mono_s):
             self._neighbour_changed(change, now.mono_s)
         self._follow_links(now.mono_s)  # at once: these frames would be lost
@@ -163,6 +164,7 @@ class Switch:
     def receive(self, arrivals: Sequence[Arrival], now: Instant) -> None:
         """Take frames that the data plane handed up."""
         has_others = False
+        self._flooding.look_at_clock(now)
         for arrival in arrivals:
             try:
                 header = decode(arrival.frame)
@@ -185,6 +187,7 @@ class Switch:
     def timeout(self, now: Instant) -> None:
         """Do what is due."""
         now_s = now.mono_s
+        self._flooding.look_at_clock(now)
         lost = self.greeter.expire(now_s)
         for change in lost:
             self._neighbour_changed(change, now_s)
@@ -207,7 +210,6 @@ class Switch:
         if now_s >= self._rivals_sought_s + _RIVALS_S:
             self._look_for_rivals(now_s)
         self._joiner.expire(now_s)
-        self._hellos.expire(now_s)
         self.parked.expire(now_s)
         self.inquirer.expire(now_s)
         for key in self.table.expire(now_s):
@@ -248,6 +250,10 @@ class Switch:
             times.append(self.attached.next_expiry())
         return min(time for time in times if time is not None)
 
+    def take_neighbours(self) -> Mapping[int, frozenset[bytes]]:
+        """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
+        return self.greeter.take_addresses()
+
     def take(self) -> list[Transmit]:
         """Return, once, what is to be sent: nothing from a switch whose identity an older one has."""
         return [] if self.is_displaced else self._outbox.take()
@@ -279,12 +285,14 @@ class Switch:
         if header.kind >= CONTROL_FROM:
             if header.kind not in _CONTROL:
                 raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
-            joiner = self._joiner
+            if header.kind == Kind.COOKIE:
+                self.greeter.receive_cookie(arrival, header)
+                return
             if header.kind == Kind.HELLO:
-                joiner = self._hellos
+                wire = self.greeter.join(arrival, header, now.mono_s)
             else:
                 self._sender(arrival)  # for strangers no state is kept
-            wire = joiner.add(header, arrival.frame, now.mono_s, arrival.via)
+                wire = self._joiner.add(header, arrival.frame, now.mono_s, arrival.via)
             if wire is not None:
                 statement = parse(wire)
                 with self.boundary.guard(arrival.via + statement.signer, now.mono_s):
@@ -489,7 +497,7 @@ class Switch:
         if not self._join_paces.take(neighbour.name, now.mono_s):
             raise StatementError(DropReason.QUOTA, "joins of one neighbour")
         statement.verify(neighbour.key)
-        self.greeter.ports[neighbour.port].take_join(join, neighbour.name)
+        self.greeter.ports[neighbour.port].take_join(join, neighbour)
         if join.lease_s > 0:
             claim = self._verifier.verify(join.evidence, now.unix_s)
             if claim.right not in HEARS or claim.name != join.topic:

@@ -62,7 +62,7 @@ class Planter:
     """All trees of one switch.
 
     Args:
-        first_sequence: of our joins; above those of an earlier life, wall-clock milliseconds do.
+        first_sequence: of our joins.
     """
 
     def __init__(
@@ -191,7 +191,7 @@ class Planter:
         at = (neighbour.port, neighbour.mac)
         if join.lease_s == 0:
             tree = self.trees.get(join.topic, join.publisher)
-            if tree is not None and at in tree.branches and tree.branches[at].sequence < join.sequence:
+            if tree is not None and at in tree.branches and not _is_overtaken(join, tree.branches[at]):
                 self._cut(tree, at)
             return False
         if self._policy.own not in join.allowed or neighbour.domain not in join.allowed:
@@ -200,8 +200,8 @@ class Planter:
             raise StatementError(DropReason.WRONG_DOMAIN, "a backup for another domain")
         tree = self._tree(join.topic, join.publisher, join.allowed)
         before = tree.branches.get(at)
-        if before is not None and join.sequence < before.sequence:
-            return False  # a newer one overtook it
+        if before is not None and _is_overtaken(join, before):
+            return False
         if tree.former is not None and tree.former[0] == at and join.backup_for == ZERO:
             self._leave_former(tree)  # it takes the messages from here now
         is_behind = join.version < tree.version
@@ -209,7 +209,10 @@ class Planter:
         if join.version >= tree.version:
             self._place_at(tree, join.switch, join.domain, join.version)
             tree.allowed = join.allowed
-        branch = Branch(now_s + min(join.lease_s, JOIN_LEASE_S), join.mtu, join.evidence, join.mtu, join.sequence)
+        branch = Branch(
+            now_s + min(join.lease_s, JOIN_LEASE_S), join.mtu, join.evidence, join.mtu, join.sequence,
+            join.sender_session,
+        )  # fmt: skip
         branch.fit(self._outbox.mtu_of(neighbour.port))
         if join.backup_for != ZERO:
             branch.backup_for = join.backup_for
@@ -478,9 +481,10 @@ class Planter:
         self, tree: Tree, above: At, name: Name, mtu: int, lease_s: float, evidence: bytes, *, backup_for: Name = ZERO
     ) -> None:
         """Send a join, or with no lease a leave, to one above."""
-        session = self._outbox.session_of(above[0], name)
-        if session is None:
+        sessions = self._outbox.sessions_with(above[0], name)
+        if sessions is None:
             return  # it is gone, and with it what it knew of us
+        own_session, session = sessions
         self._sequence += 1
         join = Join(
             tree.topic,
@@ -495,6 +499,7 @@ class Planter:
             self._sequence,
             tree.version,
             backup_for,
+            own_session,
         )
         kind = Kind.JOIN if lease_s else Kind.LEAVE
         self._outbox.say_at(*above, kind, join.to_wire(self._identity.name, self._identity.key))
@@ -503,3 +508,8 @@ class Planter:
 def _owner(at: At) -> bytes:
     """Return in whose name room is taken for something of a neighbour."""
     return at[0].to_bytes(4, "big") + at[1]
+
+
+def _is_overtaken(join: Join, branch: Branch) -> bool:
+    """Return whether a newer join or leave of the same session of the neighbour came before."""
+    return join.sender_session == branch.session and join.sequence <= branch.sequence

@@ -33,6 +33,7 @@ class Branch:
     evidence: bytes  # the signed claim of a reader down there
     said_mtu: int = FRAME_MAX_BYTES  # what the neighbour said of the way; a reader says nothing
     sequence: int = 0  # of its last join
+    session: bytes = b""  # of the neighbour that sent it, within which the sequence rises
     backup_for: Name | None = None  # the switch that asked for a backup; None: an ordinary branch
     active_until_s: float | None = None  # a backup whose protected branch was lost gets copies until then
 

@@ -30,6 +30,7 @@ from gdp.message.report import Missing, Report, ReportFlag
 from gdp.message.status import Start, Status
 from gdp.names import Name
 from gdp.trust.adcert import AdCert
+from gdp.trust.audit import BEGIN, AuditLine
 from gdp.trust.card import Card
 from gdp.trust.claim import ClaimBody
 from gdp.trust.delegation import Delegation
@@ -43,6 +44,8 @@ __all__ = ["DECODERS"]
 
 _A: Final = Name(b"a" * 32)
 _NODE: Final = ROBOT
+_HEIR: Final = SCHOOL.succeed(LAB.key, DAY, NOW)
+_AUDIT: Final = AuditLine(1, NOW, "accepted", "name", "ab", "cd", "", 1, BEGIN).to_line()
 _ENTRY: Final = Entry(b"claim", b"cert", _A, _A, _A, (_A,), 9.0, is_from_above=False)
 _READS: Final[dict[str, tuple[bytes, Callable[[Fields], object]]]] = {
     **{name.replace(" ", "-"): (wire, read) for name, (wire, _, read) in BODIES.items()},
@@ -143,7 +146,8 @@ DECODERS: Final = (
     ),
     Decoder("delegation", Delegation.from_wire, (cbor.encode({"format": ""}),), (StatementError,), is_cbor=True),
     Decoder("card", Card.from_wire, (Card.make(_NODE),), (StatementError,)),
-    Decoder("root", Root.from_wire, (SCHOOL.root.wire,), (StatementError,)),
+    Decoder("root", Root.from_wire, (SCHOOL.root.wire, _HEIR.root.to_pem()), (StatementError,)),
+    Decoder("audit-line", AuditLine.from_line, (_AUDIT,), (LocalError,)),
     Decoder("membership", Unverified.from_wire, (_NODE.membership,), (StatementError,)),
     Decoder("request", read_request, (_NODE.membership,), (StatementError,)),
     Decoder("kem-key", KemPublicKey.from_wire, (_NODE.kem.public.wire,), (StatementError, LocalError)),

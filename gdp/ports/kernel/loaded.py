@@ -11,7 +11,7 @@ import sys
 import time
 from typing import Final
 
-from gdp.errors import DropReason, LocalError
+from gdp.errors import DROP_COUNTERS, LocalError
 from gdp.ports.kernel import shapes
 from gdp.ports.kernel.maps import KernelMap, MapKind, possible_cpus
 from gdp.ports.kernel.program import LICENCE, Descriptors, forwarder
@@ -123,7 +123,7 @@ class Loaded:
         width = len(words) // possible_cpus()
         totals = [sum(words[at::width]) for at in range(width)]
         copies = totals[Total.COPIES]
-        return Counters(totals[Total.TAKEN], copies, copies, 0, totals[: len(DropReason)])
+        return Counters(totals[Total.TAKEN], copies, copies, 0, totals[:DROP_COUNTERS])
 
     def _make(self, kind: MapKind, key_bytes: int, value_bytes: int, max_entries: int, name: str) -> KernelMap:
         made = KernelMap(kind, key_bytes, value_bytes, max_entries, name)

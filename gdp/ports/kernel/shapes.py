@@ -18,7 +18,7 @@ import struct
 from enum import IntEnum
 from typing import Final
 
-from gdp.errors import DropReason
+from gdp.errors import DROP_COUNTERS
 from gdp.names import NAME_BYTES
 from gdp.switch.table import MACS_BYTES, Hops
 
@@ -89,7 +89,7 @@ class PortFlag(IntEnum):
 class Total(IntEnum):
     """Indices of the counters behind those of the drop reasons."""
 
-    TAKEN = len(DropReason)  # frames that were not handed up
+    TAKEN = DROP_COUNTERS  # frames that were not handed up
     COPIES = TAKEN + 1  # forwarded
     BYTES = TAKEN + 2  # of those copies, Ethernet header included
 
