@@ -73,6 +73,7 @@ class DropReason(IntEnum):
     INTERNAL = 37  # it drew an error of this program's own
     QUARANTINED = 38  # from a sender whose statements drew such errors
     MISPLACED = 39  # no proof that a node is attached where this says
+    UNCONCERNED = 40  # a revocation by somebody of whom no certificate is held here
 
     @property
     def label(self) -> str:

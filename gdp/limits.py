@@ -55,6 +55,7 @@ CONTROL_JOIN_SOURCE_BYTES: Final = 64 << 10
 CONTROL_PATIENCE_S: Final = 2.0
 CBOR_DEPTH_MAX: Final = 16
 CHAIN_MAX: Final = 4  # delegations between an owner's key and a node
+CERTIFICATE_LIFE_MAX_S: Final = 20 * 366 * 86_400.0  # of a membership or delegation; so long may a revocation count
 CLOCK_EARLY_S: Final = 3_600.0  # so long before it begins a certificate is believed
 CLOCK_SKEW_S: Final = 120.0
 
@@ -84,3 +85,9 @@ PARKED_BYTES_MAX: Final = 4 << 20
 PARKED_S: Final = 1.5
 RIB_NAMES_PER_SENDER: Final = 200_000
 RIB_WATCHES_MAX: Final = 500_000
+
+# Revocations
+REVOCATIONS_PER_ROOT: Final = 262_144  # of one trusted domain
+REVOCATIONS_OF_OWNERS: Final = 65_536  # of all owners and nodes whose certificates are held here
+REVOCATIONS_PER_ISSUER: Final = 1_024  # of one of these
+REVOCATIONS_PER_GIVER: Final = 8_192  # that came over one neighbour, or from one relay

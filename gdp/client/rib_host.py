@@ -13,7 +13,7 @@ from gdp.client.attachment import Attachment
 from gdp.control.frames import ControlJoiner
 from gdp.control.settings import NodeSettings
 from gdp.crypto.identity import Identity
-from gdp.crypto.statements import StatementType
+from gdp.crypto.statements import Statement, StatementType
 from gdp.effects import Arrival, Instant, Transmit
 from gdp.errors import DropReason, FrameError, RemoteError
 from gdp.frame.codec import decode
@@ -91,7 +91,7 @@ class RibHost:
         if header.kind >= CONTROL_FROM:
             statement = self.attachment.receive_control(arrival, header, now)
             if statement is not None and statement.type is StatementType.REVOKE:
-                self.rib.revoke(statement.wire, now)
+                self._take_revocation(statement, now)
             return []
         if header.destination != self.name:
             raise FrameError(DropReason.NOT_FOR_US)
@@ -99,6 +99,12 @@ class RibHost:
             raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
         wire = self._joiner.add(header, arrival.frame, now.mono_s, arrival.via)
         return [] if wire is None else [(wire, Name(header.source))]
+
+    def _take_revocation(self, statement: Statement, now: Instant) -> None:
+        switch = self.attachment.switch
+        if switch is not None:
+            self.rib.revoke(statement.wire, switch.name, now)
+            self.attachment.greeter.recheck(statement.fields.bytes_("cert"), now)
 
     def _note_connection(self, now: Instant) -> None:
         is_connected = self.attachment.switch is not None

@@ -38,6 +38,7 @@ class Kind(IntEnum):
     KEEPALIVE = 0x88  # to a neighbour that is up: I am still here; no statement, but a tag by a key of both sessions
     REDIRECT = 0x89  # to the neighbour whose frames came here: where the node is now
     WHERE = 0x8A  # to the neighbour whose frame came here, while no RIB answers: where is that node?
+    REVOKED = 0x8B  # between neighbours: which revocations each keeps, and those that the other lacks
 
 
 class Flag(IntFlag):

@@ -28,6 +28,7 @@ class Route:
         expires_s: end of the lease, monotonic seconds.
         valid_until_unix_s: when the claim's evidence runs out; it cannot be played back after that.
         fingerprints: of that evidence; a revocation names one of them.
+        issuers: keys that may revoke something of it, the domain's root apart.
     """
 
     name: Name
@@ -44,6 +45,7 @@ class Route:
     expires_s: float
     valid_until_unix_s: int
     fingerprints: frozenset[bytes]
+    issuers: frozenset[bytes] = frozenset()
 
     @classmethod
     def of(
@@ -73,6 +75,7 @@ class Route:
             expires_s=expires_s,
             valid_until_unix_s=claim.valid_until_unix_s,
             fingerprints=claim.fingerprints,
+            issuers=claim.issuers,
         )
 
     @property

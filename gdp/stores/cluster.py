@@ -196,6 +196,10 @@ class ClusterStore:
         every = (route for routes in self._cache.values() for route in routes.values())
         return [route for route in every if fingerprint in route.fingerprints]
 
+    def has_issuer(self, key: bytes) -> bool:
+        """Return whether a route in memory rests on a certificate that this key, 33 bytes, issued; looks at all."""
+        return any(key in route.issuers for routes in self._cache.values() for route in routes.values())
+
     def changed(self) -> list[tuple[Name, list[Route]]]:
         """Return the names that other RIBs changed since the last call, each with the routes that were in memory."""
         found: dict[Name, list[Route]] = {}

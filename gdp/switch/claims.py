@@ -17,6 +17,7 @@ from gdp.frame.kinds import Kind
 from gdp.limits import WITHDRAWAL_MAX_BYTES
 from gdp.names import ZERO, Name
 from gdp.switch.attached import Attached
+from gdp.switch.held import Held
 from gdp.switch.inquirer import Inquirer
 from gdp.switch.outbox import Outbox
 from gdp.switch.places import Places
@@ -43,6 +44,7 @@ class Claims:
         unicast: Unicast,
         inquirer: Inquirer,
         relocations: Relocations,
+        held: Held,
         outbox: Outbox,
     ) -> None:
         self._identity = identity
@@ -53,6 +55,7 @@ class Claims:
         self._unicast = unicast
         self._inquirer = inquirer
         self._relocations = relocations
+        self._held = held
         self._outbox = outbox
 
     def take(self, neighbour: Neighbour, statement: Statement, now: Instant) -> None:
@@ -76,6 +79,7 @@ class Claims:
             self._judge(neighbour, claim.name, DropReason.STALE, newest)
             raise StatementError(DropReason.STALE, "a claim that its maker has renewed")
         if claim.right in HEARS:
+            self._held.note_claim(claim, at)
             if self._planter.add_reader(claim, at, self._places.of(claim.name, now.mono_s), now.mono_s):
                 self._places.want(claim.name, now.mono_s, watch=True)
             for place in self._places.of(claim.name, now.mono_s):
@@ -85,6 +89,7 @@ class Claims:
             self._judge(neighbour, claim.name, None, claim.sequence)
         if claim.right is not Right.READ:
             known = self._attached.get(claim.name, claim.node)
+            self._held.note_claim(claim, at)
             self._attached.put(claim, *at, now.mono_s)
             if known is None or (known.port, known.mac) != at:
                 self._unicast.forget(claim.name)

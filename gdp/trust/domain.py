@@ -16,7 +16,7 @@ from gdp.crypto.certificates import Membership, Root, Unverified
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.names import Name
 from gdp.trust.lru import Lru
-from gdp.trust.revocation import Revocations
+from gdp.trust.revocations import Revocations
 
 __all__ = ["MEMBERS_REMEMBERED", "Policy"]
 
@@ -50,7 +50,7 @@ class Policy:
         self.transit: Final = frozenset(roots if transit is None else {own.domain, *transit})
         if not self.transit <= roots.keys():
             raise LocalError("transit goes through trusted domains only")
-        self.revoked: Final = Revocations(frozenset(root.key.compressed for root in roots.values()))
+        self.revoked: Final = Revocations({root.key.compressed: root.domain for root in roots.values()})
         self._by_issuer: dict[bytes, list[Root]] = {}
         for root in roots.values():
             self._by_issuer.setdefault(root.distinguished_name, []).append(root)
