@@ -26,8 +26,9 @@ from gdp.names import Name
 from gdp.nodes.counts import count_list
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
+from gdp.nodes.revocation_upkeep import WRITE_S, RevocationUpkeep
 from gdp.nodes.rights import confine_proxy
-from gdp.nodes.runtime import Runtime
+from gdp.nodes.runtime import Runtime, now
 from gdp.nodes.single_instance import run_alone
 from gdp.nodes.uplink import open_uplink
 from gdp.ports.plane import Plane
@@ -122,6 +123,9 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
     member = Member(identity, policy, settings)
     with contextlib.ExitStack() as stack:
         stack.enter_context(run_alone("proxy", identity.name))
+        revocations = RevocationUpkeep(config.state, policy.revoked)
+        revocations.load(now())
+        stack.callback(revocations.close)
         plane = stack.enter_context(open_uplink(config.iface))
         runtime = Runtime(member, plane, spin_s=config.spin_us / 1e6)
         node_log = NodeLog(
@@ -139,8 +143,11 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
         stack.callback(signal.signal, signal.SIGUSR1, signal.signal(signal.SIGUSR1, node.leave_soon))
         stack.enter_context(runtime.signals(node.reload))
         if config.sandbox:
-            recordings = () if config.record is None else (config.record.path.parent,)
-            confine_proxy((config.identity, config.delegations), recordings, has_ros=bool(config.ros))
+            written = () if config.record is None else (config.record.path.parent,)
+            written += () if config.state is None else (config.state,)
+            confine_proxy((config.identity, config.delegations), written, has_ros=bool(config.ros))
+        revocations.start()
+        runtime.every(WRITE_S, revocations.work)
         if config.metrics is not None:
             from gdp.telemetry.metrics import Metrics
 

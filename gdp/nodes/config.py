@@ -103,6 +103,7 @@ class SwitchConfig(Section):
     data_plane: DataPlane = "auto"
     table_max: int = Field(default=ENTRIES_DEFAULT, ge=1, le=TABLE_MAX)
     revocations: Directory | None = None
+    state: Directory | None = None
     metrics: Metrics | None = None
     hello_s: float = Field(default=HELLO_S, ge=0.01, le=60.0)
     dead_s: float = Field(default=DEAD_S, ge=0.02, le=600.0)
@@ -216,6 +217,7 @@ class RibConfig(Section):
     lease_s: LeaseSeconds = CLAIM_LEASE_S
     store: Literal["memory"] | SharedStore = "memory"
     snapshot: NewFile | None = None
+    state: Directory | None = None
     quotas: Quotas = Quotas()
     metrics: Metrics | None = None
     sandbox: bool = True

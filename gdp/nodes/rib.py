@@ -19,6 +19,7 @@ from gdp.nodes.config import RibConfig
 from gdp.nodes.counts import count_list
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
+from gdp.nodes.revocation_upkeep import WRITE_S, RevocationUpkeep
 from gdp.nodes.rib_upkeep import MemoryUpkeep, Upkeep
 from gdp.nodes.rights import confine_rib
 from gdp.nodes.runtime import Runtime, now
@@ -54,6 +55,10 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
         stack.enter_context(run_alone("RIB", identity.name))
         if config.sandbox:
             confine_rib(config)  # before the thread that keeps copies; the device can still be opened
+        revocations = RevocationUpkeep(config.state, policy.revoked)
+        revocations.load(now())
+        revocations.start()
+        stack.callback(revocations.close)
         upkeep = _upkeep(config, policy)
         stack.callback(upkeep.close)
         rib = Rib(identity, policy, upkeep.store, settings)
@@ -62,6 +67,7 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
         plane = stack.enter_context(open_uplink(config.iface))
         runtime = Runtime(host, plane)
         runtime.every(upkeep.every_s, upkeep.work)
+        runtime.every(WRITE_S, revocations.work)
         node_log = NodeLog(
             host.attachment.greeter,
             policy,

@@ -41,11 +41,12 @@ def confine_switch(config: SwitchConfig, plane: str) -> None:
         plane: the name of its data plane.
     """
     revocations = () if config.revocations is None else (config.revocations,)
+    kept = () if config.state is None else (config.state,)
     is_kernel = plane == "kernel"
     _confine(
         Needs(
-            _DEVICE | (_PROGRAMS if is_kernel else frozenset()) | _past_owners(reads=revocations),
-            (*_CHANGED, lock_directory()),
+            _DEVICE | (_PROGRAMS if is_kernel else frozenset()) | _past_owners(revocations, kept),
+            (*_CHANGED, lock_directory(), *kept),
             (*_code(), *revocations),
             () if config.metrics is None else (config.metrics.port,),
             spared_calls=frozenset({"bpf"} if is_kernel else ()),
@@ -58,6 +59,7 @@ def confine_rib(config: RibConfig) -> None:
     is_shared = config.store != "memory"
     secrets = () if config.store == "memory" else _files_of(config.store.cluster)
     snapshots = () if config.snapshot is None else (config.snapshot.parent,)
+    snapshots += () if config.state is None else (config.state,)
     ports = () if config.metrics is None else (config.metrics.port,)
     _confine(
         Needs(
@@ -74,13 +76,13 @@ def confine_proxy(reads: Iterable[Path], writes: Iterable[Path], *, has_ros: boo
 
     Args:
         reads: what it reads again on SIGHUP.
-        writes: folders of its recording.
+        writes: folders of its recording and of its state.
         has_ros: whether it takes part in a graph. ROS middleware writes logs and shared memory, which it shares with
             nodes of other users: CAP_DAC_OVERRIDE is kept for that.
     """
-    recordings = tuple(writes)
-    changed = [*_CHANGED, lock_directory(), Path(tempfile.gettempdir()), *recordings]
-    kept = _DEVICE | _past_owners(reads, recordings)
+    written = tuple(writes)
+    changed = [*_CHANGED, lock_directory(), Path(tempfile.gettempdir()), *written]
+    kept = _DEVICE | _past_owners(reads, written)
     if has_ros:
         changed += _ros_folders()
         kept |= {Capability.DAC_OVERRIDE}

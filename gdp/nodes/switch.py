@@ -21,6 +21,7 @@ from gdp.nodes.data_plane import Chosen, choose_plane
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.pairs import attach_pairs, switch_end
+from gdp.nodes.revocation_upkeep import WRITE_S, RevocationUpkeep
 from gdp.nodes.rights import confine_switch
 from gdp.nodes.runtime import Runtime, now
 from gdp.nodes.single_instance import own_devices, run_alone
@@ -71,6 +72,9 @@ def run_switch(
     switch = Switch(identity, policy, table, settings)
     with contextlib.ExitStack() as stack:
         stack.enter_context(run_alone("switch", identity.name))
+        upkeep = RevocationUpkeep(config.state, policy.revoked)
+        upkeep.load(now())
+        stack.callback(upkeep.close)
         stack.enter_context(own_devices(ifaces))
         stack.enter_context(attach_pairs(config.attach, identity.name, _widest(ifaces)))
         wanted = [port.iface for port in config.ports if not port.optional]
@@ -102,6 +106,8 @@ def run_switch(
         _revoke(switch, config.revocations)
         if config.sandbox:
             confine_switch(config, chosen.name)
+        upkeep.start()
+        runtime.every(WRITE_S, upkeep.work)
         if config.metrics is not None:
             from gdp.telemetry.metrics import Metrics
 

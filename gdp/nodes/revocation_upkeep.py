@@ -1,0 +1,73 @@
+"""A node's revocations across its restarts: read at the start, written when there is news.
+
+Layer: I/O.
+"""
+
+from __future__ import annotations
+
+import logging
+from itertools import islice
+from pathlib import Path
+from typing import Final
+
+from gdp.crypto.statements import parse
+from gdp.effects import Instant
+from gdp.errors import RemoteError
+from gdp.stores.revocation_file import SLICE, RevocationFile
+from gdp.trust.revocations import Revocations
+
+__all__ = ["WRITE_S", "RevocationUpkeep"]
+
+log = logging.getLogger(__name__)
+
+WRITE_S: Final = 0.05  # between two slices
+
+
+class RevocationUpkeep:
+    """The care of one node's revocations.
+
+    Args:
+        folder: the node's state folder; None: they are kept in memory only.
+
+    Raises:
+        LocalError: others may write to the folder.
+    """
+
+    def __init__(self, folder: Path | None, revoked: Revocations) -> None:
+        self._file = None if folder is None else RevocationFile(folder)
+        self._revoked = revoked
+
+    def load(self, now: Instant) -> None:
+        """Take back what was kept in an earlier life, each statement verified."""
+        if self._file is None:
+            return
+        refused = 0
+        for row in self._file.load(now.unix_s):
+            try:
+                self._revoked.restore(parse(row.statement), row.giver, now)
+            except RemoteError:
+                refused += 1
+        self._revoked.changes = set()
+        log.info("revocations read kept=%d refused=%d", len(self._revoked), refused)
+
+    def start(self) -> None:
+        """Begin to write; after rights were given away, which threads do not share."""
+        if self._file is not None:
+            self._file.start()
+
+    def work(self, now: Instant) -> None:
+        """Hand one slice of changes to the file, if it is not behind."""
+        del now
+        changes = self._revoked.changes
+        if changes and self._file is not None and self._file.is_ready:
+            keys = list(islice(changes, SLICE))
+            changes.difference_update(keys)
+            self._file.write([(key, self._revoked.kept(key)) for key in keys])
+
+    def close(self) -> None:
+        """Write what is left, and end."""
+        if self._file is None:
+            return
+        while self._revoked.changes and self._file.is_ready:
+            self.work(Instant(0.0, 0.0))
+        self._file.close()
