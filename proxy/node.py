@@ -143,8 +143,8 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
         stack.callback(signal.signal, signal.SIGUSR1, signal.signal(signal.SIGUSR1, node.leave_soon))
         stack.enter_context(runtime.signals(node.reload))
         if config.sandbox:
-            written = () if config.record is None else (config.record.path.parent,)
-            written += () if config.state is None else (config.state,)
+            kept = (None if config.record is None else config.record.path.parent, config.state)
+            written = [folder for folder in kept if folder is not None]
             confine_proxy((config.identity, config.delegations), written, has_ros=bool(config.ros))
         revocations.start()
         runtime.every(WRITE_S, revocations.work)

@@ -44,7 +44,7 @@ class RevocationUpkeep:
         refused = 0
         for row in self._file.load(now.unix_s):
             try:
-                self._revoked.restore(parse(row.statement), row.giver, now)
+                self._revoked.restore(parse(row.statement), row.giver, now, of_root=row.is_root)
             except RemoteError:
                 refused += 1
         self._revoked.changes = set()

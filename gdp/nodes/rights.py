@@ -58,8 +58,8 @@ def confine_rib(config: RibConfig) -> None:
     """Give away what a RIB does not need."""
     is_shared = config.store != "memory"
     secrets = () if config.store == "memory" else _files_of(config.store.cluster)
-    snapshots = () if config.snapshot is None else (config.snapshot.parent,)
-    snapshots += () if config.state is None else (config.state,)
+    kept = (None if config.snapshot is None else config.snapshot.parent, config.state)
+    snapshots = tuple(folder for folder in kept if folder is not None)
     ports = () if config.metrics is None else (config.metrics.port,)
     _confine(
         Needs(

@@ -42,6 +42,7 @@ Change = tuple[KeptKey, Kept | None]  # None: it is gone
 class Row(NamedTuple):
     """One revocation as it was written."""
 
+    is_root: bool
     giver: bytes
     statement: bytes
 
@@ -74,9 +75,9 @@ class RevocationFile:
             with contextlib.closing(_opened(self._path)) as database:
                 with database:
                     database.execute("DELETE FROM revocations WHERE until <= ?", (int(unix_s),))
-                rows = database.execute("SELECT giver, statement FROM revocations ORDER BY is_root DESC")
-                for giver, statement in rows:
-                    yield Row(bytes(giver), bytes(statement))
+                rows = database.execute("SELECT is_root, giver, statement FROM revocations ORDER BY is_root DESC")
+                for is_root, giver, statement in rows:
+                    yield Row(bool(is_root), bytes(giver), bytes(statement))
         except sqlite3.OperationalError as error:
             self.failures += 1
             log.error("revocations not read path=%s reason=%s; the node starts without them", self._path, error)

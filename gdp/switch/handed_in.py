@@ -8,8 +8,6 @@ name later meets it.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Final
 
 __all__ = ["HandedIn"]
@@ -28,11 +26,6 @@ class HandedIn:
         self._due: list[tuple[float, int, bytes]] = []  # when, how often it was said, fingerprint
         self._tick_at_s = float("-inf")
 
-    @property
-    def wires(self) -> Mapping[bytes, bytes]:
-        """Return all statements by fingerprint."""
-        return MappingProxyType(self._wires)
-
     def add(self, fingerprint: bytes, wire: bytes, now_s: float) -> None:
         """Have a statement said from now on."""
         if fingerprint not in self._wires:
@@ -47,16 +40,16 @@ class HandedIn:
         """Have everything said anew: there is another RIB."""
         self._due = [(now_s, 0, fingerprint) for fingerprint in self._wires]
 
-    def due(self, now_s: float) -> list[bytes]:
-        """Return the few statements to say now."""
+    def due(self, now_s: float) -> list[tuple[bytes, bytes]]:
+        """Return the few statements to say now, each with its fingerprint."""
         if now_s < self._tick_at_s:
             return []
-        said: list[bytes] = []
+        said: list[tuple[bytes, bytes]] = []
         while self._due and self._due[0][0] <= now_s and len(said) < _PER_TICK:
             _, times, fingerprint = heapq.heappop(self._due)
             wire = self._wires.get(fingerprint)
             if wire is not None:
-                said.append(wire)
+                said.append((fingerprint, wire))
                 pause_s = _FIRST_S[times] if times < len(_FIRST_S) else _AGAIN_S
                 heapq.heappush(self._due, (now_s + pause_s, times + 1, fingerprint))
         if said:

@@ -279,7 +279,7 @@ class Switch:
         if self.inquirer.rib != self._told_rib:
             self._told_rib = self.inquirer.rib
             self._revoker.handed_in.say_again(now_s)
-        for wire in self._revoker.handed_in.due(now_s):
+        for wire in self._revoker.due_for_rib(now_s):
             self.inquirer.relay(wire, now_s)
 
     def _digest_for(self, port: LinkPort) -> bytes:

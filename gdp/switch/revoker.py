@@ -18,7 +18,7 @@ from typing import Final
 from gdp.control.greeter import Greeter
 from gdp.control.neighbour import Neighbour
 from gdp.control.revocation_sync import RevocationSync
-from gdp.crypto.statements import Statement
+from gdp.crypto.statements import Statement, parse
 from gdp.effects import Instant
 from gdp.errors import StatementError
 from gdp.frame.kinds import Kind
@@ -74,9 +74,6 @@ class Revoker:
         self._outbox = outbox
         self.handed_in = HandedIn()
 
-    def __len__(self) -> int:
-        return len(self._revoked)
-
     def take(self, statement: Statement, neighbour: Neighbour, now: Instant) -> list[Name]:
         """Take a revocation from a neighbour; return the topics that lost all readers here.
 
@@ -116,8 +113,19 @@ class Revoker:
         revocation = self._revoked.take(statement, OPERATOR, now, self._held.has_issuer)
         issued = revocation or Revocation.read(statement)
         if not self._revoked.is_root(issued.issuer.owner_key):
-            self.handed_in.add(issued.fingerprint, statement.wire, now.mono_s)
+            self.handed_in.add(statement.fingerprint, statement.wire, now.mono_s)
         return [] if revocation is None else self._spread(revocation, statement, None, now)
+
+    def due_for_rib(self, now_s: float) -> list[bytes]:
+        """Return what the RIB is to be told now of what the operator handed in; what has run out is forgotten."""
+        wires = []
+        for fingerprint, wire in self.handed_in.due(now_s):
+            revocation = Revocation.read(parse(wire))
+            if self._revoked.has(revocation.fingerprint, revocation.issuer.owner_key):
+                wires.append(wire)
+            else:
+                self.handed_in.remove(fingerprint)
+        return wires
 
     def _spread(
         self, revocation: Revocation, statement: Statement, giver: Neighbour | None, now: Instant

@@ -166,13 +166,18 @@ class Revocations:
         self._add(revocation, statement, giver, now.unix_s)
         return revocation
 
-    def restore(self, statement: Statement, giver: bytes, now: Instant) -> None:
+    def restore(self, statement: Statement, giver: bytes, now: Instant, *, of_root: bool) -> None:
         """Take back what this node kept in an earlier life: verified, but without a rate.
+
+        Args:
+            of_root: it was kept as a trusted domain's, which the domain must be still.
 
         Raises:
             StatementError: as ``take``.
         """
         revocation = Revocation.read(statement)
+        if of_root and not self.is_root(revocation.issuer.owner_key):
+            raise StatementError(DropReason.UNCONCERNED, "a domain that is trusted no more")
         self._check_end(revocation, now.unix_s)
         revocation.verify(statement)
         if self._until(revocation.issuer.owner_key, revocation.fingerprint) < revocation.until_unix_s:
