@@ -28,7 +28,14 @@ from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.effects import Instant
 from gdp.errors import DropReason, RemoteError, StatementError, StoreError
 from gdp.frame.kinds import Kind
-from gdp.limits import LEASE_MAX_S, NEGATIVE_LEASE_S, RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX, WITHDRAWAL_MAX_BYTES
+from gdp.limits import (
+    CLOCK_SKEW_S,
+    LEASE_MAX_S,
+    NEGATIVE_LEASE_S,
+    RIB_NAMES_PER_SENDER,
+    RIB_WATCHES_MAX,
+    WITHDRAWAL_MAX_BYTES,
+)
 from gdp.names import Name
 from gdp.rib.above import Above
 from gdp.rib.digest_tree import DigestTree
@@ -39,6 +46,7 @@ from gdp.rib.store import Store
 from gdp.rib.upstream import PROBE_S, Passed, Upstream
 from gdp.rib.watches import Asker, Watches
 from gdp.trust.adcert import AdCert
+from gdp.trust.audit import Action
 from gdp.trust.claim import Claim, ClaimBody
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
@@ -48,6 +56,7 @@ __all__ = ["Letter", "Rib", "RibSettings"]
 
 _ADVISED_S: Final = 30.0  # who was answered is told of a move for so long
 _UNTOLD_S: Final = 1.0  # ... where there are too many for that
+_NAMES_OF_ISSUER_MAX: Final = 256  # whose watchers are told of what somebody revoked who is not their owner
 _DOUBT_S: Final = 0.1  # a RIB above that said nothing for so long is asked for a sign of life beside a question
 _PEER_MESSAGES: Final[dict[StatementType, type[Message]]] = {
     StatementType.DIGEST: Digest,
@@ -88,6 +97,7 @@ class Rib:
 
     def __init__(self, identity: Identity, policy: Policy, store: Store, settings: RibSettings) -> None:
         self._identity = identity
+        self._audit = policy.audit
         self._policy = policy
         self._store = store
         self._settings = settings
@@ -256,7 +266,7 @@ class Rib:
                 raise StatementError(DropReason.WRONG_DOMAIN, "a claim of a domain that is not trusted")
             if member.domain != self._policy.own and not claim.is_global:
                 raise StatementError(DropReason.WRONG_DOMAIN, "a local name of another domain")
-            self._check_identity(claim, now.mono_s)
+            self._check_identity(claim, now)
             if claim.right is Right.ATTACH and self.identities.is_refused_above(
                 claim.node, claim.incarnation, now.mono_s
             ):
@@ -272,13 +282,15 @@ class Rib:
             route = replace(route, domain=relay.domain)
         self._store.put(route)
         self.accepted += 1
+        if not isinstance(known, Route):
+            self._audit.note(Action.ACCEPTED, "name", who=route.advertiser.to_text(), about=route.name.to_text())
         self._judge(route.name, route.advertiser, None, route.sequence, member.name)
         self._tell(route, known, now.mono_s)
         self._replicate(route.name, route.advertiser)
         if claim.is_global and not self._upstream.has(member.name):
             self._pass_up(route, relay.statement, route.sequence, now.mono_s)
 
-    def _check_identity(self, claim: Claim, now_s: float) -> None:
+    def _check_identity(self, claim: Claim, now: Instant) -> None:
         """Refuse a node's own name in another incarnation while the older node lives at another switch.
 
         Raises:
@@ -288,10 +300,11 @@ class Rib:
         if not isinstance(held, Route) or held.switch == claim.switch:
             return
         older = ClaimBody.from_statement(parse(held.claim)).incarnation
-        if older == claim.incarnation or self.identities.is_free(claim.node, older, held.switch, now_s):
+        if older == claim.incarnation or self.identities.is_free(claim.node, older, held.switch, now.mono_s):
             return
-        if self.identities.must_ask(claim.node, older, held.switch, now_s):
-            question = Presence(claim.node, older, claim.switch)
+        number = int(now.unix_s * 1_000)
+        if self.identities.must_ask(claim.node, older, held.switch, number, now.mono_s):
+            question = Presence(claim.node, older, claim.switch, number)
             wire = question.to_wire(self._identity.name, self._identity.key, self._identity.membership)
             self._letters.append(Letter(held.switch, Kind.RIB_ANSWER, wire))
         raise StatementError(DropReason.IN_USE, "another node with this identity")
@@ -316,10 +329,21 @@ class Rib:
             is_repeated = isinstance(known, Route) and (known.claim, known.via) == (claim.wire, member.domain)
             if not is_repeated:
                 raise StatementError(DropReason.STALE, str(known.sequence))
-        is_new = known is None or known.sender != member.name
-        if is_new and self._store.count_of(member.name) >= self._settings.names_per_sender:
-            raise StatementError(DropReason.QUOTA, "names of one sender")
+        if known is None or known.sender != member.name:
+            self._check_quota(member.name, claim.node)
         return known
+
+    def _check_quota(self, sender: Name, node: Name) -> None:
+        """Return if a sender may bring another name, and a node have one: as many as the sender has left, at most.
+
+        Raises:
+            StatementError: QUOTA.
+        """
+        free = self._settings.names_per_sender - self._store.count_of(sender)
+        if free <= 0:
+            raise StatementError(DropReason.QUOTA, "names of one sender")
+        if self._store.count_of(node) >= free:
+            raise StatementError(DropReason.QUOTA, "names of one node")
 
     def _route(self, claim: Claim, transit: tuple[Name, ...], member: Membership, now: Instant) -> Route:
         left_s = max(claim.valid_until_unix_s - now.unix_s, 1.0)
@@ -370,6 +394,8 @@ class Rib:
             name = ClaimBody.from_statement(passed_on).subject.name
         except StatementError:
             return  # not even a claim: nothing to name in an answer; the caller counts it
+        who, reason = passed_on.signer.to_text(), error.reason.label
+        self._audit.note(Action.REFUSED, "name", who=who, about=name.to_text(), reason=reason)
         known = self._store.get(name, passed_on.signer)
         if error.reason is DropReason.REVOKED:
             self._send_revocations(self._revocations.behind(_revocable(passed_on)), [member.name])
@@ -389,6 +415,8 @@ class Rib:
     def _take_query(self, statement: Statement, now: Instant) -> None:
         fields = statement.fields
         member = self._sender(fields.bytes_("c"), statement, now)
+        if member.role not in (Role.SWITCH, Role.RIB):
+            raise StatementError(DropReason.NOT_DELEGATED, "only switches and RIBs ask")
         statement.verify(member.key)
         query = Query.from_fields(fields)
         if query.name == self._identity.name:
@@ -598,13 +626,20 @@ class Rib:
         if revocation is None:
             self._pass_revocation_up(statement, giver, now)  # it is repeated for those that did not know it
             return
+        who, about = revocation.issuer.name.to_text(), revocation.fingerprint.hex()
+        self._audit.note(Action.REVOKED, "certificate", who=who, about=about)
         told: dict[Asker, None] = {}
         closed = self._revocations.closed(revocation, now)
         if not self._policy.revoked.is_root(revocation.issuer.owner_key):  # switches carry those of roots everywhere
             for name in dict.fromkeys((revocation.issuer.name, *(route.name for route in closed))):
                 told |= self._concerned_by(name, now.mono_s)
-            tiers = [*self._above_and_beside(giver), *(asker.name for asker in told)]
-            self._send_revocations([statement.wire], [to for to in dict.fromkeys(tiers) if to != giver])
+            if not told:  # it signs in its own name: an owner's successor, or a delegate
+                others = self._store.resting_on(revocation.issuer.owner_key)
+                for name in list(dict.fromkeys(route.name for route in others))[:_NAMES_OF_ISSUER_MAX]:
+                    told |= self._concerned_by(name, now.mono_s)
+            ribs = self._above_and_beside(giver)
+            self._send_revocations([statement.wire], ribs, Kind.RIB_REQUEST)
+            self._send_revocations([statement.wire], [each.name for each in told if each.name not in (giver, *ribs)])
         for route in closed:
             self._store.withdraw(route.name, route.advertiser)
             self._tell_gone(route, now.mono_s)
@@ -616,7 +651,7 @@ class Rib:
         if upper is None or is_root or self._upstream.has(sender) or sender in self._settings.peers:
             return
         if self._revocations.may_pass_up(statement, sender, now):
-            self._send_revocations([statement.wire], [upper])
+            self._send_revocations([statement.wire], [upper], Kind.RIB_REQUEST)
 
     def _concerned_by(self, name: Name, now_s: float) -> dict[Asker, None]:
         """Return who brought, holds or watches a name."""
@@ -632,11 +667,11 @@ class Rib:
         above = [] if self._upstream.rib is None else [self._upstream.rib]
         return above if giver in self._settings.peers else [*above, *self._settings.peers]
 
-    def _send_revocations(self, wires: Iterable[bytes], to: Iterable[Name]) -> None:
-        askers = list(to)
-        for wire in wires if askers else ():
+    def _send_revocations(self, wires: Iterable[bytes], to: Iterable[Name], kind: Kind = Kind.RIB_ANSWER) -> None:
+        names = list(to)
+        for wire in wires if names else ():
             relay = Relay(wire, (), self._identity.membership).to_wire(self._identity.name, self._identity.key)
-            self._letters += [Letter(name, Kind.RIB_ANSWER, relay) for name in askers]
+            self._letters += [Letter(name, kind, relay) for name in names]
 
     # -- other RIBs of the domain
 
@@ -703,8 +738,8 @@ class Rib:
             return
         if entry.is_from_above and (not isinstance(known, Route) or known.is_from_above):
             return  # nothing here that it corrects
-        if known is None and self._store.count_of(entry.sender) >= self._settings.names_per_sender:
-            raise StatementError(DropReason.QUOTA, "names of one sender")
+        if known is None:
+            self._check_quota(entry.sender, claim.node)
         route = Route.of(
             claim,
             sender=entry.sender,
@@ -732,13 +767,13 @@ class Rib:
             return
         member = self._sender(entry.membership, withdrawal, now)
         withdrawal.verify(member.key)
-        until_unix_s = min(entry.until_unix_s, member.not_after_unix_s)
+        until_unix_s = min(entry.until_unix_s, member.not_after_unix_s + int(CLOCK_SKEW_S))
         if known is not None:  # a peer cannot have us forget sooner what we know
             until_unix_s = max(until_unix_s, known.valid_until_unix_s)
         if until_unix_s <= now.unix_s:
             return  # forgotten here already
-        if known is None and self._store.count_of(entry.sender) >= self._settings.names_per_sender:
-            raise StatementError(DropReason.QUOTA, "names of one sender")
+        if known is None:
+            self._check_quota(entry.sender, withdrawal.signer)
         gone = Withdrawn(entry.sender, sequence, until_unix_s, withdrawal.wire, entry.membership)
         route = self._store.withdraw(name, withdrawal.signer, gone)
         if route is not None:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from gdp.errors import LocalError
+from gdp.limits import CLOCK_SKEW_S
 from gdp.stores.ownership import refuse_shared_folder
 from gdp.trust.revocations import Kept, KeptKey
 
@@ -74,7 +75,7 @@ class RevocationFile:
         try:
             with contextlib.closing(_opened(self._path)) as database:
                 with database:
-                    database.execute("DELETE FROM revocations WHERE until <= ?", (int(unix_s),))
+                    database.execute("DELETE FROM revocations WHERE until < ?", (int(unix_s - CLOCK_SKEW_S),))
                 rows = database.execute("SELECT is_root, giver, statement FROM revocations ORDER BY is_root DESC")
                 for is_root, giver, statement in rows:
                     yield Row(bool(is_root), bytes(giver), bytes(statement))

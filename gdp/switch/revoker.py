@@ -31,9 +31,10 @@ from gdp.switch.outbox import Outbox
 from gdp.switch.places import Places
 from gdp.switch.planter import Planter
 from gdp.switch.unicast import Unicast
+from gdp.trust.audit import Action
 from gdp.trust.claim import Claim
 from gdp.trust.revocation import Revocation
-from gdp.trust.revocations import OPERATOR
+from gdp.trust.revocations import OPERATOR, hash_of
 from gdp.trust.verifier import ClaimVerifier
 
 __all__ = ["Revoker"]
@@ -92,7 +93,7 @@ class Revoker:
         revocation = self._revoked.take(statement, neighbour.name, now, self._held.has_issuer)
         if revocation is None:
             return []
-        self._sync.took(neighbour, revocation.issuer.name, now.mono_s)
+        self._sync.took(neighbour, hash_of(revocation.issuer.owner_key), now.mono_s)
         return self._apply(revocation, now)
 
     def take_from_rib(self, statement: Statement, rib: Name, now: Instant) -> list[Name]:
@@ -137,6 +138,8 @@ class Revoker:
 
     def _apply(self, revocation: Revocation, now: Instant) -> list[Name]:
         """Close what carries the revoked certificate; return the topics that lost all readers here."""
+        issuer, about = revocation.issuer.name.to_text(), revocation.fingerprint.hex()
+        self._verifier.policy.audit.note(Action.REVOKED, "certificate", who=issuer, about=about)
         orphaned: list[Name] = []
         for holder in self._held.resting_on(revocation.fingerprint):
             if isinstance(holder, AttachedClaim):

@@ -11,10 +11,10 @@ A revocation is kept until the certificate would have run out by itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import reduce
-from hashlib import blake2b
+from hashlib import blake2b, sha256
 from operator import xor
 from typing import Final, NamedTuple
 
@@ -34,7 +34,7 @@ from gdp.names import Name
 from gdp.trust.revocation import Revocation
 from gdp.trust.token_buckets import TokenBuckets
 
-__all__ = ["BUCKETS", "ID_BYTES", "OPERATOR", "Kept", "KeptKey", "Revocations"]
+__all__ = ["BUCKETS", "ID_BYTES", "OPERATOR", "Kept", "KeptKey", "Revocations", "hash_of"]
 
 BUCKETS: Final = 256  # of a root's revocations, by the first byte of the fingerprint
 ID_BYTES: Final = 8
@@ -60,9 +60,13 @@ class Kept(NamedTuple):
 
 @dataclass(slots=True)
 class _Root:
-    """What one trusted domain took back. A value: until when (8 bytes), and the signature, or the whole statement."""
+    """What one root took back. A value: until when (8 bytes), and the signature, or the whole statement.
 
-    domain: Name
+    Args:
+        root: the hash of its key.
+    """
+
+    root: Name
     subject: Subject | None = None
     buckets: list[dict[bytes, bytes]] = field(default_factory=lambda: [{} for _ in range(BUCKETS)])
     hashes: list[int] = field(default_factory=lambda: [0] * BUCKETS)
@@ -83,7 +87,7 @@ class Revocations:
     """What has been taken back, as far as this node was told and it matters here.
 
     Args:
-        roots: the trusted domains' compressed keys, with their names.
+        root_keys: the trusted domains' compressed keys, those of former roots too.
         per_root, of_owners, per_issuer, per_giver: bounds, see ``limits``.
 
     Attributes:
@@ -92,15 +96,16 @@ class Revocations:
 
     def __init__(
         self,
-        roots: Mapping[bytes, Name],
+        root_keys: Iterable[bytes],
         *,
         per_root: int = REVOCATIONS_PER_ROOT,
         of_owners: int = REVOCATIONS_OF_OWNERS,
         per_issuer: int = REVOCATIONS_PER_ISSUER,
         per_giver: int = REVOCATIONS_PER_GIVER,
     ) -> None:
-        self._roots = {key: _Root(domain) for key, domain in roots.items()}
-        self._key_of = {domain: key for key, domain in roots.items()}
+        self._roots: dict[bytes, _Root] = {}
+        self._key_of: dict[Name, bytes] = {}  # by the hash by which neighbours speak of it
+        self.trust(root_keys)
         self._owners: dict[bytes, dict[bytes, _Owned]] = {}  # by the issuer's key and the fingerprint
         self._about: dict[Name, dict[KeptKey, None]] = {}  # of owners, by the name that signed
         self._shares: dict[bytes, dict[bytes, int]] = {}  # how many of owners by giver and issuer's key
@@ -117,6 +122,13 @@ class Revocations:
 
     def __len__(self) -> int:
         return self._owned + sum(root.count for root in self._roots.values())
+
+    def trust(self, root_keys: Iterable[bytes]) -> None:
+        """Count these, too, as trusted domains' keys from now on; what is known stays."""
+        for key in root_keys:
+            if key not in self._roots:
+                self._roots[key] = _Root(hash_of(key))
+                self._key_of[hash_of(key)] = key
 
     def is_root(self, issuer_key: bytes) -> bool:
         """Return whether this is the key of a trusted domain."""
@@ -235,37 +247,37 @@ class Revocations:
     # -- what roots took back, for neighbours
 
     def summary(self) -> list[tuple[Name, int, bytes]]:
-        """Return for each trusted domain how many it took back, and a digest."""
+        """Return for each root, by the hash of its key, how many it took back, and a digest."""
         return [
-            (root.domain, root.count, reduce(xor, root.hashes).to_bytes(ID_BYTES, "big"))
+            (root.root, root.count, reduce(xor, root.hashes).to_bytes(ID_BYTES, "big"))
             for root in self._roots.values()
         ]
 
-    def hashes(self, domain: Name) -> list[bytes] | None:
-        """Return the digests of a trusted domain's buckets; None: it is not trusted."""
-        root = self._root(domain)
+    def hashes(self, of: Name) -> list[bytes] | None:
+        """Return the digests of a root's buckets; None: it is not trusted."""
+        root = self._root(of)
         return None if root is None else [each.to_bytes(ID_BYTES, "big") for each in root.hashes]
 
-    def ids(self, domain: Name, bucket: int) -> list[bytes]:
-        """Return short ids of a trusted domain's revocations in one bucket."""
-        root = self._root(domain)
+    def ids(self, of: Name, bucket: int) -> list[bytes]:
+        """Return short ids of a root's revocations in one bucket."""
+        root = self._root(of)
         entries = {} if root is None else root.buckets[bucket]
         return [_id(print_, _end_of(value)).to_bytes(ID_BYTES, "big") for print_, value in entries.items()]
 
-    def lacking(self, domain: Name, bucket: int, ids: frozenset[bytes]) -> list[KeptKey]:
-        """Return what of a bucket is not among these ids."""
-        root = self._root(domain)
+    def lacking(self, of: Name, bucket: int, ids: frozenset[bytes]) -> list[KeptKey]:
+        """Return what of a root's bucket is not among these ids."""
+        root = self._root(of)
         if root is None:
             return []
-        key = self._key_of[domain]
+        key = self._key_of[of]
         return [
             (key, print_)
             for print_, value in root.buckets[bucket].items()
             if _id(print_, _end_of(value)).to_bytes(ID_BYTES, "big") not in ids
         ]
 
-    def _root(self, domain: Name) -> _Root | None:
-        key = self._key_of.get(domain)
+    def _root(self, of: Name) -> _Root | None:
+        key = self._key_of.get(of)
         return None if key is None else self._roots[key]
 
     # -- room
@@ -388,6 +400,11 @@ class Revocations:
         if not share:
             del self._shares[owned.giver]
         self._owned -= 1
+
+
+def hash_of(root_key: bytes) -> Name:
+    """Return the hash by which neighbours speak of a root: a domain may have had several."""
+    return Name(sha256(root_key).digest())
 
 
 def _id(fingerprint: bytes, until_unix_s: int) -> int:

@@ -18,9 +18,11 @@ from gdp.errors import DropReason
 from gdp.frame.codec import ETHER_BYTES, decode
 from gdp.frame.kinds import Kind
 from gdp.metadata import Metadata
+from gdp.names import Name
 from gdp.nodes.revocation_upkeep import RevocationUpkeep
 from gdp.testbed.world import World
 from gdp.trust.revocation import Revocation
+from gdp.trust.revocations import hash_of
 from gdp.trust.right import Right
 from tests.journeys.flows import ROBOT, SERVER, Flow, flowing, ring
 from tests.journeys.test_attacks import mac_of, still_flows
@@ -42,6 +44,10 @@ def junk_of(key: SigningKey, number: int, until_s: int) -> bytes:
 def by_root(world: World, label: str, fingerprint: bytes) -> bytes:
     root = world.authorities[label]
     return Revocation.make(root.key, root.root.subject, fingerprint, until(world))
+
+
+def school_of(world: World) -> Name:
+    return hash_of(world.authorities["school"].root.key.compressed)
 
 
 def say(world: World, wire: bytes, label: str, to: str, kind: Kind = Kind.REVOKE) -> None:
@@ -253,7 +259,7 @@ def test_a06_a_proven_neighbour_draws_twice_all_there_is_at_most(monkeypatch: py
     answered = Bytes(world, "nuc1", THIEF)
     session = world.switches["nuc1"].greeter.ports[port].nonce
     for number in range(6):
-        said = Lacking(session, int(2e15) + number, world.authorities["school"].root.domain, (), ())
+        said = Lacking(session, int(2e15) + number, school_of(world), (), ())
         say(world, said.to_wire(identity.name, identity.key), THIEF, "nuc1", Kind.REVOKED)
         world.network.run(0.5)
     assert answered.sent < (2 * 300 + 100 + 12) * 500
@@ -263,7 +269,7 @@ def test_a06_a_proven_neighbour_draws_twice_all_there_is_at_most(monkeypatch: py
 def test_a_recorded_digest_draws_nothing() -> None:
     world, flow = with_thief()
     identity, port = world.identities[THIEF], port_of(world, THIEF)
-    school = world.authorities["school"].root.domain
+    school = school_of(world)
     session = world.switches["nuc1"].greeter.ports[port].nonce
     said = Revoked(session, int(2e15), ((school, 5, b"another!"),)).to_wire(identity.name, identity.key)
     for _ in range(20):

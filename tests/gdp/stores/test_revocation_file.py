@@ -80,8 +80,8 @@ def test_what_a_killed_node_had_synced_comes_back(tmp_path: Path) -> None:
 
 
 def test_what_has_run_out_is_forgotten_by_the_file_too(tmp_path: Path) -> None:
-    written(tmp_path, of_school(1, NOW + 10), of_school(2))
-    assert len(read(tmp_path, Instant(0.0, NOW + 500))) == 1
+    written(tmp_path, of_school(1, NOW + 10), of_school(2, NOW + 9_000))
+    assert len(read(tmp_path, Instant(0.0, NOW + 5_000))) == 1
     with sqlite3.connect(tmp_path / "revocations") as database:
         assert database.execute("SELECT count(*) FROM revocations").fetchone() == (1,)
     database.close()
