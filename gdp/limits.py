@@ -59,6 +59,7 @@ CONTROL_JOIN_SOURCE_BYTES: Final = 64 << 10
 CONTROL_PATIENCE_S: Final = 2.0
 CBOR_DEPTH_MAX: Final = 16
 CHAIN_MAX: Final = 4  # delegations between an owner's key and a node
+CERTIFICATE_LIFE_MAX_S: Final = 20 * 366 * 86_400.0  # of a membership or delegation; so long may a revocation count
 CLOCK_EARLY_S: Final = 3_600.0  # so long before it begins a certificate is believed
 CLOCK_SKEW_S: Final = 3_600.0  # so long after it has ended
 CLOCKS_APART_S: Final = 7_200.0  # two clocks, each an hour off at most
@@ -99,3 +100,9 @@ SWITCH_QUESTIONS_PER_S: Final = 256.0  # ... or a neighbouring switch
 SWITCH_QUESTIONS_BURST: Final = 2_048.0
 RIB_NAMES_PER_SENDER: Final = 200_000
 RIB_WATCHES_MAX: Final = 500_000
+
+# Revocations
+REVOCATIONS_PER_ROOT: Final = 262_144  # of one trusted domain
+REVOCATIONS_OF_OWNERS: Final = 65_536  # of all owners and nodes whose certificates are held here
+REVOCATIONS_PER_ISSUER: Final = 1_024  # of one of these
+REVOCATIONS_PER_GIVER: Final = 8_192  # that came over one neighbour, or from one relay

@@ -26,6 +26,7 @@ from gdp.nodes.counts import count_list
 from gdp.nodes.credentials import Credentials, watched_folders
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
+from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rights import confine_proxy
 from gdp.nodes.runtime import Runtime, now
 from gdp.nodes.single_instance import run_alone
@@ -124,6 +125,7 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
     member = Member(identity, policy, settings)
     with contextlib.ExitStack() as stack:
         stack.enter_context(run_alone("proxy", identity.name))
+        revocations = load_revocations(config.state, policy.revoked, stack)
         plane = stack.enter_context(open_uplink(config.iface))
         runtime = Runtime(member, plane, spin_s=config.spin_us / 1e6)
         node_log = NodeLog(
@@ -143,9 +145,11 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
         stack.callback(signal.signal, signal.SIGUSR1, signal.signal(signal.SIGUSR1, node.leave_soon))
         stack.enter_context(runtime.signals(node.reload))
         if config.sandbox:
-            recordings = () if config.record is None else (config.record.path.parent,)
             again = watched_folders(config.identity, config.domain)
-            confine_proxy((*again, config.delegations), recordings, has_ros=bool(config.ros))
+            kept = (None if config.record is None else config.record.path.parent, config.state)
+            written = [folder for folder in kept if folder is not None]
+            confine_proxy((*again, config.delegations), written, has_ros=bool(config.ros))
+        revocations.start(runtime)
         if config.metrics is not None:
             from gdp.telemetry.metrics import Metrics
 

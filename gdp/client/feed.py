@@ -45,6 +45,7 @@ from gdp.message.move import Move
 from gdp.message.report import Missing, Report, ReportFlag
 from gdp.message.status import Start, Status
 from gdp.names import Name
+from gdp.trust.claim import Claim
 
 __all__ = ["Delivered", "Ended", "Feed", "FeedState", "Reader"]
 
@@ -122,7 +123,7 @@ class Feed:
         self._unreported_bytes = 0
         self._clean_bytes = 0  # reported since something was last missing
         self.idle_s = REPORT_IDLE_S  # it reports at least so often
-        self.claim = b""  # of the publisher, the newest
+        self.claim: Claim | None = None  # of the publisher, the newest
         self.claim_sequence = 0
         self.losses = Losses()
         self.delivered = 0

@@ -430,8 +430,14 @@ class Member:
 
     def _revoke(self, statement: Statement, now: Instant) -> None:
         """Open nothing more of a publisher whose claim rests on what was taken back."""
-        if self._verifier.revoke(statement.wire, now.unix_s) is not None:
-            self._close(self._subscriptions.recheck(now.unix_s))
+        revocation = self.attachment.take_revocation(statement, now, self._holds)
+        if revocation is not None:
+            self._close(self._subscriptions.recheck(revocation.fingerprint, now.unix_s))
+
+    def _holds(self, issuer_key: bytes) -> bool:
+        """Return whether a certificate of this key is held here: our own delegations', or of whom we hear."""
+        is_own = any(issuer_key == claimed.subject.owner_key for claimed in self.attachment.claims)
+        return is_own or self._subscriptions.has_issuer(issuer_key)
 
     def _close(self, feeds: list[Feed], *, goodbye: bool = True) -> None:
         """Say goodbye to whom these feeds are of, unless told otherwise; a party that goes is told nothing more."""

@@ -569,6 +569,19 @@ class Greeter:
             port.answer(received_bytes, now_s)
         raise StatementError(DropReason.IN_USE, "an older node with this identity is alive")
 
+    def recheck(self, fingerprint: bytes, now: Instant) -> None:
+        """Have ``expire`` let neighbours go whose membership, of this fingerprint, was revoked."""
+        for port in self.ports.values():
+            for neighbour in port.neighbours.values():
+                member = neighbour.member
+                if member is None or member.fingerprint != fingerprint:
+                    continue
+                try:
+                    self._policy.check_member(member, now.unix_s)
+                except StatementError:
+                    self._next_s = None
+                    neighbour.heard_s = float("-inf")
+
     def let_go(self, neighbour: Neighbour, now_s: float) -> None:
         """Have ``expire`` let a neighbour go, for an older node with its identity is alive."""
         self._next_s = None
@@ -646,7 +659,7 @@ class Greeter:
 
     def expire(self, now_s: float) -> list[Change]:
         """Let silent neighbours go; return them. What waits at the sockets must have been taken before."""
-        if now_s > self._due_s + _LATE_S:
+        if float("-inf") < self._due_s < now_s - _LATE_S:  # who is let go is due at once: nobody is late
             self._lateness_s += now_s - self._due_s
             self._slowness.late(now_s - self._due_s, now_s)
         self._due_s, self._next_s = float("inf"), None

@@ -40,6 +40,7 @@ class Kind(IntEnum):
     REDIRECT = 0x89  # to the neighbour whose frames came here: where the node is now
     WHERE = 0x8A  # to the neighbour whose frame came here, while no RIB answers: where is that node?
     COOKIE = 0x8B  # to whoever said hello: too many do, show this before your signature is verified; no statement
+    REVOKED = 0x8C  # between neighbours: which revocations each keeps, and those that the other lacks
 
 
 class Flag(IntFlag):

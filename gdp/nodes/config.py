@@ -103,6 +103,7 @@ class SwitchConfig(Section):
     data_plane: DataPlane = "auto"
     table_max: int = Field(default=ENTRIES_DEFAULT, ge=1, le=TABLE_MAX)
     revocations: Directory | None = None
+    state: Directory | None = None
     metrics: Metrics | None = None
     audit: NewFile | None = None
     token_folders: Annotated[tuple[Directory, ...], Unique] = ()
@@ -218,6 +219,7 @@ class RibConfig(Section):
     lease_s: LeaseSeconds = CLAIM_LEASE_S
     store: Literal["memory"] | SharedStore = "memory"
     snapshot: NewFile | None = None
+    state: Directory | None = None
     quotas: Quotas = Quotas()
     metrics: Metrics | None = None
     audit: NewFile | None = None

@@ -20,6 +20,7 @@ from gdp.nodes.counts import count_list
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
+from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rib_upkeep import MemoryUpkeep, Upkeep
 from gdp.nodes.rights import confine_rib
 from gdp.nodes.runtime import Runtime, now
@@ -59,6 +60,7 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
             if folder is not None:
                 AuditLog(folder)  # makes it
             confine_rib(config)  # before the thread that keeps copies; the device can still be opened
+        revocations = load_revocations(config.state, policy.revoked, stack)
         upkeep = _upkeep(config, policy)
         stack.callback(upkeep.close)
         rib = Rib(identity, policy, upkeep.store, settings)
@@ -67,6 +69,7 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
         plane = stack.enter_context(open_uplink(config.iface))
         runtime = Runtime(host, plane)
         runtime.every(upkeep.every_s, upkeep.work)
+        revocations.start(runtime)
         keep_audit(config.audit, policy.audit, host.drops, runtime, stack)
         node_log = NodeLog(
             host.attachment.greeter,

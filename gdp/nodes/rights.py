@@ -44,7 +44,8 @@ def confine_switch(config: SwitchConfig, plane: str) -> None:
     """
     again = watched_folders(config.identity, config.domain)
     again += () if config.revocations is None else (config.revocations,)
-    kept = (*_audits(config.audit), *config.token_folders)
+    state = () if config.state is None else (config.state,)
+    kept = (*state, *_audits(config.audit), *config.token_folders)
     is_kernel = plane == "kernel"
     _confine(
         Needs(
@@ -62,7 +63,8 @@ def confine_rib(config: RibConfig) -> None:
     is_shared = config.store != "memory"
     again = watched_folders(config.identity, config.domain)
     secrets = () if config.store == "memory" else _files_of(config.store.cluster)
-    snapshots = () if config.snapshot is None else (config.snapshot.parent,)
+    folders = (None if config.snapshot is None else config.snapshot.parent, config.state)
+    snapshots = tuple(folder for folder in folders if folder is not None)
     kept = (*snapshots, *_audits(config.audit), *config.token_folders)
     ports = () if config.metrics is None else (config.metrics.port,)
     _confine(
@@ -80,13 +82,13 @@ def confine_proxy(reads: Iterable[Path], writes: Iterable[Path], *, has_ros: boo
 
     Args:
         reads: what it reads again on SIGHUP.
-        writes: folders of its recording.
+        writes: folders of its recording and of its state.
         has_ros: whether it takes part in a graph. ROS middleware writes logs and shared memory, which it shares with
             nodes of other users: CAP_DAC_OVERRIDE is kept for that.
     """
-    recordings = tuple(writes)
-    changed = [*_CHANGED, lock_directory(), Path(tempfile.gettempdir()), *recordings]
-    kept = _DEVICE | _past_owners(reads, recordings)
+    written = tuple(writes)
+    changed = [*_CHANGED, lock_directory(), Path(tempfile.gettempdir()), *written]
+    kept = _DEVICE | _past_owners(reads, written)
     if has_ros:
         changed += _ros_folders()
         kept |= {Capability.DAC_OVERRIDE}

@@ -22,6 +22,7 @@ from gdp.nodes.data_plane import Chosen, choose_plane
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.pairs import attach_pairs, switch_end
+from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rights import confine_switch
 from gdp.nodes.runtime import Runtime, now
 from gdp.nodes.single_instance import own_devices, run_alone
@@ -72,6 +73,7 @@ def run_switch(
     switch = Switch(identity, policy, table, settings)
     with contextlib.ExitStack() as stack:
         stack.enter_context(run_alone("switch", identity.name))
+        revocations = load_revocations(config.state, policy.revoked, stack)
         stack.enter_context(own_devices(ifaces))
         stack.enter_context(attach_pairs(config.attach, identity.name, _widest(ifaces)))
         wanted = [port.iface for port in config.ports if not port.optional]
@@ -111,6 +113,7 @@ def run_switch(
         keep_audit(config.audit, policy.audit, switch.drops, runtime, stack)
         if config.sandbox:
             confine_switch(config, chosen.name)
+        revocations.start(runtime)
         if config.metrics is not None:
             from gdp.telemetry.metrics import Metrics
 

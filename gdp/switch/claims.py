@@ -17,6 +17,7 @@ from gdp.frame.kinds import Kind
 from gdp.limits import WITHDRAWAL_MAX_BYTES
 from gdp.names import ZERO, Name
 from gdp.switch.attached import Attached
+from gdp.switch.held import Held
 from gdp.switch.inquirer import Inquirer
 from gdp.switch.outbox import Outbox
 from gdp.switch.places import Places
@@ -44,6 +45,7 @@ class Claims:
         unicast: Unicast,
         inquirer: Inquirer,
         relocations: Relocations,
+        held: Held,
         outbox: Outbox,
     ) -> None:
         self._identity = identity
@@ -55,6 +57,7 @@ class Claims:
         self._unicast = unicast
         self._inquirer = inquirer
         self._relocations = relocations
+        self._held = held
         self._outbox = outbox
 
     def take(self, neighbour: Neighbour, statement: Statement, now: Instant) -> None:
@@ -83,6 +86,7 @@ class Claims:
             except StatementError as error:
                 self._refuse(neighbour, statement, error)
                 raise
+            self._held.note_claim(claim, at)
             if is_first:
                 self._places.want(claim.name, now.mono_s, watch=True)
             for place in self._places.of(claim.name, now.mono_s):
@@ -97,6 +101,7 @@ class Claims:
             except StatementError as error:
                 self._refuse(neighbour, statement, error)
                 raise
+            self._held.note_claim(claim, at)
             if known is None or (known.port, known.mac) != at:
                 self._audit.note(Action.ACCEPTED, "name", who=claim.node.to_text(), about=claim.name.to_text())
                 self._unicast.forget(claim.name)

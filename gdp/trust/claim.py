@@ -91,6 +91,12 @@ class Claim:
         return min(self.member.not_after_unix_s, self.rtcert.validity.not_after_unix_s, *links)
 
     @property
+    def issuers(self) -> frozenset[bytes]:
+        """Return the keys, 33 bytes each, that may revoke something of the evidence, the domain's root apart."""
+        given = [key for link in self.chain.links for key in (link.subject.owner_key, link.delegate_key)]
+        return frozenset((self.member.key.compressed, *given))
+
+    @property
     def fingerprints(self) -> frozenset[bytes]:
         """Return the fingerprints of all evidence: when one of them is revoked, ask the verifier to ``recheck``."""
         links = [link.fingerprint for link in self.chain.links]

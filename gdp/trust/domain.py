@@ -17,7 +17,7 @@ from gdp.errors import DropReason, LocalError, StatementError
 from gdp.names import Name
 from gdp.trust.audit import AuditTrail
 from gdp.trust.lru import Lru
-from gdp.trust.revocation import Revocations
+from gdp.trust.revocations import Revocations
 
 __all__ = ["MEMBERS_REMEMBERED", "Policy"]
 

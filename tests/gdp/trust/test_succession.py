@@ -8,7 +8,10 @@ from gdp.crypto.certificates import Membership, Role, Root
 from gdp.crypto.identity import NodeKeys
 from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
+from gdp.crypto.statements import parse
+from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
+from gdp.effects import Instant
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.limits import CLOCK_SKEW_S
 from gdp.trust.adcert import AdCertCache, Chain
@@ -91,6 +94,11 @@ def test_another_roots_successor_is_no_successor() -> None:
         SCHOOL.succeed(SCHOOL.key, DAY, RETIRES)
 
 
+def take_back(policy: Policy, key: SigningKey, signer: Subject, fingerprint: bytes) -> None:
+    wire = Revocation.make(key, signer, fingerprint, DAY.not_after_unix_s)
+    assert policy.revoked.take(parse(wire), b"a neighbour", Instant(0.0, NOW), lambda _: True) is not None
+
+
 def test_a_member_names_no_founder() -> None:
     """The URI of a successor counts in a root only: a member who had it could take a name of another key."""
     forged = NodeKeys.generate(Role.PROXY, "forged")
@@ -99,9 +107,9 @@ def test_a_member_names_no_founder() -> None:
 
 def test_a_successor_takes_back_what_its_predecessor_issued_and_not_the_other_way() -> None:
     policy = Policy(HEIR.root)
-    policy.revoked.add(Revocation(YOUNG.member.fingerprint, SCHOOL.root.signer, DAY.not_after_unix_s), NOW)
+    take_back(policy, SCHOOL.key, SCHOOL.root.signer, YOUNG.member.fingerprint)
     policy.verify_membership(YOUNG.membership, NOW)
-    policy.revoked.add(Revocation(ROBOT.member.fingerprint, HEIR.root.signer, DAY.not_after_unix_s), NOW)
+    take_back(policy, HEIR.key, HEIR.root.signer, ROBOT.member.fingerprint)
     assert refusal(policy, ROBOT.membership) is DropReason.REVOKED
 
 
@@ -175,7 +183,7 @@ def test_a_successor_takes_back_what_it_gave() -> None:
     chain = Chain.walk(given.chain, CAMERA, ROBOT.subject, AdCertCache(4))
     policy = Policy(SCHOOL.root)
     assert successor.signer == successor_subject(successor.key.public)
-    policy.revoked.add(Revocation(chain.links[-1].fingerprint, successor.signer, DAY.not_after_unix_s), NOW)
+    take_back(policy, successor.key, successor.signer, chain.links[-1].fingerprint)
     with pytest.raises(StatementError) as caught:
         chain.check(Right.PUBLISH, NOW, policy.revoked)
     assert caught.value.reason is DropReason.REVOKED
