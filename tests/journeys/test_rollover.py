@@ -17,8 +17,11 @@ from gdp.trust.owner import Owner
 from gdp.trust.right import Right
 from tests.journeys.flows import ROBOT, SERVER, Flow, flowing, ring
 
-LASTS_S = 60  # of a short membership
-MESSAGES = 300  # one a second: past the ends of five memberships
+LASTS_S = 30  # of a short membership, clocks' differences included
+RENEWED_S = 20
+MESSAGES = 100  # one a second: past the ends of three memberships
+RETIRES_S = 50  # of the old root, clocks' differences included
+SKEW_S = int(CLOCK_SKEW_S)
 
 
 def unix_s(world: World) -> int:
@@ -29,7 +32,7 @@ def renew_all(world: World, lasts_s: int) -> None:
     """Issue every membership anew, by the present root of its domain."""
     for identity in world.identities.values():
         authority = next(each for each in world.authorities.values() if each.root.domain == identity.member.domain)
-        validity = Validity(unix_s(world), unix_s(world) + lasts_s)
+        validity = Validity(unix_s(world) - 2 * SKEW_S, unix_s(world) + lasts_s - SKEW_S)
         identity.renew(authority.renew(identity.member, validity), authority.root)
 
 
@@ -48,8 +51,8 @@ def test_memberships_that_are_renewed_in_time_cost_no_message() -> None:
     flow = flowing(ring())
     renew_all(flow.world, LASTS_S)
     stream(flow)
-    for again in range(1, MESSAGES // 40 + 1):
-        flow.world.network.call(again * 40.0, lambda: renew_all(flow.world, LASTS_S))
+    for again in range(1, MESSAGES // RENEWED_S + 1):
+        flow.world.network.call(again * float(RENEWED_S), lambda: renew_all(flow.world, LASTS_S))
     assert flow.world.network.run(MESSAGES + 30, lambda: flow.has(SERVER, MESSAGES))
     assert flow.numbers(SERVER) == list(range(MESSAGES))
 
@@ -61,14 +64,14 @@ def test_without_renewal_the_same_flow_ends() -> None:
     stream(flow)
     assert not flow.world.network.run(MESSAGES + 30, lambda: flow.has(SERVER, MESSAGES))
     flow.collect()
-    assert LASTS_S <= len(flow.numbers(SERVER)) <= LASTS_S + CLOCK_SKEW_S + 30
+    assert LASTS_S - 2 <= len(flow.numbers(SERVER)) <= LASTS_S + 30
 
 
 @pytest.mark.momentary("a root ends here, and with it whatever rests on it")
 def test_a_domains_root_rolls_over_without_a_lost_message() -> None:
     flow = flowing(ring())
     world, network = flow.world, flow.world.network
-    retires = unix_s(world) + 60
+    retires = unix_s(world) + RETIRES_S - SKEW_S
     heirs = {
         label: authority.succeed(SigningKey.generate(), world.validity, retires)
         for label, authority in world.authorities.items()
@@ -80,13 +83,13 @@ def test_a_domains_root_rolls_over_without_a_lost_message() -> None:
     roots = {each.root.domain: each.root for each in heirs.values()}
     for index, policy in enumerate(policies(world)):  # one node after the other
         network.call(1.0 + index, partial(policy.renew_roots, [roots[domain] for domain in policy.roots]))
-    network.call(30.0, finish)
+    network.call(20.0, finish)
     for index, identity in enumerate(world.identities.values()):
         authority = next(each for each in heirs.values() if each.root.domain == identity.member.domain)
         member = authority.renew(identity.member, world.validity)
-        network.call(31.0 + index, partial(identity.renew, member, authority.root))
-    stream(flow)  # until the old root has been dead for two minutes, clocks' differences included
-    assert MESSAGES > 60 + CLOCK_SKEW_S + 100
+        network.call(21.0 + index, partial(identity.renew, member, authority.root))
+    assert 21 + len(world.identities) < RETIRES_S < MESSAGES - 30
+    stream(flow)
     assert network.run(MESSAGES + 30, lambda: flow.has(SERVER, MESSAGES))
     assert flow.numbers(SERVER) == list(range(MESSAGES))
 
@@ -96,7 +99,7 @@ def test_who_was_not_renewed_is_out_when_the_old_root_retires() -> None:
     flow = flowing(ring())
     world, network = flow.world, flow.world.network
     heirs = {
-        label: authority.succeed(SigningKey.generate(), world.validity, unix_s(world) + 60)
+        label: authority.succeed(SigningKey.generate(), world.validity, unix_s(world) + RETIRES_S - SKEW_S)
         for label, authority in world.authorities.items()
     }
     roots = {each.root.domain: each.root for each in heirs.values()}

@@ -44,7 +44,7 @@ from gdp.trust.verifier import ClaimVerifier
 
 NOW = 1_800_000_000.0
 CAMERA = Metadata({"kind": "topic", "name": "/camera/image"})
-PRIVATE = {"root.key", "owner.key", "master.key", "node.key", "kem.key", "issued.jsonl"}
+PRIVATE = {"root.key", "owner.key", "master.key", "node.key", "kem.key", "issued.jsonl", "audit.jsonl"}
 
 
 @pytest.fixture
