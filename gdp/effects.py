@@ -6,7 +6,7 @@ frames to send and the moment at which it wants to be called again.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple, Protocol
 
 __all__ = ["BROADCAST", "Arrival", "Instant", "Machine", "Transmit"]
@@ -64,6 +64,9 @@ class Machine(Protocol):
 
     def next_timeout(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
+
+    def take_neighbours(self) -> Mapping[int, frozenset[bytes]]:
+        """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
 
     def take(self) -> list[Transmit]:
         """Return, once, what is to be sent; more may come at the next call, until nothing does."""

@@ -8,8 +8,10 @@ count it, carry on), a ``ConfigError`` names the place in the file, a ``StoreErr
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import Final
 
 __all__ = [
+    "DROP_COUNTERS",
     "ConfigError",
     "DropReason",
     "EnvelopeError",
@@ -73,11 +75,18 @@ class DropReason(IntEnum):
     INTERNAL = 37  # it drew an error of this program's own
     QUARANTINED = 38  # from a sender whose statements drew such errors
     MISPLACED = 39  # no proof that a node is attached where this says
+    NO_CHANNEL = 40  # what must come in a channel came outside, or in one that is not known
+    WRONG_SIDE = 41  # a topic's frame from a port on the way to which its publisher is not
+    RATE_LIMITED = 42  # more hellos than are verified
+    COOKIE_REQUIRED = 43  # a stranger's hello under load, without proof that it receives at its address
 
     @property
     def label(self) -> str:
         """Return the word used in metrics and traces, such as ``bad-tag``."""
         return self.name.lower().replace("_", "-")
+
+
+DROP_COUNTERS: Final = max(DropReason) + 1  # length of a list of counters, of which each stands at its reason
 
 
 class GdpError(Exception):

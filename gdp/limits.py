@@ -11,6 +11,8 @@ from typing import Final
 HOPS_MAX: Final = 64  # hops left at the source
 FRAME_MAX_BYTES: Final = 65_535  # largest Ethernet frame any port may carry, header included
 MTU_MIN_BYTES: Final = 576  # a link below this is refused: a signed hello would no longer fit in a few parts
+MTU_NARROWINGS: Final = 4  # times that a publisher's path may become narrower, which has what is kept sealed anew
+MTU_HOLD_S: Final = 10.0  # ... and once more after so long
 
 # Messages
 MESSAGE_MAX_BYTES: Final = 24 << 20  # serialised message, before sealing; it must fit, in parts, into JOIN_SOURCE_BYTES
@@ -42,6 +44,7 @@ READER_GRACE_S: Final = 60.0  # ... but what it lacks is kept for it for this lo
 CALL_LAG_S: Final = 1.0  # ... or of requests, that has not confirmed in this time what another server has
 CALL_IDLE_S: Final = 0.5  # a live server reports at least this often to its clients
 CALL_QUIET_S: Final = 2.0  # a server that does not report for this long is no peer meanwhile
+EPOCH_GRACE_S: Final = 10.0  # after a new epoch began, readers of before it are heard under the one before
 NACKS_PER_REPORT: Final = 24  # ranges: a report, sealed and alone in its frame, fits the smallest link there may be
 
 # Control plane
@@ -49,6 +52,7 @@ CONTROL_MAX_BYTES: Final = 16 << 10  # one statement with its evidence
 CLAIM_MAX_BYTES: Final = 9 << 10  # with its evidence: a relay, an answer or a join around it must fit one statement
 WITHDRAWAL_MAX_BYTES: Final = 1 << 10
 SEQUENCE_AHEAD_S: Final = 366 * 86_400.0  # sequence numbers are wall-clock milliseconds, at most so far ahead
+RECORD_OVERHEAD_BYTES: Final = 33  # what a channel puts around a statement: head and tag
 CONTROL_PARTS_MAX: Final = 64
 CONTROL_JOIN_BYTES: Final = 1 << 20  # reassembly of control messages, per node
 CONTROL_JOIN_SOURCE_BYTES: Final = 64 << 10
@@ -56,7 +60,8 @@ CONTROL_PATIENCE_S: Final = 2.0
 CBOR_DEPTH_MAX: Final = 16
 CHAIN_MAX: Final = 4  # delegations between an owner's key and a node
 CLOCK_EARLY_S: Final = 3_600.0  # so long before it begins a certificate is believed
-CLOCK_SKEW_S: Final = 120.0
+CLOCK_SKEW_S: Final = 3_600.0  # so long after it has ended
+CLOCKS_APART_S: Final = 7_200.0  # two clocks, each an hour off at most
 
 # Leases
 LEASE_MIN_S: Final = 1.0
@@ -72,6 +77,7 @@ KEEPALIVE_MS: Final = 70  # between keepalives to a neighbour that is up
 DETECT_MULTIPLIER: Final = 3  # of which it is gone
 LINK_STATE_REFRESH_S: Final = 30.0
 LINK_STATE_LEASE_S: Final = 100.0
+LINK_STATE_AGE_MAX_S: Final = CLOCKS_APART_S + LINK_STATE_LEASE_S  # by two clocks
 JOIN_REFRESH_S: Final = 2.0
 JOIN_LEASE_S: Final = 7.0
 
@@ -82,5 +88,14 @@ TABLE_MAX: Final = 1 << 20
 PARKED_FRAMES_MAX: Final = 2_048
 PARKED_BYTES_MAX: Final = 4 << 20
 PARKED_S: Final = 1.5
+ATTACHED_MAX: Final = 16_384  # claims of the nodes attached to a switch, some 3 KiB each
+READERS_MAX: Final = 16_384  # claims of the readers attached to a switch
+TREES_MAX: Final = 65_536  # branches of a switch's trees, some 4 KiB each
+JOINS_PER_S: Final = 2_000.0  # of one neighbouring switch; each is verified
+JOINS_BURST: Final = 16_384.0
+QUESTIONS_PER_S: Final = 16.0  # new names that an attached node may have a RIB asked for
+QUESTIONS_BURST: Final = 256.0
+SWITCH_QUESTIONS_PER_S: Final = 256.0  # ... or a neighbouring switch
+SWITCH_QUESTIONS_BURST: Final = 2_048.0
 RIB_NAMES_PER_SENDER: Final = 200_000
 RIB_WATCHES_MAX: Final = 500_000

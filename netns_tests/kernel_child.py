@@ -1,4 +1,4 @@
-"""A kernel plane in a process of its own, for tests that end it badly; it names its program and polls until killed.
+"""A kernel plane in a process of its own, for tests that end it badly; it names its programs and polls until killed.
 
 python -m netns_tests.kernel_child link|filter p0 p1 ...
 """
@@ -16,6 +16,6 @@ if __name__ == "__main__":
     table = Table()
     table.install_many(ENTRIES.items(), float("inf"))
     plane = KernelPlane(sys.argv[2:], table, clsact=sys.argv[1] == "filter")
-    print(program_id(plane._loaded.program), flush=True)
+    print(*(program_id(plane._loaded.program_of(port)) for port in plane.ports), flush=True)
     while True:
         plane.poll(None)

@@ -54,13 +54,13 @@ def ports(space: Space) -> list[str]:
 
 
 @contextlib.contextmanager
-def running(mode: str, ports: list[str]) -> Iterator[tuple[subprocess.Popen[str], int]]:
+def running(mode: str, ports: list[str]) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
     """A process with a kernel plane, and its program; killed at the end, whatever happens."""
     argv = [sys.executable, "-m", "netns_tests.kernel_child", mode, *ports]
     with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, env=WHERE, cwd=PROJECT) as child:
         try:
             assert child.stdout is not None
-            yield child, int(child.stdout.readline())
+            yield child, [int(each) for each in child.stdout.readline().split()]
         finally:
             child.kill()
 
@@ -120,23 +120,24 @@ def test_opening_and_closing_again_and_again_leaves_nothing(ports: list[str], cl
     descriptors = os.listdir("/proc/self/fd")
     for _ in range(3):
         plane = KernelPlane(ports, table(), clsact=clsact)
-        mine = program_id(plane._loaded.program)
-        assert loaded()[mine] == PROGRAM
-        assert links_of(mine) == (0 if clsact else len(ports))
+        mine = [program_id(plane._loaded.program_of(port)) for port in range(len(ports))]
+        names = loaded()
+        assert {names[each] for each in mine} == {PROGRAM}
+        assert list(map(links_of, mine)) == [0 if clsact else 1] * len(ports)
         plane.close()
-        assert gone(mine)
-        assert links_of(mine) == 0
+        assert all(map(gone, mine))
+        assert list(map(links_of, mine)) == [0] * len(ports)
     assert len(os.listdir("/proc/self/fd")) == len(descriptors)
     assert not any(map(has_clsact, ports))
 
 
 def test_a_killed_switch_leaves_no_program_and_no_link(ports: list[str]) -> None:
     with running("link", ports) as (child, mine):
-        assert links_of(mine) == len(ports)
+        assert list(map(links_of, mine)) == [1] * len(ports)
         assert crosses(PATIENCE_S)
         child.send_signal(signal.SIGKILL)
         child.wait()
-    assert gone(mine)
+    assert all(map(gone, mine))
     assert not crosses(0.1)
     assert attached(socket.if_nametoindex(ports[0]), TCX_INGRESS) == []
 
@@ -151,7 +152,7 @@ def test_the_filter_of_a_killed_switch_forwards_no_more_and_the_next_run_replace
     while crosses(0.1):  # until its lease ends
         assert time.monotonic() < deadline_s
     plane = KernelPlane(ports, table(), clsact=True)
-    assert gone(mine)
+    assert all(map(gone, mine))
     assert [name.split(":")[1] for name in filters(ports[0])] == [str(os.getpid())]
     assert crosses(PATIENCE_S)
     plane.close()

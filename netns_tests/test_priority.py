@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import socket
+import time
 from collections.abc import Callable, Iterator
 
 import pytest
 from pyroute2 import IPRoute
 
 from gdp.effects import Arrival
-from gdp.errors import LocalError
+from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import ETHER_BYTES, FLAGS_AT, decode
 from gdp.frame.kinds import Flag, Kind
 from gdp.ports.raw import RawPlane
@@ -118,11 +119,44 @@ def reader(space: Space) -> Iterator[RawPlane]:
     plane.close()
 
 
+def hello_frame(number: int = 0, source: bytes = b"") -> bytes:
+    hello = frame(bytes(32), number=number)
+    hello = hello[: ETHER_BYTES + 1] + bytes([Kind.HELLO]) + hello[ETHER_BYTES + 2 :]
+    return hello[:6] + source + hello[6 + len(source) :]
+
+
+def test_a41_a_neighbours_hello_is_not_lost_in_a_flood_of_strangers(reader: RawPlane) -> None:
+    reader.set_neighbours(0, {hello_frame()[6:12]})
+    with far_end("q0") as sender:
+        for number in range(5_000):
+            sender.send(hello_frame(number, b"\x06" + number.to_bytes(5, "big")))
+        sender.send(hello_frame(9_999))
+    got = poll_until(reader, lambda: reader.counters.handed_up > 0)
+    assert decode(got[0].frame).number == 9_999
+    begun_s = now_s = time.monotonic()
+    while now_s < begun_s + 0.3:
+        got += reader.poll(0.05)
+        now_s = time.monotonic()
+    assert len(got) <= 1 + 128 + 64 + 500 * (now_s - begun_s + 0.1)
+    assert reader.counters.drops[DropReason.PORT_FULL] > 4_000
+
+
+def test_a_neighbour_that_has_gone_is_a_stranger_again_for_the_plane(reader: RawPlane) -> None:
+    own = hello_frame()[6:12]
+    for known in ({own}, set(), {own, bytes(6)}, {bytes(6)}):
+        reader.set_neighbours(0, known)
+        with far_end("q0") as sender:
+            sender.send(hello_frame(7))
+        had = reader.counters.handed_up
+        got = poll_until(reader, lambda had=had: reader.counters.handed_up > had)  # type: ignore[misc]
+        assert [decode(each.frame).number for each in got] == [7]
+
+
 def test_a_reader_that_did_not_read_for_a_while_gets_first_what_neighbours_say_then_what_is_urgent(
     reader: RawPlane,
 ) -> None:
-    hello = frame(bytes(32))
-    hello = hello[: ETHER_BYTES + 1] + bytes([Kind.HELLO]) + hello[ETHER_BYTES + 2 :]
+    hello = hello_frame()
+    reader.set_neighbours(0, {hello[6:12]})
     with far_end("q0") as sender:
         for number in range(ORDINARY):
             sender.send(frame(number=number))

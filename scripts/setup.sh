@@ -14,7 +14,7 @@ cd "$root"
 venv=$root/.venv
 extras=""
 lock=run  # of requirements/
-dev="[dev,bench,cluster,dds,ros2,aws,skypilot,experiments]"
+dev="[dev,bench,cluster,dds,ros2,aws,skypilot,experiments,pkcs11]"
 case "${1:-}" in
     --dev) extras=$dev lock=dev ;;
     --ros2) extras="[ros2]" lock=ros2 ;;
@@ -91,6 +91,7 @@ if [[ "$extras" == "$dev" ]]; then
         if [[ -d /run/systemd/system && ! -e "$mask" ]]; then ln -s /dev/null "$mask"; fi
         RUNLEVEL=1 package redis-server "tests of RIBs that share a cluster start it"
     fi
+    command -v softhsm2-util >/dev/null || package softhsm2 "tests keep keys in its tokens"
     command -v openssl >/dev/null || package openssl "tests read our certificates with it"
 fi
 

@@ -17,6 +17,7 @@ __all__ = [
     "Directory",
     "Force",
     "Json",
+    "KeyUri",
     "Kind",
     "Label",
     "Maintainer",
@@ -24,6 +25,7 @@ __all__ = [
     "Name",
     "Out",
     "Pin",
+    "Protect",
     "Type",
 ]
 
@@ -43,3 +45,8 @@ Days = Annotated[float, typer.Option("--days", min=0.001, help="how long it is v
 Label = Annotated[str, typer.Option("--label", help="its name for people")]
 Directory = Annotated[Path, typer.Argument(metavar="DIR", help="where its files are, or are made")]
 Out = Annotated[Optional[Path], typer.Option("--out", "-o", metavar="FILE", help="write it to this file")]  # noqa: UP045
+Protect = Annotated[bool, typer.Option("--protect", help="put private keys under a passphrase; see gdp key --help")]
+KeyUri = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--key", metavar="URI", help="the signing key is in a token: pkcs11:... (RFC 7512)"),
+]

@@ -49,7 +49,7 @@ _IN_USE_S: Final = 2.0  # ... and after so long this seldom
 _RTCERT_S: Final = 7_200
 _RTCERT_RENEW_S: Final = 1_800  # so that it holds at clocks that are an hour ahead, too
 _RTCERTS_MAX: Final = 32
-_RTCERT_BEFORE_S: Final = 900  # it is dated back by so much, for clocks that lag
+_RTCERT_BEFORE_S: Final = 4_500  # it is dated back by so much: CLOCK_EARLY_S is for one clock, this is for the other
 
 
 @dataclass(slots=True)
@@ -72,14 +72,20 @@ class Claimed:
 
 
 class Attachment:
-    """One node's hold on the overlay."""
+    """One node's hold on the overlay.
 
-    def __init__(self, identity: Identity, policy: Policy, settings: NodeSettings) -> None:
+    Args:
+        exchange: X25519 key of this life, for notes to what it claims to publish, serve or call; empty: it takes none.
+    """
+
+    def __init__(self, identity: Identity, policy: Policy, settings: NodeSettings, exchange: bytes = b"") -> None:
         self._identity = identity
+        self._exchange = exchange
         self._policy = policy
         self._incarnation = settings.incarnation
         self._lease_s = settings.lease_s
         self._sequence = settings.first_sequence
+        self.started = settings.first_sequence  # above what earlier lives said here, as far as is known
         self.splitter = ControlSplitter(identity.name, settings.incarnation)
         self.joiner = ControlJoiner()
         is_rib = identity.member.role is Role.RIB
@@ -127,6 +133,11 @@ class Attachment:
         return list(self._claims.values())
 
     @property
+    def drops(self) -> Counter[DropReason]:
+        """Return which unfinished statements were given up."""
+        return self.joiner.drops + self.greeter.drops
+
+    @property
     def mtu(self) -> int:
         """Return the MTU of the port to the switch, in bytes after the Ethernet header."""
         assert self._switch is not None
@@ -170,7 +181,16 @@ class Attachment:
         if header.kind == Kind.KEEPALIVE:
             self.greeter.receive_keepalive(arrival, header, now)
             return None
-        wire = self.joiner.add(header, arrival.frame, now.mono_s, arrival.via)
+        if header.kind == Kind.COOKIE:
+            self.greeter.receive_cookie(arrival, header)
+            return None
+        switch = self._switch
+        if header.kind == Kind.HELLO:
+            wire = self.greeter.join(arrival, header, now.mono_s)
+        elif switch is None or (arrival.port, arrival.mac) != (switch.port, switch.mac):
+            raise FrameError(DropReason.UNKNOWN_SENDER, "not our switch")
+        else:
+            wire = self.joiner.add(header, arrival.frame, now.mono_s, arrival.via)
         if wire is None:
             return None
         statement = parse(wire)
@@ -178,15 +198,13 @@ class Attachment:
             if self.greeter.receive(arrival, statement, now) is not None:
                 self._choose_switch(now.mono_s)
             return None
-        switch = self._switch
-        if switch is None or (arrival.port, arrival.mac) != (switch.port, switch.mac):
-            raise FrameError(DropReason.UNKNOWN_SENDER, "not our switch")
+        assert switch is not None  # seen above
         if header.kind == Kind.VERDICT:
             return self._take_verdict(statement, switch, now)
         if header.kind in (Kind.JOIN, Kind.LEAVE):
             join = Join.from_fields(statement.expect(StatementType.JOIN))
             statement.verify(switch.key)
-            self.greeter.ports[switch.port].take_join(join, switch.name)
+            self.greeter.ports[switch.port].take_join(join, switch)
             self._note_newest(join)
             return statement
         if header.kind == Kind.REVOKE:
@@ -259,6 +277,7 @@ class Attachment:
             is_global=each.is_global,
             chain=each.chain,
             previous=self._former if now.mono_s - self._moved_s < _MOVED_S else ZERO,
+            exchange=self._exchange if each.right in HEARS.values() else b"",
         )
 
     def _rtcert_for(self, switch: Name) -> bytes:
@@ -322,7 +341,7 @@ class Attachment:
         self.refusals[verdict.refused] += 1
         each.is_taken = False
         if verdict.refused is DropReason.STALE:
-            self._sequence = max(self._sequence, verdict.sequence)
+            self._sequence = self.started = max(self._sequence, verdict.sequence)
             each.claim_at_s = now_s  # an earlier life of ours was ahead: try again above it
         elif verdict.refused is DropReason.IN_USE and each.right is Right.ATTACH:
             if each.refused is not verdict.refused:

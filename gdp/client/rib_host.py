@@ -10,10 +10,11 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from gdp.client.attachment import Attachment
+from gdp.control.channel import Channels
 from gdp.control.frames import ControlJoiner
 from gdp.control.settings import NodeSettings
 from gdp.crypto.identity import Identity
-from gdp.crypto.statements import StatementType
+from gdp.crypto.statements import StatementType, parse
 from gdp.effects import Arrival, Instant, Transmit
 from gdp.errors import DropReason, FrameError, RemoteError
 from gdp.frame.codec import decode
@@ -33,6 +34,8 @@ class RibHost:
         self._joiner = ControlJoiner()
         self._drops: Counter[DropReason] = Counter()
         self._is_connected = False
+        self._now_s = 0.0  # of the last call
+        self._channels = Channels(identity, policy, settings.random_bytes, accepts=True)
         self.attachment = Attachment(identity, policy, settings)
         self.rib = rib
 
@@ -43,7 +46,8 @@ class RibHost:
 
     def drops(self) -> Mapping[DropReason, int]:
         """Return what was dropped or refused, by reason."""
-        return self._drops + self._joiner.drops + self.attachment.joiner.drops + self.rib.refusals
+        own = self._drops + self._joiner.drops + self._channels.drops
+        return own + self.attachment.drops + self.rib.refusals
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Instant) -> None:
         """Begin to look for a switch on a port."""
@@ -51,6 +55,7 @@ class RibHost:
 
     def receive(self, arrivals: Sequence[Arrival], now: Instant) -> None:
         """Take frames in."""
+        self._now_s = now.mono_s
         statements: list[tuple[bytes, Name]] = []
         for arrival in arrivals:
             try:
@@ -70,16 +75,22 @@ class RibHost:
 
     def timeout(self, now: Instant) -> None:
         """Do what is due."""
+        self._now_s = now.mono_s
         self.attachment.timeout(now)
         self._note_connection(now)
         self._joiner.expire(now.mono_s)
         self.rib.timeout(now)
+        self._channels.timeout(now.mono_s)
         self._post()
 
     def next_timeout(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self.attachment.next_timeout(), self.rib.next_timeout()]
+        times = [self.attachment.next_timeout(), self.rib.next_timeout(), self._channels.next_timeout()]
         return min((time for time in times if time is not None), default=None)
+
+    def take_neighbours(self) -> Mapping[int, frozenset[bytes]]:
+        """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
+        return self.attachment.greeter.take_addresses()
 
     def take(self) -> list[Transmit]:
         """Return, once, what is to be sent."""
@@ -98,7 +109,15 @@ class RibHost:
         if header.kind not in (Kind.RIB_REQUEST, Kind.RIB_ANSWER):
             raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
         wire = self._joiner.add(header, arrival.frame, now.mono_s, arrival.via)
-        return [] if wire is None else [(wire, Name(header.source))]
+        if wire is None:
+            return []
+        sender = Name(header.source)
+        opened = self._channels.receive(wire, sender, now)
+        if opened is None:
+            return []
+        if not opened.is_fresh and parse(opened.wire).type is not StatementType.PRESENCE:
+            raise FrameError(DropReason.NO_CHANNEL, "a statement that may be a recorded one")
+        return [(opened.wire, sender)]
 
     def _note_connection(self, now: Instant) -> None:
         is_connected = self.attachment.switch is not None
@@ -111,5 +130,13 @@ class RibHost:
         if self.attachment.switch is None:
             return  # nobody to carry them: whoever asked will ask again
         for letter in letters:
-            frames = self.attachment.splitter.split(letter.kind, letter.statement, self.attachment.mtu, letter.to)
-            self.attachment.send(frames)
+            if letter.kind is Kind.RIB_REQUEST:
+                self._channels.ask(letter.to, letter.statement, self._now_s)
+            elif not self._channels.answer(letter.to, letter.statement):
+                self._send(letter.kind, letter.statement, letter.to)  # a question about presence, to any switch
+        for each in self._channels.take():
+            self._send(Kind.RIB_ANSWER if each.is_answer else Kind.RIB_REQUEST, each.wire, each.to)
+
+    def _send(self, kind: Kind, statement: bytes, to: Name) -> None:
+        attachment = self.attachment
+        attachment.send(attachment.splitter.split(kind, statement, attachment.mtu, to))

@@ -202,6 +202,7 @@ class Subscriptions:
         is_heard = HEARS[subscription.right] is claim.right
         if not is_heard or claim.name != answer.name or claim.node != answer.advertiser:
             raise StatementError(DropReason.WRONG_NAME, "a claim about something else")
+        self._reader.notes.shared(claim.exchange)  # or it is refused before anything changes
         if feed is not None:
             if claim.sequence <= feed.claim_sequence:
                 return change
@@ -239,8 +240,8 @@ class Subscriptions:
         else:
             subscription.forget_absent(party, LossReason.PUBLISHER_RESTARTED)
         feed = Feed(
-            topic.name, reader, party, claim.incarnation, claim.member.key, topic.secrets, self._budget, now_s, ended,
-            restarted=life != claim.incarnation,
+            topic.name, reader, party, claim.incarnation, claim.member.key, claim.exchange, topic.secrets, self._budget,
+            now_s, ended, restarted=life != claim.incarnation,
         )  # fmt: skip
         feed.claim_sequence, feed.claim = claim.sequence, claim.wire
         subscription.feeds[party] = feed

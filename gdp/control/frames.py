@@ -23,6 +23,7 @@ from gdp.limits import (
     CONTROL_PATIENCE_S,
     HOPS_MAX,
     MTU_MIN_BYTES,
+    RECORD_OVERHEAD_BYTES,
 )
 from gdp.message.memory import Budget
 from gdp.names import ZERO
@@ -56,7 +57,7 @@ class ControlSplitter:
         """
         room = (mtu if destination == ZERO else min(mtu, _FAR_MTU)) - HEADER_BYTES
         chunks = [statement[at : at + room] for at in range(0, len(statement), room)] or [b""]
-        if len(statement) > CONTROL_MAX_BYTES or len(chunks) > CONTROL_PARTS_MAX:
+        if len(statement) > CONTROL_MAX_BYTES + RECORD_OVERHEAD_BYTES or len(chunks) > CONTROL_PARTS_MAX:
             raise LocalError(f"a statement of {len(statement)} bytes is above the limit")
         self._number += 1
         header = Header(
@@ -123,7 +124,7 @@ class ControlJoiner:
             raise FrameError(DropReason.BAD_PARTS, "the number of parts changed")
         if header.part in waiting.chunks:
             raise FrameError(DropReason.DUPLICATE, "statement")
-        if waiting.held_bytes + len(payload) > CONTROL_MAX_BYTES + _COST_BYTES:
+        if waiting.held_bytes + len(payload) > CONTROL_MAX_BYTES + RECORD_OVERHEAD_BYTES + _COST_BYTES:
             self._drop(key)
             raise FrameError(DropReason.TOO_BIG, "statement")
         self._reserve(origin, len(payload))

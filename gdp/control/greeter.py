@@ -6,6 +6,10 @@ A hello is signed by a member of a trusted domain and carries its certificate. I
 nonce of our port's present session, and is newer than all that came of its own, so a recorded hello brings nobody up:
 of sessions that ended, too, the last sequence number is remembered.
 
+Whose signature is verified, and how often, ``admission.py`` decides. Who has not echoed our nonce is a candidate. Its
+place is apart from those of neighbours, and where none is left the oldest makes room. Candidates are answered
+with no more bytes than they have sent.
+
 Hellos also say what each end takes: a link is as wide as its narrowest end. Where an end changes, both know at once.
 
 Between neighbours that are up, keepalives (``keepalive.py``) take over from most hellos: a silent cut is noticed after
@@ -14,12 +18,32 @@ the negotiated detection time. Time in which this node itself was not called cou
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Final
 
-from gdp.control.frames import ControlSplitter
-from gdp.control.hello import DIGEST_BYTES, LIFE_BYTES, NO_KEEPALIVES, NONCE_BYTES, RTCERTS_MAX, Hello, Timing
+from gdp.control.admission import (
+    NEIGHBOUR_HELLOS,
+    Admission,
+    Cookies,
+    TokenBucket,
+    cookie_payload,
+    read_cookie,
+    seal_cookie,
+)
+from gdp.control.frames import ControlJoiner, ControlSplitter
+from gdp.control.hello import (
+    DIGEST_BYTES,
+    HELLO_MAX_BYTES,
+    LIFE_BYTES,
+    NO_KEEPALIVES,
+    NONCE_BYTES,
+    RTCERTS_MAX,
+    Hello,
+    Timing,
+)
 from gdp.control.join import Join
 from gdp.control.keepalive import KeepaliveSession, Slowness
 from gdp.control.neighbour import TRANSITIONS, Neighbour, NeighbourEvent, NeighbourState
@@ -32,7 +56,7 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType
 from gdp.effects import BROADCAST, Arrival, Instant, Transmit
 from gdp.errors import DropReason, FrameError, StatementError
-from gdp.frame.codec import Header
+from gdp.frame.codec import HEADER_BYTES, Header
 from gdp.frame.kinds import Kind
 from gdp.limits import DEAD_S, HELLO_IDLE, HELLO_S, MTU_MIN_BYTES
 from gdp.message.replay import ReplayWindow
@@ -42,8 +66,14 @@ from gdp.trust.rtcert import RtCertCache
 
 __all__ = ["Change", "Greeter", "LinkPort"]
 
-NEIGHBOURS_PER_PORT: Final = 32
+NEIGHBOURS_MAX: Final = 64  # on one port
+CANDIDATES_MAX: Final = 32  # on one port, who have not echoed our nonce; the one silent for longest makes room
+PADDED_BYTES: Final = 1_400  # of a hello with its header; what it draws from who does not know us is not longer
+_PARTS_MAX: Final = -(-HELLO_MAX_BYTES // (MTU_MIN_BYTES - HEADER_BYTES))
+_ADDRESSES_MAX: Final = 96  # of neighbours and former ones, whose frames the data plane keeps apart from strangers'
+_CREDIT_MAX_BYTES: Final = 16 << 10
 _UNHEARD: Final = (-1, -1)
+_NOTHING: Final[Mapping[int, frozenset[bytes]]] = MappingProxyType({})
 _RTCERTS_REMEMBERED: Final = 256
 _ENDED_MAX: Final = 1_024  # sessions of the far ends, remembered for one session of a port
 _JOINS_WINDOW: Final = 1_024  # how far joins may overtake each other
@@ -70,16 +100,21 @@ class LinkPort:
     cost: int
     nonce: bytes
     exchange_key: ExchangeKey
+    admission: Admission
     is_up: bool = True
     sequence: int = 0
     keepalive_sequence: int = 0
     eager: int = _EAGER_HELLOS  # hellos until they become rare
     hello_at_s: float = 0.0
+    answer_at_s: float = float("inf")  # of a hello to candidates, as far as ``credit_bytes`` go
+    credit_bytes: int = 0  # that came of them, and were not answered yet
+    owes_answer: bool = False  # for want of bytes
     said_s: float = float("-inf")
     neighbours: dict[Name, Neighbour] = field(default_factory=dict)
-    ended: dict[bytes, tuple[int, int]] = field(default_factory=dict)  # nonce to last hello and keepalive
-    joins: dict[Name, ReplayWindow] = field(default_factory=dict)  # which joins were taken in this session
+    ended: dict[tuple[Name, bytes], tuple[int, int]] = field(default_factory=dict)  # last numbers
+    joins: dict[bytes, ReplayWindow] = field(default_factory=dict)  # which were taken, by session of the far end
     said_mtus: dict[Name, int] = field(default_factory=dict)  # what each neighbour's end takes
+    addresses: dict[bytes, None] = field(default_factory=dict)  # of neighbours, former ones too; the last proven last
     strangers: Strangers = field(default_factory=Strangers)  # whose hellos were refused
 
     @property
@@ -96,41 +131,73 @@ class LinkPort:
     def last_of(self, name: Name, nonce: bytes) -> int:
         """Return the last sequence number that came of a neighbour's session, or -1."""
         known = self.neighbours.get(name)
-        return known.sequence if known is not None and known.nonce == nonce else self.ended.get(nonce, _UNHEARD)[0]
+        if known is not None and nonce in (known.nonce, known.candidate):
+            return known.sequence if known.nonce == nonce else known.candidate_sequence
+        return self.ended.get((name, nonce), _UNHEARD)[0]
 
     @property
     def is_idle(self) -> bool:
-        """Return whether all neighbours are up and hear us, and we them, by keepalives."""
-        sessions = [each.keepalives for each in self.neighbours.values()]
+        """Return whether all neighbours hear us, and we them, by keepalives; whoever else is heard does not count."""
+        sessions = [each.keepalives for each in self.neighbours.values() if each.is_proven]
         return bool(sessions) and all(each is not None and each.is_heard and each.hears_us for each in sessions)
 
     def hurry(self, at_s: float) -> None:
         """Say hello at ``at_s`` or before, and then often for a while: what it says has changed."""
         self.hello_at_s, self.eager = min(self.hello_at_s, at_s), _EAGER_HELLOS
 
+    def answer(self, received_bytes: int, now_s: float) -> None:
+        """Say hello soon to who has not proved itself, with at most as many bytes as came of such."""
+        self.credit_bytes = min(self.credit_bytes + received_bytes, _CREDIT_MAX_BYTES)
+        self.answer_at_s = min(self.answer_at_s, max(now_s, self.said_s + _ANSWER_S))
+
+    def note_address(self, mac: bytes) -> bool:
+        """Note that a neighbour has this address; return whether that is news."""
+        is_new = mac not in self.addresses
+        self.addresses.pop(mac, None)
+        self.addresses[mac] = None
+        if len(self.addresses) > _ADDRESSES_MAX:
+            del self.addresses[next(iter(self.addresses))]
+        return is_new
+
+    def candidates(self) -> list[Neighbour]:
+        """Return who was heard, and has not echoed our nonce."""
+        return [each for each in self.neighbours.values() if not each.is_proven]
+
+    def is_neighbour_at(self, mac: bytes) -> bool:
+        """Return whether a neighbour that is up has this address."""
+        return any(each.mac == mac and each.state is NeighbourState.UP for each in self.neighbours.values())
+
+    def heard(self) -> tuple[bytes, ...]:
+        """Return the nonces that a hello echoes: those of neighbours first, then of candidates, the newest first."""
+        proven = [each for each in self.neighbours.values() if each.is_proven]
+        others = sorted(self.candidates(), key=lambda each: each.heard_s, reverse=True)
+        restarts = [each.candidate for each in proven if each.candidate]
+        return *(each.nonce for each in proven), *(each.nonce for each in others), *restarts
+
     def end(self, neighbour: Neighbour) -> None:
-        """Remember how far a session came."""
-        if neighbour.nonce:
-            _, received = self.ended.pop(neighbour.nonce, _UNHEARD)
+        """Remember how far a session came that has proved itself; others cannot bring anybody up again."""
+        if neighbour.is_proven:
+            session = neighbour.name, neighbour.nonce  # a nonce alone could be said by another member, too
+            _, received = self.ended.pop(session, _UNHEARD)
             if neighbour.keepalives is not None:
                 received = neighbour.keepalives.received
-            self.ended[neighbour.nonce] = neighbour.sequence, received
+            self.ended[session] = neighbour.sequence, received
             if len(self.ended) > _ENDED_MAX:
                 del self.ended[next(iter(self.ended))]
 
-    def take_join(self, join: Join, name: Name) -> None:
+    def take_join(self, join: Join, neighbour: Neighbour) -> None:
         """Note a verified join or leave of a neighbour.
 
         Raises:
-            StatementError: REPLAYED: it is of another session of this port, came before, or is too old to tell.
+            StatementError: REPLAYED: it is of another session of either end, came before, or is too old to tell.
         """
-        if join.session != self.nonce:
+        if (join.session, join.sender_session) != (self.nonce, neighbour.nonce):
             raise StatementError(DropReason.REPLAYED, "a join of another session")
-        window = self.joins.get(name)
+        window = self.joins.get(neighbour.nonce)
         if window is None:
             if len(self.joins) >= _ENDED_MAX:
                 del self.joins[next(iter(self.joins))]
-            window = self.joins[name] = ReplayWindow(_JOINS_WINDOW)
+            window = self.joins[neighbour.nonce] = ReplayWindow(_JOINS_WINDOW)
         if window.is_finished(join.sequence):
             raise StatementError(DropReason.REPLAYED, "join")
         window.finish(join.sequence)
@@ -188,6 +255,13 @@ class Greeter:
         self._rtcert_for = rtcert_for
         self._rtcerts = RtCertCache(_RTCERTS_REMEMBERED)
         self.rivals = Rivals()
+        self._cookies = Cookies(random_bytes)
+        self._replies: list[Transmit] = []
+        self._reply_at_s = float("inf")
+        self._has_moved = False  # there is a new address
+        self._told_addresses: dict[int, frozenset[bytes]] = {}
+        self._joiner = ControlJoiner()  # of neighbours' hellos
+        self._strangers_joiner = ControlJoiner()
         self.clashes = 0
         self.clash_told_by: Name | None = None
         self._clash_since_s = self._clash_s = float("-inf")
@@ -236,7 +310,10 @@ class Greeter:
         if port is None or not port.is_up or port.mac != mac:
             lost = [] if port is None else self._lose(port, list(port.neighbours.values()), NeighbourEvent.LINK_LOST)
             nonce, key = self._session()
-            self.ports[index] = LinkPort(index, mac, own_mtu, cost, nonce, key, hello_at_s=now_s)
+            self.ports[index] = LinkPort(
+                index, mac, own_mtu, cost, nonce, key, Admission(now_s), hello_at_s=now_s,
+                addresses={} if port is None else port.addresses,
+            )  # fmt: skip
             return lost
         if (port.own_mtu, port.cost) == (own_mtu, cost):
             return []
@@ -252,48 +329,96 @@ class Greeter:
         found = on.neighbours.get(name) if on is not None else None
         return found if found is not None and found.state is NeighbourState.UP else None
 
+    def take_addresses(self) -> Mapping[int, frozenset[bytes]]:
+        """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
+        if not self._has_moved:
+            return _NOTHING
+        self._has_moved = False
+        changed = {}
+        for index, port in self.ports.items():
+            macs = frozenset(port.addresses)
+            if macs != self._told_addresses.get(index, frozenset()):
+                changed[index] = self._told_addresses[index] = macs
+        return changed
+
     def all_up(self) -> list[Neighbour]:
         """Return every neighbour that is up."""
         return [n for port in self.ports.values() for n in port.neighbours.values() if n.state is NeighbourState.UP]
+
+    @property
+    def drops(self) -> Counter[DropReason]:
+        """Return which unfinished hellos were given up."""
+        return self._joiner.drops + self._strangers_joiner.drops
+
+    @property
+    def held_bytes(self) -> int:
+        """Return how much memory unfinished hellos of strangers hold."""
+        return self._strangers_joiner.held_bytes
+
+    def join(self, arrival: Arrival, header: Header, now_s: float) -> bytes | None:
+        """Take a frame of a hello; return the statement when it is whole.
+
+        Raises:
+            FrameError: BAD_PARTS, MEMORY_FULL and the like; RATE_LIMITED, its address has used up its share.
+        """
+        port = self.ports.get(arrival.port)
+        if header.parts > _PARTS_MAX:
+            raise FrameError(DropReason.BAD_PARTS, f"a hello in {header.parts} parts")
+        if port is None or not port.is_up:
+            return None
+        if port.is_neighbour_at(arrival.mac):
+            return self._joiner.add(header, arrival.frame, now_s, arrival.via)
+        port.admission.look(arrival.mac, now_s)
+        return self._strangers_joiner.add(header, arrival.frame, now_s, arrival.via)
+
+    def receive_cookie(self, arrival: Arrival, header: Header) -> None:
+        """Take a cookie: of a neighbour that was heard, at its address, in answer to a hello of this session.
+
+        Raises:
+            FrameError: UNKNOWN_SENDER or TRUNCATED.
+        """
+        port = self.ports.get(arrival.port)
+        known = port.neighbours.get(Name(header.source)) if port is not None else None
+        session, nonce, cookie = read_cookie(arrival.frame[HEADER_BYTES : HEADER_BYTES + header.length])
+        if port is None or known is None or (known.mac, known.nonce, port.nonce) != (arrival.mac, session, nonce):
+            raise FrameError(DropReason.UNKNOWN_SENDER, "a cookie")
+        self._next_s = None
+        known.cookie = cookie
+        port.hello_at_s = min(port.hello_at_s, port.said_s + self._hello_s)
 
     def receive(self, arrival: Arrival, statement: Statement, now: Instant) -> Change | None:
         """Take a hello; return what it changed.
 
         Raises:
-            StatementError: it does not hold; nothing has changed.
+            StatementError: it does not hold, or no more are verified now; nothing has changed.
         """
-        hello = Hello.from_fields(statement.expect(StatementType.HELLO))
-        self._next_s = None
         port = self.ports.get(arrival.port)
         if port is None or not port.is_up:
             return None
-        if statement.signer == self._identity.name:
-            raise StatementError(DropReason.NOT_FOR_US, "our own hello came back")
-        try:
-            member = self._policy.verify_membership(hello.membership, now.unix_s)
-        except StatementError as error:
-            port.strangers.note(hello.membership, error.reason, now.mono_s)
-            raise
-        if member.name != statement.signer:
-            raise StatementError(DropReason.BAD_CERTIFICATE, "a hello under another's certificate")
-        known = port.neighbours.get(member.name)
-        if hello.sequence <= port.last_of(member.name, hello.nonce):
-            raise StatementError(DropReason.REPLAYED, "hello")
-        statement.verify(member.key)
-        self._refuse_rival(port, hello, member.name, arrival.mac, now.mono_s)
+        hello, member = self._verified(port, arrival, statement, now)
+        proof = self._proof_of_place(hello, member)
+        received_bytes = max(len(arrival.frame), HEADER_BYTES + len(statement.wire))
+        self._refuse_rival(port, hello, member.name, (arrival.mac, received_bytes), now.mono_s)
         self.rivals.take(member.name, hello.life)
+        is_two_way = port.nonce in hello.heard
+        known = port.neighbours.get(member.name)
+        self._make_room(port, known, is_two_way=is_two_way)
         if known is None:
-            if len(port.neighbours) >= NEIGHBOURS_PER_PORT:
-                raise StatementError(DropReason.QUOTA, "neighbours on one port")
             known = port.neighbours[member.name] = Neighbour(
                 member.name, member.role, member.domain, member.key, port.index, arrival.mac, 0, b"", 0, b"", 0.0
             )
-        is_two_way = port.nonce in hello.heard
         is_new_session = known.nonce != hello.nonce
-        if not is_two_way or is_new_session:
+        if is_two_way:
+            has_news = is_new_session or (port.owes_answer and not known.is_proven)
+        else:
+            has_news = known.is_proven and not is_new_session  # it does not hear us any more
+            if not has_news:
+                port.answer(received_bytes, now.mono_s)
+        if has_news:
             port.hurry(max(now.mono_s, port.said_s + _ANSWER_S))
-        if is_new_session and not is_two_way and known.state is NeighbourState.UP:
-            known.candidate = hello.nonce  # a restart, or an old hello played back: only an echo of our nonce will tell
+        if is_new_session and not is_two_way and known.is_proven:
+            known.candidate, known.candidate_sequence = hello.nonce, hello.sequence
+            # a restart, or an old hello played back: only an echo of our nonce will tell
             return None
         if is_new_session or not is_two_way:
             port.end(known)
@@ -302,9 +427,13 @@ class Greeter:
         mtu = min(said_mtu, port.own_mtu)
         is_resized = known.mtu != mtu
         known.mac, known.mtu, known.nonce, known.candidate = arrival.mac, mtu, hello.nonce, b""
+        known.is_proven = is_two_way or (known.is_proven and not is_new_session)
+        if known.is_proven:
+            self._has_moved = port.note_address(arrival.mac) or self._has_moved
+        known.cookie = b"" if is_new_session else known.cookie
         known.sequence, known.digest, known.greeted_s = hello.sequence, hello.digest, now.mono_s
         known.member, known.checked_s, known.life = member, now.mono_s, hello.life
-        had_proof, known.proof = known.proof is not None, self._proof_of_place(hello, member)
+        had_proof, known.proof = known.proof is not None, proof
         self._note_clash(port, known, hello, now.mono_s)
         self._alive(known, now.mono_s)
         if is_two_way and known.keepalives is None:
@@ -316,6 +445,77 @@ class Greeter:
         if change is None and (is_resized or is_placed) and known.state is NeighbourState.UP:
             return known, known.state
         return change
+
+    def _verified(
+        self, port: LinkPort, arrival: Arrival, statement: Statement, now: Instant
+    ) -> tuple[Hello, Membership]:
+        """Return a hello and whose it is, cheap checks first.
+
+        Raises:
+            StatementError: it does not hold, or no more are verified now.
+        """
+        if len(statement.wire) > HELLO_MAX_BYTES:
+            raise StatementError(DropReason.TOO_BIG, "hello")
+        hello = Hello.from_fields(statement.expect(StatementType.HELLO))
+        if statement.signer == self._identity.name:
+            raise StatementError(DropReason.NOT_FOR_US, "our own hello came back")
+        if hello.sequence <= port.last_of(statement.signer, hello.nonce):
+            port.admission.refused(now.mono_s)
+            raise StatementError(DropReason.REPLAYED, "hello")
+        self._admit(port, arrival, statement.signer, hello, now.mono_s)
+        self._next_s = None
+        try:
+            member = self._policy.verify_membership(hello.membership, now.unix_s)
+        except StatementError as error:
+            port.strangers.note(hello.membership, error.reason, now.mono_s)
+            raise
+        if member.name != statement.signer:
+            raise StatementError(DropReason.BAD_CERTIFICATE, "a hello under another's certificate")
+        statement.verify(member.key)
+        return hello, member
+
+    def _admit(self, port: LinkPort, arrival: Arrival, signer: Name, hello: Hello, now_s: float) -> None:
+        """Decide by what is cheap to see whether a hello's signature is verified.
+
+        Raises:
+            StatementError: RATE_LIMITED; COOKIE_REQUIRED, and a cookie is on its way.
+        """
+        known = port.neighbours.get(signer)
+        member = known.member if known is not None else None
+        seen = arrival.mac, hello.membership
+        if known is not None and member is not None and known.is_proven and (known.mac, member.wire) == seen:
+            known.hellos = known.hellos or TokenBucket(*NEIGHBOUR_HELLOS, now_s)
+            port.admission.admit_neighbour(known.hellos, now_s)
+            return
+        try:
+            port.admission.admit_stranger(
+                arrival.mac, now_s, lambda: self._cookies.proves(hello, port.nonce, arrival.mac, now_s)
+            )
+        except StatementError as error:
+            if error.reason is DropReason.COOKIE_REQUIRED and port.admission.may_send_cookie(now_s):
+                cookie = self._cookies.make(port.nonce, arrival.mac, now_s)
+                payload = cookie_payload(port.nonce, hello.nonce, cookie)
+                frames = self._splitter.split(Kind.COOKIE, payload, MTU_MIN_BYTES)
+                self._replies.append(Transmit(port.index, arrival.mac, frames))
+                self._next_s, self._reply_at_s = None, min(self._reply_at_s, now_s)
+            raise
+
+    @staticmethod
+    def _make_room(port: LinkPort, known: Neighbour | None, *, is_two_way: bool) -> None:
+        """See that there is a place: neighbours keep theirs, candidates give way to the next one.
+
+        Raises:
+            StatementError: QUOTA, there are too many neighbours.
+        """
+        if known is not None and (known.is_proven or not is_two_way):
+            return
+        candidates = port.candidates()
+        if is_two_way:
+            if len(port.neighbours) - len(candidates) >= NEIGHBOURS_MAX:
+                raise StatementError(DropReason.QUOTA, "neighbours on one port")
+        elif len(candidates) >= CANDIDATES_MAX:
+            oldest = min(candidates, key=lambda each: each.heard_s)
+            del port.neighbours[oldest.name], port.said_mtus[oldest.name]
 
     def _proof_of_place(self, hello: Hello, member: Membership) -> tuple[bytes, bytes] | None:
         """Return what proves to others that a RIB is attached to this switch, or None.
@@ -331,8 +531,13 @@ class Greeter:
                 return hello.membership, wire
         return None
 
-    def _refuse_rival(self, port: LinkPort, hello: Hello, name: Name, mac: bytes, now_s: float) -> None:
+    def _refuse_rival(
+        self, port: LinkPort, hello: Hello, name: Name, arrived: tuple[bytes, int], now_s: float
+    ) -> None:
         """Take a hello's word only if no older node with its identity is alive; a younger one is let go.
+
+        Args:
+            arrived: from which address, and how many bytes.
 
         Raises:
             StatementError: IN_USE.
@@ -341,22 +546,28 @@ class Greeter:
             other
             for each in self.ports.values()
             if (other := each.neighbours.get(name)) is not None
+            and other.is_proven
             and other.life != hello.life
             and now_s < self._gone_at_s(other)
         ]
+        mac, received_bytes = arrived
         if any((other.port, other.mac) == (port.index, mac) for other in others):
             return  # it was restarted there
         elsewhere = self._life_elsewhere(name)
         is_outlived_here = any(other.life < hello.life for other in others)
+        is_proven = port.nonce in hello.heard  # else it may be an old one played back
+        tell = self._tell_rival if is_proven else self.rivals.tell
         for other in others:
             if is_outlived_here:
-                self._tell_rival(other.port, other.nonce, name, now_s)
-            else:
+                tell(other.port, other.nonce, name, now_s)
+            elif is_proven:
                 self.let_go(other, now_s)
         if not is_outlived_here and (elsewhere is None or hello.life <= elsewhere):
             return
         self.rivals.refuse(name, hello.life, now_s)
-        self._tell_rival(port.index, hello.nonce, name, now_s)
+        tell(port.index, hello.nonce, name, now_s)
+        if not is_proven:
+            port.answer(received_bytes, now_s)
         raise StatementError(DropReason.IN_USE, "an older node with this identity is alive")
 
     def let_go(self, neighbour: Neighbour, now_s: float) -> None:
@@ -429,6 +640,7 @@ class Greeter:
             port.nonce, port.exchange_key = self._session()
             port.ended.clear()
             port.joins.clear()
+            port.answer_at_s, port.credit_bytes = float("inf"), 0
             port.hurry(now_s)
             return []
         return self._lose(port, list(port.neighbours.values()), NeighbourEvent.LINK_LOST)
@@ -439,23 +651,30 @@ class Greeter:
             self._lateness_s += now_s - self._due_s
             self._slowness.late(now_s - self._due_s, now_s)
         self._due_s, self._next_s = float("inf"), None
+        self._joiner.expire(now_s)
+        self._strangers_joiner.expire(now_s)
         changes: list[Change] = []
         for port in self.ports.values():
             silent = [n for n in port.neighbours.values() if now_s >= self._gone_at_s(n)]
             if silent:
-                port.hurry(now_s)  # who still hears us hears at once that we do not hear it
+                if any(each.is_proven for each in silent):
+                    port.hurry(now_s)  # who still hears us hears at once that we do not hear it
                 changes += self._lose(port, silent, NeighbourEvent.SILENCE)
         return changes
 
     def take(self, now_s: float) -> list[Transmit]:
-        """Return the hellos and keepalives that are due."""
+        """Return the hellos, keepalives and cookies that are due."""
         self._next_s = None
-        out: list[Transmit] = []
+        out, self._replies, self._reply_at_s = self._replies, [], float("inf")
         for port in self.ports.values():
             if not port.is_up:
                 continue
             if port.hello_at_s <= now_s:
-                out.append(Transmit(port.index, BROADCAST, self._hello(port, now_s)))
+                out.append(Transmit(port.index, BROADCAST, self._scheduled_hello(port, now_s)))
+            elif port.answer_at_s <= now_s:
+                answer = self._answer(port, now_s)
+                if answer:
+                    out.append(Transmit(port.index, BROADCAST, answer))
             for neighbour in port.neighbours.values():
                 session = neighbour.keepalives
                 if session is None:
@@ -483,10 +702,10 @@ class Greeter:
         return None if self._due_s == float("inf") else self._due_s
 
     def _look_ahead(self) -> float:
-        due_s = float("inf")
+        due_s = self._reply_at_s
         for port in self.ports.values():
-            if port.is_up and port.hello_at_s < due_s:
-                due_s = port.hello_at_s
+            if port.is_up:
+                due_s = min(due_s, port.hello_at_s, port.answer_at_s)
             for neighbour in port.neighbours.values():
                 session, at_s = neighbour.keepalives, self._gone_at_s(neighbour)
                 if session is not None and port.is_up:
@@ -500,7 +719,8 @@ class Greeter:
         session = neighbour.keepalives
         if session is None or not session.is_heard:
             return neighbour.heard_s + self._dead_s + late_s
-        hellos_end_s = neighbour.greeted_s + _HELLOS_MISSED * HELLO_IDLE * self._hello_s
+        flooded_until_s = self.ports[neighbour.port].admission.flooded_until_s  # its hellos may be among those refused
+        hellos_end_s = max(neighbour.greeted_s, flooded_until_s) + _HELLOS_MISSED * HELLO_IDLE * self._hello_s
         return min(neighbour.heard_s + session.detect_s, hellos_end_s) + late_s
 
     def _alive(self, neighbour: Neighbour, heard_s: float) -> None:
@@ -513,21 +733,44 @@ class Greeter:
     def _begin_keepalives(self, port: LinkPort, neighbour: Neighbour, hello: Hello, now_s: float) -> None:
         timing = self._timings.get(port.index, self._timing)
         ends = port.nonce + self._identity.name, neighbour.nonce + neighbour.name
-        _, received = port.ended.get(neighbour.nonce, _UNHEARD)
+        _, received = port.ended.get((neighbour.name, neighbour.nonce), _UNHEARD)
         neighbour.keepalives = KeepaliveSession.begin(
             port.exchange_key, hello.exchange_key, ends, (timing, hello.timing), received, now_s
         )
 
+    def _scheduled_hello(self, port: LinkPort, now_s: float) -> list[bytes]:
+        """Return a hello, padded: who does not know us yet may answer with as many bytes."""
+        port.eager = max(port.eager - 1, 0)
+        is_rare = port.is_idle and not port.eager and not port.admission.is_loaded(now_s)
+        port.hello_at_s = now_s + self._hello_s * (HELLO_IDLE if is_rare else 1)
+        frames = self._hello(port, now_s)
+        port.owes_answer = False
+        frames[-1] = frames[-1].ljust(min(PADDED_BYTES, port.hello_mtu), b"\0")
+        return frames
+
+    def _answer(self, port: LinkPort, now_s: float) -> list[bytes]:
+        """Return a hello for those who have not proved themselves, or nothing if they have sent fewer bytes."""
+        port.answer_at_s = float("inf")
+        frames = self._hello(port, now_s)
+        size = sum(map(len, frames))
+        port.owes_answer = size > port.credit_bytes
+        if port.owes_answer:
+            return []
+        port.credit_bytes -= size
+        return frames
+
     def _hello(self, port: LinkPort, now_s: float) -> list[bytes]:
         port.sequence += 1
-        port.said_s = now_s
-        port.eager = max(port.eager - 1, 0)
-        port.hello_at_s = now_s + self._hello_s * (HELLO_IDLE if port.is_idle and not port.eager else 1)
-        heard = tuple(n for each in port.neighbours.values() for n in (each.nonce, each.candidate) if n)
+        port.said_s, port.answer_at_s = now_s, float("inf")
+        heard = port.heard()
         identity, timing = self._identity, self._timings.get(port.index, self._timing)
         hello = Hello(
             port.nonce, port.sequence, heard, port.own_mtu, self._digest_for(port), identity.membership,
             timing, port.exchange_key.public, self._life, self.rivals.on(port.index, now_s), self._rtcerts_on(port),
+            tuple(
+                (each.nonce, seal_cookie(each.cookie, port.nonce, port.sequence))
+                for each in port.neighbours.values() if each.cookie
+            ),
         )  # fmt: skip
         return self._splitter.split(Kind.HELLO, hello.to_wire(identity.name, identity.key), port.hello_mtu)
 
@@ -535,8 +778,9 @@ class Greeter:
         """Return a RIB's RtCerts for the switches that it hears on a port."""
         if self._rtcert_for is None:
             return ()
-        switches = sorted(each.name for each in port.neighbours.values() if each.role is Role.SWITCH)
-        return tuple(self._rtcert_for(name) for name in switches[:RTCERTS_MAX])
+        heard = [each for each in port.neighbours.values() if each.role is Role.SWITCH]
+        switches = sorted((not each.is_proven, each.name) for each in heard)
+        return tuple(self._rtcert_for(name) for _, name in switches[:RTCERTS_MAX])
 
     def _lose(self, port: LinkPort, lost: list[Neighbour], event: NeighbourEvent) -> list[Change]:
         for neighbour in lost:

@@ -17,7 +17,11 @@ from gdp.limits import FRAME_MAX_BYTES
 from gdp.names import Name
 
 __all__ = [
+    "COOKIES_MAX",
+    "COOKIE_BYTES",
     "DIGEST_BYTES",
+    "HEARD_MAX",
+    "HELLO_MAX_BYTES",
     "INTERVAL_MAX_MS",
     "LIFE_BYTES",
     "MULTIPLIER_MAX",
@@ -31,7 +35,11 @@ __all__ = [
 NONCE_BYTES: Final = 8
 DIGEST_BYTES: Final = 8
 LIFE_BYTES: Final = 16  # first sequence number (wall-clock milliseconds of the start), incarnation; big-endian
-HEARD_MAX: Final = 32
+COOKIE_BYTES: Final = 16
+HEARD_MAX: Final = 128  # NEIGHBOURS_MAX of a port, and as many that have not proved themselves yet
+RIVALS_MAX: Final = 32
+COOKIES_MAX: Final = 16
+HELLO_MAX_BYTES: Final = 10 << 10  # a certificate, ``RTCERTS_MAX`` RtCerts and all nonces fit
 RTCERTS_MAX: Final = 8
 INTERVAL_MAX_MS: Final = 60_000
 MULTIPLIER_MAX: Final = 255
@@ -74,6 +82,7 @@ class Hello:
         life: mark of the sender's life, ``LIFE_BYTES``.
         rtcerts: of a RIB, one for each switch that it hears here: which switch may speak of it.
         rivals: nonces of those at this port whose identity another node has, too; refused are those not in ``heard``.
+        cookies: for each receiver that asked for one, the nonce of its port and what shows the cookie.
     """
 
     nonce: bytes
@@ -87,6 +96,7 @@ class Hello:
     life: bytes = bytes(LIFE_BYTES)
     rivals: tuple[bytes, ...] = ()
     rtcerts: tuple[bytes, ...] = ()
+    cookies: tuple[tuple[bytes, bytes], ...] = ()
 
     def to_wire(self, signer: Name, key: SigningKey) -> bytes:
         """Return the signed statement."""
@@ -100,8 +110,9 @@ class Hello:
             "k": list(self.timing),
             "x": self.exchange_key,
             "b": self.life,
-            "u": list(self.rivals[:HEARD_MAX]),
+            "u": list(self.rivals[:RIVALS_MAX]),
             "r": list(self.rtcerts[:RTCERTS_MAX]),
+            "y": [asker + tag for asker, tag in self.cookies[:COOKIES_MAX]],
         }
         return sign(StatementType.HELLO, body, signer, key)
 
@@ -122,8 +133,12 @@ class Hello:
             _timing(fields),
             fields.bytes_("x", EXCHANGE_KEY_BYTES) if fields.get("x") != b"" else b"",
             fields.bytes_("b", LIFE_BYTES),
-            tuple(fields.byte_strings("u", HEARD_MAX, NONCE_BYTES)),
+            tuple(fields.byte_strings("u", RIVALS_MAX, NONCE_BYTES)),
             tuple(fields.byte_strings("r", RTCERTS_MAX)),
+            tuple(
+                (each[:NONCE_BYTES], each[NONCE_BYTES:])
+                for each in fields.byte_strings("y", COOKIES_MAX, NONCE_BYTES + COOKIE_BYTES)
+            ),
         )
 
 

@@ -1,6 +1,7 @@
 """A request of one switch to the next towards a publisher: let this tree grow (or shrink) here.
 
-Place: pure. A recorded join or leave moves nothing: each names the receiver's present session and counts up.
+Place: pure. A recorded join or leave moves nothing: each names the present sessions of both ends and counts up within
+them. So a sender that has restarted is heard at once, whatever its clock says.
 """
 
 from __future__ import annotations
@@ -30,10 +31,11 @@ class Join:
         lease_s: how long the branch stands unless renewed; 0 takes it down (LEAVE).
         evidence: the signed claim of a reader further down; whoever passes a join on checks it.
         session: nonce of the receiver's port, as its hellos say it.
-        sequence: rises with every join and leave of the sender, over its restarts too.
+        sequence: rises with every join and leave of the sender within its session.
         version: sequence number of the publisher's claim that ``switch`` was read from; the newest decides.
         backup_for: the switch below that has the tree another way, and wants copies only while that way is broken;
             ``ZERO`` in an ordinary join. Source: the secondary join of RFC 7431.
+        sender_session: nonce of the sender's port.
     """
 
     topic: Name
@@ -48,6 +50,7 @@ class Join:
     sequence: int
     version: int = 0
     backup_for: Name = ZERO
+    sender_session: bytes = bytes(NONCE_BYTES)
 
     def to_wire(self, signer: Name, key: SigningKey) -> bytes:
         """Return the signed statement."""
@@ -64,6 +67,7 @@ class Join:
             "s": self.sequence,
             "v": self.version,
             "b": self.backup_for,
+            "o": self.sender_session,
         }
         return sign(StatementType.JOIN, body, signer, key)
 
@@ -87,4 +91,5 @@ class Join:
             fields.uint("s"),
             fields.uint("v"),
             fields.optional_name("b"),
+            fields.bytes_("o", NONCE_BYTES),
         )

@@ -27,7 +27,7 @@ LINKS_MAX: Final = 128
 RIBS_MAX: Final = 16
 MEMBERS_MAX: Final = 128  # 4.4 kB; of a larger domain the rest is reached through the nearest border
 COST_MAX: Final = 1 << 24
-_HEAD_BYTES: Final = 320  # COSE, keys, heads, sequence number, life and signature
+_HEAD_BYTES: Final = 330  # COSE, keys, heads, sequence number, life, time and signature
 _LINK_BYTES: Final = 80
 _NAME_BYTES: Final = 34
 _RIB_BYTES: Final = 110  # beside its two certificates
@@ -90,6 +90,7 @@ class LinkState:
     life: bytes = bytes(LIFE_BYTES)  # mark of the origin's life
     refused: tuple[Name, ...] = ()  # identities refused at this switch, for an older node has them
     is_partial: bool = False  # there are members that are not listed
+    said_unix_s: int = 0  # when it was signed, by the origin's wall clock
 
     def fitted(self, membership: bytes) -> LinkState:
         """Return as much of it as one statement carries beside the signer's certificate: RIBs and links first."""
@@ -124,6 +125,7 @@ class LinkState:
             "z": self.is_partial,
             "b": self.life,
             "u": list(self.refused),
+            "e": self.said_unix_s,
             "c": membership,
         }
         return sign(StatementType.LINK_STATE, body, self.origin, key)
@@ -150,6 +152,7 @@ class LinkState:
             fields.bytes_("b", LIFE_BYTES),
             tuple(fields.names("u", RIBS_MAX)),
             fields.flag("z"),
+            fields.uint("e"),
         )
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
+from gdp.control.admission import TokenBucket
 from gdp.control.hello import LIFE_BYTES
 from gdp.control.keepalive import KeepaliveSession
 from gdp.crypto.certificates import Membership, Role
@@ -74,6 +75,7 @@ class Neighbour:
     heard_s: float  # when it last gave a sign of life
     state: NeighbourState = NeighbourState.GONE
     candidate: bytes = b""  # nonce of a session that has not proved itself yet
+    candidate_sequence: int = -1  # of its last hello
     member: Membership | None = None
     checked_s: float = 0.0  # when its membership was last seen to hold
     greeted_s: float = 0.0  # when its last hello came
@@ -82,3 +84,6 @@ class Neighbour:
     life: bytes = bytes(LIFE_BYTES)
     proof: tuple[bytes, bytes] | None = None  # of a RIB that is attached here: its membership, its RtCert for us
     refuses_us: bool = False  # its last hello said that an older node has our identity
+    is_proven: bool = False  # its present session has echoed our nonce: it is on this link now
+    cookie: bytes = b""  # that it gave us: it verifies strangers' hellos with one only
+    hellos: TokenBucket | None = None  # how many of its hellos are verified, once it is proven

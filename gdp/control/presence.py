@@ -38,12 +38,14 @@ class Presence:
         node: the identity.
         incarnation: of the older node.
         other: the switch that the newer node claims through.
+        question: Unix milliseconds at which it was asked; the answer repeats them, so that an old one is told.
         is_answer: whether this answers the question; then ``is_there`` says how.
     """
 
     node: Name
     incarnation: int
     other: Name
+    question: int
     is_answer: bool = False
     is_there: bool = False
 
@@ -53,6 +55,7 @@ class Presence:
             "n": self.node,
             "i": self.incarnation,
             "w": self.other,
+            "s": self.question,
             "q": not self.is_answer,
             "y": self.is_there,
             "c": membership,
@@ -66,13 +69,15 @@ class Presence:
         Raises:
             StatementError: MALFORMED.
         """
-        return cls(fields.name("n"), fields.uint("i"), fields.name("w"), not fields.flag("q"), fields.flag("y"))
+        names = fields.name("n"), fields.uint("i"), fields.name("w")
+        return cls(*names, fields.uint("s"), not fields.flag("q"), fields.flag("y"))
 
 
 @dataclass(slots=True)
 class _Check:
     incarnation: int
     switch: Name
+    question: int
     asked_s: float
     answer: bool | None = None
     answered_s: float = 0.0
@@ -102,8 +107,8 @@ class IdentityChecks:
         self.clashes += check.answer is True
         return False
 
-    def must_ask(self, node: Name, incarnation: int, switch: Name, now_s: float) -> bool:
-        """Return whether the switch is to be asked now, and note that it is."""
+    def must_ask(self, node: Name, incarnation: int, switch: Name, question: int, now_s: float) -> bool:
+        """Return whether the switch is to be asked now, and note under which number it is."""
         check = self._checks.get(node)
         is_same = check is not None and (check.incarnation, check.switch) == (incarnation, switch)
         if check is not None and is_same and (check.answer is None or now_s < check.answered_s + _BELIEVED_S):
@@ -111,7 +116,7 @@ class IdentityChecks:
         self._checks.pop(node, None)
         if len(self._checks) >= _CHECKS_MAX:
             del self._checks[next(iter(self._checks))]
-        self._checks[node] = _Check(incarnation, switch, now_s)
+        self._checks[node] = _Check(incarnation, switch, question, now_s)
         return True
 
     def refused_above(self, node: Name, incarnation: int, now_s: float) -> None:
@@ -133,5 +138,6 @@ class IdentityChecks:
     def answered(self, presence: Presence, switch: Name, now_s: float) -> None:
         """Take a verified answer of a switch; one to no open question is ignored."""
         check = self._checks.get(presence.node)
-        if check is not None and (check.incarnation, check.switch) == (presence.incarnation, switch):
+        said = presence.incarnation, switch, presence.question
+        if check is not None and (check.incarnation, check.switch, check.question) == said:
             check.answer, check.answered_s = presence.is_there, now_s

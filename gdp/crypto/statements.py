@@ -50,6 +50,8 @@ class StatementType(str, Enum):
     FETCH = "fetch"
     INVENTORY = "inventory"
     REPLICAS = "replicas"
+    OPEN = "open"  # switch or RIB to a RIB: a channel
+    ACCEPT = "accept"
 
 
 _TYPES: Final[dict[Value, StatementType]] = {member.value: member for member in StatementType}

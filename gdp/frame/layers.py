@@ -37,11 +37,11 @@ from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION, Flag, Kind
 from gdp.limits import HOPS_MAX
 from gdp.names import NAME_BYTES, ZERO, Name
 
-__all__ = ["GDP", "Keepalive", "Statement", "layout"]
+__all__ = ["GDP", "Cookie", "Keepalive", "Statement", "layout"]
 
 KIND_NAMES: Final = {int(kind): kind.name.lower().replace("_", "-") for kind in Kind}
 FLAG_NAMES: Final = [next((f.name.lower() for f in Flag if f.name and f == 1 << bit), f"bit{bit}") for bit in range(8)]
-_NO_STATEMENTS: Final = frozenset({Kind.KEEPALIVE})  # of those for the neighbour itself
+_NO_STATEMENTS: Final = frozenset({Kind.KEEPALIVE, Kind.COOKIE})  # of those for the neighbour itself
 _STATEMENTS: Final = frozenset(
     {Kind.RIB_REQUEST, Kind.RIB_ANSWER, *(kind for kind in Kind if kind >= CONTROL_FROM and kind not in _NO_STATEMENTS)}
 )
@@ -49,6 +49,7 @@ _ANSWER_TO: Final = {Kind.RIB_ANSWER: Kind.RIB_REQUEST, Kind.ECHO_REPLY: Kind.EC
 _COSE_SIGN1: Final = 0xD284  # tag 18, an array of four
 _LENGTH_AT: Final = 6
 _KEEPALIVE_BYTES: Final = 26
+_COOKIE_BYTES: Final = 32
 
 
 class NameField(XStrFixedLenField):
@@ -122,6 +123,8 @@ class GDP(Packet):
             return Statement
         if self.version == VERSION and self.kind == Kind.KEEPALIVE and len(payload) >= _KEEPALIVE_BYTES:
             return Keepalive
+        if self.version == VERSION and self.kind == Kind.COOKIE and len(payload) >= _COOKIE_BYTES:
+            return Cookie
         return conf.raw_layer
 
     def hashret(self) -> bytes:
@@ -158,6 +161,17 @@ class Keepalive(Packet):
         ByteField("multiplier", 3),
         XStrFixedLenField("digest", bytes(8), length=8),
         XStrFixedLenField("tag", bytes(16), length=16),
+    ]
+
+
+class Cookie(Packet):
+    """The payload of a cookie: both ports' sessions, and what the next hello shows (``control/admission.py``)."""
+
+    name = "GDP cookie"
+    fields_desc = [  # noqa: RUF012  (the form that Scapy prescribes)
+        XStrFixedLenField("session", bytes(8), length=8),
+        XStrFixedLenField("nonce", bytes(8), length=8),
+        XStrFixedLenField("cookie", bytes(16), length=16),
     ]
 
 

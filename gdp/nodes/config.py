@@ -104,6 +104,8 @@ class SwitchConfig(Section):
     table_max: int = Field(default=ENTRIES_DEFAULT, ge=1, le=TABLE_MAX)
     revocations: Directory | None = None
     metrics: Metrics | None = None
+    audit: NewFile | None = None
+    token_folders: Annotated[tuple[Directory, ...], Unique] = ()
     hello_s: float = Field(default=HELLO_S, ge=0.01, le=60.0)
     dead_s: float = Field(default=DEAD_S, ge=0.02, le=600.0)
     lease_s: LeaseSeconds = CLAIM_LEASE_S
@@ -218,6 +220,8 @@ class RibConfig(Section):
     snapshot: NewFile | None = None
     quotas: Quotas = Quotas()
     metrics: Metrics | None = None
+    audit: NewFile | None = None
+    token_folders: Annotated[tuple[Directory, ...], Unique] = ()
     sandbox: bool = True
 
     @model_validator(mode="after")

@@ -153,6 +153,8 @@ class Runtime:
 
     def send(self) -> bool:
         """Send what the machine has to say next; return whether there may be more."""
+        for index, macs in self._machine.take_neighbours().items():
+            self._plane.set_neighbours(index, macs)
         transmits = self._machine.take()
         for port, mac, frames in transmits:
             self._plane.transmit(port, mac, frames)

@@ -17,7 +17,7 @@ import logging
 import select
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -54,6 +54,7 @@ class LinkedPlane(ABC):
 
     def __init__(self, ifnames: Sequence[str] = (), table: Table | None = None) -> None:
         self._entries: Mapping[bytes, Hops] | None = None if table is None else table.entries
+        self._sides: Mapping[bytes, int] = {} if table is None else table.sides
         self._ports: dict[int, Port] = {}
         self._mtus: dict[int, int] = {}  # of the ports that are up
         self._devices: dict[int, int] = {}  # ifindex of an open device -> port index
@@ -181,6 +182,9 @@ class LinkedPlane(ABC):
 
     def on_link(self, callback: LinkCallback) -> None:
         self._on_link.append(callback)
+
+    @abstractmethod
+    def set_neighbours(self, port: int, macs: Collection[bytes]) -> None: ...
 
     def close(self) -> None:
         for index in list(self._ports):

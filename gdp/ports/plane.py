@@ -7,12 +7,12 @@ A plane without a table (a proxy's, a RIB's) hands everything up.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 from gdp.effects import BROADCAST, Arrival
-from gdp.errors import DropReason
+from gdp.errors import DROP_COUNTERS
 
 __all__ = ["BROADCAST", "MAC_BYTES", "Arrival", "Counters", "HasFileno", "LinkCallback", "Plane", "Port"]
 
@@ -53,7 +53,7 @@ class Counters:
     frames_out: int = 0
     forwarded: int = 0
     handed_up: int = 0
-    drops: list[int] = field(default_factory=lambda: [0] * len(DropReason))
+    drops: list[int] = field(default_factory=lambda: [0] * DROP_COUNTERS)
 
 
 class HasFileno(Protocol):
@@ -119,6 +119,9 @@ class Plane(Protocol):
         It is called with ``up`` again where only the MTU changed, and with down and up where the address did: to its
         neighbours that is another port. ``ports`` has the new facts.
         """
+
+    def set_neighbours(self, port: int, macs: Collection[bytes]) -> None:
+        """Learn the addresses of a port's neighbours; what they say goes before what strangers say."""
 
     def close(self) -> None:
         """Close every socket; the plane is of no use afterwards."""

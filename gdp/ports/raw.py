@@ -3,16 +3,20 @@
 Place: I/O; no Scapy, and the struct codec's offsets only.
 Source: DESIGN section 7. What is ordinary is decided here, in one pass over the batch; whatever is not goes to
 ``gdp.switch.forwarder.decide``, and fixtures hold the two together. Neighbouring frames of a batch that go the same way
-leave in one call, a *run*; each lane of a port has its own socket, and the first one goes first::
+leave in one call, a *run*; each lane of a port has its own socket, and the first one goes first. Of hellos, and of all
+that strangers say, a port takes so many frames a second; the others are left to the kernel, which drops them when the
+socket is full::
 
     take  | A A A A B B A |      decide      runs: A A A A | B B | A      put, put, put
 """
 
 from __future__ import annotations
 
+import select
 import socket
 import struct
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import lru_cache, partial
 from typing import Final
 
@@ -23,9 +27,10 @@ from gdp.names import NAME_BYTES
 from gdp.ports.batch import SLOTS, Batch, make_batch, put_one
 from gdp.ports.linked import LinkedPlane
 from gdp.ports.plane import MAC_BYTES, Arrival, Port
-from gdp.ports.sockets import Lane, hear_nothing, kernel_drops, open_port
+from gdp.ports.ration import Ration
+from gdp.ports.sockets import Lane, hear_nothing, kernel_drops, open_port, tell_neighbours
 from gdp.switch.forwarder import Drop, Forward, decide
-from gdp.switch.table import NOWHERE, Hops, Table
+from gdp.switch.table import NOWHERE, Hops, Table, is_side
 
 __all__ = ["RawPlane"]
 
@@ -34,7 +39,8 @@ _GLANCE: Final = struct.Struct("!HxBxxH24x64s")
 _FIRST: Final = VERSION << 8
 _FIRST_CONTROL: Final = _FIRST | CONTROL_FROM
 _URGENT: Final = int(Flag.URGENT)
-_LANES: Final = (Lane.CONTROL, Lane.URGENT, Lane.ORDINARY)  # as they are served
+_LANES: Final = (Lane.CONTROL, Lane.HELLO, Lane.URGENT, Lane.ORDINARY, Lane.GUEST)  # as they are served
+_GREETINGS: Final = (500.0, 128.0)  # a second, and at once; each costs 30 us at most before it is refused
 
 
 @lru_cache(maxsize=4_096)  # more than the sizes that come often
@@ -67,6 +73,8 @@ class RawPlane(LinkedPlane):
         self._bypass_qdisc = bypass_qdisc
         self._lanes: dict[Lane, dict[int, socket.socket]] = {lane: {} for lane in _LANES}  # by port
         self._batch: Batch = make_batch(OVERHEAD_BYTES)
+        self._neighbours: dict[int, frozenset[bytes]] = {}  # addresses, by port
+        self._resting: dict[int, tuple[socket.socket, float]] = {}  # not read until then, by file descriptor
         super().__init__(ifnames, table)
 
     def _open(self, port: Port) -> None:
@@ -84,8 +92,47 @@ class RawPlane(LinkedPlane):
         if self._entries is None:
             ready = partial(self._hand_up_all, port.index, opened)
         else:
-            ready = partial(self._forward_all, self._entries, port.index, opened, sockets)
+            ready = partial(self._forward_all, self._entries, self._sides, port.index, opened, sockets)
+        if lane in (Lane.HELLO, Lane.GUEST):
+            ready = partial(self._take_some, opened, Ration(*_GREETINGS, time.monotonic()), ready)
         self.watch(opened, ready, rank=rank)
+        tell_neighbours(opened, lane, self._neighbours.get(port.index, ()))
+
+    def set_neighbours(self, port: int, macs: Collection[bytes]) -> None:
+        before, after = self._neighbours.get(port, frozenset()), frozenset(macs)
+        self._neighbours[port] = after
+        steps = (Lane.GUEST, before & after), (Lane.CONTROL, after), (Lane.HELLO, after), (Lane.GUEST, after)
+        for lane, known in steps:  # in this order, so that no frame falls between two lanes
+            opened = self._lanes[lane].get(port)
+            if opened is not None:
+                tell_neighbours(opened, lane, known)
+
+    def poll(self, timeout_s: float | None) -> list[Arrival]:
+        if self._resting:
+            now_s = time.monotonic()
+            for fd in [fd for fd, (_, until_s) in self._resting.items() if until_s <= now_s]:
+                self._end_rest(fd)
+            if self._resting:
+                left_s = min(until_s for _, until_s in self._resting.values()) - now_s
+                timeout_s = left_s if timeout_s is None else min(timeout_s, left_s)
+        return super().poll(timeout_s)
+
+    def remove_port(self, index: int) -> None:
+        super().remove_port(index)
+        self._neighbours.pop(index, None)
+
+    def _take_some(self, source: socket.socket, ration: Ration, ready: Callable[[], None]) -> None:
+        """Take a batch; leave the socket alone for a while where that was more than its share."""
+        before = self._counters.frames_in
+        ready()
+        rest_s = ration.charge(self._counters.frames_in - before, now_s := time.monotonic())
+        if rest_s > 0 and source.fileno() not in self._resting:
+            self._epoll.unregister(source)
+            self._resting[source.fileno()] = source, now_s + rest_s
+
+    def _end_rest(self, fd: int) -> None:
+        if self._resting.pop(fd, None) is not None:
+            self._epoll.register(fd, select.EPOLLIN)
 
     def _widen(self, port: Port) -> None:
         if port.mtu + ETHER_BYTES > self._batch.slot_bytes:
@@ -96,6 +143,7 @@ class RawPlane(LinkedPlane):
         for sockets in self._lanes.values():
             opened = sockets.pop(index, None)
             if opened is not None:
+                self._end_rest(opened.fileno())
                 self.unwatch(opened)
                 opened.close()
 
@@ -149,7 +197,12 @@ class RawPlane(LinkedPlane):
         return Arrival(port, *_shape(size).unpack_from(self._batch.pool, slot))
 
     def _forward_all(
-        self, entries: Mapping[bytes, Hops], port: int, source: socket.socket, sinks: Mapping[int, socket.socket]
+        self,
+        entries: Mapping[bytes, Hops],
+        sides: Mapping[bytes, int],
+        port: int,
+        source: socket.socket,
+        sinks: Mapping[int, socket.socket],
     ) -> None:
         """Take one batch from a port and forward it by ``sinks``, handing up what is for the node."""
         batch, get = self._batch, entries.get
@@ -166,14 +219,14 @@ class RawPlane(LinkedPlane):
                 if hops is None:
                     hops = get(key[:NAME_BYTES])
                 run_key, run_hops, run_start = key, hops or NOWHERE, slot
-                fits = self._narrowest(run_hops)
+                fits = self._narrowest(run_hops) if key not in sides or is_side(sides[key], port) else 0
             if HEADER_BYTES + length <= size <= fits and hops_left > 1 and _FIRST <= first < _FIRST_CONTROL:
                 pool[at + HOPS_AT] = hops_left - 1
             else:
                 slot = at // step
                 self._send(sinks, run_hops, run_start, slot - run_start)
                 run_start = slot + 1
-                self._consider(entries, port, sinks, slot, size)
+                self._consider(entries, sides, port, sinks, slot, size)
         self._send(sinks, run_hops, run_start, len(sizes) - run_start)
 
     def _narrowest(self, hops: Hops) -> int:
@@ -181,12 +234,18 @@ class RawPlane(LinkedPlane):
         return min((self._mtus.get(hop[0], 0) for hop in hops), default=0)
 
     def _consider(
-        self, entries: Mapping[bytes, Hops], port: int, sinks: Mapping[int, socket.socket], slot: int, size: int
+        self,
+        entries: Mapping[bytes, Hops],
+        sides: Mapping[bytes, int],
+        port: int,
+        sinks: Mapping[int, socket.socket],
+        slot: int,
+        size: int,
     ) -> None:
         """Decide on the one frame in a slot by the reference, and do what it says."""
         batch, drops = self._batch, self._counters.drops
         at = slot * batch.slot_bytes
-        verdict = decide(batch.pool[at : at + ETHER_BYTES + size], entries, self._mtus)
+        verdict = decide(batch.pool[at : at + ETHER_BYTES + size], entries, self._mtus, sides, port)
         if isinstance(verdict, Drop):
             drops[verdict.reason] += 1
         elif isinstance(verdict, Forward):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import select
 import socket
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import partial
 from typing import Final
 
@@ -95,6 +95,9 @@ class ScapyPlane(LinkedPlane):
                 left += self._send(port, ether / GDP(frame))
         return left
 
+    def set_neighbours(self, port: int, macs: Collection[bytes]) -> None:
+        """Do nothing: one socket a port takes frames as they come."""
+
     def _sniff(self, index: int) -> None:
         """Read a burst from one port that is ready; return when it is empty."""
         opened, _ = self._sockets[index]
@@ -119,7 +122,7 @@ class ScapyPlane(LinkedPlane):
         if self._entries is None:
             self._hand_up(index, frame)
             return
-        verdict = decide(frame, self._entries, self._mtus)
+        verdict = decide(frame, self._entries, self._mtus, self._sides, index)
         if isinstance(verdict, Drop):
             counters.drops[verdict.reason] += 1
         elif isinstance(verdict, Forward):

@@ -10,9 +10,10 @@ sending, and a data frame that was broadcast (which every switch on a shared lin
 our business: neither forwarded nor counted.
 
 A port may have a socket for each *lane*, so that nothing waits in a queue behind what matters less: what neighbours
-say to each other, frames flagged urgent, all the rest. A flood on one lane fills that lane's queue alone. What leaves
-by the first two carries a priority that every queueing discipline with bands honours (``pfifo_fast``, ``prio``, and the
-access categories of Wi-Fi).
+say to each other, their hellos, frames flagged urgent, all the rest, and last what strangers say to us. A flood on one
+lane fills that lane's queue alone. Who is a neighbour is told by its address, which the filters are given with each
+change. What leaves by the lanes of neighbours and of urgent frames carries a priority that every queueing discipline
+with bands honours (``pfifo_fast``, ``prio``, and the access categories of Wi-Fi).
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ import errno
 import socket
 import struct
 from array import array
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from enum import Enum
 from typing import Final
 
 from gdp.errors import LocalError
 from gdp.frame.codec import ETHER_BYTES, FLAGS_AT, KIND_AT
-from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, Flag
+from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, Flag, Kind
 
 __all__ = [
     "AS_ROOT",
@@ -38,6 +39,8 @@ __all__ = [
     "large_buffers",
     "only_ours",
     "open_port",
+    "steps_of",
+    "tell_neighbours",
 ]
 
 AS_ROOT: Final = "run this as root, or with scripts/privileged.sh"
@@ -50,10 +53,13 @@ _PACKET_IGNORE_OUTGOING: Final = 23  # Linux 4.20; older kernels rely on the fil
 _SO_ATTACH_FILTER: Final = 26
 _SO_SNDBUFFORCE: Final = 32
 _SO_RCVBUFFORCE: Final = 33
+_GREETING_BUFFER_BYTES: Final = 128 << 10  # about a hundred hellos: those of a flood are old before they are read
 _BUFFER_BYTES: Final = 16 << 20  # a 921,600-byte message is 1.6 MB of socket memory at MTU 1500
 
 _Step = tuple[int, int, int, int]  # code, steps to jump if it holds, if it does not, value
 _LOAD_BYTE: Final = 0x30  # BPF_LD | BPF_B | BPF_ABS; beyond the frame's end, the frame is left
+_LOAD_HALF: Final = 0x28  # BPF_LD | BPF_H | BPF_ABS
+_LOAD_WORD: Final = 0x20  # BPF_LD | BPF_W | BPF_ABS
 _LOAD_LENGTH: Final = 0x80  # BPF_LD | BPF_W | BPF_LEN
 _JUMP_EQUAL: Final = 0x15  # BPF_JMP | BPF_JEQ | BPF_K
 _JUMP_GREATER_EQUAL: Final = 0x35  # BPF_JMP | BPF_JGE | BPF_K
@@ -69,10 +75,28 @@ _LANED_BYTES: Final = ETHER_BYTES + FLAGS_AT + 1  # what tells a frame's lane
 _LENGTH: Final = (_LOAD_LENGTH, 0, 0, 0)
 _TAKE: Final = (_RETURN, 0, 0, _WHOLE)
 _LEAVE: Final = (_RETURN, 0, 0, 0)
+_SOURCE_AT: Final = 6  # in the Ethernet header
+_CONTROL_ONLY: Final = (
+    _TYPE,
+    (_JUMP_EQUAL, 2, 0, socket.PACKET_HOST),
+    (_JUMP_EQUAL, 1, 0, socket.PACKET_BROADCAST),
+    _LEAVE,
+    _LENGTH,
+    (_JUMP_GREATER_EQUAL, 1, 0, _LANED_BYTES),
+    _LEAVE,
+    _KIND,
+    (_JUMP_GREATER_EQUAL, 1, 0, CONTROL_FROM),
+    _LEAVE,
+)
+_NO_HELLO: Final = ((_JUMP_EQUAL, 0, 1, Kind.HELLO), _LEAVE)
+_HELLO_ONLY: Final = ((_JUMP_EQUAL, 1, 0, Kind.HELLO), _LEAVE)
 
 
 class Lane(Enum):
-    """Which of our frames a socket sees: steps of (code, jump if true, jump if false, value)."""
+    """Which of our frames a socket sees: steps of (code, jump if true, jump if false, value).
+
+    In the lanes of ``_BY_ADDRESS`` the sender's address decides what follows.
+    """
 
     ALL = (
         _TYPE,
@@ -83,17 +107,9 @@ class Lane(Enum):
         _TAKE,
         _LEAVE,
     )
-    CONTROL = (
-        _TYPE,
-        (_JUMP_EQUAL, 1, 0, socket.PACKET_HOST),
-        (_JUMP_EQUAL, 0, 5, socket.PACKET_BROADCAST),
-        _LENGTH,
-        (_JUMP_GREATER_EQUAL, 0, 3, _LANED_BYTES),
-        _KIND,
-        (_JUMP_GREATER_EQUAL, 0, 1, CONTROL_FROM),
-        _TAKE,
-        _LEAVE,
-    )
+    CONTROL = (*_CONTROL_ONLY, *_NO_HELLO)  # of neighbours
+    HELLO = (*_CONTROL_ONLY, *_HELLO_ONLY)  # of neighbours
+    GUEST = _CONTROL_ONLY  # of everybody else
     URGENT = (
         _TYPE,
         (_JUMP_EQUAL, 0, 5, socket.PACKET_HOST),
@@ -118,6 +134,39 @@ class Lane(Enum):
     )
 
 
+_BY_ADDRESS: Final = {Lane.CONTROL: (_TAKE, _LEAVE), Lane.HELLO: (_TAKE, _LEAVE), Lane.GUEST: (_LEAVE, _TAKE)}
+
+
+def steps_of(lane: Lane, neighbours: Iterable[bytes] = ()) -> tuple[_Step, ...]:
+    """Return the filter of a lane.
+
+    Args:
+        neighbours: addresses, 6 bytes each; five steps for each of them.
+    """
+    steps: tuple[_Step, ...] = lane.value
+    if lane not in _BY_ADDRESS:
+        return steps
+    neighbours_own, others = _BY_ADDRESS[lane]
+    for mac in sorted(neighbours):
+        steps += (
+            (_LOAD_WORD, 0, 0, _SOURCE_AT),
+            (_JUMP_EQUAL, 0, 3, int.from_bytes(mac[:4], "big")),
+            (_LOAD_HALF, 0, 0, _SOURCE_AT + 4),
+            (_JUMP_EQUAL, 0, 1, int.from_bytes(mac[4:], "big")),
+            neighbours_own,
+        )
+    return (*steps, others)
+
+
+def tell_neighbours(opened: socket.socket, lane: Lane, neighbours: Iterable[bytes]) -> None:
+    """Give a socket the addresses of a port's neighbours.
+
+    Raises:
+        OSError: not a packet socket.
+    """
+    _filter(opened, steps_of(lane, neighbours))
+
+
 def open_port(ifname: str, lane: Lane = Lane.ALL, *, bypass_qdisc: bool = False) -> socket.socket:
     """Open a non-blocking socket for our EtherType on one device.
 
@@ -134,11 +183,14 @@ def open_port(ifname: str, lane: Lane = Lane.ALL, *, bypass_qdisc: bool = False)
         raise LocalError(NO_RAW_SOCKETS) from error
     try:
         only_ours(opened, lane)
-        if lane in (Lane.CONTROL, Lane.URGENT):
+        if lane in (Lane.CONTROL, Lane.HELLO, Lane.URGENT):
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_PRIORITY, _PRIORITY)
         if bypass_qdisc:
             opened.setsockopt(_SOL_PACKET, _PACKET_QDISC_BYPASS, 1)
-        large_buffers(opened)
+        if lane in (Lane.HELLO, Lane.GUEST):
+            opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _GREETING_BUFFER_BYTES)
+        else:
+            large_buffers(opened)
         opened.setblocking(False)
         opened.bind((ifname, ETHERTYPE))
     except OSError as error:
@@ -153,7 +205,7 @@ def only_ours(opened: socket.socket, lane: Lane = Lane.ALL) -> None:
     Raises:
         OSError: not a packet socket.
     """
-    _filter(opened, lane.value)
+    _filter(opened, steps_of(lane))
     try:
         opened.setsockopt(_SOL_PACKET, _PACKET_IGNORE_OUTGOING, 1)
     except OSError as error:

@@ -28,7 +28,14 @@ from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.effects import Instant
 from gdp.errors import DropReason, RemoteError, StatementError, StoreError
 from gdp.frame.kinds import Kind
-from gdp.limits import LEASE_MAX_S, NEGATIVE_LEASE_S, RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX, WITHDRAWAL_MAX_BYTES
+from gdp.limits import (
+    CLOCK_SKEW_S,
+    LEASE_MAX_S,
+    NEGATIVE_LEASE_S,
+    RIB_NAMES_PER_SENDER,
+    RIB_WATCHES_MAX,
+    WITHDRAWAL_MAX_BYTES,
+)
 from gdp.names import Name
 from gdp.rib.above import Above
 from gdp.rib.digest_tree import DigestTree
@@ -37,6 +44,7 @@ from gdp.rib.route import Route, Withdrawn
 from gdp.rib.store import Store
 from gdp.rib.upstream import PROBE_S, Passed, Upstream
 from gdp.rib.watches import Asker, Watches
+from gdp.trust.audit import Action
 from gdp.trust.claim import Claim, ClaimBody
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
@@ -86,6 +94,7 @@ class Rib:
 
     def __init__(self, identity: Identity, policy: Policy, store: Store, settings: RibSettings) -> None:
         self._identity = identity
+        self._audit = policy.audit
         self._policy = policy
         self._store = store
         self._settings = settings
@@ -189,6 +198,8 @@ class Rib:
             return
         if revocation is None:
             return
+        who, about = revocation.issuer.name.to_text(), revocation.fingerprint.hex()
+        self._audit.note(Action.REVOKED, "certificate", who=who, about=about)
         for route in self._store.resting_on(revocation.fingerprint):
             try:
                 self._verifier.verify(route.claim, now.unix_s)
@@ -251,7 +262,7 @@ class Rib:
                 raise StatementError(DropReason.WRONG_DOMAIN, "a claim of a domain that is not trusted")
             if member.domain != self._policy.own and not claim.is_global:
                 raise StatementError(DropReason.WRONG_DOMAIN, "a local name of another domain")
-            self._check_identity(claim, now.mono_s)
+            self._check_identity(claim, now)
             if claim.right is Right.ATTACH and self.identities.is_refused_above(
                 claim.node, claim.incarnation, now.mono_s
             ):
@@ -267,13 +278,15 @@ class Rib:
             route = replace(route, domain=relay.domain)
         self._store.put(route)
         self.accepted += 1
+        if not isinstance(known, Route):
+            self._audit.note(Action.ACCEPTED, "name", who=route.advertiser.to_text(), about=route.name.to_text())
         self._judge(route.name, route.advertiser, None, route.sequence, member.name)
         self._tell(route, known, now.mono_s)
         self._replicate(route.name, route.advertiser)
         if claim.is_global and not self._upstream.has(member.name):
             self._pass_up(route, relay.statement, route.sequence, now.mono_s)
 
-    def _check_identity(self, claim: Claim, now_s: float) -> None:
+    def _check_identity(self, claim: Claim, now: Instant) -> None:
         """Refuse a node's own name in another incarnation while the older node lives at another switch.
 
         Raises:
@@ -283,10 +296,11 @@ class Rib:
         if not isinstance(held, Route) or held.switch == claim.switch:
             return
         older = ClaimBody.from_statement(parse(held.claim)).incarnation
-        if older == claim.incarnation or self.identities.is_free(claim.node, older, held.switch, now_s):
+        if older == claim.incarnation or self.identities.is_free(claim.node, older, held.switch, now.mono_s):
             return
-        if self.identities.must_ask(claim.node, older, held.switch, now_s):
-            question = Presence(claim.node, older, claim.switch)
+        number = int(now.unix_s * 1_000)
+        if self.identities.must_ask(claim.node, older, held.switch, number, now.mono_s):
+            question = Presence(claim.node, older, claim.switch, number)
             wire = question.to_wire(self._identity.name, self._identity.key, self._identity.membership)
             self._letters.append(Letter(held.switch, Kind.RIB_ANSWER, wire))
         raise StatementError(DropReason.IN_USE, "another node with this identity")
@@ -311,10 +325,21 @@ class Rib:
             is_repeated = isinstance(known, Route) and (known.claim, known.via) == (claim.wire, member.domain)
             if not is_repeated:
                 raise StatementError(DropReason.STALE, str(known.sequence))
-        is_new = known is None or known.sender != member.name
-        if is_new and self._store.count_of(member.name) >= self._settings.names_per_sender:
-            raise StatementError(DropReason.QUOTA, "names of one sender")
+        if known is None or known.sender != member.name:
+            self._check_quota(member.name, claim.node)
         return known
+
+    def _check_quota(self, sender: Name, node: Name) -> None:
+        """Return if a sender may bring another name, and a node have one: as many as the sender has left, at most.
+
+        Raises:
+            StatementError: QUOTA.
+        """
+        free = self._settings.names_per_sender - self._store.count_of(sender)
+        if free <= 0:
+            raise StatementError(DropReason.QUOTA, "names of one sender")
+        if self._store.count_of(node) >= free:
+            raise StatementError(DropReason.QUOTA, "names of one node")
 
     def _route(self, claim: Claim, transit: tuple[Name, ...], member: Membership, now: Instant) -> Route:
         left_s = max(claim.valid_until_unix_s - now.unix_s, 1.0)
@@ -365,6 +390,8 @@ class Rib:
             name = ClaimBody.from_statement(passed_on).subject.name
         except StatementError:
             return  # not even a claim: nothing to name in an answer; the caller counts it
+        who, reason = passed_on.signer.to_text(), error.reason.label
+        self._audit.note(Action.REFUSED, "name", who=who, about=name.to_text(), reason=reason)
         known = self._store.get(name, passed_on.signer)
         self._judge(name, passed_on.signer, error.reason, 0 if known is None else known.sequence, member.name)
         has_moved = error.reason is DropReason.STALE and isinstance(known, Route) and known.sender != member.name
@@ -382,6 +409,8 @@ class Rib:
     def _take_query(self, statement: Statement, now: Instant) -> None:
         fields = statement.fields
         member = self._sender(fields.bytes_("c"), statement, now)
+        if member.role not in (Role.SWITCH, Role.RIB):
+            raise StatementError(DropReason.NOT_DELEGATED, "only switches and RIBs ask")
         statement.verify(member.key)
         query = Query.from_fields(fields)
         if query.name == self._identity.name:
@@ -635,8 +664,8 @@ class Rib:
             return
         if entry.is_from_above and (not isinstance(known, Route) or known.is_from_above):
             return  # nothing here that it corrects
-        if known is None and self._store.count_of(entry.sender) >= self._settings.names_per_sender:
-            raise StatementError(DropReason.QUOTA, "names of one sender")
+        if known is None:
+            self._check_quota(entry.sender, claim.node)
         route = Route.of(
             claim,
             sender=entry.sender,
@@ -664,13 +693,13 @@ class Rib:
             return
         member = self._sender(entry.membership, withdrawal, now)
         withdrawal.verify(member.key)
-        until_unix_s = min(entry.until_unix_s, member.not_after_unix_s)
+        until_unix_s = min(entry.until_unix_s, member.not_after_unix_s + int(CLOCK_SKEW_S))
         if known is not None:  # a peer cannot have us forget sooner what we know
             until_unix_s = max(until_unix_s, known.valid_until_unix_s)
         if until_unix_s <= now.unix_s:
             return  # forgotten here already
-        if known is None and self._store.count_of(entry.sender) >= self._settings.names_per_sender:
-            raise StatementError(DropReason.QUOTA, "names of one sender")
+        if known is None:
+            self._check_quota(entry.sender, withdrawal.signer)
         gone = Withdrawn(entry.sender, sequence, until_unix_s, withdrawal.wire, entry.membership)
         route = self._store.withdraw(name, withdrawal.signer, gone)
         if route is not None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gdp.limits import CLOCK_SKEW_S
 from gdp.names import Name
 from gdp.trust.claim import Claim
 
@@ -26,7 +27,7 @@ class Route:
         claim: the signed bytes.
         is_from_above: learnt from the tier above, to be passed down only.
         expires_s: end of the lease, monotonic seconds.
-        valid_until_unix_s: when the claim's evidence runs out; it cannot be played back after that.
+        valid_until_unix_s: ``CLOCK_SKEW_S`` after the claim's evidence runs out; it cannot be played back after that.
         fingerprints: of that evidence; a revocation names one of them.
     """
 
@@ -71,7 +72,7 @@ class Route:
             claim=claim.wire,
             is_from_above=is_from_above,
             expires_s=expires_s,
-            valid_until_unix_s=claim.valid_until_unix_s,
+            valid_until_unix_s=claim.valid_until_unix_s + int(CLOCK_SKEW_S),
             fingerprints=claim.fingerprints,
         )
 

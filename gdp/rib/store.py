@@ -56,8 +56,11 @@ class Store(Protocol):
     def next_expiry(self) -> float | None:
         """Return the monotonic second of the next lease end, or None."""
 
-    def count_of(self, sender: Name) -> int:
-        """Return how many routes, withdrawn ones that are not forgotten too, are kept for a sender."""
+    def count_of(self, owner: Name) -> int:
+        """Return how many routes are kept that a sender relayed, or a node advertises.
+
+        Withdrawn ones that are not forgotten count too.
+        """
 
     def resting_on(self, fingerprint: bytes) -> list[Route]:
         """Return the routes whose evidence includes a certificate; looks at all."""
@@ -109,7 +112,7 @@ class MemoryStore:
         if not route.is_from_above:
             self.digests.put(route.name, route.advertiser, route.sequence, is_withdrawn=False)
         self._routes.setdefault(route.name, {})[route.advertiser] = route
-        self._counts[route.sender] = self._counts.get(route.sender, 0) + 1
+        self._count(route.sender, route.advertiser)
         self._size += 1
         heapq.heappush(self._ends, (route.expires_s, route.name, route.advertiser))
 
@@ -124,7 +127,7 @@ class MemoryStore:
             self.changes.add((name, advertiser))
         self._forget_withdrawn(name, advertiser)
         self._withdrawn[name, advertiser] = withdrawn
-        self._counts[withdrawn.sender] = self._counts.get(withdrawn.sender, 0) + 1
+        self._count(withdrawn.sender, advertiser)
         heapq.heappush(self._forget, (withdrawn.valid_until_unix_s, name, advertiser))
         if withdrawn.proof:
             self.digests.put(name, advertiser, withdrawn.sequence, is_withdrawn=True)
@@ -152,9 +155,9 @@ class MemoryStore:
         """Return a monotonic second that is no later than the next lease end, or None."""
         return self._ends[0][0] if self._ends else None
 
-    def count_of(self, sender: Name) -> int:
-        """Return how many routes, withdrawn ones that are not forgotten too, are kept for a sender."""
-        return self._counts.get(sender, 0)
+    def count_of(self, owner: Name) -> int:
+        """Return how many routes are kept that a sender relayed, or a node advertises."""
+        return self._counts.get(owner, 0)
 
     def resting_on(self, fingerprint: bytes) -> list[Route]:
         """Return the routes whose evidence includes a certificate; looks at all."""
@@ -169,19 +172,24 @@ class MemoryStore:
         if not of_name:
             del self._routes[name]
         self._size -= 1
-        self._uncount(route.sender)
+        self._uncount(route.sender, advertiser)
         self.digests.remove(name, advertiser)
         return route
 
     def _forget_withdrawn(self, name: Name, advertiser: Name) -> None:
         withdrawn = self._withdrawn.pop((name, advertiser), None)
         if withdrawn is not None:
-            self._uncount(withdrawn.sender)
+            self._uncount(withdrawn.sender, advertiser)
             self.digests.remove(name, advertiser)
 
-    def _uncount(self, sender: Name) -> None:
-        left = self._counts[sender] - 1
-        if left:
-            self._counts[sender] = left
-        else:
-            del self._counts[sender]
+    def _count(self, *owners: Name) -> None:
+        for owner in owners:
+            self._counts[owner] = self._counts.get(owner, 0) + 1
+
+    def _uncount(self, *owners: Name) -> None:
+        for owner in owners:
+            left = self._counts[owner] - 1
+            if left:
+                self._counts[owner] = left
+            else:
+                del self._counts[owner]

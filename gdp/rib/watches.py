@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from gdp.errors import DropReason, StatementError
 from gdp.limits import RIB_WATCHES_MAX
+from gdp.message.shares import Shares
 from gdp.names import Name
 
 __all__ = ["Asker", "Watches"]
@@ -27,17 +28,16 @@ class Watches:
     """Watches by name and asker; their ends in a heap, whose entries are renewed when they come up.
 
     Args:
-        maximum: how many there may be at once.
+        maximum: how many there may be at once, shared among those who watch and their domains.
     """
 
     def __init__(self, maximum: int = RIB_WATCHES_MAX) -> None:
-        self._maximum = maximum
         self._by_name: dict[Name, dict[Asker, float]] = {}
         self._ends: list[tuple[float, Name, Asker]] = []
-        self._size = 0
+        self._shares = Shares(maximum)
 
     def __len__(self) -> int:
-        return self._size
+        return len(self._shares)
 
     def add(self, name: Name, asker: Asker, until_s: float) -> None:
         """Watch, or watch on.
@@ -50,9 +50,8 @@ class Watches:
         if known_s is not None and watchers is not None:
             watchers[asker] = max(until_s, known_s)
             return
-        if self._size >= self._maximum:
+        if not self._shares.take(asker.name, asker.domain):
             raise StatementError(DropReason.QUOTA, "watches")
-        self._size += 1
         self._by_name.setdefault(name, {})[asker] = until_s
         heapq.heappush(self._ends, (until_s, name, asker))
 
@@ -76,4 +75,4 @@ class Watches:
             del self._by_name[name][asker]
             if not self._by_name[name]:
                 del self._by_name[name]
-            self._size -= 1
+            self._shares.give(asker.name, asker.domain)

@@ -86,7 +86,7 @@ class ClusterStore:
         self._floors: OrderedDict[Key, Withdrawn] = OrderedDict()  # what the cluster said is newer
         self._writes: list[_Write] = []
         self._ends: list[tuple[float, Name, Name]] = []
-        self._senders: dict[Name, dict[int, float]] = {}  # ends of leases, of what came through this RIB
+        self._owners: dict[Name, dict[int, float]] = {}  # ends of leases, by sender and by advertiser
         self.refusals: Counter[DropReason] = Counter()  # of what was read and does not hold
         self.digests = None
 
@@ -119,8 +119,8 @@ class ClusterStore:
         self._of(route.name)[route.advertiser] = route
         self._floors.pop((route.name, route.advertiser), None)
         heapq.heappush(self._ends, (route.expires_s, route.name, route.advertiser))
-        held = self._senders.setdefault(route.sender, {})
-        held[hash((route.name, route.advertiser))] = route.expires_s
+        for owner in (route.sender, route.advertiser):
+            self._owners.setdefault(owner, {})[hash((route.name, route.advertiser))] = route.expires_s
         if not route.is_from_above:
             self._writes.append(self._put_command(route))
 
@@ -184,11 +184,11 @@ class ClusterStore:
         """Return a monotonic second that is no later than the next lease end in memory, or None."""
         return self._ends[0][0] if self._ends else None
 
-    def count_of(self, sender: Name) -> int:
-        """Return how many routes of a sender came through this RIB and hold still."""
-        held = self._senders.get(sender, {})
+    def count_of(self, owner: Name) -> int:
+        """Return how many routes of a sender or a node came through this RIB and hold still."""
+        held = self._owners.get(owner, {})
         if len(held) > 1_000 and min(held.values()) <= self._now.mono_s:
-            held = self._senders[sender] = {key: end for key, end in held.items() if end > self._now.mono_s}
+            held = self._owners[owner] = {key: end for key, end in held.items() if end > self._now.mono_s}
         return len(held)
 
     def resting_on(self, fingerprint: bytes) -> list[Route]:

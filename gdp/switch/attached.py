@@ -5,9 +5,13 @@ Place: pure; time comes in as ``now_s`` (monotonic seconds).
 
 from __future__ import annotations
 
+import heapq
 from dataclasses import dataclass
 from typing import Final
 
+from gdp.errors import DropReason, StatementError
+from gdp.limits import ATTACHED_MAX
+from gdp.message.shares import Shares
 from gdp.names import Name
 from gdp.trust.claim import Claim
 from gdp.trust.right import Right
@@ -32,14 +36,17 @@ class Attachment:
 
 
 class Attached:
-    """The claims of all attached nodes, by (name, advertiser)."""
+    """The claims of all attached nodes, by (name, advertiser); bounded, and shared among the nodes."""
 
     def __init__(self) -> None:
         self._by_name: dict[Name, dict[Name, Attachment]] = {}
-        self._next_s = float("inf")  # nothing is due before
+        self._shares = Shares(ATTACHED_MAX)
+        self._relays: list[tuple[float, int, Attachment]] = []  # heaps; entries that a renewal made stale are skipped
+        self._ends: list[tuple[float, int, Attachment]] = []
+        self._pushed = 0
 
     def __len__(self) -> int:
-        return sum(map(len, self._by_name.values()))
+        return len(self._shares)
 
     def get(self, name: Name, advertiser: Name) -> Attachment | None:
         """Return a claim, or None."""
@@ -53,16 +60,25 @@ class Attached:
         return None
 
     def put(self, claim: Claim, port: int, mac: bytes, now_s: float) -> Attachment:
-        """Note a verified claim; it is to be relayed at once."""
+        """Note a verified claim; it is to be relayed at once.
+
+        Raises:
+            StatementError: QUOTA, the node has too many.
+        """
+        if self.get(claim.name, claim.node) is None and not self._shares.take(claim.node):
+            raise StatementError(DropReason.QUOTA, "claims of one node")
         attachment = Attachment(claim, port, mac, now_s + claim.lease_s, now_s)
         self._by_name.setdefault(claim.name, {})[claim.node] = attachment
-        self._next_s = min(self._next_s, now_s)
+        self._push(self._relays, now_s, attachment)
+        self._push(self._ends, attachment.expires_s, attachment)
         return attachment
 
     def remove(self, name: Name, advertiser: Name) -> Attachment | None:
         """Forget a claim; return it, if it was there."""
         claims = self._by_name.get(name, {})
         gone = claims.pop(advertiser, None)
+        if gone is not None:
+            self._shares.give(advertiser)
         if not claims:
             self._by_name.pop(name, None)
         return gone
@@ -89,47 +105,59 @@ class Attached:
 
     def relay_all(self, now_s: float) -> None:
         """Have everything relayed again: there is a new RIB."""
-        for claims in self._by_name.values():
-            for attachment in claims.values():
-                attachment.is_settled, attachment.relay_at_s, attachment.tries = False, now_s, 0
-        self._next_s = min(self._next_s, now_s)
+        for attachment in self.all():
+            attachment.is_settled, attachment.relay_at_s, attachment.tries = False, now_s, 0
+            self._push(self._relays, now_s, attachment)
 
     def due(self, now_s: float) -> list[Attachment]:
         """Return the claims to relay now."""
-        if now_s < self._next_s:
-            return []
         due = []
-        for claims in self._by_name.values():
-            for each in claims.values():
-                if not each.is_settled and each.relay_at_s <= now_s and each.tries < RELAY_TRIES:
-                    each.tries += 1
-                    each.relay_at_s = now_s + RELAY_AGAIN_S
-                    due.append(each)
-        self._look_ahead()
+        while self._next_relay() <= now_s:
+            each = heapq.heappop(self._relays)[2]
+            each.tries += 1
+            each.relay_at_s = now_s + RELAY_AGAIN_S
+            self._push(self._relays, each.relay_at_s, each)
+            due.append(each)
         return due
 
     def expire(self, now_s: float) -> list[Attachment]:
         """Forget and return what was not renewed."""
-        if now_s < self._next_s:
-            return []
-        late = [each for claims in self._by_name.values() for each in claims.values() if each.expires_s <= now_s]
-        for each in late:
-            self.remove(each.claim.name, each.claim.node)
+        late = []
+        while self._next_end() <= now_s:
+            late.append(heapq.heappop(self._ends)[2])
+            self.remove(late[-1].claim.name, late[-1].claim.node)
         return late
 
     def next_event(self) -> float | None:
-        """Return a monotonic second that is no later than the next relay or lease end, or None."""
-        return self._next_s if self._by_name else None
+        """Return the monotonic second of the next relay or lease end, or None."""
+        next_s = min(self._next_relay(), self._next_end())
+        return None if next_s == float("inf") else next_s
 
     def next_expiry(self) -> float | None:
-        """Return the monotonic second of the next lease end, or None; looks at all."""
-        ends = (each.expires_s for claims in self._by_name.values() for each in claims.values())
-        return min(ends, default=None)
+        """Return the monotonic second of the next lease end, or None."""
+        next_s = self._next_end()
+        return None if next_s == float("inf") else next_s
 
-    def _look_ahead(self) -> None:
-        times = [
-            each.expires_s if each.is_settled or each.tries >= RELAY_TRIES else min(each.relay_at_s, each.expires_s)
-            for claims in self._by_name.values()
-            for each in claims.values()
-        ]
-        self._next_s = min(times, default=float("inf"))
+    def _push(self, heap: list[tuple[float, int, Attachment]], at_s: float, attachment: Attachment) -> None:
+        self._pushed += 1
+        heapq.heappush(heap, (at_s, self._pushed, attachment))
+
+    def _is_held(self, attachment: Attachment) -> bool:
+        return self.get(attachment.claim.name, attachment.claim.node) is attachment
+
+    def _next_relay(self) -> float:
+        while self._relays:
+            at_s, _, each = self._relays[0]
+            is_open = not each.is_settled and each.tries < RELAY_TRIES
+            if is_open and each.relay_at_s == at_s and self._is_held(each):
+                return at_s
+            heapq.heappop(self._relays)
+        return float("inf")
+
+    def _next_end(self) -> float:
+        while self._ends:
+            at_s, _, each = self._ends[0]
+            if self._is_held(each):
+                return at_s
+            heapq.heappop(self._ends)
+        return float("inf")

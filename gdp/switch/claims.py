@@ -23,6 +23,7 @@ from gdp.switch.places import Places
 from gdp.switch.planter import Planter
 from gdp.switch.relocation import Relocations
 from gdp.switch.unicast import Unicast
+from gdp.trust.audit import Action
 from gdp.trust.claim import ClaimBody
 from gdp.trust.right import HEARS, Right
 from gdp.trust.verifier import ClaimVerifier
@@ -47,6 +48,7 @@ class Claims:
     ) -> None:
         self._identity = identity
         self._verifier = verifier
+        self._audit = verifier.policy.audit
         self._attached = attached
         self._places = places
         self._planter = planter
@@ -76,7 +78,12 @@ class Claims:
             self._judge(neighbour, claim.name, DropReason.STALE, newest)
             raise StatementError(DropReason.STALE, "a claim that its maker has renewed")
         if claim.right in HEARS:
-            if self._planter.add_reader(claim, at, self._places.of(claim.name, now.mono_s), now.mono_s):
+            try:
+                is_first = self._planter.add_reader(claim, at, self._places.of(claim.name, now.mono_s), now.mono_s)
+            except StatementError as error:
+                self._refuse(neighbour, statement, error)
+                raise
+            if is_first:
                 self._places.want(claim.name, now.mono_s, watch=True)
             for place in self._places.of(claim.name, now.mono_s):
                 self._inquirer.tell_reader(at, claim.right, place, now.mono_s)
@@ -85,8 +92,13 @@ class Claims:
             self._judge(neighbour, claim.name, None, claim.sequence)
         if claim.right is not Right.READ:
             known = self._attached.get(claim.name, claim.node)
-            self._attached.put(claim, *at, now.mono_s)
+            try:
+                self._attached.put(claim, *at, now.mono_s)
+            except StatementError as error:
+                self._refuse(neighbour, statement, error)
+                raise
             if known is None or (known.port, known.mac) != at:
+                self._audit.note(Action.ACCEPTED, "name", who=claim.node.to_text(), about=claim.name.to_text())
                 self._unicast.forget(claim.name)
             self._unicast.release(claim.name, now.mono_s)
             self._planter.publisher_attached(claim, now.mono_s)
@@ -106,6 +118,8 @@ class Claims:
             body = ClaimBody.from_statement(statement)
         except StatementError:
             return  # not even a claim: the caller counts it
+        about, reason = body.subject.name.to_text(), error.reason.label
+        self._audit.note(Action.REFUSED, "name", who=neighbour.name.to_text(), about=about, reason=reason)
         self._judge(neighbour, body.subject.name, error.reason, body.sequence)
 
     def _judge(self, neighbour: Neighbour, name: Name, refused: DropReason | None, sequence: int) -> None:

@@ -23,7 +23,7 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement
 from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
-from gdp.limits import LINK_STATE_REFRESH_S
+from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_REFRESH_S
 from gdp.names import Name
 from gdp.switch.damping import Damping
 from gdp.switch.link_states import LinkStates
@@ -76,6 +76,7 @@ class Flooding:
         self._answers: dict[tuple[bytes, Scope], int] = {}  # by life: how often it went above what we said
         self.is_displaced = False
         self._rivals_seen = 0
+        self._unix_ahead_s = 0.0  # of the wall clock before the monotonic one
         self._begun_s: float | None = None
         self._stub_until_s: float | None = None
         self._was_stub = False
@@ -89,6 +90,10 @@ class Flooding:
         self._refresh_at_s: dict[Scope, float] = {}  # each by itself: news in one scope renew nothing of the other
         self._synced_s: dict[tuple[int, Name], float] = {}
         self._differs_s: dict[tuple[int, Name], float] = {}  # since when keepalives show other ones
+
+    def look_at_clock(self, now: Instant) -> None:
+        """Learn what the wall clock says, before anything is said."""
+        self._unix_ahead_s = now.unix_s - now.mono_s
 
     def digest_for(self, port: LinkPort) -> bytes:
         """Return what to say in a hello on a port: nothing where its switches are of several domains."""
@@ -106,6 +111,10 @@ class Flooding:
             scope = Scope.BORDER if fields.text("o", 8) == Scope.BORDER.value else Scope.DOMAIN
             if not self.link_states.is_news(statement.signer, scope, fields.uint("s")):
                 return False
+            if self.link_states.is_past(statement.signer, scope, fields.uint("s"), fields.bytes_("b", LIFE_BYTES)):
+                raise StatementError(DropReason.STALE, "a link state that is over")
+            if abs(now.unix_s - fields.uint("e")) > LINK_STATE_AGE_MAX_S:
+                raise StatementError(DropReason.STALE, "a link state of another time")
         check_sequence(fields.uint("s"), now.unix_s)
         member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
         if member.name != statement.signer or member.role is not Role.SWITCH:
@@ -238,7 +247,8 @@ class Flooding:
         self._said[scope] = said
         self._sequence += 1
         state = LinkState(
-            self._identity.name, self._domain, scope, self._sequence, links, inside, ribs, members, self._life, refused
+            self._identity.name, self._domain, scope, self._sequence, links, inside, ribs, members, self._life, refused,
+            said_unix_s=max(int(now_s + self._unix_ahead_s), 0),
         ).fitted(self._identity.membership)
         wire = state.to_wire(self._identity.key, self._identity.membership)
         self.link_states.put(state, wire, now_s)

@@ -6,7 +6,8 @@ Source: DESIGN sections 3 and 7. In this order:
 1. shorter than an Ethernet and a GDP header: drop, truncated; another EtherType or version: drop;
 2. a kind from 0x80 on is for the neighbour itself: hand up;
 3. hops left 0 or 1: drop, for it may not leave again; a payload longer than what came: drop, truncated;
-4. look up destination and source, then destination alone; a miss: hand up; an entry without hops: drop, no route;
+4. look up destination and source, then destination alone; a miss: hand up; an entry whose frames come from other
+   sides: drop, wrong side; an entry without hops: drop, no route;
 5. one copy to every hop, or to its alternate while the hop's port is down, except to a port that is down or whose link
    is too narrow: that copy alone is dropped.
 """
@@ -19,10 +20,11 @@ from typing import Final, NamedTuple
 from gdp.errors import DropReason
 from gdp.frame.codec import DESTINATION_AT, ETHER_BYTES, HEADER_BYTES, HOPS_AT, KIND_AT, OVERHEAD_BYTES, SOURCE_AT
 from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION
-from gdp.switch.table import MACS_BYTES, Hop, Hops
+from gdp.switch.table import MACS_BYTES, Hop, Hops, is_side
 
 __all__ = ["HAND_UP", "Drop", "Forward", "HandUp", "Verdict", "decide", "rewrite"]
 
+_NO_SIDES: Final[Mapping[bytes, int]] = {}
 _ETHERTYPE: Final = ETHERTYPE.to_bytes(2, "big")
 _HOPS: Final = ETHER_BYTES + HOPS_AT
 _LENGTH: Final = ETHER_BYTES + 6
@@ -51,13 +53,21 @@ Verdict = Drop | HandUp | Forward
 HAND_UP: Final = HandUp()
 
 
-def decide(frame: bytes | bytearray | memoryview, entries: Mapping[bytes, Hops], mtus: Mapping[int, int]) -> Verdict:
+def decide(
+    frame: bytes | bytearray | memoryview,
+    entries: Mapping[bytes, Hops],
+    mtus: Mapping[int, int],
+    sides: Mapping[bytes, int] = _NO_SIDES,
+    port: int = 0,
+) -> Verdict:
     """Say what becomes of a frame. Any bytes get a verdict; nothing is raised.
 
     Args:
         frame: from the Ethernet header on, padding included.
         entries: the forwarding table.
         mtus: port index to MTU (bytes after the Ethernet header) of the ports that are up.
+        sides: the table's masks of ports that frames may come from.
+        port: index of the one that this frame came from.
     """
     if len(frame) < OVERHEAD_BYTES:
         return Drop(DropReason.TRUNCATED)
@@ -71,11 +81,14 @@ def decide(frame: bytes | bytearray | memoryview, entries: Mapping[bytes, Hops],
         return Drop(DropReason.HOPS_EXPIRED)
     if len(frame) < OVERHEAD_BYTES + int.from_bytes(frame[_LENGTH : _LENGTH + 2], "big"):
         return Drop(DropReason.TRUNCATED)
-    hops = entries.get(bytes(frame[_DESTINATION : ETHER_BYTES + HEADER_BYTES]))
+    key = bytes(frame[_DESTINATION : ETHER_BYTES + HEADER_BYTES])
+    hops = entries.get(key)
     if hops is None:
         hops = entries.get(bytes(frame[_DESTINATION:_SOURCE]))
     if hops is None:
         return HAND_UP
+    if key in sides and not is_side(sides[key], port):
+        return Drop(DropReason.WRONG_SIDE)
     if not hops:
         return Drop(DropReason.NO_ROUTE)
     return _fit(hops, len(frame) - ETHER_BYTES, mtus)

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
+from gdp.control.channel import Channels, Opened
 from gdp.control.presence import Presence
 from gdp.control.query import Answer, Query
 from gdp.control.relay import relayed
@@ -66,6 +67,7 @@ class Inquirer:
         evidence: Evidence,
         outbox: Outbox,
         presence: PresenceAnswers,
+        channels: Channels,
     ) -> None:
         self._identity = identity
         self._policy = policy
@@ -79,6 +81,7 @@ class Inquirer:
         self._evidence = evidence
         self._outbox = outbox
         self._presence = presence
+        self._channels = channels
         self.rib: Name | None = None
         self._session = b""  # of that RIB with its switch: another one means that it restarted or moved
         self._chosen_s = float("-inf")
@@ -94,6 +97,8 @@ class Inquirer:
         session = b"" if known is None else known.session
         if (rib, session) != (self.rib, self._session):
             self.rib, self._session, self._chosen_s, self._owed_s = rib, session, now_s, None
+            if rib is not None:
+                self._channels.renew(rib)
             self._places.serve_stale(rib is None, now_s)
             self._attached.relay_all(now_s)
             self._places.ask_again(now_s)
@@ -113,6 +118,8 @@ class Inquirer:
 
     def ask(self, now_s: float) -> None:
         """Relay and ask what is due."""
+        self._channels.timeout(now_s)
+        self._send(now_s)
         if self.rib is None:
             return
         if now_s >= self._review_s:
@@ -153,13 +160,31 @@ class Inquirer:
         self._asked[self.rib] = None
         if len(self._asked) > 8:
             del self._asked[next(iter(self._asked))]
-        frames = self._outbox.far(Kind.RIB_REQUEST, statement, self.rib)
-        self._unicast.send(frames, self.rib, self._identity.name, now_s)
+        self._channels.ask(self.rib, statement, now_s)
+        self._send(now_s)
 
-    def receive(self, statement: Statement, now: Instant) -> None:
+    def _send(self, now_s: float) -> None:
+        for each in self._channels.take():
+            frames = self._outbox.far(Kind.RIB_REQUEST, each.wire, each.to)
+            self._unicast.send(frames, each.to, self._identity.name, now_s)
+
+    def open(self, wire: bytes, sender: Name, now: Instant) -> Opened | None:
+        """Take what came for this switch; return the statement in it, if it is for more than the channel to a RIB.
+
+        Raises:
+            RemoteError: it does not hold.
+        """
+        opened = self._channels.receive(wire, sender, now)
+        self._send(now.mono_s)
+        return opened
+
+    def receive(self, statement: Statement, now: Instant, *, is_fresh: bool) -> None:
         """Take a RIB's answer, verdict or question, or what a node's former switch knows.
 
         Whether a node is there any RIB of a trusted domain may ask: a tier above may know of another one.
+
+        Args:
+            is_fresh: it came in the channel to its signer.
 
         Raises:
             StatementError: it does not hold, or is from nobody who was asked.
@@ -176,6 +201,8 @@ class Inquirer:
         if member.role is Role.SWITCH:
             self._take_context(statement, now)
             return
+        if not is_fresh:
+            raise StatementError(DropReason.NO_CHANNEL, "an answer that may be a recorded one")
         self._rib_answered(member.name, now.mono_s)
         if statement.type is StatementType.VERDICT:
             self._take_verdict(statement)
@@ -335,5 +362,7 @@ class Inquirer:
     def next_timeout(self) -> float | None:
         """Return the monotonic second of the next question, or of the moment to leave a silent RIB."""
         owed_s = None if self._owed_s is None else self._owed_s + SILENT_S
-        times = [self._attached.next_event(), self._places.next_due(), owed_s, self._review_s]
+        times = [
+            self._attached.next_event(), self._places.next_due(), owed_s, self._review_s, self._channels.next_timeout(),
+        ]  # fmt: skip
         return None if self.rib is None else min((time for time in times if time is not None), default=None)

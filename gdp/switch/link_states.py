@@ -2,22 +2,29 @@
 
 Place: pure.
 Source: after RFC 2328, section 13.1 (which of two is newer) and 13.4 (one's own that comes back newer).
+
+What was forgotten stays known by its number for as long as anybody could believe its time (``PAST_S``): a recorded link
+state of a dead switch is refused. Numbers are kept for each life of an origin, so that one that has restarted is heard
+at once, whatever its clock says.
 """
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Final
 
 from gdp.control.hello import DIGEST_BYTES
 from gdp.control.link_state import LinkState, Scope
 from gdp.errors import DropReason, StatementError
-from gdp.limits import LINK_STATE_LEASE_S
+from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_LEASE_S
 from gdp.names import Name
 
-__all__ = ["LINK_STATES_MAX", "LinkStates"]
+__all__ = ["LINK_STATES_MAX", "PAST_S", "LinkStates"]
 
 LINK_STATES_MAX = 8_192
+PAST_S: Final = 2 * LINK_STATE_AGE_MAX_S  # what was signed by a clock ahead holds for so long at clocks behind
+_LIVES_MAX: Final = 8  # of one origin that are told apart; then the highest number of all counts
 
 
 @dataclass(slots=True)
@@ -25,6 +32,21 @@ class _Entry:
     state: LinkState
     wire: bytes
     expires_s: float
+
+
+@dataclass(slots=True)
+class _Past:
+    """Numbers of one origin and scope that are over."""
+
+    until_s: float
+    lives: dict[bytes, int] = field(default_factory=dict)
+    floor: int = -1  # of all lives that are not listed
+
+    def note(self, life: bytes, sequence: int, until_s: float) -> None:
+        self.until_s = until_s
+        self.lives[life] = max(sequence, self.lives.pop(life, -1))
+        if len(self.lives) > _LIVES_MAX:
+            self.floor = max(self.floor, self.lives.pop(next(iter(self.lives))))
 
 
 class LinkStates:
@@ -38,15 +60,21 @@ class LinkStates:
         self._domain = domain
         self._entries: dict[tuple[Name, Scope], _Entry] = {}
         self._digests: dict[bool, bytes] = {}
+        self._past: dict[tuple[Name, Scope], _Past] = {}  # in order of their end
         self.version = 0
 
     def __len__(self) -> int:
         return len(self._entries)
 
     def is_news(self, origin: Name, scope: Scope, sequence: int) -> bool:
-        """Return whether a link state with this sequence number would be taken."""
+        """Return whether a link state is newer than the present one."""
         known = self._entries.get((origin, scope))
         return known is None or sequence > known.state.sequence
+
+    def is_past(self, origin: Name, scope: Scope, sequence: int, life: bytes) -> bool:
+        """Return whether a link state is of what was forgotten or replaced."""
+        past = self._past.get((origin, scope))
+        return past is not None and sequence <= past.lives.get(life, past.floor)
 
     def sequence_of(self, origin: Name, scope: Scope) -> int:
         """Return the newest sequence number known, or 0."""
@@ -60,11 +88,13 @@ class LinkStates:
             StatementError: QUOTA, the database is full.
         """
         key = (state.origin, state.scope)
-        if not self.is_news(*key, state.sequence):
+        if not self.is_news(*key, state.sequence) or self.is_past(*key, state.sequence, state.life):
             return False
         known = self._entries.get(key)
         if known is None and len(self._entries) >= LINK_STATES_MAX:
             raise StatementError(DropReason.QUOTA, "link states")
+        if known is not None and known.state.life != state.life:
+            self._bury(known.state, now_s)
         self._entries[key] = _Entry(state, wire, now_s + LINK_STATE_LEASE_S)
         self._digests.clear()
         if known is None or _ways(known.state) != _ways(state):
@@ -75,10 +105,23 @@ class LinkStates:
         """Forget what was not renewed."""
         late = [key for key, entry in self._entries.items() if entry.expires_s <= now_s]
         for key in late:
-            del self._entries[key]
+            self._bury(self._entries.pop(key).state, now_s)
             self.version += 1
+        while self._past:
+            key, past = next(iter(self._past.items()))
+            if past.until_s > now_s:
+                break
+            del self._past[key]
         if late:
             self._digests.clear()
+
+    def _bury(self, state: LinkState, now_s: float) -> None:
+        key = state.origin, state.scope
+        past = self._past.pop(key, None) or _Past(now_s)
+        past.note(state.life, state.sequence, now_s + PAST_S)
+        self._past[key] = past
+        if len(self._past) > 2 * LINK_STATES_MAX:
+            del self._past[next(iter(self._past))]
 
     def next_expiry(self) -> float | None:
         """Return the monotonic second of the next expiry, or None."""

@@ -16,6 +16,7 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from gdp.control.boundary import ErrorBoundary
+from gdp.control.channel import Channels, Opened
 from gdp.control.frames import ControlJoiner, ControlSplitter
 from gdp.control.greeter import Change, Greeter, LinkPort
 from gdp.control.join import Join
@@ -29,7 +30,8 @@ from gdp.effects import Arrival, Instant, Transmit
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
 from gdp.frame.codec import HEADER_BYTES, Header, decode, encode
 from gdp.frame.kinds import CONTROL_FROM, Kind
-from gdp.limits import HOPS_MAX
+from gdp.limits import HOPS_MAX, JOINS_BURST, JOINS_PER_S
+from gdp.message.token_bucket import Paces
 from gdp.names import Name
 from gdp.switch.attached import Attached
 from gdp.switch.claims import Claims
@@ -70,7 +72,6 @@ class Switch:
         self.table = table
         self._splitter = ControlSplitter(identity.name, settings.incarnation)
         self._joiner = ControlJoiner()
-        self._hellos = ControlJoiner()
         self.greeter = Greeter.of_node(
             identity, policy, self._splitter, settings,
             digest_for=self._digest_for, life_elsewhere=self._life_elsewhere,
@@ -103,15 +104,17 @@ class Switch:
         self._protect_at_s: float | None = None  # when alternates are computed
         self._followed_s = self._rivals_sought_s = float("-inf")
         self._presence = PresenceAnswers(identity, self.greeter, self.attached, self.unicast, self._outbox)
+        self._channels = Channels(identity, policy, settings.random_bytes, accepts=False)
         self.inquirer = Inquirer(
             identity, policy, self._paths, self.attached, self.places, self.parked, self.planter, self.unicast,
-            self.relocations, self._evidence, self._outbox, self._presence,
+            self.relocations, self._evidence, self._outbox, self._presence, self._channels,
         )  # fmt: skip
         self._claims = Claims(
             identity, self._verifier, self.attached, self.places, self.planter, self.unicast, self.inquirer,
             self.relocations, self._outbox,
         )  # fmt: skip
         self.boundary = ErrorBoundary()
+        self._join_paces = Paces(JOINS_PER_S, JOINS_BURST)
         self._drops: Counter[DropReason] = Counter()
         self._rest_due_s: float | None = None  # when something other than the greeter is due; None: to be looked up
 
@@ -137,12 +140,13 @@ class Switch:
 
     def drops(self) -> Mapping[DropReason, int]:
         """Return what the control plane dropped, by reason."""
-        own = self._drops + self._joiner.drops + self._hellos.drops
+        own = self._drops + self._joiner.drops + self.greeter.drops + self._channels.drops
         return own + self._flooding.drops + self.parked.drops + self.planter.drops + self.unicast.drops
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Instant) -> None:
         """Begin to use a port, or learn that the MTU or cost of one that is up has changed."""
         self._rest_due_s = None
+        self._flooding.look_at_clock(now)
         changes = self.greeter.add_port(index, mac, mtu, cost, now.mono_s)
         for change in changes:
             self._neighbour_changed(change, now.mono_s)
@@ -152,6 +156,7 @@ class Switch:
     def port_changed(self, port: int, up: bool, now: Instant) -> None:
         """Learn that a port's link came or went."""
         self._rest_due_s = None
+        self._flooding.look_at_clock(now)
         for change in self.greeter.port_changed(port, up, now.mono_s):
             self._neighbour_changed(change, now.mono_s)
         self._follow_links(now.mono_s)  # at once: these frames would be lost
@@ -159,6 +164,7 @@ class Switch:
     def receive(self, arrivals: Sequence[Arrival], now: Instant) -> None:
         """Take frames that the data plane handed up."""
         has_others = False
+        self._flooding.look_at_clock(now)
         for arrival in arrivals:
             try:
                 header = decode(arrival.frame)
@@ -181,6 +187,7 @@ class Switch:
     def timeout(self, now: Instant) -> None:
         """Do what is due."""
         now_s = now.mono_s
+        self._flooding.look_at_clock(now)
         lost = self.greeter.expire(now_s)
         for change in lost:
             self._neighbour_changed(change, now_s)
@@ -203,7 +210,6 @@ class Switch:
         if now_s >= self._rivals_sought_s + _RIVALS_S:
             self._look_for_rivals(now_s)
         self._joiner.expire(now_s)
-        self._hellos.expire(now_s)
         self.parked.expire(now_s)
         self.inquirer.expire(now_s)
         for key in self.table.expire(now_s):
@@ -244,6 +250,10 @@ class Switch:
             times.append(self.attached.next_expiry())
         return min(time for time in times if time is not None)
 
+    def take_neighbours(self) -> Mapping[int, frozenset[bytes]]:
+        """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
+        return self.greeter.take_addresses()
+
     def take(self) -> list[Transmit]:
         """Return, once, what is to be sent: nothing from a switch whose identity an older one has."""
         return [] if self.is_displaced else self._outbox.take()
@@ -275,12 +285,14 @@ class Switch:
         if header.kind >= CONTROL_FROM:
             if header.kind not in _CONTROL:
                 raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
-            joiner = self._joiner
+            if header.kind == Kind.COOKIE:
+                self.greeter.receive_cookie(arrival, header)
+                return
             if header.kind == Kind.HELLO:
-                joiner = self._hellos
+                wire = self.greeter.join(arrival, header, now.mono_s)
             else:
                 self._sender(arrival)  # for strangers no state is kept
-            wire = joiner.add(header, arrival.frame, now.mono_s, arrival.via)
+                wire = self._joiner.add(header, arrival.frame, now.mono_s, arrival.via)
             if wire is not None:
                 statement = parse(wire)
                 with self.boundary.guard(arrival.via + statement.signer, now.mono_s):
@@ -290,7 +302,8 @@ class Switch:
         if header.destination == self.name:
             self._take_own(header, arrival, now)
         else:
-            sought = self.unicast.miss(header, arrival.frame[: HEADER_BYTES + header.length], now.mono_s)
+            frame = arrival.frame[: HEADER_BYTES + header.length]
+            sought = self.unicast.miss(header, frame, neighbour, now.mono_s)
             if sought is not None and self.places.serves_stale:
                 self.relocations.ask_neighbour(sought, neighbour, now.mono_s)
             self.relocations.frame_came(Name(header.destination), neighbour, now.mono_s)
@@ -341,10 +354,17 @@ class Switch:
             wire = self._joiner.add(header, arrival.frame, now.mono_s, arrival.via)
             if wire is None:
                 return
-            statement = parse(wire)
+            opened: Opened | None = Opened(wire, is_fresh=False)
+            if header.kind == Kind.RIB_ANSWER:
+                opened = self.inquirer.open(wire, Name(header.source), now)
+            if opened is None:
+                return
+            statement = parse(opened.wire)
+            if opened.is_fresh and statement.signer != header.source:
+                raise StatementError(DropReason.UNKNOWN_SENDER, "signed by another than its sender")
             with self.boundary.guard(arrival.via + statement.signer, now.mono_s):
                 if header.kind == Kind.RIB_ANSWER:
-                    self.inquirer.receive(statement, now)
+                    self.inquirer.receive(statement, now, is_fresh=opened.is_fresh)
                 else:
                     self._relocated(statement, now)
         elif header.kind == Kind.ECHO_REQUEST:
@@ -474,8 +494,10 @@ class Switch:
         join = Join.from_fields(statement.expect(StatementType.JOIN))
         if neighbour.role is not Role.SWITCH or statement.signer != neighbour.name:
             raise StatementError(DropReason.UNKNOWN_SENDER, "a join is from a neighbouring switch")
+        if not self._join_paces.take(neighbour.name, now.mono_s):
+            raise StatementError(DropReason.QUOTA, "joins of one neighbour")
         statement.verify(neighbour.key)
-        self.greeter.ports[neighbour.port].take_join(join, neighbour.name)
+        self.greeter.ports[neighbour.port].take_join(join, neighbour)
         if join.lease_s > 0:
             claim = self._verifier.verify(join.evidence, now.unix_s)
             if claim.right not in HEARS or claim.name != join.topic:

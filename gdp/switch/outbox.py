@@ -51,10 +51,10 @@ class Outbox:
         found = [n for port in self._greeter.ports if (n := self._greeter.neighbour(port, name)) is not None]
         return min(found, key=lambda n: (self._greeter.ports[n.port].cost, n.port), default=None)
 
-    def session_of(self, port: int, name: Name) -> bytes | None:
-        """Return the nonce of a neighbour's present session; None when it is not up."""
+    def sessions_with(self, port: int, name: Name) -> tuple[bytes, bytes] | None:
+        """Return the nonces of our port's and of a neighbour's present session; None when it is not up."""
         neighbour = self._greeter.neighbour(port, name)
-        return None if neighbour is None else neighbour.nonce
+        return None if neighbour is None else (self._greeter.ports[port].nonce, neighbour.nonce)
 
     def hop(self, neighbour: Neighbour) -> Hop:
         """Return the table's hop to a neighbour."""

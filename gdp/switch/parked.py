@@ -1,7 +1,7 @@
 """Frames that wait for the answer of a RIB.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds). Bounded in frames, bytes and time; what does not fit is
-counted, never silently lost.
+Place: pure; time comes in as ``now_s`` (monotonic seconds). Bounded in frames, bytes and time, and shared among the
+neighbours that they came from; what does not fit is counted, never silently lost.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from gdp.errors import DropReason
 from gdp.limits import PARKED_BYTES_MAX, PARKED_FRAMES_MAX, PARKED_S
+from gdp.message.shares import Shares
 
 __all__ = ["Parked"]
 
@@ -18,6 +19,7 @@ __all__ = ["Parked"]
 class _Waiting(NamedTuple):
     frame: bytes
     until_s: float
+    owner: bytes
 
 
 class Parked:
@@ -25,33 +27,45 @@ class Parked:
 
     def __init__(self) -> None:
         self._by_name: OrderedDict[bytes, deque[_Waiting]] = OrderedDict()
-        self._frames = 0
-        self._bytes = 0
+        self._frames = Shares(PARKED_FRAMES_MAX)
+        self._bytes = Shares(PARKED_BYTES_MAX)
         self.drops: Counter[DropReason] = Counter()
 
     def __len__(self) -> int:
-        return self._frames
+        return len(self._frames)
 
-    def park(self, name: bytes, frame: bytes, now_s: float, until_s: float | None = None) -> None:
-        """Keep a frame until ``release``, or until ``until_s``; if not given, until ``PARKED_S`` have gone."""
-        if self._frames >= PARKED_FRAMES_MAX or self._bytes + len(frame) > PARKED_BYTES_MAX:
+    def park(
+        self, name: bytes, frame: bytes, now_s: float, until_s: float | None = None, *, owner: bytes = b""
+    ) -> None:
+        """Keep a frame until ``release``, or until ``until_s``; if not given, until ``PARKED_S`` have gone.
+
+        Args:
+            owner: the neighbour that it came from.
+        """
+        if not self._frames.take(owner):
             self.drops[DropReason.PARKED_FULL] += 1
             return
-        waiting = _Waiting(frame, now_s + PARKED_S if until_s is None else until_s)
+        if not self._bytes.take(owner, size=len(frame)):
+            self._frames.give(owner)
+            self.drops[DropReason.PARKED_FULL] += 1
+            return
+        waiting = _Waiting(frame, now_s + PARKED_S if until_s is None else until_s, owner)
         self._by_name.setdefault(name, deque()).append(waiting)
-        self._frames += 1
-        self._bytes += len(frame)
 
     def is_waiting(self, name: bytes) -> bool:
         """Return whether frames wait for a name."""
         return name in self._by_name
 
-    def release(self, name: bytes) -> list[tuple[bytes, float]]:
-        """Return, in order, what waited for a name, and until when each frame would have waited."""
+    def release(self, name: bytes) -> list[tuple[bytes, float, bytes]]:
+        """Return, in order, what waited for a name, until when each frame would have waited, and its owner."""
         waiting = self._by_name.pop(name, deque())
-        self._frames -= len(waiting)
-        self._bytes -= sum(len(each.frame) for each in waiting)
-        return [(each.frame, each.until_s) for each in waiting]
+        for each in waiting:
+            self._give_back(each)
+        return [(each.frame, each.until_s, each.owner) for each in waiting]
+
+    def _give_back(self, waiting: _Waiting) -> None:
+        self._frames.give(waiting.owner)
+        self._bytes.give(waiting.owner, size=len(waiting.frame))
 
     def refuse(self, name: bytes, reason: DropReason) -> None:
         """Drop what waited for a name, under a reason."""
@@ -62,8 +76,7 @@ class Parked:
         for name in list(self._by_name):
             waiting = self._by_name[name]
             while waiting and waiting[0].until_s <= now_s:
-                self._frames -= 1
-                self._bytes -= len(waiting.popleft().frame)
+                self._give_back(waiting.popleft())
                 self.drops[DropReason.PARKED_EXPIRED] += 1
             if not waiting:
                 del self._by_name[name]

@@ -29,7 +29,8 @@ from gdp.control.neighbour import Neighbour
 from gdp.crypto.identity import Identity
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
-from gdp.limits import JOIN_LEASE_S, JOIN_REFRESH_S
+from gdp.limits import JOIN_LEASE_S, JOIN_REFRESH_S, READERS_MAX, TREES_MAX
+from gdp.message.shares import Shares
 from gdp.names import ZERO, Name
 from gdp.switch.attached import Attached
 from gdp.switch.backups import Backups
@@ -61,7 +62,7 @@ class Planter:
     """All trees of one switch.
 
     Args:
-        first_sequence: of our joins; above those of an earlier life, wall-clock milliseconds do.
+        first_sequence: of our joins.
     """
 
     def __init__(
@@ -83,6 +84,9 @@ class Planter:
         self._outbox = outbox
         self._backups = Backups(identity.name, policy.own, paths, outbox)
         self._readers: dict[Name, dict[At, _Reader]] = {}
+        self._reader_shares = Shares(READERS_MAX)
+        self._readers_end_s = float("inf")  # no reader's lease ends before
+        self._branch_shares = Shares(TREES_MAX)
         self.trees = Trees()
         self.drops: Counter[DropReason] = Counter()
 
@@ -96,10 +100,17 @@ class Planter:
         return None if reader is None else reader.claim
 
     def add_reader(self, claim: Claim, at: At, places: list[Place], now_s: float) -> bool:
-        """Take the verified claim of an attached node that hears others; return whether it is the name's first here."""
+        """Take the verified claim of an attached node that hears others; return whether it is the name's first here.
+
+        Raises:
+            StatementError: QUOTA, the node reads too many topics.
+        """
+        is_first = claim.name not in self._readers
+        if at not in self._readers.get(claim.name, {}) and not self._reader_shares.take(_owner(at)):
+            raise StatementError(DropReason.QUOTA, "topics that one node reads")
         readers = self._readers.setdefault(claim.name, {})
-        is_first = not readers
         readers[at] = _Reader(claim, now_s + claim.lease_s)
+        self._readers_end_s = min(self._readers_end_s, now_s + claim.lease_s)
         for place in places:
             self.publisher_found(place, now_s)
         return is_first
@@ -107,7 +118,8 @@ class Planter:
     def remove_reader(self, topic: Name, at: At) -> bool:
         """Let a reader go; return whether the topic has none left here."""
         readers = self._readers.get(topic, {})
-        readers.pop(at, None)
+        if readers.pop(at, None) is not None:
+            self._reader_shares.give(_owner(at))
         for tree in self.trees.of_topic(topic):
             self._cut(tree, at)
         if readers:
@@ -125,7 +137,10 @@ class Planter:
             if place.sequence >= tree.version:
                 self._place_at(tree, place.switch, place.domain, place.sequence)
                 tree.allowed = allowed
-            tree.branches[at] = Branch(reader.expires_s, self._outbox.mtu_of(at[0]), reader.claim.wire)
+            branch = Branch(reader.expires_s, self._outbox.mtu_of(at[0]), reader.claim.wire)
+            if not self._put_branch(tree, at, branch):
+                self.drops[DropReason.QUOTA] += 1
+                continue
             self._plant(tree)
             self._follow(tree, now_s)
             self._ask_above(tree, now_s)
@@ -176,7 +191,7 @@ class Planter:
         at = (neighbour.port, neighbour.mac)
         if join.lease_s == 0:
             tree = self.trees.get(join.topic, join.publisher)
-            if tree is not None and at in tree.branches and tree.branches[at].sequence < join.sequence:
+            if tree is not None and at in tree.branches and not _is_overtaken(join, tree.branches[at]):
                 self._cut(tree, at)
             return False
         if self._policy.own not in join.allowed or neighbour.domain not in join.allowed:
@@ -185,8 +200,8 @@ class Planter:
             raise StatementError(DropReason.WRONG_DOMAIN, "a backup for another domain")
         tree = self._tree(join.topic, join.publisher, join.allowed)
         before = tree.branches.get(at)
-        if before is not None and join.sequence < before.sequence:
-            return False  # a newer one overtook it
+        if before is not None and _is_overtaken(join, before):
+            return False
         if tree.former is not None and tree.former[0] == at and join.backup_for == ZERO:
             self._leave_former(tree)  # it takes the messages from here now
         is_behind = join.version < tree.version
@@ -194,12 +209,16 @@ class Planter:
         if join.version >= tree.version:
             self._place_at(tree, join.switch, join.domain, join.version)
             tree.allowed = join.allowed
-        branch = Branch(now_s + min(join.lease_s, JOIN_LEASE_S), join.mtu, join.evidence, join.mtu, join.sequence)
+        branch = Branch(
+            now_s + min(join.lease_s, JOIN_LEASE_S), join.mtu, join.evidence, join.mtu, join.sequence,
+            join.sender_session,
+        )  # fmt: skip
         branch.fit(self._outbox.mtu_of(neighbour.port))
         if join.backup_for != ZERO:
             branch.backup_for = join.backup_for
             branch.active_until_s = None if before is None else before.active_until_s
-        tree.branches[at] = branch
+        if not self._put_branch(tree, at, branch):
+            raise StatementError(DropReason.QUOTA, "branches of one neighbour")
         self._plant(tree)
         if not self._follow(tree, now_s):
             if (before is None and branch.is_active) or not is_same_place or tree.is_doubted:
@@ -260,27 +279,43 @@ class Planter:
     def timeout(self, now_s: float) -> list[Name]:
         """Prune, renew upwards; return the topics that lost their last reader here."""
         orphaned = []
-        for topic in list(self._readers):
-            for at in [at for at, reader in self._readers[topic].items() if reader.expires_s <= now_s]:
-                if self.remove_reader(topic, at):
-                    orphaned.append(topic)
-        for tree in self.trees.prune(now_s):
-            self._after_cut(tree)
-        for tree in self.trees.deactivate(now_s):
+        if now_s >= self._readers_end_s:
+            for topic in list(self._readers):
+                for at in [at for at, reader in self._readers[topic].items() if reader.expires_s <= now_s]:
+                    if self.remove_reader(topic, at):
+                        orphaned.append(topic)
+            ends = [reader.expires_s for readers in self._readers.values() for reader in readers.values()]
+            self._readers_end_s = min(ends, default=float("inf"))
+        for tree in self.trees.due(now_s):
+            self._tree_due(tree, now_s)
+        return orphaned
+
+    def _tree_due(self, tree: Tree, now_s: float) -> None:
+        for at in [at for at, branch in tree.branches.items() if branch.expires_s <= now_s]:
+            self._cut(tree, at)
+        if not tree.branches:
+            self.trees.remove(tree)
+            return
+        rested = [
+            branch
+            for branch in tree.branches.values()
+            if branch.active_until_s is not None and branch.active_until_s <= now_s
+        ]
+        for branch in rested:
+            branch.active_until_s = None
+        if rested:
             self._plant(tree)
             self._restate(tree)
-        for tree in self.trees.all():
-            if tree.renew_at_s <= now_s:
-                self._ask_above(tree, now_s)
-            if tree.former is not None and tree.former_until_s <= now_s:
-                self._leave_former(tree)
-        return orphaned
+        if tree.renew_at_s <= now_s:
+            self._ask_above(tree, now_s)
+        if tree.former is not None and tree.former_until_s <= now_s:
+            self._leave_former(tree)
 
     def next_timeout(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        readers = [reader.expires_s for readers in self._readers.values() for reader in readers.values()]
-        times = [time for time in (self.trees.next_event(), min(readers, default=None)) if time is not None]
-        return min(times, default=None)
+        tree_s = self.trees.next_event()
+        next_s = self._readers_end_s if tree_s is None else min(tree_s, self._readers_end_s)
+        return None if next_s == float("inf") else next_s
 
     def _tree(self, topic: Name, publisher: Name, allowed: frozenset[Name]) -> Tree:
         tree = self.trees.get(topic, publisher)
@@ -291,11 +326,21 @@ class Planter:
 
     def _plant(self, tree: Tree) -> None:
         tree.protection = self._backups.protection(tree)
-        if not self._table.install(tree.key, tree.hops(self._outbox.mac_of()), tree.expires_s()):
+        if not self._table.install(tree.key, tree.hops(self._outbox.mac_of()), tree.expires_s(), tree.sides):
             self.drops[DropReason.QUOTA] += 1
+
+    def _put_branch(self, tree: Tree, at: At, branch: Branch) -> bool:
+        """Add or replace a branch; return False, and let go of a bare tree, where its neighbour has too many."""
+        if at not in tree.branches and not self._branch_shares.take(_owner(at)):
+            if not tree.branches:
+                self.trees.remove(tree)
+            return False
+        tree.branches[at] = branch
+        return True
 
     def _cut(self, tree: Tree, at: At) -> None:
         if tree.branches.pop(at, None) is not None:
+            self._branch_shares.give(_owner(at))
             self._after_cut(tree)
 
     def _after_cut(self, tree: Tree) -> None:
@@ -346,6 +391,9 @@ class Planter:
         self._show(tree)
         if has_settled and self._paths.has_alternates:
             self._ask_for_backup(tree)
+        if has_settled and tree.left:
+            tree.left.clear()
+            self._plant(tree)
 
     def _restate(self, tree: Tree) -> None:
         """Say at once, to the one above, that what fits this tree, or whether anybody wants copies, has changed."""
@@ -361,7 +409,8 @@ class Planter:
         other = self._backups.above(tree)
         if other != tree.backup:
             self._leave_backup(tree)
-        tree.backup = other
+            tree.backup = other
+            self._plant(tree)
         if other is not None:
             (port, _), _ = other
             mtu = min(tree.mtu, self._outbox.mtu_of(port))
@@ -370,6 +419,7 @@ class Planter:
     def _leave_backup(self, tree: Tree) -> None:
         if tree.backup is not None:
             (at, name), tree.backup = tree.backup, None
+            tree.left.add(at[0])
             if at != tree.above:
                 self._say(tree, at, name, 1, 0.0, b"")
 
@@ -417,11 +467,13 @@ class Planter:
     def _leave_former(self, tree: Tree) -> None:
         if tree.former is not None:
             (at, name), tree.former = tree.former, None
+            tree.left.add(at[0])
             if at != tree.above:
                 self._say(tree, at, name, 1, 0.0, b"")
 
     def _leave(self, tree: Tree) -> None:
         if tree.above is not None and tree.above_name is not None:
+            tree.left.add(tree.above[0])
             self._say(tree, tree.above, tree.above_name, 1, 0.0, b"")
         tree.above = tree.above_name = None
 
@@ -429,9 +481,10 @@ class Planter:
         self, tree: Tree, above: At, name: Name, mtu: int, lease_s: float, evidence: bytes, *, backup_for: Name = ZERO
     ) -> None:
         """Send a join, or with no lease a leave, to one above."""
-        session = self._outbox.session_of(above[0], name)
-        if session is None:
+        sessions = self._outbox.sessions_with(above[0], name)
+        if sessions is None:
             return  # it is gone, and with it what it knew of us
+        own_session, session = sessions
         self._sequence += 1
         join = Join(
             tree.topic,
@@ -446,6 +499,17 @@ class Planter:
             self._sequence,
             tree.version,
             backup_for,
+            own_session,
         )
         kind = Kind.JOIN if lease_s else Kind.LEAVE
         self._outbox.say_at(*above, kind, join.to_wire(self._identity.name, self._identity.key))
+
+
+def _owner(at: At) -> bytes:
+    """Return in whose name room is taken for something of a neighbour."""
+    return at[0].to_bytes(4, "big") + at[1]
+
+
+def _is_overtaken(join: Join, branch: Branch) -> bool:
+    """Return whether a newer join or leave of the same session of the neighbour came before."""
+    return join.sender_session == branch.session and join.sequence <= branch.sequence

@@ -26,6 +26,7 @@ from gdp.switch.outbox import Outbox
 from gdp.switch.places import Places
 from gdp.switch.planter import Planter
 from gdp.switch.unicast import Unicast
+from gdp.trust.audit import Action
 from gdp.trust.claim import Claim
 from gdp.trust.verifier import ClaimVerifier
 
@@ -71,6 +72,8 @@ class Revoker:
         revocation = self._verifier.revoke(statement.wire, now.unix_s)
         if revocation is None:
             return []
+        issuer, about = revocation.issuer.name.to_text(), revocation.fingerprint.hex()
+        self._verifier.policy.audit.note(Action.REVOKED, "certificate", who=issuer, about=about)
         self._told[statement.fingerprint] = statement.wire
         while len(self._told) > TOLD_MAX:
             self._told.popitem(last=False)

@@ -6,6 +6,9 @@ which they stand in a frame), the longer one looked up first. A value is the tup
 empty tuple is a negative entry: known to lead nowhere. A hop may name an alternate, computed ahead (RFC 5286), which a
 data plane takes by itself while the first port is down.
 
+An entry may say from which sides its frames come (reverse path forwarding, RFC 5110, section 1.2): a mask of ports, for
+the trees of topics. A frame from another side is dropped, so that nobody below a publisher can speak in its name.
+
 Leases stand beside the entries, so that the hot dictionary holds nothing that forwarding does not need. A heap holds
 for every entry at least one item that is no later than the end of its lease; renewing a lease leaves the item alone,
 and it is put right when it comes to the top. So no operation looks at all entries, except a rebuild that as many
@@ -24,7 +27,20 @@ from gdp.errors import LocalError
 from gdp.limits import TABLE_MAX
 from gdp.names import NAME_BYTES
 
-__all__ = ["EXPIRE_MAX", "MACS_BYTES", "NOWHERE", "Hop", "Hops", "Observer", "ProtectedHop", "Table"]
+__all__ = [
+    "EVERY_SIDE",
+    "EXPIRE_MAX",
+    "MACS_BYTES",
+    "NOWHERE",
+    "SHARED_SIDE",
+    "Hop",
+    "Hops",
+    "Observer",
+    "ProtectedHop",
+    "Table",
+    "is_side",
+    "sides_of",
+]
 
 MACS_BYTES: Final = 12  # destination MAC, source MAC: the first bytes of the frame that goes out
 
@@ -33,6 +49,8 @@ ProtectedHop = tuple[int, bytes, int, bytes]  # a hop, and its alternate
 Hops = tuple[Hop | ProtectedHop, ...]
 
 NOWHERE: Final[Hops] = ()
+EVERY_SIDE: Final = (1 << 64) - 1
+SHARED_SIDE: Final = 63  # the bit of that port and all above
 
 _KEY_SIZES: Final = (NAME_BYTES, 2 * NAME_BYTES)
 _UNSEEN: Final[tuple[Hops, Hops | None]] = (NOWHERE, None)
@@ -59,12 +77,14 @@ class Table:
 
     Attributes:
         entries: key to hops. Data planes hold this very dictionary; it is never replaced.
+        sides: key to the mask of ports that frames may come from; what is not in it may come from everywhere.
     """
 
-    __slots__ = ("_ends", "_heap", "_latest_s", "_max", "_observer", "_shared", "entries")
+    __slots__ = ("_ends", "_heap", "_latest_s", "_max", "_observer", "_shared", "entries", "sides")
 
     def __init__(self, max_entries: int = TABLE_MAX) -> None:
         self.entries: dict[bytes, Hops] = {}
+        self.sides: dict[bytes, int] = {}
         self._ends: dict[bytes, float] = {}
         self._heap: list[tuple[float, bytes]] = []
         self._latest_s = float("-inf")  # no end in the heap is later
@@ -81,13 +101,14 @@ class Table:
         if observer is not None and self.entries:
             observer.put(self.entries)
 
-    def install(self, key: bytes, hops: Hops, expires_s: float) -> bool:
+    def install(self, key: bytes, hops: Hops, expires_s: float, sides: int = EVERY_SIDE) -> bool:
         """Put or replace an entry and its lease; False when the table is full and the key is new.
 
         Args:
             key: 32 bytes (destination) or 64 (destination, source).
             hops: where copies go; equal tuples are shared in memory. ``NOWHERE`` makes a negative entry.
             expires_s: end of the lease, on the monotonic clock of the caller.
+            sides: mask of ports that frames may come from, as ``sides_of`` makes it.
 
         Raises:
             LocalError: a key or an address of another length.
@@ -99,8 +120,12 @@ class Table:
                 return False
             key = bytes(key)  # a plain one: looked up faster than a subclass
         hops = self._share(hops)
-        is_news = self._observer is not None and self.entries.get(key) != hops
+        is_news = self.entries.get(key) != hops or self.sides.get(key, EVERY_SIDE) != sides
         self.entries[key] = hops
+        if sides != EVERY_SIDE:
+            self.sides[bytes(key)] = sides
+        else:
+            self.sides.pop(key, None)
         self._ends[key] = expires_s
         self._latest_s = max(self._latest_s, expires_s)
         if known is None or expires_s < known:
@@ -139,7 +164,7 @@ class Table:
                 else:
                     if expires_s < known:
                         sooner.append(key)
-                    if entries[key] != shared:
+                    if entries[key] != shared or self.sides.pop(key, None) is not None:
                         news[key] = shared
                         entries[key] = shared
                 ends[key] = expires_s
@@ -155,6 +180,7 @@ class Table:
         if self.entries.pop(key, None) is None:
             return False
         del self._ends[key]
+        self.sides.pop(key, None)
         self._rebuild_if_stale()
         if self._observer is not None:
             self._observer.remove((key,))
@@ -171,6 +197,7 @@ class Table:
             key = heapq.heappop(self._heap)[1]
             del self._ends[key]
             del self.entries[key]
+            self.sides.pop(key, None)
             gone.append(key)
         if self._observer is not None and gone:
             self._observer.remove(gone)
@@ -214,6 +241,19 @@ class Table:
         if len(self._heap) > 2 * len(self.entries) + _SLACK:
             self._heap = [(end, key) for key, end in self._ends.items()]
             heapq.heapify(self._heap)
+
+
+def sides_of(ports: Iterable[int]) -> int:
+    """Return the mask of ports; those from the 63rd on share one bit."""
+    mask = 0
+    for port in ports:
+        mask |= 1 << min(port, SHARED_SIDE)
+    return mask
+
+
+def is_side(mask: int, port: int) -> bool:
+    """Return whether a port is in a mask."""
+    return bool(mask >> min(port, SHARED_SIDE) & 1)
 
 
 def _check(key: bytes, hops: Hops) -> None:

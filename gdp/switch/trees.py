@@ -9,15 +9,19 @@ in the forwarding table it is the alternate of the branch that it protects.
 
 from __future__ import annotations
 
+import heapq
 from dataclasses import dataclass, field
+from typing import Final
 
 from gdp.limits import FRAME_MAX_BYTES
 from gdp.names import Name
-from gdp.switch.table import Hop, Hops, ProtectedHop
+from gdp.switch.table import Hop, Hops, ProtectedHop, sides_of
 
 __all__ = ["Branch", "Tree", "Trees"]
 
 At = tuple[int, bytes]  # port, MAC of the one below
+_Key = tuple[Name, Name]  # topic and publisher
+_HEAP_SLACK: Final = 1_024
 
 
 @dataclass(slots=True)
@@ -29,6 +33,7 @@ class Branch:
     evidence: bytes  # the signed claim of a reader down there
     said_mtu: int = FRAME_MAX_BYTES  # what the neighbour said of the way; a reader says nothing
     sequence: int = 0  # of its last join
+    session: bytes = b""  # of the neighbour that sent it, within which the sequence rises
     backup_for: Name | None = None  # the switch that asked for a backup; None: an ordinary branch
     active_until_s: float | None = None  # a backup whose protected branch was lost gets copies until then
 
@@ -65,6 +70,7 @@ class Tree:
     is_doubted: bool = False  # that proves nothing any more
     asked_backup_for: Name | None = None  # what the last join said
     backup: tuple[At, Name] | None = None  # whom a backup branch was asked of
+    left: set[int] = field(default_factory=set)  # ports that copies may still come from, until the tree has settled
     protection: dict[At, At] = field(default_factory=dict)  # branch to the backup that takes its place
 
     @property
@@ -102,6 +108,27 @@ class Tree:
         return max(branch.expires_s for branch in self.branches.values())
 
     @property
+    def sides(self) -> int:
+        """Return the ports that copies may come from: of whoever was asked for them, or was until a moment ago.
+
+        Nobody was asked: the mask is empty.
+        """
+        asked = [self.above] if self.above is not None else []
+        asked += [each[0] for each in (self.former, self.backup) if each is not None]
+        return sides_of([*(port for port, _ in asked), *self.left])
+
+    def next_s(self) -> float:
+        """Return when something is due: a renewal, the end of a lease, of an overlap, of a backup's turn."""
+        times = [self.renew_at_s]
+        if self.former is not None:
+            times.append(self.former_until_s)
+        for branch in self.branches.values():
+            times.append(branch.expires_s)
+            if branch.active_until_s is not None:
+                times.append(branch.active_until_s)
+        return min(times)
+
+    @property
     def is_wanted_below(self) -> bool:
         """Return whether anybody but the one above wants a copy."""
         return any(at != self.above for at in self.branches)
@@ -129,65 +156,86 @@ class Tree:
 
 
 class Trees:
-    """All trees that pass one switch."""
+    """All trees that pass one switch, and which is due next.
+
+    What is handed out may be changed by the caller. So its timers are read again before the next look at the time:
+    the cost is proportional to the trees that changed.
+    """
 
     def __init__(self) -> None:
-        self._trees: dict[tuple[Name, Name], Tree] = {}
+        self._by_topic: dict[Name, dict[Name, Tree]] = {}
+        self._size = 0
+        self._touched: dict[_Key, Tree] = {}
+        self._due_s: dict[_Key, float] = {}  # what the valid entry of the heap says
+        self._heap: list[tuple[float, _Key]] = []
 
     def __len__(self) -> int:
-        return len(self._trees)
+        return self._size
 
     def get(self, topic: Name, publisher: Name) -> Tree | None:
         """Return a tree, or None."""
-        return self._trees.get((topic, publisher))
+        tree = self._by_topic.get(topic, {}).get(publisher)
+        if tree is not None:
+            self._touched[topic, publisher] = tree
+        return tree
 
     def all(self) -> list[Tree]:
         """Return every tree."""
-        return list(self._trees.values())
+        return [tree for topic in list(self._by_topic) for tree in self.of_topic(topic)]
 
     def of_topic(self, topic: Name) -> list[Tree]:
         """Return a topic's trees."""
-        return [tree for (its, _), tree in self._trees.items() if its == topic]
+        trees = list(self._by_topic.get(topic, {}).values())
+        self._touched.update({(topic, tree.publisher): tree for tree in trees})
+        return trees
 
     def put(self, tree: Tree) -> None:
         """Add a tree."""
-        self._trees[tree.topic, tree.publisher] = tree
+        trees = self._by_topic.setdefault(tree.topic, {})
+        self._size += tree.publisher not in trees
+        trees[tree.publisher] = tree
+        self._touched[tree.topic, tree.publisher] = tree
 
     def remove(self, tree: Tree) -> None:
         """Take a tree away."""
-        self._trees.pop((tree.topic, tree.publisher), None)
+        trees = self._by_topic.get(tree.topic, {})
+        if trees.pop(tree.publisher, None) is not None:
+            self._size -= 1
+        if not trees:
+            self._by_topic.pop(tree.topic, None)
+        self._touched.pop((tree.topic, tree.publisher), None)
+        self._due_s.pop((tree.topic, tree.publisher), None)
 
-    def prune(self, now_s: float) -> list[Tree]:
-        """Cut branches whose lease ended; return the trees that changed, bare ones too."""
-        changed = []
-        for tree in self._trees.values():
-            late = [at for at, branch in tree.branches.items() if branch.expires_s <= now_s]
-            for at in late:
-                del tree.branches[at]
-            if late:
-                changed.append(tree)
-        return changed
-
-    def deactivate(self, now_s: float) -> list[Tree]:
-        """Let backups rest whose time is over; return the trees that changed."""
-        changed = []
-        for tree in self._trees.values():
-            late = [
-                branch
-                for branch in tree.branches.values()
-                if branch.active_until_s is not None and branch.active_until_s <= now_s
-            ]
-            for branch in late:
-                branch.active_until_s = None
-            if late:
-                changed.append(tree)
-        return changed
+    def due(self, now_s: float) -> list[Tree]:
+        """Return the trees of which something is due; each is returned again while that is so."""
+        self._schedule()
+        due = []
+        while self._heap and self._heap[0][0] <= now_s:
+            at_s, key = heapq.heappop(self._heap)
+            if self._due_s.get(key) == at_s:
+                del self._due_s[key]
+                tree = self._by_topic[key[0]][key[1]]
+                self._touched[key] = tree
+                due.append(tree)
+        return due
 
     def next_event(self) -> float | None:
-        """Return the monotonic second of the next renewal or lease end, or None."""
-        times = [tree.renew_at_s for tree in self._trees.values()]
-        times += [tree.former_until_s for tree in self._trees.values() if tree.former is not None]
-        branches = [branch for tree in self._trees.values() for branch in tree.branches.values()]
-        times += [branch.expires_s for branch in branches]
-        times += [branch.active_until_s for branch in branches if branch.active_until_s is not None]
-        return min(times, default=None)
+        """Return the monotonic second at which something is due next, or None."""
+        self._schedule()
+        while self._heap:
+            at_s, key = self._heap[0]
+            if self._due_s.get(key) == at_s:
+                return at_s
+            heapq.heappop(self._heap)
+        return None
+
+    def _schedule(self) -> None:
+        for key, tree in self._touched.items():
+            next_s = tree.next_s()
+            if self._due_s.get(key) != next_s:
+                self._due_s[key] = next_s
+                heapq.heappush(self._heap, (next_s, key))
+        self._touched.clear()
+        if len(self._heap) > 4 * self._size + _HEAP_SLACK:
+            self._heap = [(at_s, key) for key, at_s in self._due_s.items()]
+            heapq.heapify(self._heap)

@@ -12,9 +12,12 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Final
 
+from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
 from gdp.errors import DropReason
 from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_AT, SOURCE_AT, Header
+from gdp.limits import QUESTIONS_BURST, QUESTIONS_PER_S, SWITCH_QUESTIONS_BURST, SWITCH_QUESTIONS_PER_S
+from gdp.message.token_bucket import Paces
 from gdp.names import Name
 from gdp.switch.attached import Attached
 from gdp.switch.outbox import Outbox
@@ -30,6 +33,8 @@ NODE_LEASE_S: Final = 30.0  # an entry for a switch or a RIB, which the link sta
 STALE_S: Final = 5.0  # an entry for a place whose lease has ended, while no RIB answers
 NEGATIVE_S: Final = 0.5
 _REFRESH_AT_ONCE: Final = 4_096  # ways; about 50 ms
+_FROM_NODE: Final = b"n"  # begins an owner
+_FROM_SWITCH: Final = b"s"
 _TAKES_FRAMES: Final = (Right.ATTACH, Right.SERVE)
 
 
@@ -74,16 +79,21 @@ class Unicast:
         self._installed: dict[bytes, _Installed] = {}
         self._stale = deque[bytes]()  # keys of ways to be computed anew
         self._keys_of: dict[Name, set[bytes]] = {}  # of what is installed, by destination
+        self._paces = {
+            _FROM_NODE: Paces(QUESTIONS_PER_S, QUESTIONS_BURST),
+            _FROM_SWITCH: Paces(SWITCH_QUESTIONS_PER_S, SWITCH_QUESTIONS_BURST),
+        }
         self.drops: Counter[DropReason] = Counter()
 
-    def miss(self, header: Header, frame: bytes, now_s: float) -> Name | None:
-        """Take a frame for which the table had no entry; return the name whose place it waits for, if it does."""
+    def miss(self, header: Header, frame: bytes, neighbour: Neighbour, now_s: float) -> Name | None:
+        """Take a neighbour's frame that has no entry in the table; return the name whose place it waits for, if any."""
         destination, source = Name(header.destination), Name(header.source)
-        return self._find(destination, source, frame, now_s)
+        kind = _FROM_SWITCH if neighbour.role is Role.SWITCH else _FROM_NODE
+        return self._find(destination, source, frame, kind + neighbour.name, now_s)
 
     def send(self, frames: list[bytes], destination: Name, source: Name, now_s: float) -> None:
         """Send frames of our own to a name, by the way that others' frames go."""
-        if self._resolve(destination, source, now_s) is None:
+        if self._resolve(destination, source, b"", now_s) is None:
             hop = self._hop(destination, source)
             if hop is None:
                 self.drops[DropReason.NO_ROUTE] += len(frames)
@@ -92,9 +102,9 @@ class Unicast:
 
     def release(self, name: Name, now_s: float) -> None:
         """Look again at what waited for a name."""
-        for frame, until_s in self._parked.release(name):
+        for frame, until_s, owner in self._parked.release(name):
             source = Name(frame[SOURCE_AT:HEADER_BYTES])
-            self._find(Name(frame[DESTINATION_AT:SOURCE_AT]), source, frame, now_s, until_s)
+            self._find(Name(frame[DESTINATION_AT:SOURCE_AT]), source, frame, owner, now_s, until_s)
 
     def refresh(self, now_s: float) -> None:
         """Compute every installed way anew, for links have changed; ``refresh_more`` does the rest of very many."""
@@ -109,7 +119,7 @@ class Unicast:
             if why is None:
                 continue
             if not why.is_negative:  # what led nowhere is looked for when the next frame comes
-                self._resolve(why.destination, why.source, now_s)
+                self._resolve(why.destination, why.source, b"", now_s)
             if self._installed.get(key) is why:  # it was not installed anew
                 self._uninstall(key)
 
@@ -148,16 +158,16 @@ class Unicast:
         self._keys_of.setdefault(why.destination, set()).add(key)
 
     def _find(
-        self, destination: Name, source: Name, frame: bytes, now_s: float, until_s: float | None = None
+        self, destination: Name, source: Name, frame: bytes, owner: bytes, now_s: float, until_s: float | None = None
     ) -> Name | None:
         """Send a frame on, or have it wait for what is asked."""
-        waits_for = self._resolve(destination, source, now_s)
+        waits_for = self._resolve(destination, source, owner, now_s)
         if waits_for is None:
             self._forward(destination, source, frame)
         elif self._places.is_asked(waits_for):
-            self._parked.park(waits_for, frame, now_s, until_s)
+            self._parked.park(waits_for, frame, now_s, until_s, owner=owner)
         else:
-            self.drops[DropReason.PARKED_FULL] += 1  # too many questions are open
+            self.drops[DropReason.PARKED_FULL] += 1  # too many questions are open, or its neighbour asks too much
         return waits_for
 
     def _forward(self, destination: Name, source: Name, frame: bytes) -> None:
@@ -175,8 +185,12 @@ class Unicast:
         hops = self._table.entries.get(destination + source) or self._table.entries.get(destination)
         return hops[0][:2] if hops else None
 
-    def _resolve(self, destination: Name, source: Name, now_s: float) -> Name | None:
-        """Install an entry, perhaps a negative one; or return the name whose place must be asked for first."""
+    def _resolve(self, destination: Name, source: Name, owner: bytes, now_s: float) -> Name | None:
+        """Install an entry, perhaps a negative one; or return the name whose place must be asked for first.
+
+        Args:
+            owner: the neighbour at whose expense that is; empty: our own.
+        """
         at = self._attached.at(destination)
         if at is not None:
             self._install(destination, b"", self._outbox.hop_at(at.port, at.mac), source, at.expires_s)
@@ -194,9 +208,9 @@ class Unicast:
             way, _ = self._paths.to_rib(destination, self._transit)
             self._install_way(destination, b"", way, source, now_s + NODE_LEASE_S, now_s)
             return None
-        return self._resolve_by_rib(destination, source, now_s)
+        return self._resolve_by_rib(destination, source, owner, now_s)
 
-    def _resolve_by_rib(self, destination: Name, source: Name, now_s: float) -> Name | None:
+    def _resolve_by_rib(self, destination: Name, source: Name, owner: bytes, now_s: float) -> Name | None:
         places = self._places.of(destination, now_s)
         takers = [place for place in places if place.right in _TAKES_FRAMES]
         if not places and (node := self._places.of_node(destination, now_s)) is not None:
@@ -204,11 +218,11 @@ class Unicast:
         if takers:
             takers = [place for place in takers if place.switch != self._me]
             if not takers:  # it has left, and nobody has said where to
-                self._places.ask_now(destination, now_s)
+                self._ask(destination, owner, now_s)
                 return destination
         else:
             if not places and not self._places.is_nowhere(destination, now_s):
-                self._places.ask_now(destination, now_s)
+                self._ask(destination, owner, now_s)
                 return destination
             self._install_nowhere(destination, source, DropReason.NO_READER if places else DropReason.NO_ROUTE, now_s)
             return None
@@ -223,11 +237,17 @@ class Unicast:
             if self._places.is_nowhere(source, now_s):
                 self._install_nowhere(destination, source, DropReason.NO_ROUTE, now_s)
                 return None
-            self._places.ask_now(source, now_s)
+            self._ask(source, owner, now_s)
             return source
         best = self._nearest(takers, transit & self._transit)
         self._install_place(destination, source, best, source, now_s)
         return None
+
+    def _ask(self, name: Name, owner: bytes, now_s: float) -> None:
+        """Have a name asked for, within the pace of the neighbour at whose expense that is."""
+        pace = self._paces.get(owner[:1])
+        if pace is None or self._places.is_asked(name) or pace.take(owner, now_s):
+            self._places.ask_now(name, now_s)
 
     def _is_of_own_domain(self, source: Name, now_s: float) -> bool:
         if self._attached.at(source) is not None or self._paths.domain_of(source) == self._own_domain:

@@ -277,7 +277,7 @@ class MemoryNetwork:
             return
         if node.table is not None:
             mtus = {port: cable.mtu for port, (cable, _, _) in node.ports.items() if cable.is_up}
-            verdict = decide(frame, node.table.entries, mtus)
+            verdict = decide(frame, node.table.entries, mtus, node.table.sides, end.port)
             if isinstance(verdict, Drop):
                 self.drops[verdict.reason] += 1
                 return

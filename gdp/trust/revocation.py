@@ -75,6 +75,10 @@ class Revocations:
     def __len__(self) -> int:
         return len(self._entries)
 
+    def trust(self, root_keys: frozenset[bytes]) -> None:
+        """Count these as the trusted roots' keys from now on; what is known stays."""
+        self._root_keys = root_keys
+
     def add(self, revocation: Revocation, unix_s: float) -> bool:
         """Remember a verified revocation; return whether it was news.
 

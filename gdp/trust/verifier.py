@@ -97,6 +97,7 @@ class ClaimVerifier:
             is_global=body.is_global,
             wire=statement.wire,
             previous=body.previous,
+            exchange=body.exchange,
         )
         self._check_evidence(claim, unix_s)
         return claim

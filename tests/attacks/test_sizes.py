@@ -75,7 +75,7 @@ def test_a70_a_link_state_of_a_rib_called_zero_is_malformed() -> None:
     liar = world.identities["nuc2"]
     state = LinkState(
         liar.name, liar.root.domain, Scope.BORDER, int(world.network.now.unix_s * 1_000) + 1, (), (),
-        (AttachedRib(ZERO, liar.root.domain, bytes(8)),),
+        (AttachedRib(ZERO, liar.root.domain, bytes(8)),), said_unix_s=int(world.network.now.unix_s),
     )  # fmt: skip
     world.network.inject(
         "nuc1", 0, control(Kind.LINK_STATE, state.to_wire(liar.key, liar.membership)), mac_of(world, "nuc1")

@@ -72,7 +72,7 @@ class Ledger(MemoryNetwork):
             self.taken["dead"] += 1
         elif is_data(frame) and node.table is not None:
             mtus = {port: cable.mtu for port, (cable, _, _) in node.ports.items() if cable.is_up}
-            verdict = decide(frame, node.table.entries, mtus)
+            verdict = decide(frame, node.table.entries, mtus, node.table.sides, end.port)
             if isinstance(verdict, Drop):
                 self.dropped[verdict.reason] += 1
             elif isinstance(verdict, Forward):
@@ -86,10 +86,16 @@ def note_others(monkeypatch: pytest.MonkeyPatch) -> Counter[DropReason]:
     find, send = Unicast._find, Unicast.send
 
     def noted_find(
-        self: Unicast, destination: Name, source: Name, frame: bytes, now_s: float, until_s: float | None = None
+        self: Unicast,
+        destination: Name,
+        source: Name,
+        frame: bytes,
+        owner: bytes,
+        now_s: float,
+        until_s: float | None = None,
     ) -> Name | None:
         before = self.drops.copy()
-        waits_for = find(self, destination, source, frame, now_s, until_s)
+        waits_for = find(self, destination, source, frame, owner, now_s, until_s)
         if frame[KIND_AT] != Kind.DATA:
             others.update(self.drops - before)
         return waits_for

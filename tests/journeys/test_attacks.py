@@ -137,9 +137,9 @@ def test_a_flood_of_beginnings_is_bounded_and_given_back() -> None:
         control(Kind.HELLO, bytes(1_000), number=n, parts=3, source=n.to_bytes(32, "big")) for n in range(3_000)
     )
     attack(flow, frames, ("nuc1",))
-    assert 0 < world.switches["nuc1"]._hellos.held_bytes <= CONTROL_JOIN_BYTES
+    assert 0 < world.switches["nuc1"].greeter.held_bytes <= CONTROL_JOIN_BYTES
     world.network.run(CONTROL_PATIENCE_S + 1)
-    assert world.switches["nuc1"]._hellos.held_bytes == 0
+    assert world.switches["nuc1"].greeter.held_bytes == 0
     flow.outlive()
 
 
@@ -308,8 +308,9 @@ def test_a_join_without_evidence_plants_nothing() -> None:
     session = nuc1.greeter.ports[0].nonce
     domains = frozenset(nuc1._policy.transit)
     join = Join(
-        secret, world.members[ROBOT].name, nuc1.name, nuc1._policy.own, domains, 1_500, 5.0, b"", session, 1 << 60
-    )
+        secret, world.members[ROBOT].name, nuc1.name, nuc1._policy.own, domains, 1_500, 5.0, b"", session, 1 << 60,
+        sender_session=nuc1.greeter.neighbour(0, nuc2.name).nonce,
+    )  # fmt: skip
     world.network.inject("nuc1", 0, control(Kind.JOIN, join.to_wire(nuc2.name, nuc2.key)), mac_of(world, "nuc1"))
     assert nuc1.planter.trees.of_topic(secret) == []
     assert nuc1.drops()[DropReason.MALFORMED] == 1
@@ -325,8 +326,9 @@ def test_a_join_with_evidence_of_another_topic_plants_nothing() -> None:
     secret, session = Name(b"t" * 32), nuc1.greeter.ports[0].nonce
     domains = frozenset(nuc1._policy.transit)
     join = Join(
-        secret, world.members[ROBOT].name, nuc1.name, nuc1._policy.own, domains, 1_500, 5.0, evidence, session, 1 << 60
-    )
+        secret, world.members[ROBOT].name, nuc1.name, nuc1._policy.own, domains, 1_500, 5.0, evidence, session, 1 << 60,
+        sender_session=nuc1.greeter.neighbour(0, nuc2.name).nonce,
+    )  # fmt: skip
     world.network.inject("nuc1", 0, control(Kind.JOIN, join.to_wire(nuc2.name, nuc2.key)), mac_of(world, "nuc1"))
     assert nuc1.planter.trees.of_topic(secret) == []
     assert nuc1.drops()[DropReason.NOT_DELEGATED] == 1

@@ -1,6 +1,7 @@
 """The program in the kernel, with its maps: what a plane writes into and reads its counts from.
 
-Place: I/O. Nothing is pinned: what is loaded here lasts as long as its descriptors, and what attaches it.
+Place: I/O. Nothing is pinned: what is loaded here lasts as long as its descriptors, and what attaches it. Each port has
+a program of its own, since an entry says which ports its frames come from.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import sys
 import time
 from typing import Final
 
-from gdp.errors import DropReason, LocalError
+from gdp.errors import DROP_COUNTERS, LocalError
 from gdp.ports.kernel import shapes
 from gdp.ports.kernel.maps import KernelMap, MapKind, possible_cpus
 from gdp.ports.kernel.program import LICENCE, Descriptors, forwarder
@@ -28,6 +29,7 @@ from gdp.ports.kernel.shapes import (
 )
 from gdp.ports.kernel.syscall import load_program
 from gdp.ports.plane import Counters
+from gdp.switch.table import SHARED_SIDE
 
 __all__ = ["PROGRAM", "Loaded"]
 
@@ -50,7 +52,7 @@ class Loaded:
 
     def __init__(self, entries_max: int, *, leased: bool = False) -> None:
         self._maps: list[KernelMap] = []
-        self.program = -1
+        self._programs: dict[int, int] = {}  # descriptors, by port
         self._last = Counters()
         try:
             self.entries = self._make(MapKind.HASH, KEY_BYTES, ENTRY_BYTES, entries_max, "gdp_entries")
@@ -59,7 +61,7 @@ class Loaded:
             self.totals = self._make(MapKind.PERCPU_ARRAY, INDEX_BYTES, TOTALS_BYTES, 1, "gdp_totals")
             self.counts = self._make(MapKind.PERCPU_ARRAY, INDEX_BYTES, COUNT_BYTES, entries_max + 1, "gdp_counts")
             self._lease = self._make(MapKind.ARRAY, INDEX_BYTES, 8, 1, "gdp_lease") if leased else None
-            descriptors = Descriptors(
+            self._descriptors = Descriptors(
                 entries=self.entries.fd,
                 ports=self.ports.fd,
                 groups=self.groups.fd,
@@ -67,10 +69,21 @@ class Loaded:
                 counts=self.counts.fd,
                 lease=None if self._lease is None else self._lease.fd,
             )
-            self.program = load_program(forwarder(descriptors), PROGRAM, LICENCE)
+            self.program_of(0)
         except LocalError:
             self.close()
             raise
+
+    def program_of(self, port: int) -> int:
+        """Return the descriptor of the program for the ingress of a port.
+
+        Raises:
+            LoadRefusedError: with the verifier's log.
+        """
+        side = min(port, SHARED_SIDE)
+        if side not in self._programs:
+            self._programs[side] = load_program(forwarder(self._descriptors, side), PROGRAM, LICENCE)
+        return self._programs[side]
 
     @property
     def is_leased(self) -> bool:
@@ -83,10 +96,11 @@ class Loaded:
 
     def close(self) -> None:
         """Let go of all; what is attached still holds what it needs."""
-        if self.program >= 0:
+        if self._programs:
             self._last = self.counters()
-            os.close(self.program)
-            self.program = -1
+        for program in self._programs.values():
+            os.close(program)
+        self._programs.clear()
         for each in self._maps:
             each.close()
 
@@ -103,13 +117,13 @@ class Loaded:
 
     def counters(self) -> Counters:
         """Return what the program did, until it was let go of. Safe in any thread."""
-        if self.program < 0:
+        if not self._programs:
             return self._last
         words = memoryview(self.totals.get(_FIRST) or b"").cast("Q")
         width = len(words) // possible_cpus()
         totals = [sum(words[at::width]) for at in range(width)]
         copies = totals[Total.COPIES]
-        return Counters(totals[Total.TAKEN], copies, copies, 0, totals[: len(DropReason)])
+        return Counters(totals[Total.TAKEN], copies, copies, 0, totals[:DROP_COUNTERS])
 
     def _make(self, kind: MapKind, key_bytes: int, value_bytes: int, max_entries: int, name: str) -> KernelMap:
         made = KernelMap(kind, key_bytes, value_bytes, max_entries, name)

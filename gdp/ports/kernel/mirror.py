@@ -30,10 +30,11 @@ from gdp.ports.kernel.shapes import (
     NOWHERE_PORT,
     PORTS_MAX,
     entry_head,
+    entry_tail,
     group,
 )
 from gdp.ports.kernel.syscall import BpfError
-from gdp.switch.table import Hops
+from gdp.switch.table import EVERY_SIDE, Hops, Table
 
 __all__ = ["EntryCounts", "Mirror"]
 
@@ -62,14 +63,15 @@ class Mirror:
     """The table, as the kernel sees it.
 
     Args:
-        table: the table's entries, read only.
+        table: what is mirrored, read only.
         entries: hash of entries.
         groups: hash of groups, by number.
         counts: per-CPU array of counters, one more than there may be entries.
     """
 
-    def __init__(self, table: Mapping[bytes, Hops], entries: KernelMap, groups: KernelMap, counts: KernelMap) -> None:
-        self._table = table
+    def __init__(self, table: Table | None, entries: KernelMap, groups: KernelMap, counts: KernelMap) -> None:
+        self._table: Mapping[bytes, Hops] = {} if table is None else table.entries
+        self._sides: Mapping[bytes, int] = {} if table is None else table.sides
         self._entries, self._groups, self._counts = entries, groups, counts
         self._counter_of: dict[bytes, int] = {}  # by the table's key: what is in the kernel
         self._key_of: list[bytes] = [b""]  # by counter
@@ -97,7 +99,7 @@ class Mirror:
         used: list[int] = []
         fresh: set[bytes] = set()  # those that the kernel did not have
         heads: dict[int, bytes] = {}  # by identity, since the table shares equal hops; those of groups are not here
-        counter_of, group_of = self._counter_of, self._group_of
+        counter_of, group_of, sides = self._counter_of, self._group_of, self._sides
         for key, hops in items.items():
             if group_of and key in group_of:
                 left.append(group_of.pop(key))
@@ -116,7 +118,7 @@ class Mirror:
             keys.append(key)
             # ``_kernel_key`` and ``_index``, written out: a table may bring a hundred thousand names at once
             kernel_keys.append(key if len(key) > NAME_BYTES else key + EVERY_SOURCE)
-            values.append(head + counter.to_bytes(INDEX_BYTES, sys.byteorder))
+            values.append(head + entry_tail(counter, sides.get(key, EVERY_SIDE)))
         self._counts.put_many([*map(_index, used)], [bytes(self._counts.value_bytes)] * len(used))
         self._write(keys, kernel_keys, values, fresh)
         for name in self._zero_sources:  # empty, but for a strange peer

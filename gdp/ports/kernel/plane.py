@@ -69,7 +69,7 @@ class KernelPlane(RawPlane):
             self._loaded = opened.enter_context(closing(Loaded(entries_max, leased=clsact or not has_links())))
             self._questions = opened.enter_context(closing(Questions()))
             self._queues = opened.enter_context(closing(QueueWatch()))
-            self._mirror = Mirror({} if table is None else table.entries, *self._loaded.of_entries)
+            self._mirror = Mirror(table, *self._loaded.of_entries)
             super().__init__(ifnames, table, bypass_qdisc=bypass_qdisc)
             opened.pop_all()  # from now on ``close`` does it
         self.watch(self._queues, self._review_queues)
@@ -131,7 +131,7 @@ class KernelPlane(RawPlane):
         try:
             ifindex = _ifindex(port.ifname)
             attach = FilterAttachment if self._loaded.is_leased else LinkAttachment
-            self._attachments[port.index] = attach(self._loaded.program, ifindex, self._questions)
+            self._attachments[port.index] = attach(self._loaded.program_of(port.index), ifindex, self._questions)
         except LocalError as error:
             self._shut(port.index)
             raise LocalError(f"port {port.ifname}: {error}") from error

@@ -11,7 +11,7 @@ rare::
 
     to our station? -> leased, and over? -> whole header? -> version, kind, hops, length good? -> known?
           no: up            yes: up             no: up                 no: up                     no: up
-                                                               known -> nowhere | one hop | a group
+                                                      known -> another side's: drop | nowhere | one hop | a group
 
 While a hop's port is down its alternate is taken. A port goes down by one write into the map of ports, however many
 entries name it.
@@ -89,8 +89,9 @@ class Descriptors:
 class _Story(Assembler):
     """The program, one method a step."""
 
-    def __init__(self, maps: Descriptors) -> None:
+    def __init__(self, maps: Descriptors, side: int) -> None:
         super().__init__()
+        self._side = side
         self._maps = maps
         places = layout()
         self._at = {name: ETHER_BYTES + offset for name, (offset, _) in places.items()}
@@ -102,6 +103,7 @@ class _Story(Assembler):
         self._whole_header()
         self._good_header()
         self._look_up()
+        self._from_its_side()
         self._urgency()
         self._where()
         self._one_hop()
@@ -178,6 +180,17 @@ class _Story(Assembler):
         self._find(self._maps.totals, 0)
         self.jump_if(Reg.R0, "==", 0, "up")
         self.move(_TOTALS, Reg.R0)
+
+    def _from_its_side(self) -> None:
+        """Reverse path: what a publisher sends comes from where it is."""
+        self.load(Reg.R2, _ENTRY, EntryAt.SIDES, 8)
+        self.move(Reg.R3, 1)
+        self.shift_left(Reg.R3, self._side)
+        self.jump_if(Reg.R2, "&", Reg.R3, "from its side")
+        self._count(Total.TAKEN)
+        self._count(DropReason.WRONG_SIDE)
+        self.jump("drop")
+        self.label("from its side")
 
     def _urgency(self) -> None:
         """Where a device queues, urgent frames go first."""
@@ -357,6 +370,6 @@ class _Story(Assembler):
         self.label(f"{where} not counted")
 
 
-def forwarder(maps: Descriptors) -> bytes:
-    """Return the program's instructions."""
-    return _Story(maps).tell()
+def forwarder(maps: Descriptors, side: int = 0) -> bytes:
+    """Return the instructions of the program for a port; ``side``: its bit in an entry's mask."""
+    return _Story(maps, side).tell()

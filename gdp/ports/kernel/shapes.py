@@ -4,7 +4,7 @@ Place: pure; numbers only. In this machine's byte order, but for names and addre
 
     key      destination (32)  source, or zero for every source (32)
     entry    port, or GROUP or NOWHERE (4)  addresses (12)  alternate port or NOWHERE (4)  its addresses (12)
-             group (4)  counter (4)
+             group (4)  counter (4)  mask of the ports that its frames may come from (8)
     port     ifindex, 0 when it is down (4)  MTU (4)  flags (4)  unused (4)
     group    number of branches (4)  unused (4)
              64 times: port (4)  addresses (12)  alternate port or NOWHERE (4)  its addresses (12)
@@ -18,7 +18,7 @@ import struct
 from enum import IntEnum
 from typing import Final
 
-from gdp.errors import DropReason
+from gdp.errors import DROP_COUNTERS
 from gdp.names import NAME_BYTES
 from gdp.switch.table import MACS_BYTES, Hops
 
@@ -44,6 +44,7 @@ __all__ = [
     "PortFlag",
     "Total",
     "entry_head",
+    "entry_tail",
     "group",
     "port",
 ]
@@ -68,6 +69,7 @@ class EntryAt(IntEnum):
     ALTERNATE = 4 + MACS_BYTES  # as port and addresses
     GROUP = 2 * (4 + MACS_BYTES)
     COUNTER = GROUP + 4
+    SIDES = COUNTER + INDEX_BYTES
 
 
 class PortAt(IntEnum):
@@ -87,18 +89,19 @@ class PortFlag(IntEnum):
 class Total(IntEnum):
     """Indices of the counters behind those of the drop reasons."""
 
-    TAKEN = len(DropReason)  # frames that were not handed up
+    TAKEN = DROP_COUNTERS  # frames that were not handed up
     COPIES = TAKEN + 1  # forwarded
     BYTES = TAKEN + 2  # of those copies, Ethernet header included
 
 
 _HEAD: Final = struct.Struct(f"=I{MACS_BYTES}sI{MACS_BYTES}sI")
+_TAIL: Final = struct.Struct("=IQ")
 _PORT: Final = struct.Struct("=IIII")
 _GROUP_HEAD: Final = struct.Struct("=II")
 _BRANCH: Final = struct.Struct(f"=I{MACS_BYTES}sI{MACS_BYTES}s")
 _NO_ALTERNATE: Final = (NOWHERE_PORT, bytes(MACS_BYTES))
 
-ENTRY_BYTES: Final = _HEAD.size + INDEX_BYTES
+ENTRY_BYTES: Final = _HEAD.size + _TAIL.size
 PORT_BYTES: Final = _PORT.size
 GROUP_HEAD_BYTES: Final = _GROUP_HEAD.size
 BRANCH_BYTES: Final = _BRANCH.size
@@ -117,6 +120,11 @@ def entry_head(
 ) -> bytes:
     """Return an entry up to its counter."""
     return _HEAD.pack(port, macs, alternate_port, alternate_macs, group)
+
+
+def entry_tail(counter: int, sides: int) -> bytes:
+    """Return the rest of an entry."""
+    return _TAIL.pack(counter, sides)
 
 
 def port(ifindex: int, mtu: int, flags: int) -> bytes:

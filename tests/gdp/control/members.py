@@ -10,6 +10,7 @@ from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.validity import Validity
 from gdp.effects import Instant
+from gdp.frame.codec import HEADER_BYTES, decode
 from gdp.trust.domain import Policy
 
 UNIX_S = 1_800_000_000
@@ -47,3 +48,8 @@ def greeter(identity: Identity, salt: int, policy: Policy = POLICY) -> Greeter:
     made = Greeter(identity, policy, ControlSplitter(identity.name, salt), Nonces(salt))
     made.add_port(0, bytes([2, salt, 0, 0, 0, 0]), 1_500, 10, 0.0)
     return made
+
+
+def statement_of(frame: bytes) -> bytes:
+    """Return what a frame carries, without its padding."""
+    return frame[HEADER_BYTES : HEADER_BYTES + decode(frame).length]

@@ -18,6 +18,7 @@ from gdp.limits import (
     CONTROL_MAX_BYTES,
     CONTROL_PARTS_MAX,
     CONTROL_PATIENCE_S,
+    RECORD_OVERHEAD_BYTES,
 )
 from gdp.names import ZERO, Name
 
@@ -56,7 +57,7 @@ def test_a_statement_that_goes_far_fits_through_a_tunnel() -> None:
 
 def test_a_statement_above_the_limit_is_not_sent() -> None:
     with pytest.raises(LocalError):
-        splitter().split(Kind.HELLO, bytes(CONTROL_MAX_BYTES + 1), 1_500)
+        splitter().split(Kind.HELLO, bytes(CONTROL_MAX_BYTES + RECORD_OVERHEAD_BYTES + 1), 1_500)
 
 
 def test_two_statements_that_interleave_do_not_mix() -> None:

@@ -6,21 +6,20 @@ from itertools import product
 
 import pytest
 
-from gdp.control.greeter import NEIGHBOURS_PER_PORT, Change, Greeter, LinkPort
+from gdp.control.greeter import NEIGHBOURS_MAX, PADDED_BYTES, Change, Greeter, LinkPort
 from gdp.control.hello import NONCE_BYTES, Hello
 from gdp.control.join import Join
-from gdp.control.neighbour import TRANSITIONS, NeighbourEvent, NeighbourState
+from gdp.control.neighbour import TRANSITIONS, Neighbour, NeighbourEvent, NeighbourState
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import parse
 from gdp.crypto.validity import Validity
 from gdp.effects import Arrival
 from gdp.errors import DropReason, StatementError
-from gdp.frame.codec import HEADER_BYTES
 from gdp.limits import DEAD_S, HELLO_S
 from gdp.names import ZERO, Name
 from gdp.trust.domain import Policy
-from tests.gdp.control.members import CLOUD, ELSEWHERE, SCHOOL, UNIX_S, YEAR, at, greeter, node
+from tests.gdp.control.members import CLOUD, ELSEWHERE, SCHOOL, UNIX_S, YEAR, at, greeter, node, statement_of
 
 A, B = node("a"), node("b")
 UP = NeighbourState.UP
@@ -28,11 +27,11 @@ UP = NeighbourState.UP
 
 def hellos(of: Greeter, now_s: float) -> list[bytes]:
     """Return the statements that a greeter says now."""
-    return [frame[HEADER_BYTES:] for transmit in of.take(now_s) for frame in transmit.frames]
+    return [statement_of(frame) for transmit in of.take(now_s) for frame in transmit.frames]
 
 
 def hear(listener: Greeter, statement: bytes, now_s: float, mac: bytes = b"\x02far\x00\x00") -> Change | None:
-    return listener.receive(Arrival(0, mac, b""), parse(statement), at(now_s))
+    return listener.receive(Arrival(0, mac, bytes(PADDED_BYTES)), parse(statement), at(now_s))
 
 
 def refusal(listener: Greeter, statement: bytes, now_s: float = 0.0) -> DropReason:
@@ -176,7 +175,7 @@ def test_a_strangers_domain_is_refused() -> None:
 
 
 def test_an_expired_certificate_is_refused() -> None:
-    expired = node("old", validity=Validity(YEAR.not_before_unix_s, UNIX_S - 1_000))
+    expired = node("old", validity=Validity(YEAR.not_before_unix_s, UNIX_S - 4_000))
     assert refusal(greeter(A, 1), forged(expired)) is DropReason.EXPIRED
 
 
@@ -186,7 +185,7 @@ def test_a_neighbour_whose_certificate_runs_out_falls_silent() -> None:
     hear(one, forged(short, heard=(one.ports[0].nonce,)), 0.0)
     assert len(one.all_up()) == 1
     with pytest.raises(StatementError) as caught:
-        one.receive(Arrival(0, b"\x02far\x00\x00", b""), parse(forged(short, sequence=2)), at(0.5, UNIX_S + 1_000))
+        one.receive(Arrival(0, b"\x02far\x00\x00", b""), parse(forged(short, sequence=2)), at(0.5, UNIX_S + 4_000))
     assert caught.value.reason is DropReason.EXPIRED
 
 
@@ -208,9 +207,12 @@ def test_ones_own_hello_come_back_is_not_for_us() -> None:
 
 def test_a_port_has_so_many_neighbours_and_no_more() -> None:
     one = greeter(A, 1)
-    for number in range(NEIGHBOURS_PER_PORT):
-        hear(one, forged(node(f"n{number}", Role.PROXY)), 0.0)
-    assert refusal(one, forged()) is DropReason.QUOTA
+    heard = (one.ports[0].nonce,)
+    for number in range(NEIGHBOURS_MAX):
+        hear(one, forged(node(f"n{number}", Role.PROXY), heard=heard), 0.0, b"\x02far\x00" + bytes([number]))
+    with pytest.raises(StatementError) as caught:
+        hear(one, forged(heard=heard), 0.0, b"\x02other")
+    assert caught.value.reason is DropReason.QUOTA
 
 
 def test_a_neighbours_mtu_is_the_smaller_of_both_ends() -> None:
@@ -316,10 +318,18 @@ def test_a_greeter_never_wants_to_be_called_in_the_past() -> None:
         assert due_s > now_s
 
 
-def is_taken(port: LinkPort, session: bytes, name: Name, sequence: int) -> bool:
-    join = Join(ZERO, ZERO, ZERO, ZERO, frozenset(), 1_500, 1.0, b"", session, sequence)
+def neighbour_of(label: bytes, nonce: bytes = b"n" * 8) -> Neighbour:
+    return Neighbour(Name(label * 32), Role.SWITCH, SCHOOL.root.domain, A.key.public, 0, b"", 1_500, nonce, 0, b"", 0.0)
+
+
+def is_taken(
+    port: LinkPort, session: bytes, neighbour: Neighbour, sequence: int, sender_session: bytes = b"n" * 8
+) -> bool:
+    join = Join(
+        ZERO, ZERO, ZERO, ZERO, frozenset(), 1_500, 1.0, b"", session, sequence, sender_session=sender_session
+    )
     try:
-        port.take_join(join, name)
+        port.take_join(join, neighbour)
     except StatementError as error:
         return error.reason is not DropReason.REPLAYED
     return True
@@ -327,15 +337,23 @@ def is_taken(port: LinkPort, session: bytes, name: Name, sequence: int) -> bool:
 
 def test_a_join_counts_once() -> None:
     port = greeter(A, 1).ports[0]
-    taken = [is_taken(port, port.nonce, B.name, sequence) for sequence in (5, 4, 5, 6, 4)]
+    taken = [is_taken(port, port.nonce, neighbour_of(b"b"), sequence) for sequence in (5, 4, 5, 6, 4)]
     assert taken == [True, True, False, True, False]
 
 
 def test_a_join_of_another_session_is_refused() -> None:
     port = greeter(A, 1).ports[0]
-    assert not is_taken(port, bytes(NONCE_BYTES), B.name, 1)
+    assert not is_taken(port, bytes(NONCE_BYTES), neighbour_of(b"b"), 1)
 
 
 def test_joins_of_two_neighbours_do_not_hinder_each_other() -> None:
     port = greeter(A, 1).ports[0]
-    assert [is_taken(port, port.nonce, name, 1) for name in (A.name, B.name)] == [True, True]
+    both = neighbour_of(b"a", b"a" * 8), neighbour_of(b"b", b"b" * 8)
+    assert [is_taken(port, port.nonce, each, 1, each.nonce) for each in both] == [True, True]
+
+
+def test_a_join_counts_from_anew_in_a_new_session_of_its_sender_and_one_of_the_last_session_not_at_all() -> None:
+    port, before, after = greeter(A, 1).ports[0], neighbour_of(b"b"), neighbour_of(b"b", b"o" * 8)
+    assert is_taken(port, port.nonce, before, 1_000)
+    assert is_taken(port, port.nonce, after, 1, b"o" * 8)
+    assert not is_taken(port, port.nonce, after, 1_001)

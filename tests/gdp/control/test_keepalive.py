@@ -19,7 +19,7 @@ from gdp.effects import Arrival
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
 from gdp.frame.codec import HEADER_BYTES, decode
 from gdp.frame.kinds import Kind
-from gdp.limits import DEAD_S, HELLO_IDLE, HELLO_S
+from gdp.limits import CLOCK_SKEW_S, DEAD_S, HELLO_IDLE, HELLO_S
 from tests.gdp.control.members import POLICY, UNIX_S, YEAR, Nonces, at, node
 
 A, B = node("a"), node("b")
@@ -249,9 +249,9 @@ def test_a_short_keepalive_is_refused() -> None:
 
 
 def test_keepalives_do_not_keep_up_whose_membership_ran_out() -> None:
-    short = node("short", validity=Validity(YEAR.not_before_unix_s, UNIX_S + 5))
+    short = node("short", validity=Validity(YEAR.not_before_unix_s, UNIX_S + 5 - int(CLOCK_SKEW_S)))
     pair = up(Pair(identities=(A, short)))
-    pair.run(130.0)  # two minutes of skew are forgiven
+    pair.run(10.0)
     assert not pair.is_up("a")
 
 

@@ -204,7 +204,8 @@ def test_a_statement_is_shown_in_words() -> None:
     assert packet[Statement].signature == b"s" * 64
 
 
-CARRIERS = [kind for kind in Kind if kind >= 0x80 and kind is not Kind.KEEPALIVE] + [Kind.RIB_REQUEST, Kind.RIB_ANSWER]
+NEIGHBOURS = [kind for kind in Kind if kind >= 0x80 and kind not in (Kind.KEEPALIVE, Kind.COOKIE)]
+CARRIERS = [*NEIGHBOURS, Kind.RIB_REQUEST, Kind.RIB_ANSWER]
 
 
 @pytest.mark.parametrize("kind", CARRIERS)

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from gdp.errors import DropReason
+from gdp.errors import DROP_COUNTERS, DropReason
 from gdp.ports import batch as batch_module
 from gdp.ports.batch import SLOTS, MmsgBatch, PlainBatch, make_batch, send_failure
 
@@ -41,7 +41,7 @@ def received(end: socket.socket) -> list[bytes]:
 
 
 def no_drops() -> list[int]:
-    return [0] * len(DropReason)
+    return [0] * DROP_COUNTERS
 
 
 @KINDS

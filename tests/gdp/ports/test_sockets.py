@@ -15,10 +15,11 @@ import pytest
 
 from gdp.frame.kinds import CONTROL_FROM, Flag, Kind
 from gdp.ports import sockets
-from gdp.ports.sockets import Lane, only_ours
+from gdp.ports.sockets import Lane, only_ours, steps_of
 from tests.fixtures_forwarding import ONE, frame
 
 LOAD_BYTE, LOAD_LENGTH, JUMP_EQUAL, JUMP_AT_LEAST, JUMP_SET, RETURN = 0x30, 0x80, 0x15, 0x35, 0x45, 0x06
+LOAD_HALF, LOAD_WORD = 0x28, 0x20
 PACKET_TYPE_AT = 0xFFFFF004
 TO_US, TO_ALL, TO_MANY, TO_ANOTHER, FROM_US = (
     socket.PACKET_HOST,
@@ -31,11 +32,12 @@ KINDS = (0x00, Kind.DATA, Kind.REPORT, CONTROL_FROM - 1, CONTROL_FROM, Kind.HELL
 FLAGS = (Flag.NONE, Flag.LAST, Flag.URGENT, Flag.URGENT | Flag.RELIABLE, 0xFF, 0xFF & ~Flag.URGENT)
 
 
-def takes(lane: Lane, packet: bytes, kind: int = TO_US) -> bool:
+def takes(lane: Lane, packet: bytes, kind: int = TO_US, neighbours: tuple[bytes, ...] = ()) -> bool:
     """Run a lane's filter on a packet, from the Ethernet header on."""
     at, value = 0, 0
+    steps = steps_of(lane, neighbours)
     while True:
-        code, if_true, if_false, operand = lane.value[at]
+        code, if_true, if_false, operand = steps[at]
         at += 1
         if code == RETURN:
             return bool(operand)
@@ -43,6 +45,9 @@ def takes(lane: Lane, packet: bytes, kind: int = TO_US) -> bool:
             value = len(packet)
         elif code == LOAD_BYTE and operand == PACKET_TYPE_AT:
             value = kind
+        elif code in (LOAD_HALF, LOAD_WORD):
+            size = 2 if code == LOAD_HALF else 4
+            value = int.from_bytes(packet[operand : operand + size], "big")
         elif code == LOAD_BYTE:
             if operand >= len(packet):
                 return False
@@ -56,23 +61,42 @@ def takes(lane: Lane, packet: bytes, kind: int = TO_US) -> bool:
             at += if_true if holds else if_false
 
 
-def lanes_of(packet: bytes, kind: int = TO_US) -> list[str]:
+def lanes_of(packet: bytes, kind: int = TO_US, neighbours: tuple[bytes, ...] = ()) -> list[str]:
     """Return the names of the lanes that take a packet."""
-    return [lane.name for lane in Lane if takes(lane, packet, kind)]
+    return [lane.name for lane in Lane if takes(lane, packet, kind, neighbours)]
+
+
+def lane_of_control(kind: int) -> str:
+    return "HELLO" if kind == Kind.HELLO else "CONTROL"
+
+
+def neighbourhood(packet: bytes, count: int) -> tuple[bytes, ...]:
+    """Return addresses, of which the packet's sender has one; others differ from it in one byte."""
+    mac = packet[6:12]
+    others = (mac[:at] + bytes([mac[at] ^ 1 << bit]) + mac[at + 1 :] for bit in range(8) for at in range(6))
+    return (mac, *others)[:count]
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("flags", FLAGS)
 def test_a_frame_to_us_comes_by_one_lane_as_its_kind_and_flags_say(kind: int, flags: int) -> None:
     of_data = "URGENT" if flags & Flag.URGENT else "ORDINARY"
-    assert lanes_of(frame(ONE, kind=kind, flags=flags)) == ["ALL", "CONTROL" if kind >= CONTROL_FROM else of_data]
+    packet = frame(ONE, kind=kind, flags=flags)
+    assert lanes_of(packet) == ["ALL", "GUEST" if kind >= CONTROL_FROM else of_data]
+    for count in (1, 2, 40):
+        known = neighbourhood(packet, count)
+        assert lanes_of(packet, TO_US, known) == ["ALL", lane_of_control(kind) if kind >= CONTROL_FROM else of_data]
+        assert lanes_of(packet, TO_US, known[1:]) == ["ALL", "GUEST" if kind >= CONTROL_FROM else of_data]
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("flags", FLAGS)
 def test_of_broadcasts_only_a_neighbours_word_comes_in(kind: int, flags: int) -> None:
-    wanted = ["ALL", "CONTROL"] if kind >= CONTROL_FROM else []
-    assert lanes_of(frame(ONE, kind=kind, flags=flags), TO_ALL) == wanted
+    packet = frame(ONE, kind=kind, flags=flags)
+    assert lanes_of(packet, TO_ALL) == (["ALL", "GUEST"] if kind >= CONTROL_FROM else [])
+    assert lanes_of(packet, TO_ALL, neighbourhood(packet, 3)) == (
+        ["ALL", lane_of_control(kind)] if kind >= CONTROL_FROM else []
+    )
 
 
 @pytest.mark.parametrize("station", [TO_MANY, TO_ANOTHER, FROM_US])
@@ -92,9 +116,9 @@ def test_a_frame_cut_short_still_comes_by_one_lane_so_that_it_is_counted(length:
 
 def test_every_jump_of_a_filter_ends_inside_it() -> None:
     for lane in Lane:
-        steps = lane.value
+        steps = steps_of(lane, [bytes([each]) * 6 for each in range(64)])
         for at, (code, if_true, if_false, _) in enumerate(steps):
-            assert code in (LOAD_BYTE, LOAD_LENGTH, JUMP_EQUAL, JUMP_AT_LEAST, JUMP_SET, RETURN)
+            assert code in (LOAD_BYTE, LOAD_LENGTH, JUMP_EQUAL, JUMP_AT_LEAST, JUMP_SET, RETURN, LOAD_HALF, LOAD_WORD)
             assert at + 1 + max(if_true, if_false) < len(steps) or code == RETURN
         assert steps[-1][0] == RETURN
 
@@ -119,7 +143,7 @@ def test_the_kernel_is_given_the_whole_filter(lane: Lane) -> None:
     only_ours(asked, lane)  # type: ignore[arg-type]
     given = asked.options[socket.SOL_SOCKET, 26]
     assert isinstance(given, bytes)
-    assert struct.unpack("@HP", given)[0] == len(lane.value)
+    assert struct.unpack("@HP", given)[0] == len(steps_of(lane))
 
 
 def test_an_older_kernel_without_the_option_to_ignore_what_leaves_will_do() -> None:

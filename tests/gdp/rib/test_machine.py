@@ -86,7 +86,8 @@ def verdicts(letters: list[Letter]) -> list[Verdict]:
 
 def answer_from_above(to: Rib, claimed: bytes, now: Instant = START, by: Identity = UPPER) -> list[Letter]:
     node = parse(claimed).signer if claimed else ROBOT.name
-    answer = Answer(NAME, node, claimed, CLOUD.root.domain, (CLOUD.root.domain,), 30.0)
+    gone = 0 if claimed else ClaimBody.from_statement(parse(claim())).sequence
+    answer = Answer(NAME, node, claimed, CLOUD.root.domain, (CLOUD.root.domain,), 30.0, gone)
     to.receive(answer.to_wire(by.name, by.key, by.membership), by.name, now)
     return to.take()
 
@@ -149,7 +150,7 @@ def test_a_good_claim_is_taken_and_its_relay_told() -> None:
 FOREIGN_SWITCH_CLAIM = claim(rtcert=RtCert.make(ROBOT, OTHER_SWITCH.name, DAY))
 REFUSED = {
     "forged": (sign(StatementType.ADVERTISE, parse(claim()).fields, ROBOT.name, GATEWAY.key), DropReason.BAD_SIGNATURE),
-    "wrong name hash": (altered({"name": bytes(32)}), DropReason.WRONG_NAME),
+    "wrong name hash": (altered({"name": bytes(NAME)[::-1]}), DropReason.WRONG_NAME),
     "not delegated": (claim(chain=[]), DropReason.NOT_DELEGATED),
     "delegated for something else": (claim(right=Right.SERVE), DropReason.NOT_DELEGATED),
     "another's RtCert": (claim(rtcert=RtCert.make(GATEWAY, SWITCH.name, DAY)), DropReason.NOT_DELEGATED),
@@ -276,7 +277,18 @@ def test_claiming_and_withdrawing_in_turn_does_not_pass_the_quota() -> None:
         own = Subject.of(Metadata({"kind": "topic", "name": f"/own{number}"}), ROBOT.key.public.compressed)
         tell(at_rib, claim(subject=own, chain=[]))
         tell(at_rib, sign(StatementType.WITHDRAW, {"n": own.name, "s": 2}, ROBOT.name, ROBOT.key))
-    assert at_rib.refusals == {DropReason.QUOTA: 5, DropReason.STALE: 5}
+    assert at_rib.refusals == {DropReason.QUOTA: 7, DropReason.STALE: 7}  # a node may hold as many as are free
+
+
+def test_a_node_leaves_room_for_the_other_nodes_of_its_switch() -> None:
+    at_rib = rib(names_per_sender=30)
+    for number in range(40):
+        own = Subject.of(Metadata({"kind": "topic", "name": f"/own{number}"}), ROBOT.key.public.compressed)
+        tell(at_rib, claim(subject=own, chain=[]))
+    assert at_rib.names == 15
+    rtcert = RtCert.make(GATEWAY, SWITCH.name, DAY)
+    others = Subject.of(Metadata({"kind": "topic", "name": "/others"}), GATEWAY.key.public.compressed)
+    assert verdicts(tell(at_rib, claim(node=GATEWAY, subject=others, chain=[], rtcert=rtcert)))[0].refused is None
 
 
 def test_an_operator_may_bound_leases_further() -> None:

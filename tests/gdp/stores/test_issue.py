@@ -12,7 +12,7 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.x509_form import to_pem
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.metadata import Metadata
-from gdp.names import ZERO
+from gdp.names import Name
 from gdp.stores.issue import (
     admit,
     admit_node,
@@ -91,7 +91,7 @@ def test_a_delegation_leads_to_a_claim_that_is_believed(keys: Path) -> None:
         identity,
         Right.PUBLISH,
         found.subject,
-        rtcert=delegate_route(keys / "robot", ZERO, days=1, unix_s=NOW),
+        rtcert=delegate_route(keys / "robot", Name(b"s" * 32), days=1, unix_s=NOW),
         sequence=1,
         incarnation=1,
         lease_s=60,

@@ -32,11 +32,15 @@ def test_a_tree_shows_the_claim_that_stands_longest() -> None:
 def test_a_branch_that_is_not_renewed_is_cut() -> None:
     trees, one = Trees(), tree()
     trees.put(one)
+    one.renew_at_s = 6.0
     assert trees.next_event() == 5.0
-    assert trees.prune(4.9) == []
-    assert trees.prune(5.0) == [one]
-    assert list(one.branches) == [FAR]
-    assert trees.next_event() == 7.0
+    assert trees.due(4.9) == []
+    assert trees.due(5.0) == [one]
+    del one.branches[NEAR]
+    assert trees.next_event() == 6.0
+    one.renew_at_s = 8.0
+    assert trees.due(6.0) == [one]
+    assert trees.next_event() == 8.0
 
 
 def test_trees_of_one_topic_are_found_by_it() -> None:
@@ -98,11 +102,12 @@ def test_a_tree_of_backups_alone_asks_for_a_backup_and_passes_on_what_comes() ->
     assert made.hops(MACS) == ((2, OTHER[1] + MACS[2]),)
 
 
-def test_a_backup_rests_again_when_its_time_is_over() -> None:
+def test_a_backup_that_got_copies_is_due_when_its_time_is_over() -> None:
     trees, made = Trees(), with_backup()
     trees.put(made)
     made.branches[OTHER].active_until_s = 3.0
     assert trees.next_event() == 3.0
-    assert trees.deactivate(2.9) == []
-    assert trees.deactivate(3.0) == [made]
-    assert (made.branches[OTHER].is_active, trees.next_event()) == (False, 5.0)
+    assert trees.due(2.9) == []
+    assert trees.due(3.0) == [made]
+    made.branches[OTHER].active_until_s = None
+    assert trees.next_event() == 5.0

@@ -6,14 +6,14 @@ from urllib.request import urlopen
 
 import pytest
 
-from gdp.errors import DropReason, LocalError
+from gdp.errors import DROP_COUNTERS, DropReason, LocalError
 from gdp.names import Name
 from gdp.telemetry.metrics import Metrics
 from gdp.telemetry.sources import Histogram, Sources
 
 
 def drops(**counts: int) -> list[int]:
-    listed = [0] * len(DropReason)
+    listed = [0] * DROP_COUNTERS
     for name, count in counts.items():
         listed[DropReason[name]] = count
     return listed

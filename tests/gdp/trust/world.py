@@ -23,7 +23,7 @@ from gdp.trust.verifier import ClaimVerifier
 NOW = 1_800_000_000
 DAY = Validity(NOW, NOW + 86_400)
 HOUR = Validity(NOW, NOW + 3_600)
-LATER = NOW + 7_200  # after the hour, within the day
+LATER = NOW + 10_000  # after the hour, within the day
 
 SCHOOL = DomainAuthority.found("school", SigningKey.generate(), DAY)
 CLOUD = DomainAuthority.found("cloud", SigningKey.generate(), DAY)

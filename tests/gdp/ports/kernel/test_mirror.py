@@ -49,7 +49,7 @@ def in_kernel(loaded: Loaded, key: bytes) -> Hops | None:
 
 def watched(loaded: Loaded) -> tuple[Table, Mirror]:
     table = Table()
-    mirror = Mirror(table.entries, *loaded.of_entries)
+    mirror = Mirror(table, *loaded.of_entries)
     table.observe(mirror)
     return table, mirror
 

@@ -24,7 +24,7 @@ from gdp.ports.kernel.mirror import Mirror
 from gdp.ports.kernel.program import DROP, REDIRECT, UP
 from gdp.ports.kernel.syscall import LoadRefusedError
 from gdp.switch.forwarder import Drop, Forward, HandUp, decide, rewrite
-from gdp.switch.table import NOWHERE, Hops, Table
+from gdp.switch.table import NOWHERE, Hops, Table, sides_of
 from tests.fixtures_forwarding import (
     ANYBODY,
     CASES,
@@ -68,7 +68,7 @@ def forwards(loaded: Loaded, entries: Mapping[bytes, Hops], mtus: Mapping[int, i
         loaded.set_port(port, 1 if port in mtus else 0, mtus.get(port, 0), 0)
     for key in list(entries):
         table.install(key, entries[key], 1.0)
-    table.observe(Mirror(table.entries, *loaded.of_entries))
+    table.observe(Mirror(table, *loaded.of_entries))
     return table
 
 
@@ -79,7 +79,7 @@ def clear(table: Table) -> None:
 
 def step(loaded: Loaded, given: bytes) -> Step:
     before = loaded.counters()
-    run = syscall.run(loaded.program, given)
+    run = syscall.run(loaded.program_of(0), given)
     after = loaded.counters()
     drops = {reason: after.drops[reason] - before.drops[reason] for reason in DropReason}
     return Step(
@@ -178,11 +178,37 @@ def test_generated_frames_and_tables_get_the_verdict_of_the_reference(
         clear(table)
 
 
+@pytest.mark.parametrize("hops", [(TO_WIDE,), NOWHERE])
+def test_what_comes_from_a_side_where_its_publisher_is_not_is_dropped_there(loaded: Loaded, hops: Hops) -> None:
+    given = TO_US + frame(ONE)[6:]
+    key = given[ETHER_BYTES + DESTINATION_AT : ETHER_BYTES + HEADER_BYTES]
+    table = forwards(loaded, {})
+    try:
+        for ports in ((0,), (2, 62), (63,), (63, 400)):
+            table.install(key, hops, 1.0, sides_of(ports))
+            for port in (0, 1, 2, 40, 62, 63, 64, 400, 999):
+                said = decide(given, table.entries, MTUS, table.sides, port)
+                before = loaded.counters()
+                run = syscall.run(loaded.program_of(port), given)
+                after = loaded.counters()
+                lost = after.drops[DropReason.WRONG_SIDE] - before.drops[DropReason.WRONG_SIDE]
+                is_ours = port in ports or (port > 63 and 63 in ports) or (port == 63 and max(ports) > 63)
+                assert (lost == 0) == is_ours
+                assert (said == Drop(DropReason.WRONG_SIDE)) != is_ours
+                assert is_ours or run.verdict == DROP
+        table.install(key, hops, 1.0)
+        assert loaded.counters().drops[DropReason.WRONG_SIDE] == after.drops[DropReason.WRONG_SIDE]
+        syscall.run(loaded.program_of(1), given)
+        assert loaded.counters().drops[DropReason.WRONG_SIDE] == after.drops[DropReason.WRONG_SIDE]
+    finally:
+        clear(table)
+
+
 def test_only_what_is_urgent_gets_a_priority(loaded: Loaded) -> None:
     table = forwards(loaded, SINGLE)
     try:
-        plain = syscall.run(loaded.program, TO_US + frame(ONE)[6:])
-        urgent = syscall.run(loaded.program, TO_US + frame(ONE, flags=Flag.URGENT)[6:])
+        plain = syscall.run(loaded.program_of(0), TO_US + frame(ONE)[6:])
+        urgent = syscall.run(loaded.program_of(0), TO_US + frame(ONE, flags=Flag.URGENT)[6:])
     finally:
         clear(table)
     assert (plain.verdict, plain.priority) == (REDIRECT, 0)

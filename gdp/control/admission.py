@@ -1,0 +1,231 @@
+"""Admission of hellos: whose signature is verified, and how often, so that a flood costs a bounded share of a core.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: WireGuard (NDSS 2017), section 5.3, for cookies; RFC
+9000, section 8.1, for the bound on what goes to an address that has proved nothing; RFC 4732 for the order of checks.
+
+A hello is judged by what is cheap to see, before any signature is verified::
+
+    neighbour's certificate and address  -> a token bucket of that neighbour
+    any other                            -> a token bucket of its address, then one for all strangers on the port
+    the strangers' bucket has run dry    -> verified with a valid cookie only; without one it gets a cookie, 128 bytes
+
+A cookie is a MAC over the port's session and the stranger's address. No state is kept for whoever gets one. The
+stranger shows it by a tag over its own session and sequence number, which stands under the signature of its hello.
+"""
+
+from __future__ import annotations
+
+import hmac
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+from gdp.control.hello import COOKIE_BYTES, NONCE_BYTES, Hello
+from gdp.errors import DropReason, FrameError, StatementError
+
+__all__ = ["Admission", "Cookies", "TokenBucket", "cookie_payload", "read_cookie", "seal_cookie"]
+
+_DIGEST: Final = "sha256"
+_SECRET_BYTES: Final = 32
+_SECRET_S: Final = 120.0  # a secret is used for so long, and its cookies are taken for as long again; WireGuard, 5.4.7
+_PURPOSE: Final = b"gdp-cookie-1"
+
+NEIGHBOUR_HELLOS: Final = (25.0, 50.0)  # a second, and at once; a neighbour in a hurry says four a second
+ADDRESS_HELLOS: Final = (10.0, 20.0)
+STRANGER_HELLOS: Final = (100.0, 200.0)  # of all strangers on a port: 2 % of a core where each shows a new certificate
+PROVEN_HELLOS: Final = (50.0, 50.0)  # of strangers with a cookie, beside the former
+COOKIES: Final = (100.0, 100.0)
+REFUSALS: Final = (100.0, 200.0)  # more of them are a flood, too
+_LOADED_S: Final = 10.0  # after the strangers' bucket has run dry
+_ADDRESSES_MAX: Final = 256
+
+
+class TokenBucket:
+    """At most ``rate`` a second on average and ``burst`` at once; source: RFC 2697, section 3, with one rate."""
+
+    __slots__ = ("_at_s", "_burst", "_rate", "_tokens")
+
+    def __init__(self, rate: float, burst: float, now_s: float) -> None:
+        self._rate = rate
+        self._burst = self._tokens = burst
+        self._at_s = now_s
+
+    def has(self, now_s: float) -> bool:
+        """Return whether there is a token."""
+        if now_s > self._at_s:
+            self._tokens = min(self._tokens + (now_s - self._at_s) * self._rate, self._burst)
+            self._at_s = now_s
+        return self._tokens >= 1.0
+
+    def take(self, now_s: float) -> bool:
+        """Take a token; return whether there was one."""
+        is_there = self.has(now_s)
+        if is_there:
+            self._tokens -= 1.0
+        return is_there
+
+
+class Cookies:
+    """Cookies of one node, by a secret that it draws anew.
+
+    Args:
+        random_bytes: source of secrets.
+    """
+
+    def __init__(self, random_bytes: Callable[[int], bytes]) -> None:
+        self._random_bytes = random_bytes
+        self._secrets: list[bytes] = []  # the present one first
+        self._drawn_s = float("-inf")
+
+    def make(self, session: bytes, mac: bytes, now_s: float) -> bytes:
+        """Return the cookie of an address.
+
+        Args:
+            session: nonce of our port.
+        """
+        self._rotate(now_s)
+        return _cookie(self._secrets[0], session, mac)
+
+    def proves(self, hello: Hello, session: bytes, mac: bytes, now_s: float) -> bool:
+        """Return whether a hello shows a cookie that this address was given in this session of our port."""
+        tag = next((tag for asker, tag in hello.cookies if asker == session), None)
+        if tag is None:
+            return False
+        self._rotate(now_s)
+        return any(
+            hmac.compare_digest(tag, seal_cookie(_cookie(secret, session, mac), hello.nonce, hello.sequence))
+            for secret in self._secrets
+        )
+
+    def _rotate(self, now_s: float) -> None:
+        if now_s >= self._drawn_s + 2 * _SECRET_S:
+            self._secrets.clear()
+        if now_s >= self._drawn_s + _SECRET_S:
+            self._secrets = [self._random_bytes(_SECRET_BYTES), *self._secrets[:1]]
+            self._drawn_s = now_s
+
+
+def _cookie(secret: bytes, session: bytes, mac: bytes) -> bytes:
+    return hmac.digest(secret, session + mac, _DIGEST)[:COOKIE_BYTES]
+
+
+def seal_cookie(cookie: bytes, nonce: bytes, sequence: int) -> bytes:
+    """Return what a hello shows of a cookie; who only hears it cannot use the cookie for another hello."""
+    return hmac.digest(cookie, _PURPOSE + nonce + sequence.to_bytes(8, "big"), _DIGEST)[:COOKIE_BYTES]
+
+
+def cookie_payload(session: bytes, nonce: bytes, cookie: bytes) -> bytes:
+    """Return the payload of a frame of kind COOKIE.
+
+    Args:
+        session: nonce of the port that gives it.
+        nonce: of the hello that it answers.
+    """
+    return session + nonce + cookie
+
+
+def read_cookie(payload: bytes) -> tuple[bytes, bytes, bytes]:
+    """Return session, nonce and cookie.
+
+    Raises:
+        FrameError: TRUNCATED.
+    """
+    if len(payload) < 2 * NONCE_BYTES + COOKIE_BYTES:
+        raise FrameError(DropReason.TRUNCATED, "cookie")
+    at = 2 * NONCE_BYTES
+    return payload[:NONCE_BYTES], payload[NONCE_BYTES:at], payload[at : at + COOKIE_BYTES]
+
+
+@dataclass(slots=True)
+class Admission:
+    """What one port may still spend on hellos.
+
+    Attributes:
+        loaded_until_s: strangers need a cookie until then.
+        flooded_until_s: hellos are refused unverified; a neighbour's may be among them.
+    """
+
+    begun_s: float
+    loaded_until_s: float = float("-inf")
+    flooded_until_s: float = float("-inf")
+    _strangers: TokenBucket = field(init=False)
+    _proven: TokenBucket = field(init=False)
+    _cookies: TokenBucket = field(init=False)
+    _refusals: TokenBucket = field(init=False)
+    _addresses: OrderedDict[bytes, TokenBucket] = field(default_factory=OrderedDict)
+
+    def __post_init__(self) -> None:
+        self._strangers = TokenBucket(*STRANGER_HELLOS, self.begun_s)
+        self._proven = TokenBucket(*PROVEN_HELLOS, self.begun_s)
+        self._cookies = TokenBucket(*COOKIES, self.begun_s)
+        self._refusals = TokenBucket(*REFUSALS, self.begun_s)
+
+    def is_loaded(self, now_s: float) -> bool:
+        """Return whether more hellos come than are verified without a cookie."""
+        return now_s < self.loaded_until_s
+
+    def look(self, mac: bytes, now_s: float) -> None:
+        """Refuse, before anything is read, an address that has used up its share.
+
+        Raises:
+            FrameError: RATE_LIMITED.
+        """
+        bucket = self._addresses.get(mac)
+        if bucket is not None and not bucket.has(now_s):
+            self.refused(now_s)
+            raise FrameError(DropReason.RATE_LIMITED, "hellos of one address")
+
+    def refused(self, now_s: float) -> None:
+        """Note a hello that was refused unverified; many of them are a flood."""
+        if not self._refusals.take(now_s):
+            self.flooded_until_s = now_s + _LOADED_S
+
+    def admit_neighbour(self, bucket: TokenBucket, now_s: float) -> None:
+        """Take a token of a neighbour.
+
+        Raises:
+            StatementError: RATE_LIMITED.
+        """
+        if not bucket.take(now_s):
+            self.flooded_until_s = now_s + _LOADED_S
+            raise StatementError(DropReason.RATE_LIMITED, "hellos of one neighbour")
+
+    def admit_stranger(self, mac: bytes, now_s: float, has_cookie: Callable[[], bool]) -> None:
+        """Take tokens of a stranger.
+
+        Args:
+            has_cookie: whether its hello shows a valid cookie; asked under load only.
+
+        Raises:
+            StatementError: RATE_LIMITED, or COOKIE_REQUIRED.
+        """
+        if not self._address(mac, now_s).take(now_s):
+            self.refused(now_s)
+            raise StatementError(DropReason.RATE_LIMITED, "hellos of one address")
+        if not self.is_loaded(now_s):
+            if self._strangers.take(now_s):
+                return
+            self._load(now_s)
+        if not has_cookie():
+            if not self._strangers.take(now_s):  # what comes without a cookie keeps the port loaded
+                self._load(now_s)
+            raise StatementError(DropReason.COOKIE_REQUIRED, "hello")
+        if not self._proven.take(now_s):
+            raise StatementError(DropReason.RATE_LIMITED, "hellos of strangers")
+
+    def may_send_cookie(self, now_s: float) -> bool:
+        """Take a token for a cookie; return whether there was one."""
+        return self._cookies.take(now_s)
+
+    def _load(self, now_s: float) -> None:
+        self.loaded_until_s = self.flooded_until_s = now_s + _LOADED_S
+
+    def _address(self, mac: bytes, now_s: float) -> TokenBucket:
+        bucket = self._addresses.get(mac)
+        if bucket is None:
+            bucket = self._addresses[mac] = TokenBucket(*ADDRESS_HELLOS, now_s)
+            if len(self._addresses) > _ADDRESSES_MAX:
+                self._addresses.popitem(last=False)
+        self._addresses.move_to_end(mac)
+        return bucket

@@ -1,0 +1,341 @@
+"""Channels: what a switch and a RIB, or two RIBs, say to each other is fresh, and from whom it says.
+
+Sans-I/O; time comes in as ``Instant``. Source: the handshake is SIGMA's (signed ephemeral X25519 keys, RFC 7296 in
+spirit), the records are those of RFC 9147. A signed statement alone proves who wrote it, not when. A recorded one could
+be played again after any restart. A record belongs to one channel, a channel to one life of both ends::
+
+    asker --OPEN (its key, for whom)---------------------> RIB     padded: the reply is never longer
+    asker <--ACCEPT (of that OPEN, channel, its key)------ RIB
+    asker --record(channel, number, [query])-------------> RIB     the first one proves that the asker is there now
+    asker <--record(channel, number, [answer])------------ RIB
+    asker <--UNKNOWN (channel)---------------------------- a RIB that was restarted: a hint, which forces nothing
+
+A recorded OPEN costs the RIB one agreement and one signature, paced for each peer. It displaces no channel in use.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+from gdp.crypto.certificates import Role
+from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
+from gdp.crypto.fields import Fields
+from gdp.crypto.identity import Identity
+from gdp.crypto.records import RecordKey
+from gdp.crypto.statements import Statement, StatementType, parse, sign
+from gdp.effects import Instant
+from gdp.errors import DropReason, FrameError, StatementError
+from gdp.limits import CONTROL_MAX_BYTES, RECORD_OVERHEAD_BYTES
+from gdp.message.replay import ReplayWindow
+from gdp.message.token_bucket import TokenBucket
+from gdp.names import Name
+from gdp.trust.domain import Policy
+
+__all__ = ["Channels", "Opened", "Outgoing"]
+
+_RECORD: Final = 0x01  # a statement begins with 0xd2
+_UNKNOWN: Final = 0x02
+_ID_BYTES: Final = 8
+_NUMBER_BYTES: Final = 8
+_HEAD_BYTES: Final = 1 + _ID_BYTES + _NUMBER_BYTES
+_OFFER_BYTES: Final = 1_536  # of an OPEN at least: more than any ACCEPT
+_PURPOSES: Final = (b"gdp channel, from asker ", b"gdp channel, to asker ")
+_WINDOW: Final = 4_096  # records that may come out of order
+_AGAIN_S: Final = (0.1, 0.2, 0.4, 0.8)  # between repetitions of an OPEN; then it is given up until there is news
+_WAITING_MAX: Final = 256  # statements that wait for a channel
+_WAITING_S: Final = 1.0  # who sent one will send it again by then
+_RENEW_S: Final = 3_600.0
+_REOPEN_S: Final = 0.3  # a hint is followed at most so often
+_CHANNELS_PER_PEER: Final = 2  # in use: the newest, and the one before
+_OFFERS_PER_PEER: Final = 4  # accepted, and not in use yet
+_PEERS_MAX: Final = 8_192
+_OFFERS_PER_S: Final = 20.0  # accepted of one peer
+_HINTS_PER_S: Final = 100.0
+_PEER_ROLES: Final = (Role.SWITCH, Role.RIB)
+
+
+class Opened(NamedTuple):
+    """A statement that came, and whether in a channel with its sender."""
+
+    wire: bytes
+    is_fresh: bool
+
+
+class Outgoing(NamedTuple):
+    """What is to be sent; ``is_answer``: to a peer that asked."""
+
+    to: Name
+    wire: bytes
+    is_answer: bool = False
+
+
+@dataclass(slots=True)
+class _Channel:
+    id: bytes
+    out_key: RecordKey
+    in_key: RecordKey
+    begun_s: float
+    sent: int = 0
+    window: ReplayWindow = field(default_factory=lambda: ReplayWindow(_WINDOW))
+    accept: bytes = b""  # our reply, to be repeated
+
+    def seal(self, plaintext: bytes) -> bytes:
+        head = bytes([_RECORD]) + self.id + self.sent.to_bytes(_NUMBER_BYTES, "big")
+        self.sent += 1
+        return head + self.out_key.seal(self.sent - 1, head, plaintext)
+
+    def open(self, record: bytes) -> bytes:
+        head = record[:_HEAD_BYTES]
+        number = int.from_bytes(head[1 + _ID_BYTES :], "big")
+        if self.window.is_finished(number):
+            raise FrameError(DropReason.REPLAYED, "a record of a channel")
+        plaintext = self.in_key.open(number, head, record[_HEAD_BYTES:])
+        self.window.finish(number)
+        return plaintext
+
+
+@dataclass(slots=True)
+class _Offer:
+    """Our OPEN that is under way."""
+
+    key: ExchangeKey
+    wire: bytes
+    fingerprint: bytes
+    again_s: float
+    tries: int = 0
+
+
+@dataclass(slots=True)
+class _Asked:
+    """Our channel to a peer that we ask."""
+
+    channel: _Channel | None = None
+    offer: _Offer | None = None
+    waiting: deque[tuple[bytes, float]] = field(default_factory=lambda: deque(maxlen=_WAITING_MAX))
+    reopened_s: float = float("-inf")
+
+
+@dataclass(slots=True)
+class _Asker:
+    """The channels that a peer opened to us, by identifier; the newest last."""
+
+    channels: OrderedDict[bytes, _Channel] = field(default_factory=OrderedDict)
+    offers: OrderedDict[bytes, _Channel] = field(default_factory=OrderedDict)  # by fingerprint of the OPEN
+    pace: TokenBucket = field(default_factory=lambda: TokenBucket(_OFFERS_PER_S, _OFFERS_PER_S))
+
+
+class Channels:
+    """The channels of one node.
+
+    Args:
+        random_bytes: source of keys and identifiers.
+        accepts: whether others may open channels here.
+    """
+
+    def __init__(
+        self, identity: Identity, policy: Policy, random_bytes: Callable[[int], bytes], *, accepts: bool
+    ) -> None:
+        self._identity = identity
+        self._policy = policy
+        self._random_bytes = random_bytes
+        self._accepts = accepts
+        self._asked: dict[Name, _Asked] = {}
+        self._askers: OrderedDict[Name, _Asker] = OrderedDict()
+        self._hints = TokenBucket(_HINTS_PER_S, _HINTS_PER_S)
+        self._out: list[Outgoing] = []
+        self.drops: Counter[DropReason] = Counter()
+
+    def ask(self, peer: Name, statement: bytes, now_s: float) -> None:
+        """Send a statement to a peer that we ask, once there is a channel."""
+        asked = self._asked.setdefault(peer, _Asked())
+        if asked.channel is None:
+            asked.waiting.append((statement, now_s + _WAITING_S))
+            self._open(peer, asked, now_s)
+            return
+        if now_s - asked.channel.begun_s >= _RENEW_S:
+            self._open(peer, asked, now_s)
+        self._out.append(Outgoing(peer, asked.channel.seal(statement)))
+
+    def answer(self, peer: Name, statement: bytes) -> bool:
+        """Send a statement over the channel that a peer opened; return whether there is one."""
+        asker = self._askers.get(peer)
+        if asker is None or not asker.channels:
+            return False
+        self._askers.move_to_end(peer)
+        self._out.append(Outgoing(peer, next(reversed(asker.channels.values())).seal(statement), is_answer=True))
+        return True
+
+    def renew(self, peer: Name) -> None:
+        """Open a new channel before anything else is sent: the peer was restarted, its keys are gone."""
+        asked = self._asked.get(peer)
+        if asked is not None:
+            asked.channel = asked.offer = None
+
+    def forget(self, peer: Name) -> None:
+        """Let go of everything with a peer."""
+        self._asked.pop(peer, None)
+        self._askers.pop(peer, None)
+
+    def receive(self, wire: bytes, sender: Name, now: Instant) -> Opened | None:
+        """Take what came for us; return the statement in it, if it is for more than the channel.
+
+        Raises:
+            RemoteError: it does not hold.
+        """
+        if wire[:1] == bytes([_RECORD]):
+            return Opened(self._take_record(wire, sender, now.mono_s), is_fresh=True)
+        if wire[:1] == bytes([_UNKNOWN]):
+            self._take_hint(wire[1:], sender, now.mono_s)
+            return None
+        statement = parse(wire)
+        if statement.type not in (StatementType.OPEN, StatementType.ACCEPT):
+            return Opened(wire, is_fresh=False)
+        if statement.signer != sender:
+            raise StatementError(DropReason.UNKNOWN_SENDER, "signed by another than its sender")
+        if statement.type is StatementType.OPEN:
+            self._take_offer(statement, now)
+        else:
+            self._take_accept(statement, now)
+        return None
+
+    def timeout(self, now_s: float) -> None:
+        """Repeat what was not accepted yet."""
+        for peer, asked in list(self._asked.items()):
+            offer = asked.offer
+            if offer is None or offer.again_s > now_s:
+                continue
+            if offer.tries == len(_AGAIN_S):
+                asked.offer = None
+                self.drops[DropReason.NO_CHANNEL] += len(asked.waiting)
+                asked.waiting.clear()
+                if asked.channel is None:
+                    del self._asked[peer]
+                continue
+            self._out.append(Outgoing(peer, offer.wire))
+            offer.again_s = now_s + _AGAIN_S[offer.tries]
+            offer.tries += 1
+
+    def next_timeout(self) -> float | None:
+        """Return the monotonic second of the next repetition, or None."""
+        return min((asked.offer.again_s for asked in self._asked.values() if asked.offer is not None), default=None)
+
+    def take(self) -> list[Outgoing]:
+        """Return, once, what is to be sent."""
+        out, self._out = self._out, []
+        return out
+
+    # -- the side that asks
+
+    def _open(self, peer: Name, asked: _Asked, now_s: float) -> None:
+        if asked.offer is not None:
+            return
+        key = ExchangeKey.from_random(self._random_bytes(EXCHANGE_KEY_BYTES))
+        identity = self._identity
+        body: dict[str, object] = {"k": key.public, "w": peer, "c": identity.membership, "p": b""}
+        bare = sign(StatementType.OPEN, body, identity.name, identity.key)
+        body["p"] = bytes(max(_OFFER_BYTES - len(bare), 0))
+        wire = sign(StatementType.OPEN, body, identity.name, identity.key)
+        asked.offer = _Offer(key, wire, parse(wire).fingerprint, now_s + _AGAIN_S[0], 1)
+        asked.reopened_s = now_s
+        self._out.append(Outgoing(peer, wire))
+
+    def _take_accept(self, statement: Statement, now: Instant) -> None:
+        fields = statement.fields
+        asked = self._asked.get(statement.signer)
+        offer = None if asked is None else asked.offer
+        if asked is None or offer is None or fields.bytes_("o") != offer.fingerprint:
+            raise StatementError(DropReason.REPLAYED, "it accepts no offer of ours")
+        self._verified(statement, now)
+        id_ = fields.bytes_("i", _ID_BYTES)
+        keys = _keys(offer.key, fields, offer.fingerprint, statement.fingerprint)
+        asked.channel, asked.offer = _Channel(id_, keys[0], keys[1], now.mono_s), None
+        waiting, asked.waiting = list(asked.waiting), deque(maxlen=_WAITING_MAX)
+        for wire, until_s in waiting:
+            if until_s > now.mono_s:
+                self._out.append(Outgoing(statement.signer, asked.channel.seal(wire)))
+
+    def _take_hint(self, id_: bytes, sender: Name, now_s: float) -> None:
+        """Open anew if that may be; what is said meanwhile still goes over the channel that is known."""
+        asked = self._asked.get(sender)
+        if asked is None or asked.channel is None or asked.channel.id != id_:
+            raise FrameError(DropReason.NO_CHANNEL, "a hint about a channel that is not ours")
+        if now_s - asked.reopened_s >= _REOPEN_S:
+            self._open(sender, asked, now_s)
+
+    # -- the side that is asked
+
+    def _take_offer(self, statement: Statement, now: Instant) -> None:
+        fields = statement.fields
+        if not self._accepts or fields.name("w") != self._identity.name:
+            raise StatementError(DropReason.NOT_FOR_US, "an offer of a channel")
+        known = self._askers.get(statement.signer)
+        fingerprint = statement.fingerprint
+        if known is not None and fingerprint in known.offers:
+            self._out.append(Outgoing(statement.signer, known.offers[fingerprint].accept, is_answer=True))
+            return
+        if known is not None and not known.pace.take(now.mono_s):
+            raise StatementError(DropReason.QUOTA, "offers of channels")
+        if self._verified(statement, now) not in _PEER_ROLES:
+            raise StatementError(DropReason.NOT_DELEGATED, "only switches and RIBs ask")
+        key = ExchangeKey.from_random(self._random_bytes(EXCHANGE_KEY_BYTES))
+        identity, id_ = self._identity, self._random_bytes(_ID_BYTES)
+        body = {"o": fingerprint, "i": id_, "k": key.public, "w": statement.signer, "c": identity.membership}
+        accept = sign(StatementType.ACCEPT, body, identity.name, identity.key)
+        if len(accept) > len(statement.wire):
+            raise StatementError(DropReason.MALFORMED, "an offer that is shorter than its answer")
+        keys = _keys(key, fields, fingerprint, parse(accept).fingerprint)
+        asker = self._askers.setdefault(statement.signer, _Asker())
+        self._askers.move_to_end(statement.signer)
+        asker.offers[fingerprint] = _Channel(id_, keys[1], keys[0], now.mono_s, accept=accept)
+        if len(asker.offers) > _OFFERS_PER_PEER:
+            asker.offers.popitem(last=False)
+        if len(self._askers) > _PEERS_MAX:
+            self._askers.popitem(last=False)
+        self._out.append(Outgoing(statement.signer, accept, is_answer=True))
+
+    # -- records
+
+    def _take_record(self, record: bytes, sender: Name, now_s: float) -> bytes:
+        if not RECORD_OVERHEAD_BYTES <= len(record) <= RECORD_OVERHEAD_BYTES + CONTROL_MAX_BYTES:
+            raise FrameError(DropReason.MALFORMED, "a record of a channel")
+        id_ = record[1 : 1 + _ID_BYTES]
+        asked = self._asked.get(sender)
+        if asked is not None and asked.channel is not None and asked.channel.id == id_:
+            return asked.channel.open(record)
+        asker = self._askers.get(sender)
+        if asker is not None:
+            channel = asker.channels.get(id_)
+            if channel is not None:
+                return channel.open(record)
+            for fingerprint, offered in asker.offers.items():
+                if offered.id == id_:
+                    plaintext = offered.open(record)
+                    del asker.offers[fingerprint]
+                    asker.channels[id_] = offered
+                    if len(asker.channels) > _CHANNELS_PER_PEER:
+                        asker.channels.popitem(last=False)
+                    return plaintext
+        if self._accepts and self._hints.take(now_s):
+            self._out.append(Outgoing(sender, bytes([_UNKNOWN]) + id_, is_answer=True))
+        raise FrameError(DropReason.NO_CHANNEL, "a record of a channel that is not known")
+
+    def _verified(self, statement: Statement, now: Instant) -> Role:
+        """Return the role of who signed.
+
+        Raises:
+            StatementError: the signer is no member of a trusted domain, or did not sign.
+        """
+        member = self._policy.verify_membership(statement.fields.bytes_("c"), now.unix_s)
+        if member.name != statement.signer:
+            raise StatementError(DropReason.BAD_CERTIFICATE, "the membership is of another node")
+        statement.verify(member.key)
+        return member.role
+
+
+def _keys(key: ExchangeKey, far: Fields, offer: bytes, accept: bytes) -> list[RecordKey]:
+    """Return the keys from the asker and to it."""
+    bound = [purpose + offer + accept for purpose in _PURPOSES]
+    return [RecordKey(secret) for secret in key.agree(far.bytes_("k"), *bound)]

@@ -1,0 +1,55 @@
+"""Shares: how a bounded room is divided among those who use it, so that nobody fills it.
+
+Sans-I/O. Source: dynamic thresholds, A. Choudhury and E. Hahne, IEEE/ACM Transactions on Networking 6(2), 1998. An
+owner may hold at most as much as is free. One owner alone gets half of the room, n greedy ones 1/(n+1) each. As much
+as one of them holds stays free for the next one, and nothing is taken away from anybody.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Shares"]
+
+
+class Shares:
+    """What each owner holds of a room.
+
+    Args:
+        size: of the whole room.
+    """
+
+    __slots__ = ("_held", "_of", "_size")
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._held = 0
+        self._of: dict[bytes, int] = {}
+
+    def __len__(self) -> int:
+        return self._held
+
+    def held_by(self, owner: bytes) -> int:
+        """Return what an owner holds."""
+        return self._of.get(owner, 0)
+
+    def take(self, *owners: bytes, size: int = 1) -> bool:
+        """Take room for something in the name of all these owners (a member and its domain, say) and return True.
+
+        Returns False, and takes none, where one of them would hold more than is left free.
+        """
+        free = self._size - self._held - size
+        if free < 0 or any(self.held_by(owner) + size > free + size for owner in owners):
+            return False
+        self._held += size
+        for owner in owners:
+            self._of[owner] = self.held_by(owner) + size
+        return True
+
+    def give(self, *owners: bytes, size: int = 1) -> None:
+        """Give back what was taken in the name of the same owners."""
+        self._held -= size
+        for owner in owners:
+            left = self._of[owner] - size
+            if left:
+                self._of[owner] = left
+            else:
+                del self._of[owner]

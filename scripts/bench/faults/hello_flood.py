@@ -1,0 +1,63 @@
+"""A stranger on a link that floods it with hellos: a process of its own, started by ``security_flood.py``.
+
+Place: shell; one packet socket. Its only argument is JSON: ``iface``; ``frames``, a file of frames from the header on,
+each behind its length (4 bytes); ``rate`` a second; ``seconds``; ``source``, an address, or nothing for many invented
+ones. It prints one line of JSON when it begins and one when it ends: how many frames left.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import struct
+import sys
+import time
+from pathlib import Path
+from typing import Final
+
+from peers.lines import say
+
+from gdp.errors import DROP_COUNTERS
+from gdp.ports.batch import make_batch
+from gdp.ports.sockets import hear_nothing, open_port
+
+__all__: list[str] = []
+
+_BATCH: Final = 16  # frames under one source address
+_BROADCAST: Final = b"\xff" * 6
+_ADDRESSES: Final = 10_000
+
+
+def main() -> None:
+    """Send until the time is over."""
+    told = json.loads(sys.argv[1])
+    data, frames = Path(told["frames"]).read_bytes(), []
+    while data:
+        (size,) = struct.unpack_from("!I", data)
+        frames.append(data[4 : 4 + size])
+        data = data[4 + size :]
+    random.shuffle(frames)
+    sources = [bytes.fromhex(told["source"])] if told["source"] else []
+    sources = sources or [b"\x06" + os.urandom(5) for _ in range(_ADDRESSES)]
+    sink, drops = open_port(told["iface"]), [0] * DROP_COUNTERS
+    hear_nothing(sink)
+    batch, at, sent = make_batch(2_000), 0, 0
+    say(ready=True)
+    begun_s = time.monotonic()
+    while (now_s := time.monotonic()) < begun_s + told["seconds"]:
+        due = int((now_s - begun_s) * told["rate"]) - at
+        if due < _BATCH:
+            time.sleep(_BATCH / told["rate"])
+            continue
+        for _ in range(min(due // _BATCH, 64)):
+            chosen = [frames[(at + each) % len(frames)] for each in range(_BATCH)]
+            sent += batch.send(sink, chosen, _BROADCAST + sources[(at // _BATCH) % len(sources)], drops)
+            at += _BATCH
+        if due > told["rate"] / 10:
+            begun_s += (due - _BATCH) / told["rate"]  # what could not be sent in time is not caught up with
+    say(sent=sent, seconds=time.monotonic() - begun_s)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,295 @@
+"""Does a flood of hellos by a stranger on a link disturb real switches? Neighbours lost, memory, goodput, cores.
+
+Three switches in a row, each a process in a namespace of its own; a topic goes from a member at the first to a member
+at the last one. A stranger on the link between the first and the middle one plays hellos to the middle one, from
+10,000 invented addresses: with certificates of its own (``fresh``), recorded ones of members (``recorded``), and with a
+member's certificate and a wrong signature (``wrong``). The rate is ten times what this machine verifies in a second.
+A calm phase before each flood is what it is compared with. At the end of each phase the first switch is killed and
+started again: how long until the middle one has it for a neighbour?
+
+    sudo .venv/bin/python scripts/bench/security_flood.py
+    sudo .venv/bin/python scripts/bench/security_flood.py --planes kernel --kinds fresh --seconds 5 --rounds 1 --no-save
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import secrets
+import signal
+import statistics
+import struct
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from faults.overlay import Overlay
+from faults.plan import Flow, Plan, make_topology
+from faults.records import Kind as Happened
+from machine import machine_state
+from peers.process import FailedError, Started
+from report import progress
+from rich.console import Console
+from rich.table import Table
+
+from gdp.control.frames import ControlSplitter
+from gdp.control.hello import LIFE_BYTES, NONCE_BYTES, Hello
+from gdp.crypto.certificates import Role
+from gdp.crypto.identity import Identity, NodeKeys
+from gdp.crypto.issuing import DomainAuthority
+from gdp.crypto.keys import SigningKey
+from gdp.crypto.validity import Validity
+from gdp.errors import GdpError
+from gdp.frame.kinds import Kind
+from gdp.ports.link import LinkWatch
+from gdp.stores.keyring import load_identity
+from gdp.testbed import netns_files
+from gdp.testbed.runs import Runs
+
+__all__ = ["main"]
+
+OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks" / "security_flood.json"
+GOAL_MEMORY_MIB: Final = 16.0
+GOAL_GOODPUT: Final = 0.9
+TIMES: Final = 10  # what a core verifies
+KINDS: Final = ("fresh", "recorded", "wrong")
+SETTLE_S: Final = 6.0
+FLOW: Final = Flow("/flood/good", "p", ("r",), reliable=False, hz=200.0, size=1_000)
+_FRAMES: Final = 2_000
+_RESTART_S: Final = 12.0
+_MTU: Final = 1_500
+_TICK_S: Final = 1 / os.sysconf("SC_CLK_TCK")
+_VICTIM: Final = "s0"
+_NEAR: Final = "s1"
+
+
+@dataclass(frozen=True, slots=True)
+class Phase:
+    """What one phase showed.
+
+    Args:
+        goodput: delivered of published messages.
+        core: share of a core that the switch in the middle took.
+        restart_s: from the kill of a neighbour until it is a neighbour again.
+        lost: neighbours that any switch lost.
+        memory_mib: resident memory of the switch in the middle at the end.
+    """
+
+    goodput: float
+    core: float
+    restart_s: float
+    lost: int
+    memory_mib: float
+
+
+def plan() -> Plan:
+    """Return three switches in a row with a member at each end."""
+    topology, members = make_topology(
+        {"home": (_VICTIM, _NEAR, "s2")}, {}, [f"{_NEAR}-{_VICTIM}", f"{_VICTIM}-s2"], (_VICTIM,),
+        {"p": _NEAR, "r": "s2"},
+    )  # fmt: skip
+    return Plan(topology, members, flows=(FLOW,))
+
+
+def verifications_hz() -> float:
+    """Return how many signatures a core verifies in a second."""
+    key, data, count = SigningKey.generate(), secrets.token_bytes(700), 2_000
+    signature, begun_s = key.sign(data), time.process_time()
+    for _ in range(count):
+        key.public.verify(signature, data)
+    return count / (time.process_time() - begun_s)
+
+
+def hellos(kind: str, overlay: Overlay) -> list[bytes]:
+    """Return frames of a flood."""
+    directory = overlay.directory / "nodes"
+    members = [load_identity(directory / f"switch-{each}", time.time()) for each in overlay.plan.switches]
+    if kind == "fresh":
+        now_s = int(time.time())
+        authority = DomainAuthority.found("stranger", SigningKey.generate(), Validity(now_s - 60, now_s + 86_400))
+        members = [
+            NodeKeys.generate(Role.PROXY, f"x{number}").join(authority, Validity(now_s - 60, now_s + 86_400))
+            for number in range(_FRAMES // 10)
+        ]
+    key = SigningKey.generate() if kind == "wrong" else None
+    return [frame for number in range(_FRAMES) for frame in _hello(members[number % len(members)], key)]
+
+
+def _hello(member: Identity, key: SigningKey | None) -> list[bytes]:
+    hello = Hello(
+        secrets.token_bytes(NONCE_BYTES), 1, (secrets.token_bytes(NONCE_BYTES),), _MTU, bytes(8), member.membership,
+        exchange_key=secrets.token_bytes(32), life=secrets.token_bytes(LIFE_BYTES),
+    )  # fmt: skip
+    wire = hello.to_wire(member.name, key or member.key)
+    return ControlSplitter(member.name, secrets.randbits(64)).split(Kind.HELLO, wire, _MTU)
+
+
+def memory_mib(pid: int) -> float:
+    """Return the resident memory of a process."""
+    line = next(each for each in Path(f"/proc/{pid}/status").read_text().splitlines() if each.startswith("VmRSS:"))
+    return int(line.split()[1]) / 1_024
+
+
+def processor_s(pid: int) -> float:
+    """Return the processor time that a process has used, of the system too."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) * _TICK_S
+
+
+def lost(overlay: Overlay) -> int:
+    """Return how often any switch has lost a neighbour so far."""
+    texts = [text for node in overlay.plan.switches for _, text in overlay.logs(f"switch {node}")]
+    return sum(text.count("neighbour lost") for text in texts)
+
+
+def counted(overlay: Overlay) -> tuple[int, int]:
+    """Return how many messages were published and delivered since the last call."""
+    seen = dict.fromkeys((Happened.PUBLISHED, Happened.DELIVERED), 0)
+    for member in overlay.plan.members:
+        for _, records in overlay.read(member):
+            for record in records:
+                if record.kind in seen:
+                    seen[Happened(record.kind)] += 1
+    return seen[Happened.PUBLISHED], seen[Happened.DELIVERED]
+
+
+def restart_s(overlay: Overlay) -> float:
+    """Return how long a neighbour on the flooded link takes to come back; a switch logs what is up each half second."""
+
+    def ups() -> int:
+        return sum(text.count(f"neighbour up port={_NEAR}") for _, text in overlay.logs(f"switch {_VICTIM}"))
+
+    before, begun_s = ups(), time.monotonic()
+    overlay.kill(f"switch {_NEAR}")
+    overlay.restart(f"switch {_NEAR}")
+    while ups() == before:
+        if time.monotonic() > begun_s + _RESTART_S:
+            break
+        time.sleep(0.05)
+    took_s = time.monotonic() - begun_s
+    overlay.await_ready(f"switch {_NEAR}")
+    return took_s
+
+
+def phase(overlay: Overlay, seconds: float) -> Phase:
+    """Let time go on, with a flood or without."""
+    pid = overlay.pid(f"switch {_VICTIM}")
+    counted(overlay)
+    before_s, before_lost, begun_s = processor_s(pid), lost(overlay), time.monotonic()
+    time.sleep(seconds)
+    core = (processor_s(pid) - before_s) / (time.monotonic() - begun_s)
+    memory = memory_mib(pid)
+    published, delivered = counted(overlay)
+    time.sleep(1.0)  # a switch logs what it lost each half second
+    losses = lost(overlay) - before_lost
+    return Phase(delivered / max(published, 1), core, restart_s(overlay), losses, memory)
+
+
+def measure(
+    runs: Runs, plane: str, kinds: Sequence[str], seconds: float, rate: float, rounds: int, *, spoof: bool
+) -> dict[str, list[dict[str, Phase]]]:
+    """Return for each kind of hello what each round showed, calm and flooded."""
+    run = runs.start()
+    try:
+        with Overlay(run, plan(), plane=plane) as overlay:
+            overlay.start_all()
+            time.sleep(SETTLE_S)
+            found: dict[str, list[dict[str, Phase]]] = {kind: [] for kind in kinds}
+            for number in range(rounds):
+                for kind in kinds:
+                    progress(f"{plane}, {kind}, round {number + 1}")
+                    path = run.directory / f"{kind}.frames"
+                    frames = hellos(kind, overlay)
+                    path.write_bytes(b"".join(struct.pack("!I", len(frame)) + frame for frame in frames))
+                    calm = phase(overlay, seconds)
+                    time.sleep(SETTLE_S)
+                    told = {
+                        "iface": _VICTIM, "frames": str(path), "rate": rate, "seconds": seconds + 1 + _RESTART_S,
+                        "source": _address_of(overlay) if spoof else "",
+                    }  # fmt: skip
+                    argv = ["-m", "faults.hello_flood", json.dumps(told)]
+                    with Started(run, f"flood {kind} {number}", partial(overlay.spaces.command, _NEAR), argv) as flood:
+                        flood.read(30)
+                        flooded = phase(overlay, seconds)
+                        said = flood.read(_RESTART_S + 30)
+                        progress(f"{float(str(said['sent'])) / float(str(said['seconds'])):,.0f} hellos a second")
+                        found[kind].append({"calm": calm, "flooded": flooded})
+                    time.sleep(SETTLE_S)
+            return found
+    finally:
+        run.end()
+
+
+def _address_of(overlay: Overlay) -> str:
+    """Return the address of the neighbour's device on the flooded link."""
+    return netns_files.inside(overlay.spaces.path(_NEAR), _own_address).hex()
+
+
+def _own_address() -> bytes:
+    with closing(LinkWatch()) as links:
+        link = links.ask(_VICTIM)
+    assert link is not None
+    return link.mac
+
+
+def main() -> None:
+    """Measure every plane with every kind of hello."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--planes", nargs="+", default=["raw", "kernel"])
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
+    parser.add_argument("--seconds", type=float, default=10.0, help="of each phase (default: %(default)s)")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--rate", type=float, help="hellos a second (default: ten times what a core verifies)")
+    parser.add_argument("--spoof", action="store_true", help="under the address of the neighbour on that link")
+    parser.add_argument("--no-save", action="store_true", help=f"do not write {OUTPUT.name}")
+    options = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
+    state, runs = machine_state(), Runs()
+    runs.sweep()
+    verified = verifications_hz()
+    rate = options.rate or TIMES * verified
+    console = Console(width=120)
+    heads = ("plane", "hellos", "goodput, ratio", "lost", "memory, MiB", "core", "restart, s")
+    table = Table(*heads, title=f"{rate:,.0f} hellos a second")
+    saved: dict[str, object] = {"machine": asdict(state), "verified_hz": verified, "rate_hz": rate}
+    try:
+        for plane in options.planes:
+            found = measure(
+                runs, plane, options.kinds, options.seconds, rate, options.rounds, spoof=options.spoof
+            )
+            for kind, rounds in found.items():
+                table.add_row(plane, kind, *_row(rounds))
+            saved[plane] = {
+                kind: [{name: asdict(each) for name, each in pair.items()} for pair in rounds]
+                for kind, rounds in found.items()
+            }
+    except (GdpError, FailedError) as error:
+        sys.exit(f"error: {error}")
+    console.print(table)
+    if not options.no_save:
+        OUTPUT.write_text(json.dumps(saved, indent=1) + "\n")
+
+
+def _row(rounds: Sequence[dict[str, Phase]]) -> list[str]:
+    ratios = [each["flooded"].goodput / max(each["calm"].goodput, 1e-9) for each in rounds]
+    grown = max(each["flooded"].memory_mib - each["calm"].memory_mib for each in rounds)
+    losses = sum(each["flooded"].lost for each in rounds)
+    cores = [statistics.median(each[name].core for each in rounds) for name in ("calm", "flooded")]
+    restarts = [statistics.median(each[name].restart_s for each in rounds) for name in ("calm", "flooded")]
+    return [
+        f"{statistics.median(ratios):.3f} ({min(ratios):.3f}-{max(ratios):.3f}), to reach {GOAL_GOODPUT}",
+        f"{losses}, to reach 0",
+        f"{grown:+.1f}, at most +{GOAL_MEMORY_MIB:g}",
+        f"{cores[0]:.2f} -> {cores[1]:.2f}",
+        f"{restarts[0]:.1f} -> {restarts[1]:.1f}",
+    ]
+
+
+if __name__ == "__main__":
+    main()

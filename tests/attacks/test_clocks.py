@@ -1,0 +1,189 @@
+"""Clocks that are an hour off, and link states of the dead: who restarts is heard at once, what is over stays over."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TypeVar
+
+import pytest
+
+from gdp.client.rib_host import RibHost
+from gdp.control.link_state import Scope
+from gdp.crypto.validity import Validity
+from gdp.effects import Instant
+from gdp.errors import DropReason, StatementError
+from gdp.frame.kinds import Kind
+from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_LEASE_S, LINK_STATE_REFRESH_S
+from gdp.rib.machine import Rib, RibSettings
+from gdp.rib.store import MemoryStore
+from gdp.switch.link_states import PAST_S
+from gdp.switch.machine import Switch
+from gdp.switch.table import Table
+from gdp.testbed.world import World
+from tests.gdp.switch.net import known, link, state
+from tests.journeys.flows import SERVER, Flow, flowing, ring
+from tests.journeys.test_attacks import mac_of
+
+HOUR_S = 3_600.0
+_M = TypeVar("_M")
+
+
+def off(machine: _M, by_s: float) -> _M:
+    """Let a machine see a wall clock that is wrong."""
+    for name in ("add_port", "receive", "port_changed", "timeout"):
+        method = getattr(machine, name)
+
+        def shifted(*given: object, method: object = method) -> None:
+            *others, now = given
+            assert isinstance(now, Instant)
+            method(*others, now._replace(unix_s=now.unix_s + by_s))  # type: ignore[operator]
+
+        setattr(machine, name, shifted)
+    return machine
+
+
+def restart_switch(world: World, name: str, by_s: float) -> Switch:
+    settings = world._settings()
+    settings = replace(settings, first_sequence=settings.first_sequence + int(by_s * 1_000))
+    table = Table()
+    policy = world.policy(world.topology.domain_of(name).label)
+    switch = world.switches[name] = off(Switch(world.identities[name], policy, table, settings), by_s)
+    world.network.replace(name, switch, table)
+    return switch
+
+
+def restart_rib(world: World, label: str, by_s: float) -> None:
+    settings = world._settings()
+    settings = replace(settings, first_sequence=settings.first_sequence + int(by_s * 1_000))
+    identity, policy = world.identities[f"rib:{label}"], world.policy(label)
+    (domain,) = (each for each in world.topology.domains if each.label == label)
+    places = RibSettings(world._rib_names(domain.upper), world._rib_names(label))
+    host = world.ribs[label] = off(
+        RibHost(identity, policy, Rib(identity, policy, MemoryStore(), places), settings), by_s
+    )
+    world.network.replace(world.rib_node(label), host)
+
+
+def flows_within(flow: Flow, seconds: float) -> bool:
+    """Return whether what is published from now on all arrives so soon."""
+    flow.collect()
+    before = len(flow.got[SERVER])
+    flow.stream(10, seconds / 20)
+    return flow.world.network.run(seconds, lambda: flow.has(SERVER, before + 10))
+
+
+@pytest.mark.momentary("how soon a flow goes on is the question")
+@pytest.mark.parametrize("by_s", [-HOUR_S, 0.0, HOUR_S])
+@pytest.mark.parametrize("switch", ["nuc2", "nuc4"])
+def test_a30_a_switch_that_restarts_with_its_clock_an_hour_off_is_heard_at_once(switch: str, by_s: float) -> None:
+    world = ring()
+    flow = flowing(world)
+    world.network.run(3)
+    restart_switch(world, switch, by_s)
+    assert flows_within(flow, 4.0)
+    assert flows_within(flow, 12.0)  # longer than the lease of branches
+
+
+@pytest.mark.momentary("how soon a flow goes on is the question")
+def test_a30_clocks_an_hour_off_to_both_sides_part_nobody() -> None:
+    world = ring()
+    flow = flowing(world)
+    world.network.run(1)
+    restart_switch(world, "nuc3", HOUR_S)
+    restart_rib(world, "school", -HOUR_S)
+    restart_switch(world, "nuc4", -HOUR_S)
+    assert flows_within(flow, 6.0)
+    assert flows_within(flow, 12.0)
+    restart_switch(world, "nuc3", -HOUR_S)
+    restart_switch(world, "nuc4", HOUR_S)
+    assert flows_within(flow, 6.0)
+    assert flows_within(flow, 12.0)
+
+
+@pytest.mark.parametrize("off_s", [-HOUR_S, HOUR_S])
+def test_a30_a_certificate_holds_at_a_clock_that_is_an_hour_off(off_s: float) -> None:
+    validity = Validity(10_000, 20_000)
+    for true_s in (10_000, 15_000, 20_000):
+        validity.check(true_s + off_s, "certificate")
+    with pytest.raises(StatementError):
+        validity.check(20_000 + HOUR_S + 1, "certificate")
+
+
+def buried(world: World, label: str) -> list[bytes]:
+    """Let a switch die and be forgotten; return its last link states."""
+    origin = world.identities[label].name
+    wires = [
+        entry.wire
+        for (its, _), entry in world.switches["nuc1"]._flooding.link_states._entries.items()
+        if its == origin
+    ]
+    assert wires
+    world.network.stop(label)
+    world.network.run(LINK_STATE_LEASE_S + LINK_STATE_REFRESH_S + 1)
+    return wires
+
+
+def play(world: World, wires: list[bytes], to: str = "nuc1") -> None:
+    """Let the neighbour of a switch, who has gone over to the enemy, play link states."""
+    for wire in wires:
+        for frame in world.switches["nuc2"]._splitter.split(Kind.LINK_STATE, wire, 1_500):
+            world.network.inject(to, 0, frame, mac_of(world, to))
+    world.network.run(1)
+
+
+def origins(world: World, label: str) -> set[bytes]:
+    known_there = world.switches[label]._flooding.link_states
+    return {bytes(each.origin) for scope in Scope for each in known_there.states(scope)}
+
+
+@pytest.mark.momentary("nothing flows")
+@pytest.mark.parametrize("later_s", [0.0, 600.0])
+def test_a38_a_recorded_link_state_of_a_dead_switch_is_refused(later_s: float) -> None:
+    world = ring()
+    world.network.run(1)
+    wires = buried(world, "nuc3")
+    world.network.run(later_s)
+    before = world.switches["nuc1"].drops()[DropReason.STALE]
+    play(world, wires)
+    dead = bytes(world.identities["nuc3"].name)
+    assert not any(dead in origins(world, each) for each in ("nuc1", "nuc2", "nuc4", "nuc5"))
+    assert world.switches["nuc1"].drops()[DropReason.STALE] == before + len(wires)
+
+
+@pytest.mark.momentary("nothing flows")
+def test_a38_a_switch_that_has_restarted_since_refuses_it_by_its_time() -> None:
+    world = ring()
+    world.network.run(1)
+    wires = buried(world, "nuc3")
+    restart_switch(world, "nuc1", LINK_STATE_AGE_MAX_S)  # so much later
+    world.network.run(2)
+    play(world, wires)
+    assert bytes(world.identities["nuc3"].name) not in origins(world, "nuc1")
+
+
+def test_a38_numbers_of_the_dead_are_known_for_as_long_as_their_time_could_be_believed() -> None:
+    states, life = known(), b"1" * 16
+    first = replace(state("a", link("b"), sequence=5), life=life)
+    states.put(first, b"wire", 0.0)
+    states.expire(LINK_STATE_LEASE_S)
+    for now_s in (LINK_STATE_LEASE_S, LINK_STATE_LEASE_S + PAST_S - 1):
+        states.expire(now_s)
+        assert states.put(first, b"wire", now_s) is False
+    assert states.put(replace(first, sequence=6), b"wire", LINK_STATE_LEASE_S + PAST_S - 1) is True
+    states.expire(2 * LINK_STATE_LEASE_S + PAST_S)
+    states.expire(2 * (LINK_STATE_LEASE_S + PAST_S))
+    assert states._past == {}
+
+
+def test_a38_a30_a_new_life_is_heard_below_the_numbers_of_the_last_and_that_stays_over() -> None:
+    states = known()
+    old = replace(state("a", link("b"), sequence=500), life=b"1" * 16)
+    states.put(old, b"wire", 0.0)
+    states.expire(LINK_STATE_LEASE_S)
+    assert states.put(replace(old, sequence=3, life=b"2" * 16), b"wire", 200.0) is True
+    assert states.put(old, b"wire", 201.0) is False
+    for number in range(3, 20):  # an origin that draws lives to have its own forgotten
+        states.put(replace(old, sequence=500 + number, life=bytes([number]) * 16), b"wire", 202.0)
+    states.expire(202.0 + LINK_STATE_LEASE_S)
+    assert states.put(old, b"wire", 400.0) is False
+    assert states.put(replace(old, life=b"n" * 16, sequence=501), b"wire", 400.0) is False

@@ -1,0 +1,158 @@
+"""One member's appetite: watches, claims, names, questions and branches leave room for the others."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import pytest
+
+from gdp.control.join import Join
+from gdp.control.query import Query
+from gdp.control.relay import Relay
+from gdp.crypto.certificates import Role
+from gdp.crypto.identity import Identity, NodeKeys
+from gdp.crypto.subject import Subject
+from gdp.effects import Instant
+from gdp.errors import DropReason, StatementError
+from gdp.frame.codec import Header, encode
+from gdp.frame.kinds import Kind
+from gdp.limits import ATTACHED_MAX, HOPS_MAX, QUESTIONS_BURST
+from gdp.metadata import Metadata
+from gdp.names import Name
+from gdp.rib.machine import Rib, RibSettings
+from gdp.rib.store import MemoryStore
+from gdp.switch.attached import Attached
+from gdp.testbed.world import World
+from gdp.trust.claim import Claim
+from gdp.trust.domain import Policy
+from gdp.trust.rtcert import RtCert
+from tests.gdp.trust.world import CLOUD, DAY, GATEWAY, NOW, ROBOT, SCHOOL, SWITCH, claim, verifier
+from tests.journeys.flows import ROBOT as ROBOT_AT
+from tests.journeys.flows import SERVER, Tap, advertise, flowing, ring
+from tests.journeys.test_attacks import mac_of, still_flows
+
+RIB = NodeKeys.generate(Role.RIB, "rib").join(SCHOOL, DAY)
+CLOUD_SWITCH = NodeKeys.generate(Role.SWITCH, "nuc4").join(CLOUD, DAY)
+CLOUD_PROXY = NodeKeys.generate(Role.PROXY, "elsewhere").join(CLOUD, DAY)
+START = Instant(0.0, NOW)
+ROOM = 64  # for branches, in a test of how it is shared
+
+
+def rib(**settings: int) -> Rib:
+    return Rib(RIB, Policy(SCHOOL.root, [CLOUD.root]), MemoryStore(), replace(RibSettings(), **settings))  # type: ignore[arg-type]
+
+
+def watch(at: Rib, by: Identity, number: int) -> None:
+    query = Query(Name(number.to_bytes(32, "big")), 3_600.0)
+    at.receive(query.to_wire(by.name, by.key, by.membership), by.name, START)
+    at.take()
+
+
+def test_a14_a_greedy_asker_leaves_room_for_the_watches_of_others() -> None:
+    at = rib(watches=100)
+    for number in range(1, 200):
+        watch(at, CLOUD_SWITCH, number)
+    assert at.watching == 50
+    for number in range(1, 20):
+        watch(at, SWITCH, number)
+    assert at.watching == 69
+
+
+def test_a14_a_proxy_watches_nothing_at_a_rib() -> None:
+    at = rib()
+    watch(at, CLOUD_PROXY, 1)
+    assert (at.watching, at.refusals) == (0, {DropReason.NOT_DELEGATED: 1})
+
+
+def test_a15_a_nodes_claims_are_bounded_and_cost_the_same_however_many_there_are() -> None:
+    attached = Attached()
+    one = verifier().verify(claim(subject=_subject("/own"), chain=[], lease_s=3_600.0), NOW)
+    for number in range(1, ATTACHED_MAX // 2 + 1):
+        attached.put(renamed(one, Name(number.to_bytes(32, "big"))), 0, b"m", 0.0)
+    with pytest.raises(StatementError, match="quota"):
+        attached.put(one, 0, b"m", 0.0)
+    rtcert = RtCert.make(GATEWAY, SWITCH.name, DAY)
+    others = claim(node=GATEWAY, subject=_subject("/others", GATEWAY), chain=[], rtcert=rtcert)
+    attached.put(verifier().verify(others, NOW), 1, b"n", 0.0)
+    assert len(attached.due(0.0)) == ATTACHED_MAX // 2 + 1
+    assert attached.due(0.1) == []
+
+
+def renamed(one: Claim, name: Name) -> Claim:
+    """Return a claim on another name, which nobody verified: what costs room is counted before."""
+    subject = copy.copy(one.subject)
+    object.__setattr__(subject, "name", name)
+    return replace(one, subject=subject)
+
+
+def test_a16_one_nodes_names_leave_room_for_the_other_nodes_of_its_switch() -> None:
+    at = rib(names_per_sender=20)
+    for number in range(30):
+        tell(at, claim(subject=_subject(f"/own{number}"), chain=[]))
+    assert (at.names, at.refusals) == (10, {DropReason.QUOTA: 20})
+    rtcert = RtCert.make(GATEWAY, SWITCH.name, DAY)
+    tell(at, claim(node=GATEWAY, subject=_subject("/others", GATEWAY), chain=[], rtcert=rtcert))
+    assert at.names == 11
+
+
+def tell(at: Rib, wire: bytes) -> None:
+    relay = Relay(wire, (SCHOOL.root.domain,), SWITCH.membership)
+    at.receive(relay.to_wire(SWITCH.name, SWITCH.key), SWITCH.name, START)
+
+
+def _subject(name: str, by: Identity = ROBOT) -> Subject:
+    return Subject.of(Metadata({"kind": "topic", "name": name}), by.key.public.compressed)
+
+
+def _frame(world: World, to: Name) -> bytes:
+    member = world.members[ROBOT_AT]
+    return encode(Header(Kind.DATA, 0, HOPS_MAX, 0, 4, 1, 0, 1, 9, to, member.name)) + b"data"
+
+
+def _port_of(world: World, switch: str, label: str) -> int:
+    ports = world.network._nodes[switch].ports
+    return next(port for port, (_, _, far) in ports.items() if far.node == label)
+
+
+def test_a17_a18_frames_to_invented_names_are_asked_for_within_a_budget_and_delay_nobody_else() -> None:
+    world = ring()
+    flow = flowing(world)
+    other = world.add_member("nuc1/other", "nuc1")
+    assert world.network.run(5, lambda: other.attachment.is_attached)
+    tap = Tap("nuc1", "nuc2")
+    world.network.taps.append(tap)
+    port = _port_of(world, "nuc1", ROBOT_AT)
+    mac = mac_of(world, "nuc1", port)
+    for number in range(1, 5_001):
+        world.network.inject("nuc1", port, _frame(world, Name(number.to_bytes(32, "big"))), mac)
+        if number % 500 == 0:
+            world.network.run(0.05)
+    switch = world.switches["nuc1"]
+    world.network.run(0.5)
+    asked = QUESTIONS_BURST + 2 * 16 * 2
+    assert switch.drops()[DropReason.PARKED_FULL] >= 5_000 - asked
+    late = advertise(world, "/late", "nuc1/other")
+    late.read_by(SERVER)
+    assert world.network.run(3, lambda: late.is_read_by(1))
+    still_flows(flow)
+    flow.outlive()
+
+
+def test_a65_one_neighbours_branches_leave_room_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gdp.switch.planter.TREES_MAX", ROOM)
+    world = ring()
+    planter = world.switches["nuc1"].planter
+    own = world.switches["nuc1"].name
+    domain = world.authorities["school"].root.domain
+    greedy, modest = (each for each in world.switches["nuc1"].greeter.all_up() if each.role is Role.SWITCH)
+    through = frozenset(world.policy("school").transit)
+    for number in range(1, ROOM // 2 + 1):
+        topic = Name(number.to_bytes(32, "big"))
+        join = Join(topic, own, own, domain, through, 1_400, 7.0, b"claim", b"", number)
+        planter.join(join, greedy, world.network.now.mono_s)
+    with pytest.raises(StatementError, match="quota"):
+        planter.join(replace(join, topic=Name(b"s" * 32)), greedy, world.network.now.mono_s)
+    assert len(planter.trees) == ROOM // 2
+    planter.join(replace(join, topic=Name(b"t" * 32)), modest, world.network.now.mono_s)
+    assert len(planter.trees) == ROOM // 2 + 1
