@@ -38,7 +38,8 @@ def test_a_join_to_another_member_that_said_our_nonce_is_not_taken() -> None:
     theirs = one.ports[0].neighbours[MALLORY.name]
     # What ``one`` signs for Mallory, as the planter makes it: the session is the nonce of Mallory's hellos.
     session = one.ports[0].nonce
-    join = Join(B.name, B.name, B.name, B.member.domain, frozenset(), 1_500, 5.0, b"", theirs.nonce, 1, 0, ZERO, session)
+    domain = B.member.domain
+    join = Join(B.name, B.name, B.name, domain, frozenset(), 1_500, 5.0, b"", theirs.nonce, 1, 0, ZERO, session)
     wire = join.to_wire(A.name, A.key)
     with pytest.raises(StatementError):
         two.ports[0].take_join(Join.from_fields(parse(wire).fields), two.ports[0].neighbours[A.name])
