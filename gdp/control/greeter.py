@@ -111,7 +111,7 @@ class LinkPort:
     owes_answer: bool = False  # for want of bytes
     said_s: float = float("-inf")
     neighbours: dict[Name, Neighbour] = field(default_factory=dict)
-    ended: dict[bytes, tuple[int, int]] = field(default_factory=dict)  # nonce to last hello and keepalive
+    ended: dict[tuple[Name, bytes], tuple[int, int]] = field(default_factory=dict)  # last numbers
     joins: dict[bytes, ReplayWindow] = field(default_factory=dict)  # which were taken, by session of the far end
     said_mtus: dict[Name, int] = field(default_factory=dict)  # what each neighbour's end takes
     addresses: dict[bytes, None] = field(default_factory=dict)  # of neighbours, former ones too; the last proven last
@@ -133,7 +133,7 @@ class LinkPort:
         known = self.neighbours.get(name)
         if known is not None and nonce in (known.nonce, known.candidate):
             return known.sequence if known.nonce == nonce else known.candidate_sequence
-        return self.ended.get(nonce, _UNHEARD)[0]
+        return self.ended.get((name, nonce), _UNHEARD)[0]
 
     @property
     def is_idle(self) -> bool:
@@ -177,10 +177,11 @@ class LinkPort:
     def end(self, neighbour: Neighbour) -> None:
         """Remember how far a session came that has proved itself; others cannot bring anybody up again."""
         if neighbour.is_proven:
-            _, received = self.ended.pop(neighbour.nonce, _UNHEARD)
+            session = neighbour.name, neighbour.nonce  # a nonce alone could be said by another member, too
+            _, received = self.ended.pop(session, _UNHEARD)
             if neighbour.keepalives is not None:
                 received = neighbour.keepalives.received
-            self.ended[neighbour.nonce] = neighbour.sequence, received
+            self.ended[session] = neighbour.sequence, received
             if len(self.ended) > _ENDED_MAX:
                 del self.ended[next(iter(self.ended))]
 
@@ -747,7 +748,7 @@ class Greeter:
     def _begin_keepalives(self, port: LinkPort, neighbour: Neighbour, hello: Hello, now_s: float) -> None:
         timing = self._timings.get(port.index, self._timing)
         ends = port.nonce + self._identity.name, neighbour.nonce + neighbour.name
-        _, received = port.ended.get(neighbour.nonce, _UNHEARD)
+        _, received = port.ended.get((neighbour.name, neighbour.nonce), _UNHEARD)
         neighbour.keepalives = KeepaliveSession.begin(
             port.exchange_key, hello.exchange_key, ends, (timing, hello.timing), received, now_s
         )
