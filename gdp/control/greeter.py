@@ -587,7 +587,7 @@ class Greeter:
         self._next_s = None
         self.rivals.refuse(neighbour.name, neighbour.life, now_s)
         self._tell_rival(neighbour.port, neighbour.nonce, neighbour.name, now_s)
-        neighbour.heard_s = float("-inf")
+        neighbour.let_go_s = now_s
 
     def tell_rivals(self, name: Name, now_s: float) -> None:
         """Tell a neighbour, where it is one, that another node has its identity."""
@@ -727,6 +727,8 @@ class Greeter:
 
     def _gone_at_s(self, neighbour: Neighbour) -> float:
         """Return when a neighbour is gone if nothing comes of it; the node's own lateness is no silence of theirs."""
+        if neighbour.let_go_s is not None:
+            return neighbour.let_go_s
         late_s = self._lateness_s - neighbour.lateness_s
         session = neighbour.keepalives
         if session is None or not session.is_heard:
@@ -736,7 +738,7 @@ class Greeter:
         return min(neighbour.heard_s + session.detect_s, hellos_end_s) + late_s
 
     def _alive(self, neighbour: Neighbour, heard_s: float) -> None:
-        neighbour.heard_s, neighbour.lateness_s = heard_s, self._lateness_s
+        neighbour.heard_s, neighbour.lateness_s, neighbour.let_go_s = heard_s, self._lateness_s, None
 
     def _session(self) -> tuple[bytes, ExchangeKey]:
         """Return nonce and key of a new session of a port."""

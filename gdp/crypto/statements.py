@@ -127,12 +127,13 @@ def sign(type_: StatementType, body: Mapping[str, object], signer: Name, key: Si
     """
     if "t" in body:
         raise LocalError("'t' is the statement's type")
-    payload = _byte_string(encode({**body, "t": type_.value}))
+    encoded = encode({**body, "t": type_.value})
+    _check_size(len(encoded))  # before two bytes have to hold it
+    payload = _byte_string(encoded)
     protected = _HEAD[2:] + signer
     signature = key.sign(_SIGNED_HEAD + protected + _NO_EXTERNAL_DATA + payload)
     wire = _wire(signer, payload, signature)
-    if len(wire) > CONTROL_MAX_BYTES:
-        raise LocalError(f"a statement of {len(wire)} bytes; at most {CONTROL_MAX_BYTES} are allowed")
+    _check_size(len(wire))
     return wire
 
 
@@ -172,6 +173,11 @@ def parse(wire: bytes) -> Statement:
         signed_bytes=_SIGNED_HEAD + wire[2:_PROTECTED_END] + _NO_EXTERNAL_DATA + boxed,
         wire=wire,
     )
+
+
+def _check_size(size: int) -> None:
+    if size > CONTROL_MAX_BYTES:
+        raise LocalError(f"a statement of {size} bytes; at most {CONTROL_MAX_BYTES} are allowed")
 
 
 def _wire(signer: bytes, boxed: bytes, signature: bytes) -> bytes:

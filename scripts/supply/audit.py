@@ -17,6 +17,7 @@ import argparse
 import base64
 import hashlib
 import json
+import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from importlib.metadata import Distribution, distributions
@@ -29,6 +30,9 @@ from packaging.utils import canonicalize_name
 from packaging.version import InvalidVersion, Version
 
 OURS = "gdp-ros"
+_METADATA = re.compile(
+    r"(?P<name>[^/]+?)-(?P<version>[^/\-]+)(?:\.dist-info/METADATA|(?:-py[\d.]+)?\.egg-info/PKG-INFO)\Z"
+)
 _WITH_EVERY_VENV = frozenset({"pip", "setuptools", "wheel"})
 
 
@@ -41,13 +45,19 @@ class Finding(NamedTuple):
 
 
 def compare(installed: Iterable[Distribution], pins: Sequence[Pin]) -> Iterator[Finding]:
-    """Yield each distribution that the lock does not pin here, or pins in another version."""
+    """Yield each distribution that the lock does not pin here, or pins in another version.
+
+    Some packages carry others: the wheel of ros-rclpy has that of rclpy in it, so its pin covers both.
+    """
     here = pins_here(list(pins))
-    for each in sorted(installed, key=_name):
+    dists = sorted(installed, key=_name)
+    carried = {metadata for each in dists if _name(each) in here for metadata in _metadata_in(each)}
+    for each in dists:
         name = _name(each)
         pinned = here.get(name, [])
         if not pinned and name not in _WITH_EVERY_VENV:
-            yield Finding("not-pinned", name, each.version)
+            if (name, each.version) not in carried:
+                yield Finding("not-pinned", name, each.version)
         elif pinned and not any(_equal(pin.version, each.version) for pin in pinned):
             yield Finding("other-version", name, f"{each.version}, pinned {', '.join(pin.version for pin in pinned)}")
 
@@ -116,6 +126,14 @@ def main(words: Sequence[str] | None = None, installed: Iterable[Distribution] |
             print(f"{each.kind:16} {each.name}  {each.detail}")
         print(f"{len(dists)} distributions, {len(findings)} findings")
     return 1 if findings else 0
+
+
+def _metadata_in(each: Distribution) -> Iterator[tuple[str, str]]:
+    """Yield name and version of each distribution whose metadata are among the files of one."""
+    for file in each.files or ():
+        match = _METADATA.search(str(file))
+        if match is not None:
+            yield canonicalize_name(match["name"]), match["version"]
 
 
 def _name(each: Distribution) -> str:

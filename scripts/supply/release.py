@@ -43,7 +43,7 @@ SUMS = "SHA256SUMS"
 SIGNATURE = "SHA256SUMS.sig"
 LOCK = "requirements/run.lock"
 _LINE = re.compile(r"([0-9a-f]{64})  ([A-Za-z0-9][\w.+\-]*)\Z")
-_BACKEND = "import sys, setuptools.build_meta as b; b.build_sdist(sys.argv[1]); b.build_wheel(sys.argv[1])"
+_BACKEND = "import sys, setuptools.build_meta as b; out = sys.argv[1]; b.build_sdist(out); b.build_wheel(out)"
 
 
 class ReleaseError(Exception):
@@ -63,11 +63,9 @@ def build(out: Path, root: Path = ROOT, commit: str = "HEAD") -> None:
     with _checked_out(root, commit) as source, tempfile.TemporaryDirectory() as made:
         env = {**os.environ, "SOURCE_DATE_EPOCH": epoch, "PYTHONHASHSEED": "0"}
         _run([sys.executable, "-c", _BACKEND, made], cwd=source, env=env)
-        for path in sorted(Path(made).iterdir()):
-            if path.name.endswith(".tar.gz"):
-                (out / path.name).write_bytes(_normalised(path, int(epoch)))
-            elif path.suffix == ".whl":
-                shutil.copyfile(path, out / path.name)
+        (sdist,), (wheel,) = Path(made).glob("*.tar.gz"), Path(made).glob("*.whl")
+        (out / sdist.name).write_bytes(_normalised(sdist, int(epoch)))
+        shutil.copyfile(wheel, out / wheel.name)
         script, lock = source / "scripts/supply/sbom.py", source / LOCK
         _run([sys.executable, str(script), "--lock", str(lock), "-o", str(out / "sbom.cdx.json")], env=env)
         shutil.copyfile(lock, out / lock.name)
