@@ -79,6 +79,7 @@ class DropReason(IntEnum):
     WRONG_SIDE = 41  # a topic's frame from a port on the way to which its publisher is not
     RATE_LIMITED = 42  # more hellos than are verified
     COOKIE_REQUIRED = 43  # a stranger's hello under load, without proof that it receives at its address
+    UNCONCERNED = 44  # a revocation by somebody of whom no certificate is held here
 
     @property
     def label(self) -> str:

@@ -11,6 +11,8 @@ from typing import Final
 HOPS_MAX: Final = 64  # hops left at the source
 FRAME_MAX_BYTES: Final = 65_535  # largest Ethernet frame any port may carry, header included
 MTU_MIN_BYTES: Final = 576  # a link below this is refused: a signed hello would no longer fit in a few parts
+MTU_NARROWINGS: Final = 4  # times that a publisher's path may become narrower, which has what is kept sealed anew
+MTU_HOLD_S: Final = 10.0  # ... and once more after so long
 
 # Messages
 MESSAGE_MAX_BYTES: Final = 24 << 20  # serialised message, before sealing; it must fit, in parts, into JOIN_SOURCE_BYTES
@@ -42,6 +44,7 @@ READER_GRACE_S: Final = 60.0  # ... but what it lacks is kept for it for this lo
 CALL_LAG_S: Final = 1.0  # ... or of requests, that has not confirmed in this time what another server has
 CALL_IDLE_S: Final = 0.5  # a live server reports at least this often to its clients
 CALL_QUIET_S: Final = 2.0  # a server that does not report for this long is no peer meanwhile
+EPOCH_GRACE_S: Final = 10.0  # after a new epoch began, readers of before it are heard under the one before
 NACKS_PER_REPORT: Final = 24  # ranges: a report, sealed and alone in its frame, fits the smallest link there may be
 
 # Control plane
@@ -56,6 +59,7 @@ CONTROL_JOIN_SOURCE_BYTES: Final = 64 << 10
 CONTROL_PATIENCE_S: Final = 2.0
 CBOR_DEPTH_MAX: Final = 16
 CHAIN_MAX: Final = 4  # delegations between an owner's key and a node
+CERTIFICATE_LIFE_MAX_S: Final = 20 * 366 * 86_400.0  # of a membership or delegation; so long may a revocation count
 CLOCK_EARLY_S: Final = 3_600.0  # so long before it begins a certificate is believed
 CLOCK_SKEW_S: Final = 3_600.0  # so long after it has ended
 CLOCKS_APART_S: Final = 7_200.0  # two clocks, each an hour off at most
@@ -96,3 +100,9 @@ SWITCH_QUESTIONS_PER_S: Final = 256.0  # ... or a neighbouring switch
 SWITCH_QUESTIONS_BURST: Final = 2_048.0
 RIB_NAMES_PER_SENDER: Final = 200_000
 RIB_WATCHES_MAX: Final = 500_000
+
+# Revocations
+REVOCATIONS_PER_ROOT: Final = 262_144  # of one trusted domain
+REVOCATIONS_OF_OWNERS: Final = 65_536  # of all owners and nodes whose certificates are held here
+REVOCATIONS_PER_ISSUER: Final = 1_024  # of one of these
+REVOCATIONS_PER_GIVER: Final = 8_192  # that came over one neighbour, or from one relay

@@ -189,9 +189,9 @@ def lab(space: Space, monkeypatch: pytest.MonkeyPatch) -> Iterator[Lab]:
     with closing(Lab(space)) as made:
         tell = made.publisher.tree_stands
 
-        def note(mtu: int) -> None:
+        def note(mtu: int) -> bool:
             made.heard.append(mtu)
-            tell(mtu)
+            return tell(mtu)
 
         monkeypatch.setattr(made.publisher, "tree_stands", note)
         made.until(lambda: made.publisher.readers > 0)

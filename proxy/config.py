@@ -69,6 +69,9 @@ class ProxyConfig(Section):
     expose: tuple[Rule, ...] = Field(default=(), description="Rules for what leaves this machine.")
     imports: tuple[Rule, ...] = Field(default=(), alias="import", description="Rules for what comes from elsewhere.")
     record: Record | None = Field(default=None, description="Write what arrives into a file.")
+    state: Directory | None = Field(
+        default=None, description="Directory that keeps revocations across restarts, for this user alone."
+    )
     metrics: Metrics | None = Field(default=None, description="Serve Prometheus text on 127.0.0.1.")
     lease_s: LeaseSeconds = Field(
         default=CLAIM_LEASE_S,

@@ -50,7 +50,7 @@ def delegate_what_is_needed(
 ) -> None:
     """Let each proxy publish, read, serve or call what its rules say; what it may already is left as it is."""
     with failing_clearly():
-        key = load_owner(owner).key.public
+        key = load_owner(owner).public
         configs = [ProxyConfig.load(file) for file in files]
         _refuse_other_owners(owner, key, files, configs)
         cards = [load_card(config.identity / CARD) for config in configs]

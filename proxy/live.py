@@ -142,7 +142,7 @@ def _reload(path: Path, first: ProxyConfig, node: ProxyNode, bridge: Bridge) -> 
     except GdpError as error:
         log.error("configuration not reloaded, the old one holds reason=%s", error)
         return
-    for key in ("identity", "domain", "iface", "ros", "metrics", "sandbox"):
+    for key in ("identity", "domain", "iface", "ros", "metrics", "sandbox", "state"):
         if getattr(settings, key) != getattr(first, key):
             log.error("configuration not reloaded, the old one holds reason=%s needs a restart to change", key)
             return

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import secrets
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -24,10 +23,12 @@ from gdp.errors import GdpError, LocalError
 from gdp.message.loss import by_label
 from gdp.names import Name
 from gdp.nodes.counts import count_list
-from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
+from gdp.nodes.credentials import Credentials, watched_folders
+from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
+from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rights import confine_proxy
-from gdp.nodes.runtime import Runtime
+from gdp.nodes.runtime import Runtime, now
 from gdp.nodes.single_instance import run_alone
 from gdp.nodes.uplink import open_uplink
 from gdp.ports.plane import Plane
@@ -59,6 +60,7 @@ class ProxyNode:
     runtime: Runtime
     plane: Plane
     node_log: NodeLog
+    credentials: Credentials
     on_reload: Callable[[], None] | None = None
     is_leaving: bool = False
     drains: bool = False
@@ -67,6 +69,7 @@ class ProxyNode:
 
     def reload(self) -> None:
         """Read anew what can be."""
+        self.credentials.look(now())
         if self.on_reload is not None:
             self.on_reload()
 
@@ -118,10 +121,11 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
         LocalError: keys, delegations or the device are not as the configuration says, or this proxy already runs.
     """
     identity, policy = load_member(config.identity, config.domain, Role.PROXY)
-    settings = NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes, lease_s=config.lease_s)
+    settings = NodeSettings(incarnation(), wall_clock_ms(), fresh_bytes, lease_s=config.lease_s)
     member = Member(identity, policy, settings)
     with contextlib.ExitStack() as stack:
         stack.enter_context(run_alone("proxy", identity.name))
+        revocations = load_revocations(config.state, policy.revoked, stack)
         plane = stack.enter_context(open_uplink(config.iface))
         runtime = Runtime(member, plane, spin_s=config.spin_us / 1e6)
         node_log = NodeLog(
@@ -135,12 +139,17 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
             on_wait=on_wait,
         )
         runtime.every(LOOK_S, node_log.look)
-        node = ProxyNode(identity, member, runtime, plane, node_log)
+        credentials = Credentials(config.identity, config.domain, identity, policy)
+        runtime.every(LOOK_S, credentials.look)
+        node = ProxyNode(identity, member, runtime, plane, node_log, credentials)
         stack.callback(signal.signal, signal.SIGUSR1, signal.signal(signal.SIGUSR1, node.leave_soon))
         stack.enter_context(runtime.signals(node.reload))
         if config.sandbox:
-            recordings = () if config.record is None else (config.record.path.parent,)
-            confine_proxy((config.identity, config.delegations), recordings, has_ros=bool(config.ros))
+            again = watched_folders(config.identity, config.domain)
+            kept = (None if config.record is None else config.record.path.parent, config.state)
+            written = [folder for folder in kept if folder is not None]
+            confine_proxy((*again, config.delegations), written, has_ros=bool(config.ros))
+        revocations.start(runtime)
         if config.metrics is not None:
             from gdp.telemetry.metrics import Metrics
 

@@ -5,17 +5,19 @@
 #   scripts/setup.sh --ros2   to run where no ROS 2 is installed: with a real one from the package index
 #   scripts/setup.sh --dev    to test as well, with all that tests use: ROS 2, Cyclone DDS, SkyPilot, ROS 1 from Debian
 #
-# Needs: python3 >= 3.10. System packages are installed only where something is missing, and only as root.
+# Needs: python3 >= 3.10. System packages are installed only where something is missing, and only as root. Python packages
+# are those of requirements/, by version and hash: pip refuses anything else.
 set -euo pipefail
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 cd "$root"
 venv=$root/.venv
 extras=""
-dev="[dev,bench,cluster,dds,ros2,aws,skypilot,experiments]"
+lock=run  # of requirements/
+dev="[dev,bench,cluster,dds,ros2,aws,skypilot,experiments,pkcs11]"
 case "${1:-}" in
-    --dev) extras=$dev ;;
-    --ros2) extras="[ros2]" ;;
+    --dev) extras=$dev lock=dev ;;
+    --ros2) extras="[ros2]" lock=ros2 ;;
 esac
 
 say() { printf 'setup: %s\n' "$*" >&2; }
@@ -64,7 +66,7 @@ compile_own() {
 }
 
 python=$(find_python)
-wanted=$({ cat pyproject.toml; "$python" --version; echo "$root"; } | sha256sum | cut -d' ' -f1)
+wanted=$({ cat pyproject.toml requirements/*.lock; "$python" --version; echo "$root"; } | sha256sum | cut -d' ' -f1)
 # What was installed for testing is enough for running.
 for stamp in "$venv/.installed$extras" "$venv/.installed[ros2]" "$venv/.installed$dev"; do
     if [[ -f "$stamp" && $(<"$stamp") == "$wanted" ]] && "$venv/bin/python" -c '' 2>/dev/null; then
@@ -89,6 +91,7 @@ if [[ "$extras" == "$dev" ]]; then
         if [[ -d /run/systemd/system && ! -e "$mask" ]]; then ln -s /dev/null "$mask"; fi
         RUNLEVEL=1 package redis-server "tests of RIBs that share a cluster start it"
     fi
+    command -v softhsm2-util >/dev/null || package softhsm2 "tests keep keys in its tokens"
     command -v openssl >/dev/null || package openssl "tests read our certificates with it"
 fi
 
@@ -99,7 +102,10 @@ fi
 say "installing this package and what it needs (once; about a minute)"
 log=$(mktemp)
 trap 'rm -f "$log"' EXIT
-if ! "$venv/bin/python" -m pip install --disable-pip-version-check --no-input -e ".$extras" >"$log" 2>&1; then
+pip() { "$venv/bin/python" -m pip install --disable-pip-version-check --no-input --no-deps "$@" >"$log" 2>&1; }
+# What builds the package is pinned too, so it is installed first and not fetched into an environment for the build.
+if ! pip --require-hashes -r requirements/build.lock || ! pip --require-hashes -r "requirements/$lock.lock" ||
+    ! pip --no-build-isolation -e .; then
     tail -n 25 "$log" >&2
     fail "pip could not install the package; the lines above say why"
 fi

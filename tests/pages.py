@@ -9,13 +9,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PAGES = (ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "gdp/frame/spec.md")
+_ALONE = ("README.md", "CHANGELOG.md", "SECURITY.md", "docs/model/README.md", "gdp/frame/spec.md")
+PAGES = (
+    *(ROOT / path for path in _ALONE),
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs/explanation").glob("*.md")),
+    *sorted((ROOT / "docs/how-to").glob("*.md")),
+)
 
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
 _HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
 _WRAPPED = re.compile(r"\\\n\s*")
-_PROGRAM = re.compile(r"(?:gdp(?:-\w+)?|fog|scripts/\w+\.(?:sh|py)|scripts/bench/\w+\.py)\Z")
+_PROGRAM = re.compile(r"(?:gdp(?:-\w+)?|fog|scripts/\w+\.(?:sh|py)|scripts/(?:bench|supply)/\w+\.py)\Z")
 
 
 @dataclass(frozen=True)

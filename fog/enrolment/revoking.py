@@ -13,8 +13,10 @@ from typing import Final
 from gdp.crypto.statements import parse
 from gdp.errors import StatementError
 from gdp.limits import CLOCK_SKEW_S
+from gdp.stores.audit_log import note_once
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.keyring import load_domain
+from gdp.trust.audit import Action
 from gdp.trust.revocation import Revocation
 
 __all__ = ["take_back"]
@@ -40,7 +42,8 @@ def take_back(domain: Path, folder: Path, fingerprints: Iterable[str], *, until_
         name = fingerprint[:_TITLE_CHARS] + _SUFFIX
         if not (folder / name).exists():
             body = bytes.fromhex(fingerprint)
-            files[name] = public(Revocation.make(authority.key, authority.root.subject, body, int(until_unix_s)))
+            files[name] = public(Revocation.make(authority.key, authority.root.signer, body, int(until_unix_s)))
+            note_once(domain, Action.REVOKED, "membership", about=fingerprint, unix_s=unix_s)
     write_all(folder, files)
     for path in folder.glob(f"[!.]*{_SUFFIX}"):
         with suppress(StatementError):  # somebody else's: left alone

@@ -7,7 +7,6 @@ what any client does. Whom it hears, the robot's proxy hears as well: both learn
 from __future__ import annotations
 
 import logging
-import secrets
 import threading
 import time
 from collections.abc import Iterable, Mapping
@@ -19,7 +18,9 @@ from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.errors import GdpError
 from gdp.names import Name
-from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
+from gdp.nodes.credentials import Credentials
+from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
+from gdp.nodes.node_log import LOOK_S
 from gdp.nodes.runtime import Runtime
 from gdp.nodes.schema import Domain
 from gdp.ports.raw import RawPlane
@@ -85,10 +86,11 @@ class Watch:
     def _look(self) -> None:
         domain = Domain(root=self._identity / ROOT_CERTIFICATE, transit=None)
         identity, policy = load_member(self._identity, domain, Role.PROXY)
-        member = Member(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes))
+        member = Member(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), fresh_bytes))
         plane = RawPlane([self._iface])
         try:
             runtime = Runtime(member, plane)
+            runtime.every(LOOK_S, Credentials(self._identity, domain, identity, policy).look)
             called = self._call(member, Held(self._identity / DELEGATIONS, identity), [])
             attached_s: float | None = None
             while not self._ended.is_set() and any(port.up for port in plane.ports.values()):

@@ -15,21 +15,36 @@ from typing import Annotated, Optional
 
 import typer
 
-from gdp.cli import options
+from gdp.cli import options, rollover
+from gdp.cli.key import asked_passphrase, token_key
 from gdp.cli.output import moment, show, span
+from gdp.cli.rollover import described_root
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.x509_form import read_request, to_pem
 from gdp.errors import LocalError
 from gdp.names import Name
+from gdp.stores.audit_log import note_once
 from gdp.stores.files import public, read_public, refuse_existing, write_all
-from gdp.stores.issue import MEMBER_DAYS, admit, admit_node, install_membership
-from gdp.stores.keyring import CARD, NODE_CERTIFICATE, load_domain, load_node_keys, load_root, parsed
+from gdp.stores.issue import (
+    MEMBER_DAYS,
+    ROOT_DAYS,
+    admit,
+    admit_node,
+    install_membership,
+    renew,
+    renew_node,
+    succeed_owner,
+)
+from gdp.stores.keyring import CARD, NODE_CERTIFICATE, load_delegation, load_domain, load_node_keys, load_root, parsed
 from gdp.stores.ledger import LEDGER, read_ledger
+from gdp.stores.rollover import trust_successor
+from gdp.trust.audit import Action
 from gdp.trust.revocation import Revocation
 
 __all__ = ["app"]
 
-app = typer.Typer(no_args_is_help=True, help="Memberships: issue, install, show, revoke.")
+app = typer.Typer(no_args_is_help=True, help="Memberships: issue, renew, install, show, revoke; rollover of roots.")
+app.add_typer(rollover.app, name="rollover")
 
 Domain = Annotated[Path, typer.Option("--domain", metavar="DIR", help="the domain's directory, with its root key")]
 Node = Annotated[
@@ -47,6 +62,15 @@ ExpectedRole = Annotated[
 ExpectedLabel = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option("--label", help="its name for people; compared with its request. Asked for at a terminal"),
+]
+Nodes = Annotated[list[Path], typer.Option("--node", metavar="DIR", help="a node's directory at hand; repeatable")]
+OldCertificate = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option("--cert", metavar="FILE", help="the membership of a node elsewhere; needs --out"),
+]
+Before = Annotated[
+    Optional[float],  # noqa: UP045
+    typer.Option("--before-days", min=0.0, help="renew only what ends within so many days"),
 ]
 RootFile = Annotated[Path, typer.Option("--root", metavar="FILE", help="the domain's root certificate")]
 CertificateFile = Annotated[Path, typer.Argument(metavar="FILE", help="a membership, PEM or DER")]
@@ -74,7 +98,7 @@ def issue(
     """
     if node is not None and request is None and out is None:
         keys = load_node_keys(node)
-        _state(keys.subject.name, keys.role.value, keys.label, days, role, label)
+        _state(domain, keys.subject.name, keys.role.value, keys.label, days, role, label)
         member = admit_node(domain, node, days=days, force=force).member
         written = {"certificate": str(node / NODE_CERTIFICATE), "card": str(node / CARD)}
     elif node is None and request is not None and out is not None:
@@ -82,13 +106,90 @@ def issue(
             refuse_existing(out)
         asked = read_public(request)
         holder = parsed(request, read_request, asked)
-        _state(holder.subject.name, holder.unit, holder.label, days, role, label)
+        _state(domain, holder.subject.name, holder.unit, holder.label, days, role, label)
         member = parsed(request, lambda wire: admit(domain, wire, days=days), asked)
         write_all(out.parent, {out.name: public(to_pem(member.wire))}, force=force)
         written = {"certificate": str(out)}
     else:
         raise LocalError("cert issue: give either --node, or --request with --out")
     show({**_described(member), **written}, as_json=as_json)
+
+
+@app.command("renew")
+def renew_(
+    domain: Domain,
+    nodes: Nodes = [],  # noqa: B006 (the library copies it)
+    certificate: OldCertificate = None,
+    out: options.Out = None,
+    before_days: Before = None,
+    days: options.Days = MEMBER_DAYS,
+    as_json: options.Json = False,
+) -> None:
+    """Issue memberships again, for the same keys. A running node takes up its new certificate by itself.
+
+    \b
+    Examples:
+      gdp cert renew --domain keys/school --node keys/robot --node keys/roof --before-days 30
+      gdp cert renew --domain keys/school --cert node.crt --out renewed.crt
+    """
+    if nodes and certificate is None and out is None:
+        for node in nodes:
+            member = renew_node(domain, node, days=days, before_days=before_days)
+            result: dict[str, object] = {"node": str(node), "renewed": member is not None}
+            show({**result, **({} if member is None else _described(member))}, as_json=as_json)
+    elif not nodes and certificate is not None and out is not None:
+        wire = read_public(certificate)
+        member = parsed(certificate, lambda data: renew(domain, data, days=days), wire)
+        write_all(out.parent, {out.name: public(to_pem(member.wire))}, force=True)
+        show({**_described(member), "certificate": str(out)}, as_json=as_json)
+    else:
+        raise LocalError("cert renew: give either --node, which may be repeated, or --cert with --out")
+
+
+@app.command("trust")
+def trust(
+    file: CertificateFile,
+    roots: Annotated[list[Path], typer.Option("--root", metavar="FILE", help="a root that a node trusts; repeatable")],
+    as_json: options.Json = False,
+) -> None:
+    """Replace a root that is trusted by its successor, if the present one vouches for it.
+
+    \b
+    Example:
+      gdp cert trust next-root.crt --root keys/robot/root.crt
+    """
+    for root in roots:
+        show({**described_root(trust_successor(file, root)), "root": str(root)}, as_json=as_json)
+
+
+@app.command("succeed")
+def succeed(
+    owner: Annotated[Path, typer.Option("--owner", metavar="DIR", help="the owner's directory")],
+    to: Annotated[Path, typer.Option("--to", metavar="DIR", help="the successor's; made if it is not there")],
+    delegations: Annotated[
+        list[Path],
+        typer.Option("--delegation", metavar="PATH", help="of a name: a file, or a folder of them; repeatable"),
+    ],
+    days: options.Days = ROOT_DAYS,
+    protect: options.Protect = False,
+    key: options.KeyUri = None,
+    as_json: options.Json = False,
+) -> None:
+    """Let another key delegate an owner's names from now on. The names stay, and so does owner.pub.
+
+    \b
+    Example:
+      gdp cert succeed --owner keys/lab --to keys/lab2 --delegation keys/robot/delegations --days 730
+    """
+    files = [file for path in delegations for file in ([path] if path.is_file() else sorted(path.glob("*.delegation")))]
+    names = {each.name: each.subject for each in map(load_delegation, files)}
+    if not names:
+        raise LocalError("cert succeed: none of --delegation has a delegation in it")
+    guard = asked_passphrase(protect)
+    heir = succeed_owner(owner, to, names.values(), days=days, key=token_key(key), passphrase=guard)
+    known = sorted(name.to_text() for name in heir.successions)
+    show({"owner": heir.public.compressed.hex(), "successor": heir.key.public.compressed.hex(), "names": known},
+         as_json=as_json)  # fmt: skip
 
 
 @app.command("issued")
@@ -151,22 +252,29 @@ def revoke(
     """
     authority = load_domain(domain)
     member = parsed(file, lambda wire: Membership.from_wire(wire, authority.root, time.time()), read_public(file))
-    subject = authority.root.subject
-    statement = Revocation.make(authority.key, subject, member.fingerprint, member.not_after_unix_s)
+    statement = Revocation.make(authority.key, authority.root.signer, member.fingerprint, member.not_after_unix_s)
+    who, about = member.name.to_text(), member.fingerprint.hex()
+    note_once(domain, Action.REVOKED, "membership", who=who, about=about, unix_s=time.time())
     write_all(out.parent, {out.name: public(statement)}, force=force)
     show({**_described(member), "revocation": str(out)}, as_json=as_json)
 
 
-def _state(name: Name, role: str, label: str, days: float, wanted: Role | None, called: str | None) -> None:
+def _state(
+    domain: Path, name: Name, role: str, label: str, days: float, wanted: Role | None, called: str | None
+) -> None:
     """Say what is about to be signed, and see that it is what was meant.
 
     Args:
+        domain: whose audit log notes a request for something else.
         name, role, label: as the request says.
         wanted, called: as the caller says; None: a person at the terminal confirms.
 
     Raises:
         LocalError: the request asks for something else, or nobody can be asked.
     """
+    if (wanted is not None and wanted.value != role) or (called is not None and called != label):
+        why = "another role or label than was meant"
+        note_once(domain, Action.REFUSED, "membership", who=name.to_text(), reason=why, unix_s=time.time())
     if wanted is not None and wanted.value != role:
         raise LocalError(f"the request asks for the role {role}, not {wanted.value}: nothing was signed")
     if called is not None and called != label:

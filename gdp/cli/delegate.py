@@ -24,10 +24,12 @@ from gdp.crypto.statements import parse
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
 from gdp.names import Name
+from gdp.stores.audit_log import note_once
 from gdp.stores.files import private, public, write_all
 from gdp.stores.issue import DELEGATION_DAYS, delegate, delegate_route, install_delegation
 from gdp.stores.keyring import load_card, load_delegation, load_owner, load_root
 from gdp.trust.adcert import AdCert
+from gdp.trust.audit import Action
 from gdp.trust.delegation import Delegation
 
 __all__ = ["app"]
@@ -162,8 +164,11 @@ def revoke(
     given = load_delegation(file)
     if not given.chain:
         raise LocalError(f"{file}: nothing was delegated: the node owns the name itself")
-    link = AdCert.from_statement(parse(given.chain[0]))
-    statement = load_owner(owner).revoke(given.subject, link.fingerprint, link.validity.not_after_unix_s)
+    holder = load_owner(owner)
+    link = AdCert.from_statement(parse(given.chain[0 if holder.founder is None else -1]))
+    statement = holder.revoke(given.subject, link.fingerprint, link.validity.not_after_unix_s)
+    who, about = given.node.to_text(), given.name.to_text()
+    note_once(owner, Action.REVOKED, "delegation", who=who, about=about, unix_s=time.time())
     write_all(out.parent, {out.name: public(statement)}, force=force)
     show({**_described(given), "revocation": str(out)}, as_json=as_json)
 

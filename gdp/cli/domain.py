@@ -11,8 +11,9 @@ from typing import Annotated
 import typer
 
 from gdp.cli import options
-from gdp.cli.output import show, span
-from gdp.crypto.certificates import Root
+from gdp.cli.key import asked_passphrase, token_key
+from gdp.cli.output import show
+from gdp.cli.rollover import described_root
 from gdp.stores.issue import ROOT_DAYS, make_domain
 from gdp.stores.keyring import ROOT_CERTIFICATE, load_root
 
@@ -28,17 +29,21 @@ def init(
     directory: options.Directory,
     label: options.Label,
     days: options.Days = ROOT_DAYS,
+    protect: options.Protect = False,
+    key: options.KeyUri = None,
     force: options.Force = False,
     as_json: options.Json = False,
 ) -> None:
     """Found a domain: a root key, and the certificate that others put among those they trust.
 
     \b
-    Example:
+    Examples:
       gdp domain init keys/school --label school
+      gdp domain init keys/school --label school --protect
     """
-    root = make_domain(directory, label, days=days, force=force).root
-    show({**_described(root), "root": str(directory / ROOT_CERTIFICATE)}, as_json=as_json)
+    guard = asked_passphrase(protect)
+    root = make_domain(directory, label, days=days, key=token_key(key), passphrase=guard, force=force).root
+    show({**described_root(root), "root": str(directory / ROOT_CERTIFICATE)}, as_json=as_json)
 
 
 @app.command("show")
@@ -49,8 +54,4 @@ def show_(file: RootFile, as_json: options.Json = False) -> None:
     Example:
       gdp domain show keys/school/root.crt
     """
-    show(_described(load_root(file)), as_json=as_json)
-
-
-def _described(root: Root) -> dict[str, object]:
-    return {"domain": root.domain.to_text(), "label": root.label, **span(root.validity)}
+    show(described_root(load_root(file)), as_json=as_json)

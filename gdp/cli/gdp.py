@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import typer
 
-from gdp.cli import cert, delegate, domain, keygen
+from gdp.cli import audit, cert, delegate, domain, key, keygen
 from gdp.cli.lab import lab
 from gdp.cli.name import name
 from gdp.errors import GdpError
@@ -27,9 +27,11 @@ app = typer.Typer(
 app.command("name", no_args_is_help=True)(name)
 app.command("lab", no_args_is_help=True)(lab)
 app.add_typer(keygen.app, name="keygen")
+app.add_typer(key.app, name="key")
 app.add_typer(domain.app, name="domain")
 app.add_typer(cert.app, name="cert")
 app.add_typer(delegate.app, name="delegate")
+app.add_typer(audit.app, name="audit")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

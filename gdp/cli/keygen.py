@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from gdp.cli import options
+from gdp.cli.key import asked_passphrase, token_key
 from gdp.cli.output import items_from_text, show
 from gdp.crypto.certificates import Role
 from gdp.stores.issue import make_node_keys, make_owner
@@ -23,14 +24,21 @@ RoleOption = Annotated[Role, typer.Option("--role", help="what the node is")]
 
 
 @app.command("owner")
-def owner(directory: options.Directory, force: options.Force = False, as_json: options.Json = False) -> None:
+def owner(
+    directory: options.Directory,
+    protect: options.Protect = False,
+    key: options.KeyUri = None,
+    force: options.Force = False,
+    as_json: options.Json = False,
+) -> None:
     """Make an owner's keys: owner.pub goes to whoever derives names, the rest stays private.
 
     \b
-    Example:
+    Examples:
       gdp keygen owner keys/lab
+      gdp keygen owner keys/lab --protect
     """
-    made = make_owner(directory, force=force)
+    made = make_owner(directory, key=token_key(key), passphrase=asked_passphrase(protect), force=force)
     path = directory / OWNER_PUBLIC
     show({"owner": made.key.public.compressed.hex(), "public": str(path)}, as_json=as_json)
 
@@ -41,16 +49,22 @@ def node(
     role: RoleOption,
     label: options.Label,
     more: options.More = [],  # noqa: B006 (the library copies it)
+    protect: options.Protect = False,
+    key: options.KeyUri = None,
     force: options.Force = False,
     as_json: options.Json = False,
 ) -> None:
     """Make the keys of a switch, a RIB or a proxy, and its request to belong to a domain.
 
     \b
-    Example:
+    Examples:
       gdp keygen node keys/robot --role proxy --label robot --meta site=roof
+      gdp keygen node keys/roof --role switch --label roof --key 'pkcs11:token=roof;object=node?module-path=...'
     """
-    made = make_node_keys(directory, role, label, more=items_from_text(more), force=force)
+    guard = asked_passphrase(protect)
+    made = make_node_keys(
+        directory, role, label, more=items_from_text(more), key=token_key(key), passphrase=guard, force=force
+    )
     result = {
         "name": made.subject.name.to_text(),
         "role": role.value,

@@ -10,6 +10,8 @@ from typing import Annotated, Optional
 
 import typer
 
+from gdp.limits import CERTIFICATE_LIFE_MAX_S
+
 __all__ = [
     "Author",
     "Days",
@@ -17,6 +19,7 @@ __all__ = [
     "Directory",
     "Force",
     "Json",
+    "KeyUri",
     "Kind",
     "Label",
     "Maintainer",
@@ -24,6 +27,7 @@ __all__ = [
     "Name",
     "Out",
     "Pin",
+    "Protect",
     "Type",
 ]
 
@@ -37,9 +41,15 @@ Description = Annotated[Optional[str], typer.Option("--description", help="what 
 Pin = Annotated[Optional[int], typer.Option("--pin", help="a number that people remember")]  # noqa: UP045
 More = Annotated[list[str], typer.Option("--meta", metavar="KEY=VALUE", help="further metadata; may be repeated")]
 
+_DAYS_MAX = CERTIFICATE_LIFE_MAX_S / 86_400
 Json = Annotated[bool, typer.Option("--json", help="print one JSON object")]
 Force = Annotated[bool, typer.Option("--force", help="replace what is there")]
-Days = Annotated[float, typer.Option("--days", min=0.001, help="how long it is valid")]
+Days = Annotated[float, typer.Option("--days", min=0.001, max=_DAYS_MAX, help="how long it is valid")]
 Label = Annotated[str, typer.Option("--label", help="its name for people")]
 Directory = Annotated[Path, typer.Argument(metavar="DIR", help="where its files are, or are made")]
 Out = Annotated[Optional[Path], typer.Option("--out", "-o", metavar="FILE", help="write it to this file")]  # noqa: UP045
+Protect = Annotated[bool, typer.Option("--protect", help="put private keys under a passphrase; see gdp key --help")]
+KeyUri = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--key", metavar="URI", help="the signing key is in a token: pkcs11:... (RFC 7512)"),
+]

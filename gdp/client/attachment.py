@@ -11,7 +11,7 @@ Place: pure. Whoever publishes, reads or serves builds on this; so does a RIB.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -20,6 +20,7 @@ from gdp.control.greeter import Greeter
 from gdp.control.join import Join
 from gdp.control.neighbour import Neighbour
 from gdp.control.presence import Presence
+from gdp.control.revocation_sync import RevocationSync
 from gdp.control.settings import NodeSettings
 from gdp.control.verdict import Verdict
 from gdp.crypto.certificates import Role
@@ -35,6 +36,8 @@ from gdp.frame.kinds import Kind
 from gdp.names import ZERO, Name
 from gdp.trust.claim import make_claim
 from gdp.trust.domain import Policy
+from gdp.trust.revocation import Revocation
+from gdp.trust.revocations import hash_of
 from gdp.trust.right import HEARS, Right
 from gdp.trust.rtcert import RtCert
 
@@ -72,14 +75,20 @@ class Claimed:
 
 
 class Attachment:
-    """One node's hold on the overlay."""
+    """One node's hold on the overlay.
 
-    def __init__(self, identity: Identity, policy: Policy, settings: NodeSettings) -> None:
+    Args:
+        exchange: X25519 key of this life, for notes to what it claims to publish, serve or call; empty: it takes none.
+    """
+
+    def __init__(self, identity: Identity, policy: Policy, settings: NodeSettings, exchange: bytes = b"") -> None:
         self._identity = identity
+        self._exchange = exchange
         self._policy = policy
         self._incarnation = settings.incarnation
         self._lease_s = settings.lease_s
         self._sequence = settings.first_sequence
+        self.started = settings.first_sequence  # above what earlier lives said here, as far as is known
         self.splitter = ControlSplitter(identity.name, settings.incarnation)
         self.joiner = ControlJoiner()
         is_rib = identity.member.role is Role.RIB
@@ -93,6 +102,9 @@ class Attachment:
         self._former = ZERO  # the one before
         self._moved_s = float("-inf")
         self._rtcerts: dict[Name, tuple[bytes, float]] = {}  # by switch, with the monotonic second of the next one
+        self._sync = RevocationSync(
+            identity, policy.revoked, self.greeter, self._say_revoked, settings.first_sequence
+        )
         self._now = Instant(0.0, 0.0)
         self._out: list[Transmit] = []
         self._in_use_s = 0.0  # since when another node with this identity keeps its place
@@ -203,7 +215,29 @@ class Attachment:
             return statement
         if header.kind == Kind.REVOKE:
             return statement  # it proves itself
+        if header.kind == Kind.REVOKED:
+            if statement.type is StatementType.REVOKE:
+                self._sync.took(switch, hash_of(statement.fields.bytes_("owner")), now.mono_s)
+                return statement
+            self._sync.receive(switch, statement, now)
+            return None
         raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
+
+    def take_revocation(self, statement: Statement, now: Instant, holds: Callable[[bytes], bool]) -> Revocation | None:
+        """Take a revocation that our switch passed on; return it if it is news.
+
+        Args:
+            holds: whether a certificate that a key (33 bytes) issued is held here.
+
+        Raises:
+            StatementError: it does not hold, concerns nothing here, or there is no room for it.
+        """
+        if self._switch is None:
+            return None
+        revocation = self._policy.revoked.take(statement, self._switch.name, now, holds)
+        if revocation is not None:
+            self.greeter.recheck(revocation.fingerprint, now)
+        return revocation
 
     def port_changed(self, port: int, up: bool, now: Instant) -> None:
         """Learn that a port's link came or went."""
@@ -217,6 +251,7 @@ class Attachment:
             self._choose_switch(now.mono_s)
         self.joiner.expire(now.mono_s)
         self._out += self.greeter.take(now.mono_s)
+        self._sync.timeout(now.mono_s)
         if self._switch is None:
             return
         for each in self._due_claims():
@@ -226,7 +261,7 @@ class Attachment:
 
     def next_timeout(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self.greeter.next_timeout()]
+        times = [self.greeter.next_timeout(), self._sync.next_timeout()]
         if self._switch is not None:
             times += [each.claim_at_s for each in self._due_claims()]
         return min((time for time in times if time is not None), default=None)
@@ -246,6 +281,11 @@ class Attachment:
         switches = [each for each in self.greeter.all_up() if each.role is Role.SWITCH]
         best = min(switches, key=lambda each: (self.greeter.ports[each.port].cost, each.port), default=None)
         is_same = best is not None and best is self._switch and best.nonce == self._switch_nonce
+        if not is_same:
+            if self._switch is not None:
+                self._sync.neighbour_lost(self._switch)
+            if best is not None:
+                self._sync.neighbour_up(best, now_s)
         self._switch = best
         self._switch_nonce = b"" if best is None else best.nonce
         if best is not None and not is_same:
@@ -271,6 +311,7 @@ class Attachment:
             is_global=each.is_global,
             chain=each.chain,
             previous=self._former if now.mono_s - self._moved_s < _MOVED_S else ZERO,
+            exchange=self._exchange if each.right in HEARS.values() else b"",
         )
 
     def _rtcert_for(self, switch: Name) -> bytes:
@@ -334,7 +375,7 @@ class Attachment:
         self.refusals[verdict.refused] += 1
         each.is_taken = False
         if verdict.refused is DropReason.STALE:
-            self._sequence = max(self._sequence, verdict.sequence)
+            self._sequence = self.started = max(self._sequence, verdict.sequence)
             each.claim_at_s = now_s  # an earlier life of ours was ahead: try again above it
         elif verdict.refused is DropReason.IN_USE and each.right is Right.ATTACH:
             if each.refused is not verdict.refused:
@@ -345,6 +386,10 @@ class Attachment:
         else:
             each.refused = verdict.refused
             each.claim_at_s = now_s + self._lease_s / 3  # it may be taken later, but not for asking often
+
+    def _say_revoked(self, neighbour: Neighbour, wire: bytes) -> None:
+        if neighbour is self._switch:
+            self._say(Kind.REVOKED, wire)
 
     def _say(self, kind: Kind, wire: bytes) -> None:
         assert self._switch is not None

@@ -2,9 +2,12 @@
 
 Place: pure; time comes in as ``now_s`` (monotonic seconds).
 
-A feed begins ``NEW``: it announces itself until a status tells it where to begin and what the messages are. ``LIVE`` it
+A feed begins ``NEW``: it introduces itself until a status tells it where to begin and what messages are. ``LIVE`` it
 delivers: a reliable topic in order and complete, a best-effort one in order and never waiting. Sequence numbers under
 the seal show what is lost between two messages, statuses what is lost behind the last, and why.
+
+Reports go under the epoch of the newest verified message. A publisher that is silent may have begun another epoch, or
+have forgotten this reader: now and then it is told under another epoch too, with an introduction.
 """
 
 from __future__ import annotations
@@ -16,8 +19,8 @@ from typing import Final
 
 from gdp.client.reading import Delivered, Ended, FeedState, Reader
 from gdp.client.source import Secrets
-from gdp.crypto.envelope import Opener
-from gdp.crypto.note import NoteSealer
+from gdp.crypto.envelope import Opener, seal_key
+from gdp.crypto.note import NoteSealer, note_key
 from gdp.effects import Arrival
 from gdp.errors import DropReason, EnvelopeError, RemoteError
 from gdp.frame.codec import Header
@@ -42,11 +45,13 @@ from gdp.message.move import Move
 from gdp.message.report import Missing, Report, ReportFlag
 from gdp.message.status import Start, Status
 from gdp.names import Name
+from gdp.trust.claim import Claim
 
 __all__ = ["Delivered", "Ended", "Feed", "FeedState", "Reader"]
 
 ANNOUNCE_S: Final = 0.1
 ANNOUNCE_TRIES: Final = 3  # under one epoch, before the next is tried
+SILENT_S: Final = 3.0  # without a message or a status, until a publisher is told again who reads
 _READY_OVERHEAD_BYTES: Final = 256  # what a message that waits for others costs beside its bytes
 _BUNDLE: Final = int(Flag.BUNDLE)
 _LATCHED: Final = int(Flag.LATCHED)
@@ -58,9 +63,13 @@ class Feed:
     """Reads one incarnation of one publisher of a topic.
 
     Args:
+        exchange: the publisher's X25519 key, as its claim names it.
         ended: where an earlier feed of the same ended. A latched topic's last messages come again all the same, as its
             publisher says in a new status, unless this feed resumes that one.
         restarted: this reader read another life of the publisher before: what was published in this one is lost.
+
+    Raises:
+        StatementError: MALFORMED, ``exchange`` is no key.
     """
 
     def __init__(
@@ -70,6 +79,7 @@ class Feed:
         publisher: Name,
         incarnation: int,
         writer: VerifiesDigest,
+        exchange: bytes,
         secrets: Secrets,
         budget: Budget,
         now_s: float,
@@ -87,7 +97,12 @@ class Feed:
         self._described = 0  # by which status
         self._openers: dict[tuple[int, int], Opener] = {}
         self._announced = 0
-        self._note = self._note_sealer(max(secrets))
+        self.exchange = exchange
+        self._shared = reader.notes.shared(exchange)
+        self._epoch = max(secrets)  # of reports
+        self._notes: dict[int, NoteSealer] = {}
+        self._epoch_at = -1  # number of the message that says so
+        self._silent_s = now_s  # since when its publisher is silent, or was last told who reads
         self._data = Joiner(
             publisher, lambda epoch: self._opener(Kind.DATA, epoch), writer, budget, head_bytes=SEQUENCE_BYTES
         )
@@ -108,7 +123,7 @@ class Feed:
         self._unreported_bytes = 0
         self._clean_bytes = 0  # reported since something was last missing
         self.idle_s = REPORT_IDLE_S  # it reports at least so often
-        self.claim = b""  # of the publisher, the newest
+        self.claim: Claim | None = None  # of the publisher, the newest
         self.claim_sequence = 0
         self.losses = Losses()
         self.delivered = 0
@@ -173,24 +188,32 @@ class Feed:
         expiries = [self._status.next_expiry(), self._data.next_expiry()]
         return min([self._report_at_s, *(expiry for expiry in expiries if expiry is not None)])
 
-    def take_report(self, now_s: float) -> bytes | None:
-        """Return the frame of the report that is due, or None."""
+    def take_notes(self, now_s: float) -> list[bytes]:
+        """Return the frames of the report that is due, if one is, and of an introduction where it is wanted."""
         if now_s < self._report_at_s:
-            return None
+            return []
         self._clean_bytes += self._unreported_bytes
         self._unreported_bytes = 0
         if self.state is FeedState.NEW:
             self._report_at_s = now_s + ANNOUNCE_S
-            self._note = self._note_sealer(self._epoch_to_try())
+            epoch = self._epoch = self._epoch_to_try()
             number, sequence = (self._before.number, self._before.sequence) if self._before.resumes else (0, 0)
-            return self._note.seal(Report(ReportFlag.NEW, number, 0, (), sequence).to_wire())
+            hello = Report(ReportFlag.NEW, number, 0, (), sequence)
+            return [*self._introduce(epoch), self._note(epoch).seal(hello.to_wire())]
         missing = self._missing() if self._is_reliable else ()
         if missing:
             self._clean_bytes = 0
         self._report_at_s = now_s + (REPORT_DELAY_S if missing else self.idle_s)
         part = self._data.progress(self._expected)
-        report = Report(ReportFlag.NONE, self._expected, part, missing, self._sequence, self.lost)
-        return self._note.seal(report.to_wire())
+        report = Report(ReportFlag.NONE, self._expected, part, missing, self._sequence, self.lost).to_wire()
+        notes = [self._note(self._epoch).seal(report)]
+        if now_s - self._silent_s >= SILENT_S:
+            self._silent_s = now_s
+            epoch = self._epoch_to_try()
+            notes += self._introduce(epoch)
+            if epoch != self._epoch:
+                notes.append(self._note(epoch).seal(report))
+        return notes
 
     def take_delivered(self) -> list[Delivered]:
         """Return, once, the messages that are ready, in order."""
@@ -205,26 +228,36 @@ class Feed:
         for number in list(self._ready):
             self._take_ready(number)
         self._report_at_s = float("inf")
-        return self._note.seal(Report(ReportFlag.BYE, self._expected, 0, (), self._sequence, self.lost).to_wire())
+        report = Report(ReportFlag.BYE, self._expected, 0, (), self._sequence, self.lost)
+        return self._note(self._epoch).seal(report.to_wire())
 
     def renew(self, secrets: Secrets) -> None:
         """Take the topic's secrets anew; what is sealed under an epoch that is still among them opens as before."""
         self._secrets = secrets
         self._openers.clear()
+        self._notes.clear()
+        if self._epoch not in secrets:
+            self._epoch = max(secrets)
 
-    def _note_sealer(self, epoch: int) -> NoteSealer:
+    def _note(self, epoch: int) -> NoteSealer:
+        """Return what seals reports under an epoch."""
+        sealer = self._notes.get(epoch)
+        if sealer is None:
+            reader = self._reader
+            ends = reader.name, reader.incarnation, self.publisher, self.incarnation
+            key = note_key(self._shared, self._secrets[epoch], Kind.REPORT, *ends, self.topic)
+            sealer = self._notes[epoch] = self._note_sealer(key, epoch, Kind.REPORT)
+        return sealer
+
+    def _introduce(self, epoch: int) -> list[bytes]:
+        """Return the frames that say whose reports these are, for who holds the secret of an epoch."""
         reader = self._reader
-        return NoteSealer(
-            self._secrets[epoch],
-            epoch,
-            Kind.REPORT,
-            reader.name,
-            reader.incarnation,
-            self.publisher,
-            self.topic,
-            self.incarnation,
-            reader.note_numbers,
-        )
+        key = seal_key(self._secrets[epoch], Kind.INTRODUCTION, reader.name, reader.incarnation, self.publisher)
+        return [self._note_sealer(key, epoch, Kind.INTRODUCTION).seal(reader.introduction())]
+
+    def _note_sealer(self, key: bytes, epoch: int, kind: Kind) -> NoteSealer:
+        reader, to = self._reader, (self.publisher, self.topic, self.incarnation)
+        return NoteSealer(key, epoch, kind, reader.name, reader.incarnation, *to, reader.note_numbers)
 
     def _epoch_to_try(self) -> int:
         """Return the epoch to announce under: the newest, and in turn the others, for the publisher may lag behind."""
@@ -259,6 +292,9 @@ class Feed:
             self._unreported_bytes += header.length
             self._plan_report(header, highest, now_s)
         if joined is not None:
+            self._silent_s = now_s
+            if joined.number >= self._epoch_at:
+                self._epoch, self._epoch_at = header.epoch, joined.number
             self._arrange(joined)
         elif joiner.drops[DropReason.MEMORY_FULL] > refused and self.state is FeedState.LIVE and self._ready:
             self._skipped = LossReason.READER_MEMORY
@@ -338,12 +374,14 @@ class Feed:
             self._status.drops[error.reason] += 1
             return
         self._is_reliable = bool(joined.flags & _WAITING)
+        self._silent_s = now_s
+        if joined.number == self._status.window.top:
+            self._epoch = epoch
         if self.state is FeedState.NEW:
             start = status.starts.get(self._reader.name)
             if start is None or start.incarnation != self._reader.incarnation:
                 return
             self.state = FeedState.LIVE
-            self._note = self._note_sealer(epoch)
             self._begin(status, start, is_latched=bool(joined.flags & _LATCHED))
             for number in [n for n in self._ready if not 0 <= n - self._expected < REPLAY_WINDOW_MESSAGES]:
                 self._take_ready(number)

@@ -16,7 +16,8 @@ from typing import Final
 from gdp.client.agenda import Agenda
 from gdp.client.attachment import Attachment
 from gdp.client.feed import Feed, FeedState, Reader
-from gdp.client.private import Life
+from gdp.client.note_keys import NoteKeys
+from gdp.client.private import Life, Party
 from gdp.client.publications import Publications
 from gdp.client.publisher import Publisher
 from gdp.client.readers import CALLS, TOPICS
@@ -26,7 +27,9 @@ from gdp.control.boundary import ErrorBoundary
 from gdp.control.join import Join
 from gdp.control.query import Answer
 from gdp.control.settings import NodeSettings
+from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
 from gdp.crypto.identity import Identity
+from gdp.crypto.introduction import Introduction
 from gdp.crypto.statements import Statement, StatementType
 from gdp.effects import Arrival, Instant, Transmit
 from gdp.errors import DropReason, LocalError, RemoteError, StatementError
@@ -40,6 +43,7 @@ from gdp.trust.right import Right
 from gdp.trust.verifier import ClaimVerifier
 
 _FOR_FEEDS: Final = (int(Kind.DATA), int(Kind.STATUS))
+_NOTES: Final = (int(Kind.REPORT), int(Kind.INTRODUCTION))
 _STALL_S: Final = 2 * HELLO_S  # a member that is not called for longer, though hellos are due, had no time
 
 __all__ = ["Member", "Message", "Topic"]
@@ -51,12 +55,14 @@ class Member:
     def __init__(self, identity: Identity, policy: Policy, settings: NodeSettings) -> None:
         self._identity = identity
         self._verifier = ClaimVerifier(policy)
-        source = Source(identity.name, settings.incarnation, identity.key)
-        self._publications = Publications(source, self._life_of)
+        notes = NoteKeys(ExchangeKey.from_random(settings.random_bytes(EXCHANGE_KEY_BYTES)))
+        source = Source(identity.name, settings.incarnation, identity.key, settings.random_bytes, notes)
+        self._publications = Publications(source, self._party_of)
         self._turns = self._publications.turns
         self._feeds_due = Agenda[Feed]()
         self._reporting: dict[Feed, None] = {}  # whose report may be due
-        reader = Reader(identity.name, settings.incarnation)  # one: its feeds share the numbers of their notes
+        self._introduced = (-1, b"")  # since when, and how
+        reader = Reader(identity.name, settings.incarnation, notes, self._introduction)  # one, for all its feeds
         self._subscriptions = Subscriptions(reader, self._verifier)
         self._messages: list[Message] = []
         self._under_way: tuple[Feed, Subscription] | None = None  # whose next part is expected
@@ -64,7 +70,8 @@ class Member:
         self._awake_s = 0.0  # since when this member has had time
         self.boundary = ErrorBoundary()
         self._drops: Counter[DropReason] = Counter()
-        self.attachment = Attachment(identity, policy, settings)
+        self._source = source
+        self.attachment = Attachment(identity, policy, settings, notes.public)
         self.attachment.claim(identity.subject, Right.ATTACH, (), is_global=True)
 
     @property
@@ -195,7 +202,7 @@ class Member:
 
     def renew(self, topic: Topic) -> None:
         """Take a topic's delegation and secrets anew, for what is published or read of it."""
-        self._publications.renew(topic.name, topic.secrets)
+        self._publications.renew(topic.name, topic.secrets, self._now_s)
         subscription = self._subscriptions.get(topic.name)
         if subscription is not None:
             subscription.topic = topic
@@ -262,8 +269,8 @@ class Member:
             header = decode(arrival.frame)
             if header.kind in _FOR_FEEDS:
                 self._feed(header, arrival.frame, now.mono_s, fed)
-            elif header.kind == Kind.REPORT:
-                self._take_report(header, arrival.frame, now.mono_s)
+            elif header.kind in _NOTES:
+                self._take_note(header, arrival.frame, now.mono_s)
             elif header.kind >= CONTROL_FROM:
                 statement = self.attachment.receive_control(arrival, header, now)
                 if statement is not None:
@@ -303,9 +310,9 @@ class Member:
         self._reporting.clear()
 
     def _report(self, feed: Feed, now_s: float) -> None:
-        report = feed.take_report(now_s)
-        if report is not None:
-            self.attachment.send([report])
+        notes = feed.take_notes(now_s)
+        if notes:
+            self.attachment.send(notes)
         self._feeds_due.touch(feed)
 
     def next_timeout(self) -> float | None:
@@ -386,14 +393,27 @@ class Member:
         if header.parts > 1:
             self._under_way = feed, subscription
 
-    def _take_report(self, header: Header, frame: bytes, now_s: float) -> None:
+    def _take_note(self, header: Header, frame: bytes, now_s: float) -> None:
         if header.destination != self.name:
             raise StatementError(DropReason.NOT_FOR_US)
-        self._publications.take_report(header, frame, now_s)
+        if header.kind == Kind.INTRODUCTION:
+            self._publications.take_introduction(header, frame)
+        else:
+            self._publications.take_report(header, frame, now_s)
+
+    def _introduction(self) -> bytes:
+        """Return what proves whose notes ours are, in this life; made anew when an earlier life proves to be ahead."""
+        started, source = self.attachment.started, self._source
+        if self._introduced[0] != started:
+            wire = Introduction.make(
+                self._identity.subject, self._identity.key, source.incarnation, started, source.notes.public
+            )
+            self._introduced = started, wire
+        return self._introduced[1]
 
     def _take_statement(self, statement: Statement, now: Instant) -> None:
         if statement.type is StatementType.JOIN:
-            self._publications.take_join(Join.from_fields(statement.fields))
+            self._publications.take_join(Join.from_fields(statement.fields), now.mono_s)
         elif statement.type is StatementType.REVOKE:
             self._revoke(statement, now)
         elif statement.type is StatementType.ANSWER:
@@ -402,16 +422,22 @@ class Member:
             self._close(change.ended, goodbye=False)  # they may come back to what waits for them
             self._reporting.update(dict.fromkeys(change.opened))
 
-    def _life_of(self, service: Name, party: bytes) -> Life | None:
-        """Return the life of another party of a service that is heard now."""
+    def _party_of(self, service: Name, party: bytes) -> Party | None:
+        """Return another party of a service that is heard now."""
         subscription = self._subscriptions.get(service)
         feed = None if subscription is None else subscription.feeds.get(party)  # type: ignore[call-overload]
-        return None if feed is None else Life(feed.publisher, feed.incarnation)
+        return None if feed is None else Party(Life(feed.publisher, feed.incarnation), feed.exchange)
 
     def _revoke(self, statement: Statement, now: Instant) -> None:
         """Open nothing more of a publisher whose claim rests on what was taken back."""
-        if self._verifier.revoke(statement.wire, now.unix_s) is not None:
-            self._close(self._subscriptions.recheck(now.unix_s))
+        revocation = self.attachment.take_revocation(statement, now, self._holds)
+        if revocation is not None:
+            self._close(self._subscriptions.recheck(revocation.fingerprint, now.unix_s))
+
+    def _holds(self, issuer_key: bytes) -> bool:
+        """Return whether a certificate of this key is held here: our own delegations', or of whom we hear."""
+        is_own = any(issuer_key == claimed.subject.owner_key for claimed in self.attachment.claims)
+        return is_own or self._subscriptions.has_issuer(issuer_key)
 
     def _close(self, feeds: list[Feed], *, goodbye: bool = True) -> None:
         """Say goodbye to whom these feeds are of, unless told otherwise; a party that goes is told nothing more."""

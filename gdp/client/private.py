@@ -12,6 +12,8 @@ Source: DESIGN section 6 ("answers return by unicast"). It is an ordinary stream
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 from gdp.client.feed import Ended, Feed, FeedState, Reader
@@ -27,7 +29,7 @@ from gdp.message.join import Joined, VerifiesDigest
 from gdp.message.memory import Budget
 from gdp.names import Name
 
-__all__ = ["IDLE_S", "Life", "PrivateFeed", "PrivateStream", "private_incarnation", "private_name"]
+__all__ = ["IDLE_S", "Life", "Party", "PrivateFeed", "PrivateStream", "private_incarnation", "private_name"]
 
 IDLE_S: Final = 60.0  # without a reader and a message, after which a stream is forgotten
 
@@ -37,6 +39,13 @@ class Life(NamedTuple):
 
     name: Name
     incarnation: int
+
+
+class Party(NamedTuple):
+    """A life of a node that is heard, and the X25519 key that its claim names."""
+
+    life: Life
+    exchange: bytes
 
 
 def private_name(service: Name, writer: Life, reader: Life) -> Name:
@@ -54,9 +63,17 @@ class _PrivateSealer(Sealer):
     """Seals under the key of a stream what is addressed to somebody."""
 
     def __init__(
-        self, secret: bytes, epoch: int, kind: int, source: Source, stream: Name, destination: Name, signer: Signer
+        self,
+        secret: bytes,
+        epoch: int,
+        kind: int,
+        source: Source,
+        stream: Name,
+        destination: Name,
+        signer: Signer,
+        random_bytes: Callable[[int], bytes],
     ) -> None:
-        super().__init__(secret, epoch, kind, source.name, source.incarnation, stream, signer)
+        super().__init__(secret, epoch, kind, source.name, source.incarnation, stream, signer, random_bytes)
         self._fixed = (epoch, kind, source.incarnation, destination, source.name)
 
 
@@ -73,7 +90,7 @@ class PrivateStream(Publisher):
         self,
         service: Name,
         writer: Source,
-        reader: Life,
+        party: Party,
         secrets: Secrets,
         *,
         mtu: int | None,
@@ -81,9 +98,10 @@ class PrivateStream(Publisher):
         past: Past,
         now_s: float,
     ) -> None:
-        name = private_name(service, Life(writer.name, writer.incarnation), reader)
-        source = Source(writer.name, private_incarnation(name), writer.signer)
-        self.reader = reader
+        self.reader = party.life
+        name = private_name(service, Life(writer.name, writer.incarnation), self.reader)
+        source = replace(writer, incarnation=private_incarnation(name))
+        self._exchange = party.exchange
         self._touched_s = now_s
         super().__init__(name, source, secrets, b"", reliable=True, urgent=urgent, past=past)
         self.tree_stands(MTU_MIN_BYTES if mtu is None else mtu)
@@ -95,6 +113,7 @@ class PrivateStream(Publisher):
         if name in self._readers:
             return
         if not self._readers.resume(name, now_s):
+            self._readers.know(name, incarnation, 0, self._exchange)
             self._readers.admit(name, incarnation, now_s).sequence = self._first_waiting()
         self._readers[name].behind_s = None
         if self._window.is_suspended(name):
@@ -102,13 +121,22 @@ class PrivateStream(Publisher):
         else:
             self._window.add_reader(name, self._next_number, now_s)
 
+    def receive_report(self, header: Header, frame: bytes, now_s: float) -> bool:
+        """Take the reader's report; a silent one is a reader again by that."""
+        is_taken = super().receive_report(header, frame, now_s)
+        if is_taken:
+            self.touch(now_s)
+        return is_taken
+
     def is_idle(self, now_s: float) -> bool:
         """Return whether it may be forgotten."""
         return not self._readers and now_s - self._touched_s >= IDLE_S
 
     def _sealer(self, kind: Kind) -> Sealer:
         source, secret = self._source, self._secrets[self._epoch]
-        return _PrivateSealer(secret, self._epoch, kind, source, self.topic, self.reader.name, source.signer)
+        return _PrivateSealer(
+            secret, self._epoch, kind, source, self.topic, self.reader.name, source.signer, source.random_bytes
+        )
 
 
 class PrivateFeed(Feed):
@@ -136,7 +164,9 @@ class PrivateFeed(Feed):
         ended: Ended,
     ) -> None:
         writer, incarnation = public.publisher, private_incarnation(name)
-        super().__init__(name, reader, writer, incarnation, verifier, secrets, budget, now_s, ended)
+        super().__init__(
+            name, reader, writer, incarnation, verifier, public.exchange, secrets, budget, now_s, ended
+        )
         self.state = FeedState.LIVE
         self._public = public
         self._early_bytes = 0
@@ -158,6 +188,5 @@ class PrivateFeed(Feed):
             self._early_bytes += len(joined.message)
         super()._hand_out(joined)
 
-    def _take_status(self, joined: Joined, epoch: int, now_s: float) -> None:
-        self._note = self._note_sealer(epoch)  # one that the server has
-        super()._take_status(joined, epoch, now_s)
+    def _introduce(self, _epoch: int) -> list[bytes]:
+        return []  # the writer knows its reader's key by the claim

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import Final
 
 from gdp.client.pasts import Pasts
-from gdp.client.private import IDLE_S, Life, PrivateStream, private_name
+from gdp.client.private import IDLE_S, Life, Party, PrivateStream, private_name
 from gdp.client.publisher import Publisher
 from gdp.client.source import Secrets, Source
 from gdp.errors import DropReason, LocalError
@@ -73,22 +73,28 @@ class PrivateStreams:
         known = self._streams.get(reader.name)
         return stream == (known.topic if known is not None else self._name_of(reader))
 
-    def stream(self, reader: Life, mtu: int | None, now_s: float) -> PrivateStream:
+    def get(self, reader: Life) -> PrivateStream | None:
+        """Return the stream to a life of a reader, or None."""
+        stream = self._streams.get(reader.name)
+        return stream if stream is not None and stream.reader == reader else None
+
+    def stream(self, party: Party, mtu: int | None, now_s: float) -> PrivateStream:
         """Return the stream to a reader, made if it is not there.
 
         Args:
-            reader: one that is heard.
+            party: the reader, one that is heard.
             mtu: smallest on the way to all of them; None where that is not known yet.
 
         Raises:
             LocalError: there are too many, all of them in use.
         """
+        reader = party.life
         stream = self._streams.get(reader.name)
         if stream is None:
             self._make_room()
             past = self._pasts.of(self._name_of(reader))
             stream = self._streams[reader.name] = PrivateStream(
-                self._service, self._writer, reader, self._secrets,
+                self._service, self._writer, party, self._secrets,
                 mtu=mtu, urgent=self._urgent, past=past, now_s=now_s,
             )  # fmt: skip
             stream.published = self._published
@@ -112,11 +118,11 @@ class PrivateStreams:
             for reader in [stream.reader for stream in self if stream.is_idle(now_s)]:
                 self.forget(reader)
 
-    def renew(self, secrets: Secrets) -> None:
+    def renew(self, secrets: Secrets, now_s: float) -> None:
         """Take the service's secrets anew."""
         self._secrets = secrets
         for stream in self:
-            stream.renew(secrets)
+            stream.renew(secrets, now_s)
 
     def close(self) -> None:
         """Say nothing any more."""

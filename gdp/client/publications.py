@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterator
 
 from gdp.client.agenda import Agenda
 from gdp.client.pasts import Pasts
-from gdp.client.private import Life
+from gdp.client.path_mtu import PathMtu
+from gdp.client.private import Life, Party
 from gdp.client.private_streams import PrivateStreams
 from gdp.client.publisher import Publisher
 from gdp.client.readers import TOPICS, Patience
@@ -31,14 +32,15 @@ class Publications:
 
     Args:
         source: the member.
-        heard: returns the life of another party of a service, if that is heard now.
+        heard: returns another party of a service, if that is heard now.
     """
 
-    def __init__(self, source: Source, heard: Callable[[Name, bytes], Life | None]) -> None:
+    def __init__(self, source: Source, heard: Callable[[Name, bytes], Party | None]) -> None:
         self._source = source
         self._heard = heard
         self._publishers: dict[Name, Publisher] = {}
         self._private: dict[Name, PrivateStreams] = {}  # by service
+        self._paths: dict[Name, PathMtu] = {}
         self._pasts = Pasts()
         self._agenda = Agenda[Publisher]()
         self.turns = Turns(self._agenda.touch)
@@ -93,6 +95,7 @@ class Publications:
     def end(self, name: Name) -> bool:
         """Say nothing on a name any more; return whether it was published."""
         publisher, streams = self._publishers.pop(name, None), self._private.pop(name, None)
+        self._paths.pop(name, None)
         if publisher is None:
             return False
         self._pasts.put(name, publisher.past)
@@ -105,11 +108,11 @@ class Publications:
             self._losses += streams.losses
         return True
 
-    def renew(self, name: Name, secrets: Secrets) -> None:
+    def renew(self, name: Name, secrets: Secrets, now_s: float) -> None:
         """Take a name's secrets anew."""
         for each in (self._publishers.get(name), self._private.get(name)):
             if each is not None:
-                each.renew(secrets)
+                each.renew(secrets, now_s)
 
     def tell(self, service: Name, party: Name, message: bytes, now_s: float) -> None:
         """Send a message to one other party of a service alone.
@@ -117,16 +120,27 @@ class Publications:
         Raises:
             LocalError: it is not heard, there are too many, or the message is above the limits.
         """
-        streams, life = self._private.get(service), self._heard(service, party)
-        if streams is None or life is None:
+        streams, heard = self._private.get(service), self._heard(service, party)
+        if streams is None or heard is None:
             raise LocalError(f"{party.short} is not heard on {service.short}")
-        streams.stream(life, self._publishers[service].mtu, now_s).publish(message)
+        streams.stream(heard, self._publishers[service].mtu, now_s).publish(message)
 
     def forget(self, service: Name, party: Life) -> None:
         """Let go of what waits for a party of a service that is gone."""
         streams = self._private.get(service)
         if streams is not None:
             streams.forget(party)
+
+    def take_introduction(self, header: Header, frame: bytes) -> None:
+        """Take a reader's introduction.
+
+        Raises:
+            RemoteError: it is about nothing that is published here.
+        """
+        publisher = self._publishers.get(topic_of(header, frame))  # type: ignore[call-overload]
+        if publisher is None:
+            raise StatementError(DropReason.NOT_FOR_US)
+        publisher.receive_introduction(header, frame)
 
     def take_report(self, header: Header, frame: bytes, now_s: float) -> None:
         """Take a reader's note.
@@ -139,13 +153,17 @@ class Publications:
         publisher.receive_report(header, frame, now_s)
         self.turns.add(publisher)
 
-    def take_join(self, join: Join) -> None:
+    def take_join(self, join: Join, now_s: float) -> None:
         """Learn that a tree stands, and how wide it is."""
         publisher = self._publishers.get(join.topic)
         if publisher is not None and join.publisher == self._source.name and join.lease_s > 0:
+            path = self._paths.setdefault(join.topic, PathMtu())
+            mtu, is_split = path.take(join.mtu, now_s), False
             for each in (publisher, *self._private.get(join.topic, ())):
-                each.tree_stands(join.mtu)
+                is_split |= each.tree_stands(mtu)
                 self.turns.add(each)
+            if is_split:
+                path.count()
 
     def timeout(self, now_s: float) -> None:
         """Do what is due."""
@@ -162,11 +180,14 @@ class Publications:
     def _stream(self, stream: bytes, reader: bytes, now_s: float) -> Publisher:
         """Return the private stream that a note is about."""
         for service, streams in self._private.items():
-            life = self._heard(service, reader)
-            if life is None or not streams.is_about(stream, life):
+            heard = self._heard(service, reader)
+            if heard is None or not streams.is_about(stream, heard.life):
                 continue
+            known = streams.get(heard.life)
+            if known is not None:
+                return known
             try:
-                return streams.stream(life, self._publishers[service].mtu, now_s)
+                return streams.stream(heard, self._publishers[service].mtu, now_s)
             except LocalError as error:
                 raise StatementError(DropReason.QUOTA, "private streams") from error
         raise StatementError(DropReason.NOT_FOR_US)

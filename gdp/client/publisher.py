@@ -12,9 +12,10 @@ kept moves to new numbers; statuses say which (``gdp/message/move.py``). Without
 Each message has a sequence number under its seal, sent or not (``gdp/message/ledger.py``). So a reader that finds a gap
 knows how many messages it lost, and statuses say why.
 
-A reader is known by its notes. One that falls silent is suspended: it holds nothing up, and what it lacks is kept for a
-grace time, as far as there is room. One that stands still, or lags while others are through, holds the window no
-longer: it gets what is sent, and is told to skip what is gone, until after a penance it may hold the window again.
+A reader is known by its introduction, and by notes that nobody else can make. One that falls silent is suspended: it
+holds nothing up, and what it lacks is kept for a grace time, as far as there is room. One that stands still, or lags
+while others are through, holds the window no longer: it gets what is sent, and is told to skip what is gone, until
+after a penance it may hold the window again.
 """
 
 from __future__ import annotations
@@ -30,10 +31,10 @@ from gdp.client.readers import TOPICS, Patience, Readers, Reading
 from gdp.client.source import Secrets, Source
 from gdp.client.statuses import Statuses
 from gdp.crypto.envelope import SIGNATURE_BYTES, Sealed, Sealer, part_room
-from gdp.errors import DropReason, LocalError, RemoteError
+from gdp.errors import DropReason, EnvelopeError, LocalError, RemoteError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Flag, Kind
-from gdp.limits import MTU_MIN_BYTES, SEQUENCE_BYTES, WINDOW_BYTES
+from gdp.limits import EPOCH_GRACE_S, MTU_MIN_BYTES, SEQUENCE_BYTES, WINDOW_BYTES
 from gdp.message.bundle import BUNDLE_BYTES, Gathered, pack
 from gdp.message.ledger import Ledger
 from gdp.message.loss import Losses, LossReason
@@ -46,6 +47,7 @@ __all__ = ["Publisher", "Secrets", "Source"]
 
 _ALL: Final = 1 << 30
 _BUNDLE: Final = int(Flag.BUNDLE)
+_NEVER: Final = float("-inf")
 _SETTLED_S: Final = 0.25  # after the last message of a best-effort topic, readers are told that it was the last
 
 
@@ -89,6 +91,7 @@ class Publisher:
         self._depth = depth
         self._flags = self._flags_now()
         self._epoch = max(secrets)
+        self._former = (self._epoch, b"", _NEVER)  # the epoch before, its secret, and until when readers use it
         self._data = self._sealer(Kind.DATA)
         self._status = self._sealer(Kind.STATUS)
         self._next_number = past.next_number
@@ -164,19 +167,25 @@ class Publisher:
         lost = max((each.lost for each in readings), default=0)
         return min(self._ledger.confirmed(below), max(self.messages - lost, 0))
 
-    def renew(self, secrets: Secrets) -> None:
+    def renew(self, secrets: Secrets, now_s: float) -> None:
         """Take the topic's secrets anew; messages from now on are sealed under the newest epoch.
+
+        Readers are told by a status. For ``EPOCH_GRACE_S`` their notes may still be of the epoch before.
 
         Raises:
             LocalError: none.
         """
         if not secrets:
             raise LocalError("a publisher needs a topic secret")
+        before = self._epoch, self._secrets[self._epoch]
         self._secrets = secrets
         if max(secrets) != self._epoch:
+            self._former = (*before, now_s + EPOCH_GRACE_S)
             self._epoch = max(secrets)
             self._data = self._sealer(Kind.DATA)
             self._status = self._sealer(Kind.STATUS)
+            self._statuses.wanted = True
+            self.published(self)
 
     def describe(self, description: bytes) -> None:
         """Say from now on that messages are something else; who reads already is told at once.
@@ -213,10 +222,14 @@ class Publisher:
         self.published(self)  # the last time: who waits for its frames finds none
         self.published = lambda _: None
 
-    def tree_stands(self, mtu: int) -> None:
-        """Learn that a tree reaches this publisher, and the smallest MTU on it (bytes after the Ethernet header)."""
+    def tree_stands(self, mtu: int) -> bool:
+        """Learn that a tree reaches this publisher, and the smallest MTU on it (bytes after the Ethernet header).
+
+        Returns:
+            whether something has to be sealed anew for it.
+        """
         self.mtu = max(mtu, MTU_MIN_BYTES)
-        self._split_anew(self.mtu)
+        return self._split_anew(self.mtu)
 
     def publish(self, message: bytes) -> int | None:
         """Queue a message; return how many that makes, or None when nobody is there to read it.
@@ -256,14 +269,42 @@ class Publisher:
             self._statuses.wanted = True
             self.published(self)
 
-    def receive_report(self, header: Header, frame: bytes, now_s: float) -> None:
-        """Take a reader's sealed report; what is wrong with it is counted."""
+    def receive_introduction(self, header: Header, frame: bytes) -> None:
+        """Take the sealed introduction of a reader, whose reports open from then on; what is wrong is counted."""
         try:
-            report, is_new = self._readers.open(header, frame, self._secrets, now_s)
+            if header.epoch != self._epoch:
+                raise EnvelopeError(DropReason.UNKNOWN_EPOCH, str(header.epoch))
+            self._readers.introduce(header, frame, self._secrets[self._epoch])
         except RemoteError as error:
             self.drops[error.reason] += 1
-            return
-        name = header.source
+
+    def receive_report(self, header: Header, frame: bytes, now_s: float) -> bool:
+        """Take a reader's sealed report; return whether it is one. What is wrong with it is counted."""
+        is_old = header.epoch != self._epoch
+        try:
+            secret = self._secret_of(header.epoch, now_s)
+            report, is_new = self._readers.open(header, frame, secret, now_s, may_begin=not is_old)
+        except RemoteError as error:
+            self.drops[error.reason] += 1
+            return False
+        self._take_note(header.source, report, is_new=is_new, now_s=now_s)
+        self._statuses.wanted |= is_old  # it has not heard yet of the new epoch
+        return True
+
+    def _secret_of(self, epoch: int, now_s: float) -> bytes:
+        """Return the secret under which notes are taken now.
+
+        Raises:
+            EnvelopeError: UNKNOWN_EPOCH, none are.
+        """
+        if epoch == self._epoch:
+            return self._secrets[epoch]
+        former, secret, until_s = self._former
+        if epoch != former or now_s >= until_s:
+            raise EnvelopeError(DropReason.UNKNOWN_EPOCH, str(epoch))
+        return secret
+
+    def _take_note(self, name: bytes, report: Report, *, is_new: bool, now_s: float) -> None:
         reading, sequence = self._readers[name], min(report.sequence, self._ledger.last + 1)
         if is_new:
             self._let_go(name)
@@ -390,21 +431,22 @@ class Publisher:
             sequence, message = self._early.popleft()
             self._queue(message, sequence)
 
-    def _seal(self, number: int, body: bytes, mtu: int, *, is_bundle: bool) -> Sealed:
+    def _seal(self, number: int, body: bytes | Sealed, mtu: int, *, is_bundle: bool) -> Sealed:
         return self._data.seal(number, self._flags | _BUNDLE * is_bundle, body, mtu)
 
-    def _split_anew(self, mtu: int) -> None:
-        """Seal anew what has become too large for its path."""
-        for body, carried in self._unsent.take_back(mtu):
+    def _split_anew(self, mtu: int) -> bool:
+        """Seal anew what has become too large for its path; return whether there is any."""
+        unsent = self._unsent.take_back(mtu)
+        for body, carried in unsent:
             self._queue(body, carried.sequence, carried.messages)
         kept = [(number, each) for number, each in self._window.kept() if isinstance(each, Sealed)]
         if not any(each.largest > mtu for _, each in kept):
-            return
+            return bool(unsent)
         first, end = kept[0][0], self._next_number
         move = Move(first, end - first, end + 1)
         is_bundle = self._ledger.is_bundle
         moved = [
-            (move.of(number), self._seal(move.of(number), each.message(), mtu, is_bundle=is_bundle(number)))
+            (move.of(number), self._seal(move.of(number), each, mtu, is_bundle=is_bundle(number)))
             for number, each in kept
         ]
         self._ledger.forget(first)
@@ -419,6 +461,7 @@ class Publisher:
             if reader.start is not None:
                 reader.start = reader.start._replace(number=move.of(reader.start.number))
         self._statuses.wanted = True
+        return True
 
     def _follow_moves(self, report: Report) -> Report:
         """Return a report as it would be under the present numbers; a reader that does not know them is told."""
@@ -430,7 +473,9 @@ class Publisher:
 
     def _sealer(self, kind: Kind) -> Sealer:
         source, secret = self._source, self._secrets[self._epoch]
-        return Sealer(secret, self._epoch, kind, source.name, source.incarnation, self.topic, source.signer)
+        return Sealer(
+            secret, self._epoch, kind, source.name, source.incarnation, self.topic, source.signer, source.random_bytes
+        )
 
     def _forget(self, name: bytes) -> None:
         if self._readers.forget(name):

@@ -2,6 +2,8 @@
 
 Place: pure; time comes in as ``now_s`` (monotonic seconds).
 
+A note opens under a key that its reader's introduction leads to, so nobody else moves what a reader has confirmed.
+
 A reader that is silent for ``READER_LEASE_S`` is suspended: it may have moved. It is no reader until it reports again,
 and is forgotten ``READER_GRACE_S`` later.
 """
@@ -13,9 +15,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from gdp.client.source import Secrets, Source
-from gdp.crypto.note import NoteOpener
-from gdp.errors import DropReason, EnvelopeError, FrameError
+from gdp.client.source import Source
+from gdp.crypto.envelope import seal_key
+from gdp.crypto.note import NoteNumbers, NoteOpener, note_key
+from gdp.errors import DropReason, EnvelopeError, FrameError, StatementError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Kind
 from gdp.limits import CALL_IDLE_S, CALL_LAG_S, CALL_QUIET_S, READER_GRACE_S, READER_LEASE_S, REPORT_IDLE_S
@@ -26,7 +29,8 @@ from gdp.names import Name
 __all__ = ["CALLS", "TOPICS", "Patience", "Readers", "Reading"]
 
 READERS_MAX: Final = 1_024
-_LIVES_MAX: Final = 4_096  # incarnations of readers whose old notes are known as such
+_LIVES_MAX: Final = 4_096  # incarnations of readers whose introductions are remembered
+_EPOCHS_KEPT: Final = 2  # the one in use and the one before
 _PENANCE_MIN_LAGS: Final = 2
 _PENANCE_MAX_LAGS: Final = 16
 
@@ -47,17 +51,50 @@ TOPICS: Final = Patience(READER_LEASE_S, READER_LEASE_S, REPORT_IDLE_S)
 CALLS: Final = Patience(CALL_LAG_S, CALL_QUIET_S, CALL_IDLE_S)  # other replicas must not wait for a dead one
 
 
+class _Life:
+    """What opens the notes of one life of a reader, and which of them were opened."""
+
+    def __init__(self, topic: Name, source: Source, incarnation: int, started: int, exchange: bytes) -> None:
+        self.started = started
+        self._topic = topic
+        self._source = source
+        self._incarnation = incarnation
+        self._shared = source.notes.shared(exchange)
+        self._numbers = NoteNumbers()
+        self._openers: dict[bytes, NoteOpener] = {}  # by topic secret
+
+    def open(self, header: Header, frame: bytes, secret: bytes, now_s: float) -> bytes:
+        """Return a note's body.
+
+        Raises:
+            EnvelopeError: REPLAYED, MALFORMED or BAD_TAG.
+        """
+        self._numbers.check(header.number, now_s)
+        opener = self._openers.get(secret)
+        if opener is None:
+            ends = header.source, self._incarnation, self._source.name, self._source.incarnation
+            key = note_key(self._shared, secret, Kind.REPORT, *ends, self._topic)
+            opener = self._openers[secret] = NoteOpener(key, self._topic, self._source.incarnation)
+            if len(self._openers) > _EPOCHS_KEPT:
+                del self._openers[next(iter(self._openers))]
+        body = opener.open(header, frame)
+        self._numbers.take(header.number, now_s)
+        return body
+
+
 @dataclass(slots=True)
 class Reading:
     """One reader, in one life of its process.
 
     Attributes:
+        life: what opens its notes.
         sequence: it has confirmed every message before this one, but for ``lost`` of them that it counted as lost.
         behind_s: since when its window has been suspended; None: it is not.
         confirmed: what ``sequence`` was at the end of a former life; 0: not known.
     """
 
     incarnation: int
+    life: _Life
     heard_s: float
     sequence: int = 0
     lost: int = 0
@@ -77,7 +114,7 @@ class Readers:
         self._patience = patience
         self._readers: dict[bytes, Reading] = {}
         self._suspended: dict[bytes, Reading] = {}
-        self._lives: OrderedDict[tuple[bytes, int, int], NoteOpener] = OrderedDict()
+        self._lives: OrderedDict[tuple[bytes, int], _Life] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self._readers)
@@ -153,45 +190,82 @@ class Readers:
         reading.out_until_s = now_s + lags * self._patience.lag_s
         reading.penances = min(reading.penances + 1, _PENANCE_MAX_LAGS)
 
+    def know(self, name: bytes, incarnation: int, started: int, exchange: bytes) -> None:
+        """Learn the key of one life of a reader, proven by its introduction or claim.
+
+        Raises:
+            StatementError: MALFORMED, it is no key.
+        """
+        life = (name, incarnation)
+        if life not in self._lives:
+            self._lives[life] = _Life(self._topic, self._source, incarnation, started, exchange)
+            if len(self._lives) > _LIVES_MAX:
+                self._lives.popitem(last=False)
+
     def admit(self, name: bytes, incarnation: int, now_s: float) -> Reading:
-        """Take somebody for a reader, in place of a former life of his."""
+        """Take somebody who is known for a reader, in place of a former life of his."""
         former = self._readers.get(name) or self._suspended.pop(name, None)
-        reading = self._readers[name] = Reading(incarnation, now_s, confirmed=former.sequence if former else 0)
+        life, confirmed = self._lives[name, incarnation], former.sequence if former else 0
+        reading = self._readers[name] = Reading(incarnation, life, now_s, confirmed=confirmed)
         return reading
 
     def forget(self, name: bytes) -> bool:
         """Let a reader go, suspended or not; return whether it was one."""
         return (self._readers.pop(name, None) or self._suspended.pop(name, None)) is not None
 
-    def open(self, header: Header, frame: bytes, secrets: Secrets, now_s: float) -> tuple[Report, bool]:
-        """Return what a reader's sealed report says, and whether that reader, or this life of his, is new.
+    def introduce(self, header: Header, frame: bytes, secret: bytes) -> None:
+        """Take the sealed introduction of a reader; of a life that is known nothing is opened.
+
+        Args:
+            secret: topic secret of the epoch in use.
 
         Raises:
-            RemoteError: it does not open, is a replay, or of a life that never began or is over.
+            RemoteError: it does not open, does not hold, or is of an earlier life than the reader's present one.
         """
-        name, life = header.source, (header.source, header.incarnation, header.epoch)
-        opener = self._lives.get(life)
-        is_known = opener is not None
-        if opener is None:
-            secret = secrets.get(header.epoch)
-            if secret is None:
-                raise EnvelopeError(DropReason.UNKNOWN_EPOCH)
-            source, topic = self._source, self._topic
-            opener = NoteOpener(secret, Kind.REPORT, name, header.incarnation, source.name, topic, source.incarnation)
-        report = Report.from_wire(opener.open(header, frame))
-        reading = self._readers.get(name) or self._suspended.get(name)
+        life, source = (header.source, header.incarnation), self._source
+        reading = self._reading_of(header.source)
+        if life in self._lives or (reading is not None and reading.incarnation == header.incarnation):
+            return
+        key = seal_key(secret, Kind.INTRODUCTION, header.source, header.incarnation, source.name)
+        body = NoteOpener(key, self._topic, source.incarnation).open(header, frame)
+        introduction = source.notes.introduced(body, Name(header.source), header.incarnation)
+        if reading is not None and introduction.started <= reading.life.started:
+            raise StatementError(DropReason.STALE, "an introduction of an earlier life")
+        self.know(header.source, header.incarnation, introduction.started, introduction.exchange)
+
+    def open(
+        self, header: Header, frame: bytes, secret: bytes, now_s: float, *, may_begin: bool
+    ) -> tuple[Report, bool]:
+        """Return what a reader's sealed report says, and whether that reader, or this life of his, is new.
+
+        Args:
+            secret: topic secret of the note's epoch.
+            may_begin: whether who is no reader yet may become one.
+
+        Raises:
+            RemoteError: it does not open, is a replay, or of a life that did not introduce itself or is over.
+        """
+        name = header.source
+        reading = self._reading_of(name)
+        is_current = reading is not None and reading.incarnation == header.incarnation
+        life = reading.life if reading is not None and is_current else self._lives.get((name, header.incarnation))
+        if life is None:
+            raise FrameError(DropReason.UNKNOWN_SENDER, "a note of a life that did not introduce itself")
+        report = Report.from_wire(life.open(header, frame, secret, now_s))
+        is_new = ReportFlag.NEW in report.flags
+        if not may_begin and (is_new or not is_current):
+            raise EnvelopeError(DropReason.UNKNOWN_EPOCH, "a new reader under an epoch that is over")
         if name not in self._readers and len(self._readers) >= READERS_MAX:
             raise EnvelopeError(DropReason.QUOTA, "readers")
-        is_current = is_known if reading is None else reading.incarnation == header.incarnation
-        if not is_current and ReportFlag.NEW not in report.flags:
-            raise FrameError(DropReason.UNKNOWN_SENDER, "a report of a life that never began, or is over")
-        self._lives[life] = opener
-        self._lives.move_to_end(life)
-        if len(self._lives) > _LIVES_MAX:
-            self._lives.popitem(last=False)
-        if reading is not None and reading.incarnation == header.incarnation:
+        if reading is not None and is_current:
             reading.heard_s = now_s
             self.resume(name, now_s)
             return report, False
+        if reading is not None and (not is_new or life.started <= reading.life.started):
+            raise FrameError(DropReason.UNKNOWN_SENDER, "a report of a life that never began, or is over")
+        self._lives.move_to_end((name, header.incarnation))
         self.admit(name, header.incarnation, now_s)
         return report, True
+
+    def _reading_of(self, name: bytes) -> Reading | None:
+        return self._readers.get(name) or self._suspended.get(name)

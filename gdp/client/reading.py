@@ -5,12 +5,13 @@ Place: pure.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import Enum
 from itertools import count
 from typing import NamedTuple
 
+from gdp.client.note_keys import NoteKeys
 from gdp.names import Name
 
 __all__ = ["Delivered", "Ended", "FeedState", "Reader"]
@@ -25,10 +26,17 @@ class FeedState(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Reader:
-    """Who reads, in this life of its process: one for all its feeds, since they share its numbers for notes."""
+    """Who reads, in this life of its process: one for all its feeds, since they share its numbers for notes.
+
+    Args:
+        notes: its keys for notes.
+        introduction: returns the wire form of what proves whose keys they are.
+    """
 
     name: Name
     incarnation: int
+    notes: NoteKeys = field(compare=False)
+    introduction: Callable[[], bytes] = field(compare=False)
     note_numbers: Iterator[int] = field(default_factory=lambda: count(1), compare=False)
 
 

@@ -14,7 +14,7 @@ from gdp.control.channel import Channels
 from gdp.control.frames import ControlJoiner
 from gdp.control.settings import NodeSettings
 from gdp.crypto.identity import Identity
-from gdp.crypto.statements import StatementType, parse
+from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.effects import Arrival, Instant, Transmit
 from gdp.errors import DropReason, FrameError, RemoteError
 from gdp.frame.codec import decode
@@ -102,7 +102,7 @@ class RibHost:
         if header.kind >= CONTROL_FROM:
             statement = self.attachment.receive_control(arrival, header, now)
             if statement is not None and statement.type is StatementType.REVOKE:
-                self.rib.revoke(statement.wire, now)
+                self._take_revocation(statement, now)
             return []
         if header.destination != self.name:
             raise FrameError(DropReason.NOT_FOR_US)
@@ -118,6 +118,12 @@ class RibHost:
         if not opened.is_fresh and parse(opened.wire).type is not StatementType.PRESENCE:
             raise FrameError(DropReason.NO_CHANNEL, "a statement that may be a recorded one")
         return [(opened.wire, sender)]
+
+    def _take_revocation(self, statement: Statement, now: Instant) -> None:
+        switch = self.attachment.switch
+        if switch is not None:
+            self.rib.revoke(statement.wire, switch.name, now)
+            self.attachment.greeter.recheck(statement.fields.bytes_("cert"), now)
 
     def _note_connection(self, now: Instant) -> None:
         is_connected = self.attachment.switch is not None

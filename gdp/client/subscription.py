@@ -202,24 +202,32 @@ class Subscriptions:
         is_heard = HEARS[subscription.right] is claim.right
         if not is_heard or claim.name != answer.name or claim.node != answer.advertiser:
             raise StatementError(DropReason.WRONG_NAME, "a claim about something else")
+        self._reader.notes.shared(claim.exchange)  # or it is refused before anything changes
         if feed is not None:
             if claim.sequence <= feed.claim_sequence:
                 return change
             if feed.incarnation == claim.incarnation:
-                feed.claim_sequence, feed.claim = claim.sequence, claim.wire
+                feed.claim_sequence, feed.claim = claim.sequence, claim
                 return change
             feed.finish()
             rest = [Message(answer.name, each, feed.description) for each in feed.take_delivered()]
             change = Change([], self._detach(subscription, claim.node), rest)
         return change._replace(opened=self._open(subscription, claim, now.mono_s))
 
-    def recheck(self, unix_s: float) -> list[Feed]:
-        """Return the feeds that are to be closed, for their party's claim holds no more."""
+    def has_issuer(self, key: bytes) -> bool:
+        """Return whether a claim that is heard rests on a certificate that this key, 33 bytes, issued."""
+        feeds = (feed for subscription in self._by_name.values() for feed in subscription.feeds.values())
+        return any(feed.claim is not None and key in feed.claim.issuers for feed in feeds)
+
+    def recheck(self, fingerprint: bytes, unix_s: float) -> list[Feed]:
+        """Return the feeds that are to be closed, for their party's claim rested on what was revoked."""
         ended: list[Feed] = []
         for subscription in self._by_name.values():
             for feed in list(subscription.feeds.values()):
+                if feed.claim is None or fingerprint not in feed.claim.fingerprints:
+                    continue
                 try:
-                    self._verifier.verify(feed.claim, unix_s)
+                    self._verifier.recheck(feed.claim, unix_s)
                 except StatementError as error:
                     self.drops[error.reason] += 1
                     ended += self._detach(subscription, feed.publisher)
@@ -239,10 +247,10 @@ class Subscriptions:
         else:
             subscription.forget_absent(party, LossReason.PUBLISHER_RESTARTED)
         feed = Feed(
-            topic.name, reader, party, claim.incarnation, claim.member.key, topic.secrets, self._budget, now_s, ended,
-            restarted=life != claim.incarnation,
+            topic.name, reader, party, claim.incarnation, claim.member.key, claim.exchange, topic.secrets, self._budget,
+            now_s, ended, restarted=life != claim.incarnation,
         )  # fmt: skip
-        feed.claim_sequence, feed.claim = claim.sequence, claim.wire
+        feed.claim_sequence, feed.claim = claim.sequence, claim
         subscription.feeds[party] = feed
         if subscription.right is Right.SERVE:
             feed.idle_s = CALL_IDLE_S

@@ -569,12 +569,25 @@ class Greeter:
             port.answer(received_bytes, now_s)
         raise StatementError(DropReason.IN_USE, "an older node with this identity is alive")
 
+    def recheck(self, fingerprint: bytes, now: Instant) -> None:
+        """Have ``expire`` let neighbours go whose membership, of this fingerprint, was revoked."""
+        for port in self.ports.values():
+            for neighbour in port.neighbours.values():
+                member = neighbour.member
+                if member is None or member.fingerprint != fingerprint:
+                    continue
+                try:
+                    self._policy.check_member(member, now.unix_s)
+                except StatementError:
+                    self._next_s = None
+                    neighbour.heard_s = float("-inf")
+
     def let_go(self, neighbour: Neighbour, now_s: float) -> None:
         """Have ``expire`` let a neighbour go, for an older node with its identity is alive."""
         self._next_s = None
         self.rivals.refuse(neighbour.name, neighbour.life, now_s)
         self._tell_rival(neighbour.port, neighbour.nonce, neighbour.name, now_s)
-        neighbour.heard_s = float("-inf")
+        neighbour.let_go_s = now_s
 
     def tell_rivals(self, name: Name, now_s: float) -> None:
         """Tell a neighbour, where it is one, that another node has its identity."""
@@ -646,7 +659,7 @@ class Greeter:
 
     def expire(self, now_s: float) -> list[Change]:
         """Let silent neighbours go; return them. What waits at the sockets must have been taken before."""
-        if now_s > self._due_s + _LATE_S:
+        if float("-inf") < self._due_s < now_s - _LATE_S:  # who is let go is due at once: nobody is late
             self._lateness_s += now_s - self._due_s
             self._slowness.late(now_s - self._due_s, now_s)
         self._due_s, self._next_s = float("inf"), None
@@ -714,6 +727,8 @@ class Greeter:
 
     def _gone_at_s(self, neighbour: Neighbour) -> float:
         """Return when a neighbour is gone if nothing comes of it; the node's own lateness is no silence of theirs."""
+        if neighbour.let_go_s is not None:
+            return neighbour.let_go_s
         late_s = self._lateness_s - neighbour.lateness_s
         session = neighbour.keepalives
         if session is None or not session.is_heard:
@@ -723,7 +738,7 @@ class Greeter:
         return min(neighbour.heard_s + session.detect_s, hellos_end_s) + late_s
 
     def _alive(self, neighbour: Neighbour, heard_s: float) -> None:
-        neighbour.heard_s, neighbour.lateness_s = heard_s, self._lateness_s
+        neighbour.heard_s, neighbour.lateness_s, neighbour.let_go_s = heard_s, self._lateness_s, None
 
     def _session(self) -> tuple[bytes, ExchangeKey]:
         """Return nonce and key of a new session of a port."""

@@ -83,6 +83,7 @@ class Neighbour:
     lateness_s: float = 0.0  # of this node, in all, when the neighbour was last heard
     life: bytes = bytes(LIFE_BYTES)
     proof: tuple[bytes, bytes] | None = None  # of a RIB that is attached here: its membership, its RtCert for us
+    let_go_s: float | None = None  # it goes then, unless it gives a sign of life before: an older node has its identity
     refuses_us: bool = False  # its last hello said that an older node has our identity
     is_proven: bool = False  # its present session has echoed our nonce: it is on this link now
     cookie: bytes = b""  # that it gave us: it verifies strangers' hellos with one only

@@ -13,6 +13,7 @@ from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import StatementType, sign
 from gdp.limits import LEASE_MAX_S
 from gdp.names import Name
+from gdp.trust.revocations import ID_BYTES
 
 __all__ = ["Answer", "Query"]
 
@@ -21,14 +22,20 @@ TRANSIT_MAX: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class Query:
-    """Who advertises ``name``? With ``watch_s`` above zero: and tell me of changes for so long."""
+    """Who advertises ``name``? With ``watch_s`` above zero: and tell me of changes for so long.
+
+    Args:
+        revoked: digest of what the asker knows that the name's owner took back; the RIB sends all where its own
+            differs. None: that does not concern the asker.
+    """
 
     name: Name
     watch_s: float
+    revoked: bytes | None = None
 
     def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:
         """Return the signed statement."""
-        body = {"n": self.name, "w": float(self.watch_s), "c": membership}
+        body = {"n": self.name, "w": float(self.watch_s), "v": self.revoked or b"", "c": membership}
         return sign(StatementType.QUERY, body, signer, key)
 
     @classmethod
@@ -38,7 +45,8 @@ class Query:
         Raises:
             StatementError: MALFORMED.
         """
-        return cls(fields.name("n"), fields.number("w", 0, LEASE_MAX_S))
+        revoked = fields.bytes_("v", ID_BYTES) if "v" in fields and fields["v"] != b"" else None
+        return cls(fields.name("n"), fields.number("w", 0, LEASE_MAX_S), revoked)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""A claim passed on: by the switch that its maker is attached to, or by a RIB to the tier above.
+"""A claim or a revocation passed on: by the switch that its maker is attached to, or by a RIB to the tier above.
 
 Place: pure. A switch speaks for claims of its own domain; a RIB says which domain a claim that it passes up is of.
 """
@@ -20,7 +20,7 @@ __all__ = ["Relay", "relayed"]
 
 @dataclass(frozen=True, slots=True)
 class Relay:
-    """A claim or a withdrawal on its way.
+    """A claim, a withdrawal or a revocation on its way.
 
     Args:
         statement: what is passed on, signed by its maker.

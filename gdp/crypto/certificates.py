@@ -7,17 +7,22 @@ Source: RFC 5280.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import Final
 
 from gdp.crypto.keys import PublicKey
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
-from gdp.crypto.x509_form import DOMAIN_UNIT, Certificate, bad, issuer_common_name, read
+from gdp.crypto.x509_form import DOMAIN_UNIT, Certificate, bad, issuer_common_name, read, to_pem
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
 
 __all__ = ["Membership", "Role", "Root", "Unverified", "issuer_label"]
+
+_SUCCESSIONS_MAX: Final = 8
+_PEM_BEGIN: Final = b"-----BEGIN"
+_PEM_END: Final = b"-----END CERTIFICATE-----\n"
 
 
 class Role(str, Enum):
@@ -42,27 +47,65 @@ class Root:
     key_id: bytes
     distinguished_name: bytes = field(repr=False)  # DER
     wire: bytes = field(repr=False)  # DER
+    predecessors: tuple[Root, ...] = ()  # the oldest first; each ends when its successor says
 
     @property
     def domain(self) -> Name:
-        """Return the domain's id, which is a name like all others."""
+        """Return the domain's id, which is a name like all others: the founder's, whoever succeeded it."""
         return self.subject.name
+
+    @property
+    def lineage(self) -> tuple[Root, ...]:
+        """Return the domain's roots, the founding one first, this one last."""
+        return (*self.predecessors, self)
+
+    @property
+    def signer(self) -> Subject:
+        """Return as whom this root's key signs statements: the domain, or in its place the successor's key."""
+        return Subject(self.subject.digest, self.key.compressed)
 
     @classmethod
     def from_wire(cls, wire: bytes) -> Root:
-        """Read a root in DER or PEM.
+        """Read a root in DER or PEM; in PEM its successors may follow it, each vouched for by the one before.
 
         Raises:
             StatementError: BAD_CERTIFICATE or WRONG_NAME.
         """
-        certificate = read(wire)
-        if (
-            certificate.holder.unit != DOMAIN_UNIT
-            or not certificate.is_authority
-            or certificate.issuer != certificate.distinguished_name
-        ):
-            raise bad("not the root of a trust domain")
+        first, *successors = _blocks(wire)
+        certificate = _root_form(first)
+        if certificate.holder.retires_unix_s is not None:
+            raise bad("the successor of a root, without the root that it succeeds")
         _check_signature(certificate, certificate.holder.key)
+        root = cls._of(certificate)
+        for each in successors:
+            root = root.succeeded_by(each)
+        return root
+
+    def succeeded_by(self, wire: bytes) -> Root:
+        """Return the root that this one vouches for as its successor; this one ends when the successor says.
+
+        Raises:
+            StatementError: BAD_CERTIFICATE or WRONG_NAME: not by this root, or of another domain.
+        """
+        certificate = _root_form(wire)
+        retires_unix_s = certificate.holder.retires_unix_s
+        if retires_unix_s is None or certificate.holder.subject != self.subject:
+            raise bad("not a successor of this domain's root")
+        if len(self.predecessors) >= _SUCCESSIONS_MAX:
+            raise bad(f"more than {_SUCCESSIONS_MAX} successions")
+        if certificate.issuer != self.distinguished_name or certificate.issuer_key_id != self.key_id:
+            raise bad("a successor that another root issued")
+        _check_signature(certificate, self.key)
+        end = min(self.validity.not_after_unix_s, retires_unix_s)
+        retired = replace(self, validity=Validity(self.validity.not_before_unix_s, end), predecessors=())
+        return replace(Root._of(certificate), predecessors=(*self.predecessors, retired))
+
+    def to_pem(self) -> bytes:
+        """Return what ``from_wire`` reads: this root, after those that it succeeded."""
+        return b"".join(to_pem(each.wire) for each in self.lineage)
+
+    @classmethod
+    def _of(cls, certificate: Certificate) -> Root:
         return cls(
             subject=certificate.holder.subject,
             label=certificate.holder.label,
@@ -85,6 +128,7 @@ class Membership:
     key: PublicKey
     validity: Validity
     fingerprint: bytes  # SHA-256 of the signed part: no second signature makes it another
+    issuer_key: bytes  # of the root that signed it, 33 bytes
     wire: bytes = field(repr=False)  # DER
 
     @property
@@ -170,11 +214,9 @@ class Unverified:
         Raises:
             StatementError: WRONG_DOMAIN (another issuer), BAD_CERTIFICATE (the signature) or EXPIRED.
         """
-        if self.certificate.issuer != root.distinguished_name or self.issuer_key_id not in (b"", root.key_id):
-            raise StatementError(DropReason.WRONG_DOMAIN, "not issued by this domain")
-        root.validity.check(unix_s, "domain root")
+        issuer = self._issuer(root)
+        issuer.validity.check(unix_s, "domain root")
         self.validity.check(unix_s, "membership")
-        _check_signature(self.certificate, root.key)
         return Membership(
             subject=self.subject,
             role=self.role,
@@ -183,8 +225,41 @@ class Unverified:
             key=self.key,
             validity=self.validity,
             fingerprint=hashlib.sha256(self.certificate.signed_bytes).digest(),
+            issuer_key=issuer.key.compressed,
             wire=self.wire,
         )
+
+    def _issuer(self, root: Root) -> Root:
+        """Return the root of a domain that signed this, the newest first."""
+        refusal = StatementError(DropReason.WRONG_DOMAIN, "not issued by this domain")
+        for each in reversed(root.lineage):
+            if self.certificate.issuer != each.distinguished_name or self.issuer_key_id not in (b"", each.key_id):
+                continue
+            try:
+                _check_signature(self.certificate, each.key)
+            except StatementError as error:
+                refusal = error
+            else:
+                return each
+        raise refusal
+
+
+def _blocks(wire: bytes) -> list[bytes]:
+    """Return the certificates of a file: one in DER, or each of several in PEM."""
+    if not wire.startswith(_PEM_BEGIN):
+        return [wire]
+    blocks = [part + _PEM_END for part in wire.split(_PEM_END) if part.strip()]
+    if len(blocks) > 1 + _SUCCESSIONS_MAX:
+        raise bad(f"more than {_SUCCESSIONS_MAX} successions")
+    return [block.lstrip() for block in blocks]
+
+
+def _root_form(wire: bytes) -> Certificate:
+    certificate = read(wire)
+    is_own = certificate.issuer == certificate.distinguished_name
+    if certificate.holder.unit != DOMAIN_UNIT or not certificate.is_authority or not is_own:
+        raise bad("not the root of a trust domain")
+    return certificate
 
 
 def _check_signature(certificate: Certificate, key: PublicKey) -> None:

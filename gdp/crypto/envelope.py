@@ -1,29 +1,33 @@
 """Sealing a message into frames, and opening its parts one by one.
 
 Place: pure; no clock, no memory of messages (that is ``gdp/message``).
-Source: DESIGN section 4; NIST SP 800-38D (GCM), RFC 5869 (HKDF), FIPS 186-5 (ECDSA). To the byte: ``frame/spec.md``.
+Source: DESIGN section 4; XAES-256-GCM (C2SP), NIST SP 800-38D (GCM), RFC 5869 (HKDF), FIPS 186-5 (ECDSA). To the byte:
+``frame/spec.md``.
 
 ::
 
-    part 0            part 1                  last part
-    header|c0|tag     header|c1|tag    ...    header|cn|tag|signature
+    part 0                 part 1                       last part
+    header|salt|c0|tag     header|salt|c1|tag    ...    header|salt|cn|tag|signature
 
-Each part is AES-256-GCM under a key that belongs to (topic secret, kind, source, incarnation, destination); the nonce
-is message number || part, the additional data the header without hops left. The signature covers SHA-256 over the
-header fields that all parts share and every payload (ciphertext and tag) in order.
+Each part is XAES-256-GCM under a key that belongs to (topic secret, kind, source, incarnation, destination). Its nonce
+of 24 bytes is salt || 0 (4) || message number || part, the additional data the header without hops left. The salt is
+drawn for each message, because two copies of one process, as two machines resumed from one snapshot, use the same
+numbers. The signature covers SHA-256 over the header fields that all parts share, the salt, each ciphertext and tag.
 """
 
 from __future__ import annotations
 
 import hashlib
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import islice
 from typing import Final, Protocol, overload
 
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.ciphers import Cipher, modes
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+from cryptography.hazmat.primitives.ciphers.algorithms import AES256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from gdp.crypto.heads import Heads
@@ -33,14 +37,32 @@ from gdp.frame.codec import HEADER_BYTES, Header, authenticated, encode
 from gdp.frame.kinds import VERSION, Flag
 from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, PARTS_MAX, SEQUENCE_BYTES
 
-__all__ = ["SIGNATURE_BYTES", "TAG_BYTES", "Opener", "Sealed", "Sealer", "Signer", "digest_of", "part_room", "seal_key"]
+__all__ = [
+    "SALT_BYTES",
+    "SEAL_BYTES",
+    "SIGNATURE_BYTES",
+    "TAG_BYTES",
+    "MessageKeys",
+    "Opener",
+    "Sealed",
+    "Sealer",
+    "Signer",
+    "digest_of",
+    "part_room",
+    "salt_of",
+    "seal_key",
+]
 
 TAG_BYTES: Final = 16
+SALT_BYTES: Final = 8
+SEAL_BYTES: Final = SALT_BYTES + TAG_BYTES  # what a sealed part has beside its ciphertext
 SIGNATURE_BYTES: Final = 64
 SECRET_BYTES: Final = 32
 _NONCE: Final = struct.Struct("!QI")
 _COMMON: Final = struct.Struct("!BBBHQIQ32s32s")
 _LAST: Final = int(Flag.LAST)  # a plain number: an IntFlag's operators cost a microsecond each
+_BODY_AT: Final = HEADER_BYTES + SALT_BYTES
+_KEYS_KEPT: Final = 64  # messages of one source whose parts may come in turns without a new derivation
 
 
 class Signer(Protocol):
@@ -51,7 +73,7 @@ class Signer(Protocol):
 
 
 def seal_key(secret: bytes, kind: int, source: bytes, incarnation: int, destination: bytes) -> bytes:
-    """Return the 32-byte AES key of one source's incarnation towards one destination.
+    """Return the 32-byte key of one source's incarnation towards one destination.
 
     A restarted source has a new incarnation, hence a new key: no nonce can come twice under one key, whatever crashed.
 
@@ -60,22 +82,47 @@ def seal_key(secret: bytes, kind: int, source: bytes, incarnation: int, destinat
     """
     if len(secret) != SECRET_BYTES:
         raise LocalError(f"a topic secret has {SECRET_BYTES} bytes, not {len(secret)}")
-    info = b"gdp-seal-1" + bytes([kind]) + source + incarnation.to_bytes(8, "big") + destination
+    info = b"gdp-seal-2" + bytes([kind]) + source + incarnation.to_bytes(8, "big") + destination
     return HKDF(algorithm=hashes.SHA256(), length=32, salt=None, info=info).derive(secret)
+
+
+class MessageKeys:
+    """The keys of messages, derived from one key of 32 bytes by a message's salt.
+
+    Source: XAES-256-GCM (C2SP, 2024), whose derivation is the CMAC-based KDF in counter mode of NIST SP 800-108r1. A
+    derivation costs about 2 us.
+    """
+
+    def __init__(self, key: bytes) -> None:
+        self._encrypt = Cipher(AES256(key), modes.ECB()).encryptor().update  # single blocks, as CMAC has them
+        zero = int.from_bytes(self._encrypt(bytes(16)), "big")
+        subkey = (zero << 1 & (1 << 128) - 1) ^ (0x87 if zero >> 127 else 0)
+        counters = int.from_bytes(b"\x00\x01X\x00" + bytes(12) + b"\x00\x02X\x00" + bytes(12), "big")
+        self._mask = counters ^ (subkey << 128 | subkey)
+
+    def of(self, salt: bytes) -> AESGCM:
+        """Return the cipher under a salt of up to 12 bytes: the first half of XAES's nonce, filled up with zeros."""
+        first = int.from_bytes(salt, "big") << 8 * (12 - len(salt))
+        return AESGCM(self._encrypt(((first << 128 | first) ^ self._mask).to_bytes(32, "big")))
+
+
+def salt_of(frame: bytes) -> bytes:
+    """Return the salt of a sealed part; not yet authenticated, and shorter where the part is."""
+    return frame[HEADER_BYTES:_BODY_AT]
 
 
 def part_room(mtu: int) -> int:
     """Return the plaintext bytes that one part carries where links take ``mtu`` bytes after the Ethernet header."""
-    room = min(mtu, FRAME_MAX_BYTES) - HEADER_BYTES - TAG_BYTES
+    room = min(mtu, FRAME_MAX_BYTES) - HEADER_BYTES - SEAL_BYTES
     if room <= SIGNATURE_BYTES:
         raise LocalError(f"an MTU of {mtu} bytes carries no sealed part")
     return room
 
 
-def digest_of(header: Header) -> hashlib._Hash:
-    """Return the running SHA-256 of a message, fed with the header fields that all its parts share."""
+def digest_of(header: Header, salt: bytes) -> hashlib._Hash:
+    """Return the running SHA-256 of a message, fed with what all its parts share: header fields and salt."""
     return hashlib.sha256(
-        b"gdp-message-1"
+        b"gdp-message-2"
         + _COMMON.pack(
             VERSION,
             header.kind,
@@ -87,21 +134,36 @@ def digest_of(header: Header) -> hashlib._Hash:
             header.destination,
             header.source,
         )
+        + salt
     )
 
 
 class Sealer:
-    """Seals one kind of message of one source towards one destination, under one epoch's key."""
+    """Seals one kind of message of one source towards one destination, under one epoch's key.
+
+    Args:
+        random_bytes: the system's randomness, asked for each message and never ahead: what was drawn before a machine
+            was copied is no longer random.
+    """
 
     def __init__(
-        self, secret: bytes, epoch: int, kind: int, source: bytes, incarnation: int, destination: bytes, signer: Signer
+        self,
+        secret: bytes,
+        epoch: int,
+        kind: int,
+        source: bytes,
+        incarnation: int,
+        destination: bytes,
+        signer: Signer,
+        random_bytes: Callable[[int], bytes],
     ) -> None:
-        self._aead = AESGCM(seal_key(secret, kind, source, incarnation, destination))
+        self._keys = MessageKeys(seal_key(secret, kind, source, incarnation, destination))
         self._signer = signer
+        self._random_bytes = random_bytes
         self._fixed = (epoch, kind, incarnation, destination, source)
         self._last_number = -1
 
-    def seal(self, number: int, flags: int, message: bytes, mtu: int) -> Sealed:
+    def seal(self, number: int, flags: int, message: bytes | Sealed, mtu: int) -> Sealed:
         """Return a message as its frames, each from the header on and at most ``mtu`` bytes long.
 
         A part is encrypted when its frame is first asked for, so that the first ones may be on their way before the
@@ -110,13 +172,14 @@ class Sealer:
         Args:
             number: message number; above every number this sealer was given before.
             flags: without ``Flag.LAST``.
+            message: one that was sealed before is opened when the first frame is asked for.
 
         Raises:
             LocalError: a number that is not newer (its nonces would come twice), or a message above the limits.
         """
         if number <= self._last_number:
             raise LocalError(f"message number {number} was sealed before")
-        size = len(message)
+        size = message.message_bytes if isinstance(message, Sealed) else len(message)
         room = part_room(mtu)
         parts = -(-(size + SIGNATURE_BYTES) // room)
         if size > MESSAGE_MAX_BYTES + SEQUENCE_BYTES or parts > PARTS_MAX:
@@ -124,22 +187,28 @@ class Sealer:
         self._last_number = number
         epoch, kind, incarnation, destination, source = self._fixed
         header = Header(kind, flags, HOPS_MAX, epoch, 0, number, 0, parts, incarnation, destination, source)
-        return Sealed(self._aead, self._signer, header, message, room)
+        salt = self._random_bytes(SALT_BYTES)
+        return Sealed(self._keys.of(salt), salt, self._signer, header, message, room)
 
 
 class Sealed(Sequence[bytes]):
     """The frames of one message, sealed in order and as far as they have been asked for; always the same bytes."""
 
-    def __init__(self, aead: AESGCM, signer: Signer, header: Header, message: bytes, room: int) -> None:
+    def __init__(
+        self, aead: AESGCM, salt: bytes, signer: Signer, header: Header, message: bytes | Sealed, room: int
+    ) -> None:
         self._aead = aead
+        self._salt = salt
         self._encrypt = aead.encrypt
         self._signer = signer
         self._header = header
-        self._message = memoryview(message)
+        self._origin: Sealed | None = (message._origin or message) if isinstance(message, Sealed) else None
+        self._message = memoryview(message if isinstance(message, bytes) else b"")
+        self.message_bytes: int = message.message_bytes if isinstance(message, Sealed) else len(message)
         self._room = room
-        self._running = digest_of(header)
+        self._running = digest_of(header, salt)
         self._frames: list[bytes] = []
-        self.size_bytes = len(message) + header.parts * (HEADER_BYTES + TAG_BYTES) + SIGNATURE_BYTES
+        self.size_bytes = self.message_bytes + header.parts * (HEADER_BYTES + SEAL_BYTES) + SIGNATURE_BYTES
 
     def __len__(self) -> int:
         return self._header.parts
@@ -160,17 +229,19 @@ class Sealed(Sequence[bytes]):
     @property
     def largest(self) -> int:
         """Return the bytes of the largest frame, sealed or not."""
-        return self.size_bytes if self._header.parts == 1 else self._room + HEADER_BYTES + TAG_BYTES
+        return self.size_bytes if self._header.parts == 1 else self._room + HEADER_BYTES + SEAL_BYTES
 
     def message(self) -> bytes:
         """Return what was sealed, to be sealed anew under another number."""
+        if self._origin is not None:
+            return self._origin.message()
         if len(self._frames) < self._header.parts:
             return bytes(self._message)
         last, number, decrypt = self._header.parts - 1, self._header.number, self._aead.decrypt
         plains = [
             decrypt(
                 _NONCE.pack(number, part),
-                frame[HEADER_BYTES : -SIGNATURE_BYTES if part == last else None],
+                frame[_BODY_AT : -SIGNATURE_BYTES if part == last else None],
                 authenticated(frame),
             )
             for part, frame in enumerate(self._frames)
@@ -178,6 +249,8 @@ class Sealed(Sequence[bytes]):
         return b"".join(plains)
 
     def _seal_until(self, end: int) -> None:
+        if self._origin is not None:
+            self._message, self._origin = memoryview(self._origin.message()), None
         full_end = min(end, self._header.parts - 2)  # the last two may be shorter
         if len(self._frames) < full_end:
             self._seal_full(full_end)
@@ -188,7 +261,7 @@ class Sealed(Sequence[bytes]):
         """Seal the parts before ``end``, all of full length, by the shortest way."""
         first, room, message = len(self._frames), self._room, self._message
         encrypt, update, append = self._encrypt, self._running.update, self._frames.append
-        heads = Heads(self._header._replace(length=room + TAG_BYTES), first, end - first)
+        heads = Heads(self._header._replace(length=room + SEAL_BYTES), first, end - first, self._salt)
         begins = range(first * room, end * room, room)
         for begin, (header,), (additional,), (nonce,) in zip(begins, *heads.each(), strict=True):
             sealed = encrypt(nonce, message[begin : begin + room], additional)
@@ -199,13 +272,13 @@ class Sealed(Sequence[bytes]):
         header, room = self._header, self._room
         plain = self._message[part * room : (part + 1) * room]
         is_last = part == header.parts - 1
-        length = len(plain) + TAG_BYTES + (SIGNATURE_BYTES if is_last else 0)
+        length = len(plain) + SEAL_BYTES + (SIGNATURE_BYTES if is_last else 0)
         kind, flags, hops_left, epoch, _, number, _, parts, incarnation, to, source = header
         flags |= _LAST * is_last
         head = encode(Header(kind, flags, hops_left, epoch, length, number, part, parts, incarnation, to, source))
         sealed = self._encrypt(_NONCE.pack(header.number, part), plain, authenticated(head))
         self._running.update(sealed)
-        frame = head + sealed
+        frame = head + self._salt + sealed
         if is_last:
             frame += self._signer.sign_digest(self._running.digest())
             self._message = self._message[:0]  # the frames hold all of it now
@@ -216,14 +289,15 @@ class Opener:
     """Opens the parts of one kind of message of one source's incarnation, under one epoch's key."""
 
     def __init__(self, secret: bytes, kind: int, source: bytes, incarnation: int, destination: bytes) -> None:
-        self._decrypt = AESGCM(seal_key(secret, kind, source, incarnation, destination)).decrypt
+        self._keys = MessageKeys(seal_key(secret, kind, source, incarnation, destination))
+        self._known: dict[bytes, AESGCM] = {}  # by the salts of messages that parts have opened of
 
     def open_run(
         self, heads: Heads, first: int, length: int, arrivals: Sequence[Arrival], at: int
     ) -> tuple[list[bytes], list[bytes]]:
         """Open the parts from ``first`` on, as far as ``arrivals[at:]`` brings them in order; the shortest way.
 
-        A frame that is not, to the bit, the one that ``heads`` foretell ends the run, as does one that was altered:
+        A frame that does not begin, to the bit, as ``heads`` foretell ends the run, as does one that was altered:
         ``open`` must look at it.
 
         Args:
@@ -234,13 +308,13 @@ class Opener:
         """
         plains: list[bytes] = []
         payloads: list[bytes] = []
-        decrypt, end = self._decrypt, HEADER_BYTES + length
+        decrypt, end = self._aead_of(heads.salt).decrypt, HEADER_BYTES + length
         expected = islice(zip(*heads.each(), strict=True), first - heads.first, None)
         for ((header,), (additional,), (nonce,)), arrival in zip(expected, islice(arrivals, at, None), strict=False):
             frame = arrival.frame
             if not frame.startswith(header):
                 break
-            sealed = frame[HEADER_BYTES:end]
+            sealed = frame[_BODY_AT:end]
             try:
                 plains.append(decrypt(nonce, sealed, additional))
             except InvalidTag:
@@ -249,7 +323,7 @@ class Opener:
         return plains, payloads
 
     def open(self, header: Header, frame: bytes) -> tuple[bytes, bytes, bytes]:
-        """Return plaintext, payload as the signature covers it, and signature (empty but for the last part).
+        """Return plaintext, ciphertext and tag as the signature covers them, and signature (only of the last part).
 
         Args:
             header: of this frame, already decoded.
@@ -263,11 +337,19 @@ class Opener:
         if is_last != bool(header.flags & _LAST):
             raise EnvelopeError(DropReason.BAD_PARTS, "the last part is flagged as such, and no other")
         sealed_end = end - SIGNATURE_BYTES if is_last else end
-        if sealed_end - HEADER_BYTES < TAG_BYTES:
-            raise EnvelopeError(DropReason.TRUNCATED, "shorter than a tag")
-        sealed = frame[HEADER_BYTES:sealed_end]
+        if sealed_end - HEADER_BYTES < SEAL_BYTES:
+            raise EnvelopeError(DropReason.TRUNCATED, "shorter than a salt and a tag")
+        salt, sealed = frame[HEADER_BYTES:_BODY_AT], frame[_BODY_AT:sealed_end]
+        aead = self._aead_of(salt)
         try:
-            plain = self._decrypt(_NONCE.pack(header.number, header.part), sealed, authenticated(frame))
+            plain = aead.decrypt(_NONCE.pack(header.number, header.part), sealed, authenticated(frame))
         except InvalidTag:
             raise EnvelopeError(DropReason.BAD_TAG) from None
+        if header.parts > 1 and salt not in self._known:
+            if len(self._known) >= _KEYS_KEPT:
+                del self._known[next(iter(self._known))]
+            self._known[salt] = aead
         return plain, sealed, frame[sealed_end:end]
+
+    def _aead_of(self, salt: bytes) -> AESGCM:
+        return self._known.get(salt) or self._keys.of(salt)

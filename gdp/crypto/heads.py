@@ -4,9 +4,9 @@ Place: pure.
 Source: ``frame/spec.md``. From part to part nothing but the part's number changes, so a template is repeated and the
 numbers are laid over it, one byte column at a time::
 
-    headers      version kind flags hops | epoch length number PART parts incarnation destination source     96 bytes
-    additional   version kind flags      | the same                                                          95 bytes
-    nonces                                 number PART                                                       12 bytes
+    headers      version kind flags hops | epoch length number PART parts incarnation destination source | salt
+    additional   version kind flags      | the same as far as the source                                 95 bytes
+    nonces                                 number PART                                                   12 bytes
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ __all__ = ["NONCE_BYTES", "Heads"]
 NONCE_BYTES: Final = 12
 _NONCE: Final = struct.Struct("!QI")
 _NONCE_WHOLE: Final = struct.Struct(f"{NONCE_BYTES}s")
-_HEADER: Final = struct.Struct(f"{HEADER_BYTES}s")
 _ADDITIONAL: Final = struct.Struct(f"{AAD_BYTES}s")
 _PART_AT: Final = 16
 _PART_BYTES: Final = 4
@@ -36,17 +35,20 @@ class Heads:
 
     Args:
         header: of any of them; its part does not matter.
+        salt: of the message; it stands behind each header.
 
     Attributes:
-        headers, additional, nonces: side by side, 96, 95 and 12 bytes a part.
+        headers, additional, nonces: side by side, 96 and the salt, 95 and 12 bytes a part.
     """
 
-    __slots__ = ("additional", "count", "first", "headers", "nonces")
+    __slots__ = ("additional", "count", "first", "headers", "nonces", "salt")
 
-    def __init__(self, header: Header, first: int, count: int) -> None:
+    def __init__(self, header: Header, first: int, count: int, salt: bytes = b"") -> None:
         self.first = first
         self.count = count
-        template = encode(header)
+        self.salt = salt
+        template = encode(header) + salt
+        width = len(template)
         headers = bytearray(template * count)
         additional = bytearray(authenticated(template) * count)
         nonces = bytearray(_NONCE.pack(header.number, 0) * count)
@@ -56,7 +58,7 @@ class Heads:
         columns = numbers.tobytes()
         for at in range(_PART_BYTES):
             column = columns[at::_PART_BYTES]
-            headers[_PART_AT + at :: HEADER_BYTES] = column
+            headers[_PART_AT + at :: width] = column
             additional[_PART_AT - 1 + at :: AAD_BYTES] = column
             nonces[_PART_IN_NONCE + at :: NONCE_BYTES] = column
         self.headers = bytes(headers)
@@ -64,6 +66,7 @@ class Heads:
         self.nonces = bytes(nonces)
 
     def each(self) -> tuple[Iterator[tuple[bytes]], Iterator[tuple[bytes]], Iterator[tuple[bytes]]]:
-        """Return header, additional data and nonce of each part, in order, by three iterators."""
-        headers, additional = _HEADER.iter_unpack(self.headers), _ADDITIONAL.iter_unpack(self.additional)
+        """Return header with salt, additional data and nonce of each part, in order, by three iterators."""
+        headers = struct.iter_unpack(f"{HEADER_BYTES + len(self.salt)}s", self.headers)
+        additional = _ADDITIONAL.iter_unpack(self.additional)
         return headers, additional, _NONCE_WHOLE.iter_unpack(self.nonces)

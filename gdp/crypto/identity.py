@@ -41,14 +41,19 @@ class NodeKeys:
     kem: KemPrivateKey
 
     @classmethod
-    def generate(cls, role: Role, label: str, more: Mapping[str, str | int] | None = None) -> NodeKeys:
+    def generate(
+        cls, role: Role, label: str, more: Mapping[str, str | int] | None = None, key: SigningKey | None = None
+    ) -> NodeKeys:
         """Return new keys from the system's randomness; ``more`` is added to the node's metadata.
+
+        Args:
+            key: its signing key, if there is one already, as in a token.
 
         Raises:
             LocalError: metadata of the wrong form, or a library without the KEM.
         """
         digest = node_metadata(role, label, more).digest()
-        return cls(role, label, digest, SigningKey.generate(), KemPrivateKey.generate())
+        return cls(role, label, digest, key or SigningKey.generate(), KemPrivateKey.generate())
 
     @property
     def subject(self) -> Subject:
@@ -75,9 +80,9 @@ class NodeKeys:
         return identity
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Identity:
-    """A node that can prove who it is.
+    """A node that can prove who it is. Its membership and root may be renewed while it runs, its keys and name not.
 
     Raises:
         LocalError: the parts do not belong together.
@@ -93,6 +98,18 @@ class Identity:
             raise LocalError("the membership certificate is for another key")
         if self.member.domain != self.root.domain:
             raise LocalError("the membership certificate is of another domain")
+
+    def renew(self, member: Membership, root: Root) -> None:
+        """Take on a newer membership of the same node, which every statement carries from now on.
+
+        Raises:
+            LocalError: it is another node's, of another domain or role; nothing has changed then.
+        """
+        if (member.subject, member.role, member.domain) != (self.subject, self.role, self.root.domain):
+            raise LocalError("the membership certificate is another node's, or names another role or domain")
+        if root.domain != member.domain:
+            raise LocalError("the root is another domain's")
+        self.member, self.root = member, root
 
     @property
     def membership(self) -> bytes:

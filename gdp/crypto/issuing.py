@@ -7,13 +7,12 @@ read; what ``openssl x509 -req -copy_extensions copy`` issues from such a reques
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from typing import Final
 
 from cryptography import x509
-from cryptography.hazmat.primitives import hashes
-from cryptography.hazmat.primitives.serialization import Encoding
 
 from gdp.crypto.certificates import Membership, Role, Root
 from gdp.crypto.keys import PublicKey, SigningKey
@@ -26,6 +25,7 @@ from gdp.crypto.x509_form import (
     distinguished_name,
     read_request,
 )
+from gdp.crypto.x509_sign import signed_certificate, signed_request
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.metadata import Metadata
 
@@ -60,7 +60,40 @@ class DomainAuthority:
             .add_extension(_key_usage(is_authority=True), critical=True)
             .add_extension(x509.SubjectKeyIdentifier(subject.name[:_KEY_ID_BYTES]), critical=False)
         )
-        return cls(key, Root.from_wire(_signed(builder, key)))
+        return cls(key, Root.from_wire(signed_certificate(builder, key)))
+
+    def succeed(self, key: SigningKey, validity: Validity, retires_unix_s: int) -> DomainAuthority:
+        """Return the domain under another root key, which this one vouches for; the domain keeps its name.
+
+        Args:
+            key: the successor's.
+            validity: of the successor.
+            retires_unix_s: until when what this key signed is believed, by whoever has the successor's root.
+
+        Raises:
+            LocalError: it is the same key.
+        """
+        if key.public == self.root.key:
+            raise LocalError("a successor has another key")
+        name = x509.load_der_x509_certificate(self.root.wire).subject
+        builder = (
+            _builder(name, name, self.root.subject, key.public, validity, retires_unix_s)
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(_key_usage(is_authority=True), critical=True)
+            .add_extension(x509.SubjectKeyIdentifier(_key_id(key.public)), critical=False)
+            .add_extension(x509.AuthorityKeyIdentifier(self.root.key_id, None, None), critical=False)
+        )
+        return DomainAuthority(key, self.root.succeeded_by(signed_certificate(builder, self.key)))
+
+    def renew(self, member: Membership, validity: Validity) -> Membership:
+        """Issue a membership again, with the same key, role and label.
+
+        Raises:
+            LocalError: it is of another domain, it would outlive the root, or the root has run out.
+        """
+        if member.domain != self.root.domain:
+            raise LocalError("a membership of another domain")
+        return self._issue(Holder(member.subject, member.role.value, member.label, member.key), validity)
 
     def admit(self, request: bytes, validity: Validity) -> Membership:
         """Issue the membership that a request asks for.
@@ -93,7 +126,7 @@ class DomainAuthority:
             .add_extension(x509.SubjectKeyIdentifier(holder.subject.name[:_KEY_ID_BYTES]), critical=False)
             .add_extension(key_id, critical=False)
         )
-        return Membership.from_wire(_signed(builder, self.key), self.root, validity.not_before_unix_s)
+        return Membership.from_wire(signed_certificate(builder, self.key), self.root, validity.not_before_unix_s)
 
 
 def request_membership(key: SigningKey, role: Role, label: str, digest: bytes) -> bytes:
@@ -113,11 +146,16 @@ def request_membership(key: SigningKey, role: Role, label: str, digest: bytes) -
         .subject_name(distinguished_name(role.value, label))
         .add_extension(alternative_names(Subject(digest, key.public.compressed)), critical=False)
     )
-    return builder.sign(key.private, hashes.SHA256()).public_bytes(Encoding.PEM)
+    return signed_request(builder, key)
 
 
 def _builder(
-    issuer: x509.Name, holder: x509.Name, subject: Subject, key: PublicKey, validity: Validity
+    issuer: x509.Name,
+    holder: x509.Name,
+    subject: Subject,
+    key: PublicKey,
+    validity: Validity,
+    retires_unix_s: int | None = None,
 ) -> x509.CertificateBuilder:
     return (
         x509.CertificateBuilder()
@@ -127,8 +165,13 @@ def _builder(
         .public_key(key.point)
         .not_valid_before(_moment(validity.not_before_unix_s))
         .not_valid_after(_moment(validity.not_after_unix_s))
-        .add_extension(alternative_names(subject), critical=False)
+        .add_extension(alternative_names(subject, retires_unix_s), critical=False)
     )
+
+
+def _key_id(key: PublicKey) -> bytes:
+    """Return a successor's key id: another than the founder's, which is the domain's name."""
+    return hashlib.sha256(key.compressed).digest()[:_KEY_ID_BYTES]
 
 
 def _moment(unix_s: int) -> datetime:
@@ -136,10 +179,6 @@ def _moment(unix_s: int) -> datetime:
         return datetime.fromtimestamp(unix_s, timezone.utc)
     except (ValueError, OverflowError, OSError) as error:
         raise LocalError(f"no calendar reaches second {unix_s}") from error
-
-
-def _signed(builder: x509.CertificateBuilder, key: SigningKey) -> bytes:
-    return builder.sign(key.private, hashes.SHA256()).public_bytes(Encoding.DER)
 
 
 def _key_usage(*, is_authority: bool) -> x509.KeyUsage:

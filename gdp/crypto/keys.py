@@ -7,6 +7,8 @@ Source: FIPS 186-5; points in the compressed form of SEC 1, section 2.3.3; signa
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Final
@@ -18,10 +20,11 @@ from cryptography.hazmat.primitives.asymmetric.utils import Prehashed, decode_ds
 
 from gdp.errors import DropReason, LocalError, StatementError
 
-__all__ = ["KEY_BYTES", "SIGNATURE_BYTES", "PublicKey", "SigningKey"]
+__all__ = ["KEY_BYTES", "SIGNATURE_BYTES", "WRONG_PASSPHRASE", "PublicKey", "SigningKey", "SoftwareKey", "is_encrypted"]
 
 KEY_BYTES: Final = 33
 SIGNATURE_BYTES: Final = 64
+WRONG_PASSPHRASE: Final = "does not open: a wrong passphrase, or the file was altered"
 _HALF: Final = SIGNATURE_BYTES // 2
 _ECDSA: Final = ec.ECDSA(hashes.SHA256())
 _ECDSA_DIGEST: Final = ec.ECDSA(Prehashed(hashes.SHA256()))
@@ -114,37 +117,88 @@ class PublicKey:
             raise StatementError(DropReason.BAD_SIGNATURE) from error
 
 
+class SigningKey(ABC):
+    """A private key, wherever it lies: in this process (``SoftwareKey``), or in a token that signs by itself.
+
+    Args:
+        public: its other half.
+    """
+
+    __slots__ = ()
+    public: PublicKey
+
+    @staticmethod
+    def generate() -> SoftwareKey:
+        """Return a new key of this process, from the system's randomness."""
+        return SoftwareKey.of(ec.generate_private_key(ec.SECP256R1()))
+
+    @staticmethod
+    def from_pem(pem: bytes, passphrase: bytes | None = None) -> SoftwareKey:
+        """Read a private key in PEM.
+
+        Args:
+            pem: PKCS #8, encrypted or not, or the older form of OpenSSL.
+            passphrase: opens an encrypted one; not looked at where the key is not encrypted.
+
+        Raises:
+            LocalError: not a P-256 private key in PEM, or it does not open with this passphrase.
+        """
+        try:
+            private = _load(pem, passphrase)
+        except (ValueError, UnsupportedAlgorithm) as error:
+            if is_encrypted(pem):
+                raise LocalError(WRONG_PASSPHRASE) from error
+            raise LocalError("not a private key in PEM") from error
+        return _software_key(private)
+
+    @staticmethod
+    def from_der(der: bytes) -> SoftwareKey:
+        """Read a private key in PKCS #8, DER, unencrypted.
+
+        Raises:
+            LocalError: not a P-256 private key.
+        """
+        try:
+            private = serialization.load_der_private_key(der, password=None)
+        except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+            raise LocalError("not a private key in DER") from error
+        return _software_key(private)
+
+    @abstractmethod
+    def sign(self, data: bytes) -> bytes:
+        """Return r || s (64 bytes) over SHA-256 of ``data``."""
+
+    @abstractmethod
+    def sign_digest(self, digest: bytes) -> bytes:
+        """Return r || s (64 bytes) over a SHA-256 digest (32 bytes).
+
+        Raises:
+            LocalError: not 32 bytes.
+        """
+
+    def sign_der(self, data: bytes) -> bytes:
+        """Return the signature over SHA-256 of ``data`` in DER, as X.509 carries it."""
+        return _to_der(self.sign(data))
+
+    @abstractmethod
+    def to_file(self, protect: Callable[[bytes], bytes] | None = None) -> bytes:
+        """Return what a private file holds of this key, in PEM.
+
+        Args:
+            protect: encrypts a PrivateKeyInfo, DER; without it the caller guards the file.
+        """
+
+
 @dataclass(frozen=True, slots=True)
-class SigningKey:
-    """A private key; it never appears in a ``repr``. A signature costs about 25 us."""
+class SoftwareKey(SigningKey):
+    """A private key in this process; it never appears in a ``repr``. A signature costs about 25 us."""
 
     private: ec.EllipticCurvePrivateKey = field(repr=False)
     public: PublicKey
 
     @classmethod
-    def generate(cls) -> SigningKey:
-        """Return a new key from the system's randomness."""
-        return cls._of(ec.generate_private_key(ec.SECP256R1()))
-
-    @classmethod
-    def from_pem(cls, pem: bytes) -> SigningKey:
-        """Read an unencrypted private key in PEM.
-
-        Raises:
-            LocalError: not a P-256 private key in PEM, or one under a password.
-        """
-        try:
-            private = serialization.load_pem_private_key(pem, password=None)
-        except TypeError as error:
-            raise LocalError("a private key under a password is not supported") from error
-        except (ValueError, UnsupportedAlgorithm) as error:
-            raise LocalError("not a private key in PEM") from error
-        if not isinstance(private, ec.EllipticCurvePrivateKey) or not isinstance(private.curve, ec.SECP256R1):
-            raise LocalError("a private key that is not ECDSA P-256")
-        return cls._of(private)
-
-    @classmethod
-    def _of(cls, private: ec.EllipticCurvePrivateKey) -> SigningKey:
+    def of(cls, private: ec.EllipticCurvePrivateKey) -> SoftwareKey:
+        """Take over a library key on P-256."""
         return cls(private, PublicKey.from_point(private.public_key()))
 
     def to_pem(self) -> bytes:
@@ -153,19 +207,38 @@ class SigningKey:
             serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
         )
 
+    def to_file(self, protect: Callable[[bytes], bytes] | None = None) -> bytes:
+        if protect is None:
+            return self.to_pem()
+        form = serialization.Encoding.DER, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        return protect(self.private.private_bytes(*form))
+
     def sign(self, data: bytes) -> bytes:
-        """Return r || s (64 bytes) over SHA-256 of ``data``."""
         return _from_der(self.private.sign(data, _ECDSA))
 
     def sign_digest(self, digest: bytes) -> bytes:
-        """Return r || s (64 bytes) over a SHA-256 digest (32 bytes).
-
-        Raises:
-            LocalError: not 32 bytes.
-        """
         if len(digest) != _HALF:
             raise LocalError("a SHA-256 digest has 32 bytes")
         return _from_der(self.private.sign(digest, _ECDSA_DIGEST))
+
+
+def _software_key(private: object) -> SoftwareKey:
+    if not isinstance(private, ec.EllipticCurvePrivateKey) or not isinstance(private.curve, ec.SECP256R1):
+        raise LocalError("a private key that is not ECDSA P-256")
+    return SoftwareKey.of(private)
+
+
+def is_encrypted(pem: bytes) -> bool:
+    """Return whether a private key in PEM needs a passphrase."""
+    return b"ENCRYPTED" in pem
+
+
+def _load(pem: bytes, passphrase: bytes | None) -> object:
+    if not is_encrypted(pem):
+        return serialization.load_pem_private_key(pem, password=None)
+    if passphrase is None:
+        raise LocalError("is protected by a passphrase, and none was given")
+    return serialization.load_pem_private_key(pem, passphrase)
 
 
 def _to_der(signature: bytes) -> bytes:

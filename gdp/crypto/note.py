@@ -1,10 +1,14 @@
 """A short sealed note from one member of a topic to another, such as a reader's report; not signed.
 
 Place: pure.
-Source: DESIGN section 4. A note proves that its sender holds the topic's secret, no more: what depends on who wrote it
-belongs in a message. Layout: ``header | topic (32) | ciphertext | tag``; the nonce is number || 0; additional data is
-the header without hops left, the topic, and the incarnation of the one it is for, so that a note is worth nothing to a
-later life of the same node.
+Source: DESIGN section 4; AES-256-GCM-SIV (RFC 8452), HKDF (RFC 5869), X25519 (RFC 7748). Layout: ``header | topic (32)
+| ciphertext | tag``; the nonce is number || 0; additional data is the header without hops left, the topic, and the
+incarnation of the one it is for.
+
+The key of a report belongs to one life of each end: it comes from the agreement of their two X25519 keys and from the
+topic's secret. So a note proves which reader wrote it, and that this reader holds the secret of the note's epoch. A
+process that was copied, as by two machines resumed from one snapshot, may use a number twice: under GCM-SIV that tells
+no more than whether two notes are the same.
 """
 
 from __future__ import annotations
@@ -14,21 +18,45 @@ from collections.abc import Iterator
 from typing import Final
 
 from cryptography.exceptions import InvalidTag
-from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.ciphers.aead import AESGCMSIV
+from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
-from gdp.crypto.envelope import TAG_BYTES, seal_key
+from gdp.crypto.envelope import TAG_BYTES
 from gdp.errors import DropReason, EnvelopeError
 from gdp.frame.codec import HEADER_BYTES, Header, authenticated, encode
 from gdp.frame.kinds import Flag
 from gdp.limits import HOPS_MAX
 from gdp.names import NAME_BYTES
 
-__all__ = ["NoteOpener", "NoteSealer", "topic_of"]
+__all__ = ["JUMP_MAX", "NoteNumbers", "NoteOpener", "NoteSealer", "note_key", "topic_of"]
 
 _NONCE: Final = struct.Struct("!QI")
 _INCARNATION: Final = struct.Struct("!Q")
-JUMP_MAX: Final = 1 << 16  # numbers between two notes that one opener sees; a reader's feeds share its numbers
+JUMP_MAX: Final = 4_096  # numbers between two notes that come together; a reader's feeds share its numbers
+_NUMBERS_PER_S: Final = 100_000  # more than one process sends
 _BODY_AT: Final = HEADER_BYTES + NAME_BYTES
+
+
+def note_key(
+    shared: bytes,
+    secret: bytes,
+    kind: int,
+    source: bytes,
+    incarnation: int,
+    destination: bytes,
+    destination_incarnation: int,
+    topic: bytes,
+) -> bytes:
+    """Return the 32-byte key of the notes that one life of a node sends to one life of another about one topic.
+
+    Args:
+        shared: what the X25519 keys of both lives agree on.
+        secret: topic secret of the epoch.
+    """
+    ends = source + _INCARNATION.pack(incarnation) + destination + _INCARNATION.pack(destination_incarnation)
+    info = b"gdp-note-1" + bytes([kind]) + ends + topic
+    return HKDF(algorithm=hashes.SHA256(), length=32, salt=secret, info=info).derive(shared)
 
 
 def topic_of(header: Header, frame: bytes) -> bytes:
@@ -46,13 +74,13 @@ class NoteSealer:
     """Seals notes of one source's incarnation about one topic to one incarnation of a destination.
 
     Args:
-        numbers: rising, from 1 on, and one iterator for all sealers of the source's incarnation: the key does not tell
-            two sealers to one destination apart, so their nonces must.
+        key: 32 bytes.
+        numbers: rising, from 1 on, and one iterator for all sealers of the source's incarnation: some share a key.
     """
 
     def __init__(
         self,
-        secret: bytes,
+        key: bytes,
         epoch: int,
         kind: int,
         source: bytes,
@@ -62,7 +90,7 @@ class NoteSealer:
         destination_incarnation: int,
         numbers: Iterator[int],
     ) -> None:
-        self._aead = AESGCM(seal_key(secret, kind, source, incarnation, destination))
+        self._aead = AESGCMSIV(key)
         self._header = Header(kind, Flag.LAST, HOPS_MAX, epoch, 0, 0, 0, 1, incarnation, destination, source)
         self._topic = topic
         self._context = topic + _INCARNATION.pack(destination_incarnation)
@@ -78,36 +106,43 @@ class NoteSealer:
 
 
 class NoteOpener:
-    """Opens notes of one source's incarnation about one topic; an older note than the last is a replay."""
+    """Opens notes under one key, whatever their numbers; ``NoteNumbers`` says which are news."""
 
-    def __init__(
-        self,
-        secret: bytes,
-        kind: int,
-        source: bytes,
-        incarnation: int,
-        destination: bytes,
-        topic: bytes,
-        destination_incarnation: int,
-    ) -> None:
-        self._aead = AESGCM(seal_key(secret, kind, source, incarnation, destination))
+    def __init__(self, key: bytes, topic: bytes, destination_incarnation: int) -> None:
+        self._aead = AESGCMSIV(key)
         self._context = topic + _INCARNATION.pack(destination_incarnation)
-        self._last = 0
 
     def open(self, header: Header, frame: bytes) -> bytes:
         """Return the note's body.
 
         Raises:
-            EnvelopeError: altered, or not newer than the last.
+            EnvelopeError: BAD_TAG, altered or under another key.
         """
-        if header.number <= self._last:
-            raise EnvelopeError(DropReason.REPLAYED, "note")
-        if self._last and header.number > self._last + JUMP_MAX:
-            raise EnvelopeError(DropReason.MALFORMED, "a note far ahead of its time")
         sealed = frame[_BODY_AT : HEADER_BYTES + header.length]
         try:
-            body = self._aead.decrypt(_NONCE.pack(header.number, 0), sealed, authenticated(frame) + self._context)
-        except InvalidTag:
+            return self._aead.decrypt(_NONCE.pack(header.number, 0), sealed, authenticated(frame) + self._context)
+        except (InvalidTag, ValueError):  # ValueError: shorter than a tag
             raise EnvelopeError(DropReason.BAD_TAG, "note") from None
-        self._last = header.number
-        return body
+
+
+class NoteNumbers:
+    """Which numbers of one source's incarnation are news: those above the last, and not further than time allows."""
+
+    def __init__(self) -> None:
+        self._last = 0
+        self._last_s = 0.0
+
+    def check(self, number: int, now_s: float) -> None:
+        """Return if a note of this number may be opened.
+
+        Raises:
+            EnvelopeError: REPLAYED, not newer than the last; MALFORMED, so far above it that no process counts so fast.
+        """
+        if number <= self._last:
+            raise EnvelopeError(DropReason.REPLAYED, "note")
+        if self._last and number - self._last > JUMP_MAX + max(now_s - self._last_s, 0.0) * _NUMBERS_PER_S:
+            raise EnvelopeError(DropReason.MALFORMED, "a note far ahead of its time")
+
+    def take(self, number: int, now_s: float) -> None:
+        """Note the number of a note that opened."""
+        self._last, self._last_s = number, now_s

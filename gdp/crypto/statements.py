@@ -25,7 +25,7 @@ from gdp.errors import DropReason, LocalError, StatementError
 from gdp.limits import CONTROL_MAX_BYTES
 from gdp.names import NAME_BYTES, Name
 
-__all__ = ["Fields", "Statement", "StatementType", "Value", "parse", "sign"]
+__all__ = ["Fields", "Statement", "StatementType", "Value", "assemble", "parse", "sign"]
 
 
 class StatementType(str, Enum):
@@ -44,6 +44,8 @@ class StatementType(str, Enum):
     GRANT = "grant"  # owner to node: a topic secret, sealed
     RELAY = "relay"  # a claim passed on by a switch or a RIB
     REVOKE = "revoke"
+    REVOKED = "revoked"  # between neighbours: digests of what each trusted domain has revoked
+    LACKING = "lacking"  # ... and which of it the sender has, so that it is sent the rest
     VERDICT = "verdict"
     PRESENCE = "presence"  # RIB to switch and back: is the older of two nodes with one identity still there?
     DIGEST = "digest"  # between RIBs of one domain
@@ -125,13 +127,19 @@ def sign(type_: StatementType, body: Mapping[str, object], signer: Name, key: Si
     """
     if "t" in body:
         raise LocalError("'t' is the statement's type")
-    payload = _byte_string(encode({**body, "t": type_.value}))
+    encoded = encode({**body, "t": type_.value})
+    _check_size(len(encoded))  # before two bytes have to hold it
+    payload = _byte_string(encoded)
     protected = _HEAD[2:] + signer
     signature = key.sign(_SIGNED_HEAD + protected + _NO_EXTERNAL_DATA + payload)
-    wire = _HEAD + signer + _UNPROTECTED + payload + _SIGNATURE_HEAD + signature
-    if len(wire) > CONTROL_MAX_BYTES:
-        raise LocalError(f"a statement of {len(wire)} bytes; at most {CONTROL_MAX_BYTES} are allowed")
+    wire = _wire(signer, payload, signature)
+    _check_size(len(wire))
     return wire
+
+
+def assemble(type_: StatementType, body: Mapping[str, object], signer: Name, signature: bytes) -> bytes:
+    """Return the wire form of a statement whose signature (64 bytes) is known already."""
+    return _wire(signer, _byte_string(encode({**body, "t": type_.value})), signature)
 
 
 def parse(wire: bytes) -> Statement:
@@ -165,6 +173,15 @@ def parse(wire: bytes) -> Statement:
         signed_bytes=_SIGNED_HEAD + wire[2:_PROTECTED_END] + _NO_EXTERNAL_DATA + boxed,
         wire=wire,
     )
+
+
+def _check_size(size: int) -> None:
+    if size > CONTROL_MAX_BYTES:
+        raise LocalError(f"a statement of {size} bytes; at most {CONTROL_MAX_BYTES} are allowed")
+
+
+def _wire(signer: bytes, boxed: bytes, signature: bytes) -> bytes:
+    return _HEAD + signer + _UNPROTECTED + boxed + _SIGNATURE_HEAD + signature
 
 
 def _byte_string(payload: bytes) -> bytes:

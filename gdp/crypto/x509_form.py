@@ -5,13 +5,17 @@ Source: RFC 5280; ECDSA P-256 with SHA-256 throughout. What is ours stands in st
 
     subject   OU = role (switch | rib | proxy; "domain" in a root), CN = the label for people
     SAN       URI gdp:<64 hex, the name>   URI gdp-metadata:<64 hex, digest of the metadata>
+              in a successor's root also   URI gdp-founder:<66 hex, the key that the name is made of>
+                                           URI gdp-retires:<unix second at which the predecessor is trusted no more>
     key ids   the first 20 bytes of the domain's name; another tool may use another method (RFC 7093)
 
 A name is the hash of digest and key, so a certificate whose three do not fit is refused before any signature is tried.
+A domain keeps its name when another root key succeeds the first: its root then names the founder's key.
 """
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -31,9 +35,11 @@ from gdp.names import Name
 __all__ = [
     "CERTIFICATE_MAX_BYTES",
     "DOMAIN_UNIT",
+    "FOUNDER_URI",
     "LABEL_MAX_CHARS",
     "METADATA_URI",
     "NAME_URI",
+    "RETIRES_URI",
     "Certificate",
     "Holder",
     "alternative_names",
@@ -49,9 +55,12 @@ CERTIFICATE_MAX_BYTES: Final = 4_096
 LABEL_MAX_CHARS: Final = 64  # ub-common-name; RFC 5280, appendix A.1
 NAME_URI: Final = "gdp:"
 METADATA_URI: Final = "gdp-metadata:"
+FOUNDER_URI: Final = "gdp-founder:"
+RETIRES_URI: Final = "gdp-retires:"
 DOMAIN_UNIT: Final = "domain"
 
 _T = TypeVar("_T")
+_UNIX_SECOND: Final = re.compile(r"[0-9]{1,12}", re.ASCII)
 _PEM: Final = b"-----"
 
 _UNDERSTOOD: Final = frozenset(
@@ -78,6 +87,7 @@ class Holder:
     unit: str  # role, or "domain"
     label: str
     key: PublicKey
+    retires_unix_s: int | None = None  # of a root that succeeds another: until when that one is trusted
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,14 +164,16 @@ def distinguished_name(unit: str, label: str) -> x509.Name:
     )
 
 
-def alternative_names(subject: Subject) -> x509.SubjectAlternativeName:
-    """Return the two URIs that carry a name and what it is made of."""
-    return x509.SubjectAlternativeName(
-        [
-            x509.UniformResourceIdentifier(NAME_URI + subject.name.to_text()),
-            x509.UniformResourceIdentifier(METADATA_URI + subject.digest.hex()),
-        ]
-    )
+def alternative_names(subject: Subject, retires_unix_s: int | None = None) -> x509.SubjectAlternativeName:
+    """Return the URIs that carry a name and what it is made of.
+
+    Args:
+        retires_unix_s: of a root that succeeds another: until when that one is trusted.
+    """
+    texts = [NAME_URI + subject.name.to_text(), METADATA_URI + subject.digest.hex()]
+    if retires_unix_s is not None:
+        texts += [FOUNDER_URI + subject.owner_key.hex(), f"{RETIRES_URI}{retires_unix_s}"]
+    return x509.SubjectAlternativeName([x509.UniformResourceIdentifier(text) for text in texts])
 
 
 def _strictly(wire: bytes, reader: Callable[[bytes], _T]) -> _T:
@@ -221,12 +233,26 @@ def _holder(distinguished: x509.Name, extensions: x509.Extensions, key: PublicKe
     uris = extensions.get_extension_for_class(x509.SubjectAlternativeName).value.get_values_for_type(
         x509.UniformResourceIdentifier
     )
+    unit = _only(distinguished, NameOID.ORGANIZATIONAL_UNIT_NAME)
+    founder, retires_unix_s = _succession(uris) if unit == DOMAIN_UNIT else (None, None)
     return Holder(
-        subject=Subject.proving(Name(_uri(uris, NAME_URI)), _uri(uris, METADATA_URI), key.compressed),
-        unit=_only(distinguished, NameOID.ORGANIZATIONAL_UNIT_NAME),
+        subject=Subject.proving(Name(_uri(uris, NAME_URI)), _uri(uris, METADATA_URI), founder or key.compressed),
+        unit=unit,
         label=label,
         key=key,
+        retires_unix_s=retires_unix_s,
     )
+
+
+def _succession(uris: list[str]) -> tuple[bytes | None, int | None]:
+    """Return the founder's key and the predecessor's last second from a root that succeeds another."""
+    founders = [uri.removeprefix(FOUNDER_URI) for uri in uris if uri.startswith(FOUNDER_URI)]
+    moments = [uri.removeprefix(RETIRES_URI) for uri in uris if uri.startswith(RETIRES_URI)]
+    if not founders and not moments:
+        return None, None
+    if len(founders) != 1 or len(moments) != 1 or not _UNIX_SECOND.fullmatch(moments[0]):
+        raise bad(f"a successor's root has one {FOUNDER_URI} and one {RETIRES_URI}")
+    return PublicKey.from_compressed(bytes.fromhex(founders[0])).compressed, int(moments[0])
 
 
 def _only(name: x509.Name, oid: ObjectIdentifier) -> str:

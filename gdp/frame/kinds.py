@@ -22,6 +22,7 @@ class Kind(IntEnum):
     DATA = 0x01  # a sealed message part, publisher to readers
     STATUS = 0x02  # sealed: what a publisher still holds, and the topic's description
     REPORT = 0x03  # sealed: what a reader has and lacks, to the publisher
+    INTRODUCTION = 0x04  # sealed: who a reader is and its key for reports, to the publisher
     RIB_REQUEST = 0x10  # a statement to a RIB
     RIB_ANSWER = 0x11  # a statement from a RIB
     RELOCATE = 0x12  # a statement of a node's new switch to its former one
@@ -39,6 +40,7 @@ class Kind(IntEnum):
     REDIRECT = 0x89  # to the neighbour whose frames came here: where the node is now
     WHERE = 0x8A  # to the neighbour whose frame came here, while no RIB answers: where is that node?
     COOKIE = 0x8B  # to whoever said hello: too many do, show this before your signature is verified; no statement
+    REVOKED = 0x8C  # between neighbours: which revocations each keeps, and those that the other lacks
 
 
 class Flag(IntFlag):

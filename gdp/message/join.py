@@ -7,8 +7,8 @@ A part is opened before it is kept, so that nothing injected or altered costs me
 its ciphertext until the hash has reached it.
 
 Whoever holds the topic's secret can make parts that open, though never a message that verifies. So nothing that such
-a part says lasts: a message whose signature is bad is forgotten, not finished; of two counts of parts the later one
-holds; and when there are too many unfinished messages, the one that is needed last gives way.
+a part says lasts: a message whose signature is bad is forgotten, not finished; of two counts of parts, or two
+salts, the later one holds; and when there are too many unfinished messages, the one that is needed last gives way.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from gdp.crypto.envelope import digest_of
+from gdp.crypto.envelope import digest_of, salt_of
 from gdp.crypto.heads import Heads
 from gdp.effects import Arrival
 from gdp.errors import DropReason, EnvelopeError, RemoteError
@@ -79,6 +79,7 @@ class _Hash(Protocol):
 @dataclass(slots=True)
 class _Unfinished:
     parts: int
+    salt: bytes
     epoch: int
     opener: OpensParts
     running: _Hash
@@ -156,7 +157,7 @@ class Joiner:
                 count = min(_AHEAD_PARTS, message.parts - 1 - part)
                 if count <= 0:
                     break
-                heads = message.heads = Heads(message.header, part, count)
+                heads = message.heads = Heads(message.header, part, count, message.salt)
             wanted = min(len(arrivals) - at - taken, heads.count - part + heads.first)
             cost = message.header.length + _PART_OVERHEAD_BYTES
             if message.prepaid_bytes < wanted * cost:
@@ -185,8 +186,9 @@ class Joiner:
         if self.window.is_finished(number):
             self.drops[DropReason.LATE] += 1
             return None
-        message = self._unfinished.get(number)
-        if message is not None and message.parts == header.parts and header.part in message.plain:
+        message, salt = self._unfinished.get(number), salt_of(frame)
+        is_same = message is not None and message.parts == header.parts and message.salt == salt
+        if is_same and message is not None and header.part in message.plain:
             self.drops[DropReason.DUPLICATE] += 1
             return None
         try:
@@ -196,17 +198,19 @@ class Joiner:
             self.drops[error.reason] += 1
             return None
         if header.parts == 1:
-            return self._take_whole(header, plain, sealed, signature)
+            return self._take_whole(header, salt, plain, sealed, signature)
         if message is None and not self._make_room(number):
             self.drops[DropReason.MEMORY_FULL] += 1
             return None
-        if message is None or message.parts != header.parts:
-            message = self._start(header, opener, now_s)
+        if message is None or not is_same:
+            message = self._start(header, salt, opener, now_s)
         return self._keep(message, header, plain, sealed, signature, now_s)
 
-    def _take_whole(self, header: Header, plain: bytes, sealed: bytes, signature: bytes) -> Joined | None:
+    def _take_whole(
+        self, header: Header, salt: bytes, plain: bytes, sealed: bytes, signature: bytes
+    ) -> Joined | None:
         number = header.number
-        running = digest_of(header)
+        running = digest_of(header, salt)
         running.update(sealed)
         if not self._is_signed(signature, running):
             return None
@@ -219,12 +223,12 @@ class Joiner:
         head, message = plain[: self._head_bytes], plain[self._head_bytes :]
         return Joined(number, header.flags & _SHARED_FLAGS, message, 1, max(HOPS_MAX - header.hops_left, 0), head)
 
-    def _start(self, header: Header, opener: OpensParts, now_s: float) -> _Unfinished:
-        """Return a message of which nothing is kept yet; one with another number of parts gives way."""
+    def _start(self, header: Header, salt: bytes, opener: OpensParts, now_s: float) -> _Unfinished:
+        """Return a message of which nothing is kept yet; one with another number of parts, or salt, gives way."""
         if header.number in self._unfinished:
             self.drops[DropReason.BAD_PARTS] += 1
             self._drop(header.number)
-        return _Unfinished(header.parts, header.epoch, opener, digest_of(header), now_s, header)
+        return _Unfinished(header.parts, salt, header.epoch, opener, digest_of(header, salt), now_s, header)
 
     def _keep(
         self, message: _Unfinished, header: Header, plain: bytes, sealed: bytes, signature: bytes, now_s: float

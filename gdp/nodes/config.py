@@ -103,7 +103,10 @@ class SwitchConfig(Section):
     data_plane: DataPlane = "auto"
     table_max: int = Field(default=ENTRIES_DEFAULT, ge=1, le=TABLE_MAX)
     revocations: Directory | None = None
+    state: Directory | None = None
     metrics: Metrics | None = None
+    audit: NewFile | None = None
+    token_folders: Annotated[tuple[Directory, ...], Unique] = ()
     hello_s: float = Field(default=HELLO_S, ge=0.01, le=60.0)
     dead_s: float = Field(default=DEAD_S, ge=0.02, le=600.0)
     lease_s: LeaseSeconds = CLAIM_LEASE_S
@@ -216,8 +219,11 @@ class RibConfig(Section):
     lease_s: LeaseSeconds = CLAIM_LEASE_S
     store: Literal["memory"] | SharedStore = "memory"
     snapshot: NewFile | None = None
+    state: Directory | None = None
     quotas: Quotas = Quotas()
     metrics: Metrics | None = None
+    audit: NewFile | None = None
+    token_folders: Annotated[tuple[Directory, ...], Unique] = ()
     sandbox: bool = True
 
     @model_validator(mode="after")

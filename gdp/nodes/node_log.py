@@ -16,6 +16,7 @@ from gdp.effects import Instant
 from gdp.errors import DropReason
 from gdp.names import Name
 from gdp.ports.plane import MAC_BYTES, Plane
+from gdp.trust.audit import Action
 from gdp.trust.domain import Policy
 
 __all__ = ["LOOK_S", "NodeLog", "OnWait", "no_name"]
@@ -103,7 +104,9 @@ class NodeLog:
             if (port, name) not in self._neighbours:
                 ifname, domain = self._ifname(port), self._domain(each.domain)
                 log.info("neighbour up port=%s role=%s name=%s domain=%s", ifname, each.role.value, name.short, domain)
+                self._policy.audit.note(Action.ACCEPTED, f"neighbour {each.role.value}", who=name.to_text())
         for port, name in self._neighbours - now.keys():
+            self._policy.audit.note(Action.ENDED, "neighbour", who=name.to_text())
             log.info("neighbour lost port=%s name=%s", self._ifname(port), name.short)
         self._neighbours = set(now)
 

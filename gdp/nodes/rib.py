@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import secrets
 from collections.abc import Callable
 
 from gdp.client.rib_host import RibHost
@@ -15,10 +14,13 @@ from gdp.client.waiting import attachment_waits
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.names import Name
+from gdp.nodes.audit import audit_folder, keep_audit
 from gdp.nodes.config import RibConfig
 from gdp.nodes.counts import count_list
-from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
+from gdp.nodes.credentials import Credentials
+from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
+from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rib_upkeep import MemoryUpkeep, Upkeep
 from gdp.nodes.rights import confine_rib
 from gdp.nodes.runtime import Runtime, now
@@ -26,6 +28,7 @@ from gdp.nodes.single_instance import run_alone
 from gdp.nodes.uplink import open_uplink
 from gdp.ports.plane import Plane
 from gdp.rib.machine import Rib, RibSettings
+from gdp.stores.audit_log import AuditLog
 from gdp.telemetry.sources import Sources
 from gdp.trust.domain import Policy
 
@@ -49,11 +52,15 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
     settings = RibSettings(
         config.upper, config.peers, config.allow_unowned, quotas.names_per_sender, quotas.watches, quotas.lease_max_s
     )
-    attachment = NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes, lease_s=config.lease_s)
+    attachment = NodeSettings(incarnation(), wall_clock_ms(), fresh_bytes, lease_s=config.lease_s)
     with contextlib.ExitStack() as stack:
         stack.enter_context(run_alone("RIB", identity.name))
+        folder = audit_folder(config.audit)
         if config.sandbox:
+            if folder is not None:
+                AuditLog(folder)  # makes it
             confine_rib(config)  # before the thread that keeps copies; the device can still be opened
+        revocations = load_revocations(config.state, policy.revoked, stack)
         upkeep = _upkeep(config, policy)
         stack.callback(upkeep.close)
         rib = Rib(identity, policy, upkeep.store, settings)
@@ -62,6 +69,8 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
         plane = stack.enter_context(open_uplink(config.iface))
         runtime = Runtime(host, plane)
         runtime.every(upkeep.every_s, upkeep.work)
+        revocations.start(runtime)
+        keep_audit(config.audit, policy.audit, host.drops, runtime, stack)
         node_log = NodeLog(
             host.attachment.greeter,
             policy,
@@ -71,7 +80,9 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
             on_wait=on_wait,
         )
         runtime.every(LOOK_S, node_log.look)
-        stack.enter_context(runtime.signals())
+        credentials = Credentials(config.identity, config.domain, identity, policy)
+        runtime.every(LOOK_S, credentials.look)
+        stack.enter_context(runtime.signals(lambda: credentials.look(now())))
         for source in upkeep.sources():
             runtime.watch(source, lambda: upkeep.work(now()))
         if config.metrics is not None:

@@ -2,9 +2,9 @@
 
 Place: shell. A switch goes on to open ports that come back and to take its veth pairs down (CAP_NET_RAW,
 CAP_NET_ADMIN), and by the kernel data plane to load and attach its program there (CAP_BPF, CAP_PERFMON). A RIB or proxy
-opens its device again when it comes back. A node reads again, on SIGHUP, what the operator put into folders; where
-another user owns these, as in a shell of sudo, the capability to read or write past the owner is kept, and Landlock
-bounds it.
+opens its device again when it comes back. A node reads again what the operator put into folders: on SIGHUP, or when its
+certificates are replaced. Where another user owns these, as in a shell of sudo, the capability to read or write past
+the owner is kept, and Landlock bounds it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
+from gdp.nodes.audit import audit_folder
 from gdp.nodes.config import ClusterConfig, RibConfig, SwitchConfig
+from gdp.nodes.credentials import watched_folders
 from gdp.nodes.single_instance import lock_directory
 from gdp.ports.sandbox import Capability, Needs, confine
 
@@ -40,13 +42,16 @@ def confine_switch(config: SwitchConfig, plane: str) -> None:
     Args:
         plane: the name of its data plane.
     """
-    revocations = () if config.revocations is None else (config.revocations,)
+    again = watched_folders(config.identity, config.domain)
+    again += () if config.revocations is None else (config.revocations,)
+    state = () if config.state is None else (config.state,)
+    kept = (*state, *_audits(config.audit), *config.token_folders)
     is_kernel = plane == "kernel"
     _confine(
         Needs(
-            _DEVICE | (_PROGRAMS if is_kernel else frozenset()) | _past_owners(reads=revocations),
-            (*_CHANGED, lock_directory()),
-            (*_code(), *revocations),
+            _DEVICE | (_PROGRAMS if is_kernel else frozenset()) | _past_owners(again, kept),
+            (*_CHANGED, lock_directory(), *kept),
+            (*_code(), *again),
             () if config.metrics is None else (config.metrics.port,),
             spared_calls=frozenset({"bpf"} if is_kernel else ()),
         )
@@ -56,14 +61,17 @@ def confine_switch(config: SwitchConfig, plane: str) -> None:
 def confine_rib(config: RibConfig) -> None:
     """Give away what a RIB does not need."""
     is_shared = config.store != "memory"
+    again = watched_folders(config.identity, config.domain)
     secrets = () if config.store == "memory" else _files_of(config.store.cluster)
-    snapshots = () if config.snapshot is None else (config.snapshot.parent,)
+    folders = (None if config.snapshot is None else config.snapshot.parent, config.state)
+    snapshots = tuple(folder for folder in folders if folder is not None)
+    kept = (*snapshots, *_audits(config.audit), *config.token_folders)
     ports = () if config.metrics is None else (config.metrics.port,)
     _confine(
         Needs(
-            _DEVICE | _past_owners(secrets, snapshots),
-            (*_CHANGED, lock_directory(), *snapshots),
-            None if is_shared else _code(),
+            _DEVICE | _past_owners((*again, *secrets), kept),
+            (*_CHANGED, lock_directory(), *kept),
+            None if is_shared else (*_code(), *again),
             None if is_shared else ports,
         )
     )
@@ -74,13 +82,13 @@ def confine_proxy(reads: Iterable[Path], writes: Iterable[Path], *, has_ros: boo
 
     Args:
         reads: what it reads again on SIGHUP.
-        writes: folders of its recording.
+        writes: folders of its recording and of its state.
         has_ros: whether it takes part in a graph. ROS middleware writes logs and shared memory, which it shares with
             nodes of other users: CAP_DAC_OVERRIDE is kept for that.
     """
-    recordings = tuple(writes)
-    changed = [*_CHANGED, lock_directory(), Path(tempfile.gettempdir()), *recordings]
-    kept = _DEVICE | _past_owners(reads, recordings)
+    written = tuple(writes)
+    changed = [*_CHANGED, lock_directory(), Path(tempfile.gettempdir()), *written]
+    kept = _DEVICE | _past_owners(reads, written)
     if has_ros:
         changed += _ros_folders()
         kept |= {Capability.DAC_OVERRIDE}
@@ -100,6 +108,11 @@ def _past_owners(reads: Iterable[Path] = (), writes: Iterable[Path] = ()) -> fro
         if any(_is_foreign(path) and not path.stat().st_mode & _WRITABLE_BY_ALL for path in writes):
             kept.add(Capability.DAC_OVERRIDE)
     return frozenset(kept)
+
+
+def _audits(configured: Path | None) -> tuple[Path, ...]:
+    folder = audit_folder(configured)
+    return () if folder is None else (folder,)
 
 
 def _files_of(store: ClusterConfig) -> tuple[Path, ...]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import secrets
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
@@ -15,12 +14,15 @@ from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError, StatementError
 from gdp.names import Name
+from gdp.nodes.audit import keep_audit
 from gdp.nodes.config import SwitchConfig
 from gdp.nodes.counts import count_list
+from gdp.nodes.credentials import Credentials
 from gdp.nodes.data_plane import Chosen, choose_plane
-from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
+from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.pairs import attach_pairs, switch_end
+from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rights import confine_switch
 from gdp.nodes.runtime import Runtime, now
 from gdp.nodes.single_instance import own_devices, run_alone
@@ -61,7 +63,7 @@ def run_switch(
     settings = NodeSettings(
         incarnation(),
         wall_clock_ms(),
-        secrets.token_bytes,
+        fresh_bytes,
         config.hello_s,
         config.dead_s,
         config.lease_s,
@@ -71,6 +73,7 @@ def run_switch(
     switch = Switch(identity, policy, table, settings)
     with contextlib.ExitStack() as stack:
         stack.enter_context(run_alone("switch", identity.name))
+        revocations = load_revocations(config.state, policy.revoked, stack)
         stack.enter_context(own_devices(ifaces))
         stack.enter_context(attach_pairs(config.attach, identity.name, _widest(ifaces)))
         wanted = [port.iface for port in config.ports if not port.optional]
@@ -98,10 +101,19 @@ def run_switch(
         )
         runtime.every(LOOK_S, node_log.look)
         runtime.every(LOOK_S, lambda _: _end_if_displaced(switch))
-        stack.enter_context(runtime.signals(lambda: _revoke(switch, config.revocations)))
+        credentials = Credentials(config.identity, config.domain, identity, policy)
+        runtime.every(LOOK_S, credentials.look)
+
+        def reload() -> None:
+            credentials.look(now())
+            _revoke(switch, config.revocations)
+
+        stack.enter_context(runtime.signals(reload))
         _revoke(switch, config.revocations)
+        keep_audit(config.audit, policy.audit, switch.drops, runtime, stack)
         if config.sandbox:
             confine_switch(config, chosen.name)
+        revocations.start(runtime)
         if config.metrics is not None:
             from gdp.telemetry.metrics import Metrics
 

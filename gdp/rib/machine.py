@@ -40,10 +40,13 @@ from gdp.names import Name
 from gdp.rib.above import Above
 from gdp.rib.digest_tree import DigestTree
 from gdp.rib.replication import Message, Replication
+from gdp.rib.revocations import RibRevocations
 from gdp.rib.route import Route, Withdrawn
 from gdp.rib.store import Store
 from gdp.rib.upstream import PROBE_S, Passed, Upstream
 from gdp.rib.watches import Asker, Watches
+from gdp.trust.adcert import AdCert
+from gdp.trust.audit import Action
 from gdp.trust.claim import Claim, ClaimBody
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
@@ -53,6 +56,7 @@ __all__ = ["Letter", "Rib", "RibSettings"]
 
 _ADVISED_S: Final = 30.0  # who was answered is told of a move for so long
 _UNTOLD_S: Final = 1.0  # ... where there are too many for that
+_NAMES_OF_ISSUER_MAX: Final = 256  # whose watchers are told of what somebody revoked who is not their owner
 _DOUBT_S: Final = 0.1  # a RIB above that said nothing for so long is asked for a sign of life beside a question
 _PEER_MESSAGES: Final[dict[StatementType, type[Message]]] = {
     StatementType.DIGEST: Digest,
@@ -93,11 +97,15 @@ class Rib:
 
     def __init__(self, identity: Identity, policy: Policy, store: Store, settings: RibSettings) -> None:
         self._identity = identity
+        self._audit = policy.audit
         self._policy = policy
         self._store = store
         self._settings = settings
         self._verifier = ClaimVerifier(policy, allow_unowned=settings.allow_unowned)
         self._watches = Watches(settings.watches)
+        self._revocations = RibRevocations(
+            self._verifier, store, lambda name: bool(self._watches.watchers(name, self._now_s))
+        )
         self._holders = Watches(settings.watches)  # who was answered, for the lease of the answer
         self._above = Above(is_top=not settings.upper)
         self._upstream = Upstream(settings.upper)
@@ -184,24 +192,21 @@ class Rib:
                 self.refusals[error.reason] += 1
         return self.names - before
 
-    def revoke(self, wire: bytes, now: Instant) -> None:
-        """Take a certificate back: what rests on it is gone, and whoever watched is told.
+    def revoke(self, wire: bytes, giver: Name, now: Instant) -> None:
+        """Take a certificate back: what rests on it is gone, and whomever it concerns is told.
 
         What does not hold is counted.
+
+        Args:
+            giver: the neighbour that it came over.
         """
+        self._now_s = now.mono_s
         try:
-            revocation = self._verifier.revoke(wire, now.unix_s)
+            self._take_revocation(parse(wire), giver, now)
         except RemoteError as error:
             self.refusals[error.reason] += 1
-            return
-        if revocation is None:
-            return
-        for route in self._store.resting_on(revocation.fingerprint):
-            try:
-                self._verifier.verify(route.claim, now.unix_s)
-            except StatementError:
-                self._store.withdraw(route.name, route.advertiser)
-                self._tell_gone(route, now.mono_s)
+        except StoreError:
+            self.refusals[DropReason.UNAVAILABLE] += 1
 
     def timeout(self, now: Instant) -> None:
         """Let expired routes go and tell who watched them; ask above again what is open."""
@@ -247,6 +252,9 @@ class Rib:
             raise StatementError(DropReason.WRONG_DOMAIN, "relays are switches or RIBs")
         statement.verify(member.key)
         passed_on = parse(relay.statement)
+        if passed_on.type is StatementType.REVOKE:
+            self._take_revocation(passed_on, member.name, now)
+            return
         if passed_on.type is StatementType.WITHDRAW:
             self._take_withdrawal(passed_on, member, now)
             return
@@ -274,6 +282,8 @@ class Rib:
             route = replace(route, domain=relay.domain)
         self._store.put(route)
         self.accepted += 1
+        if not isinstance(known, Route):
+            self._audit.note(Action.ACCEPTED, "name", who=route.advertiser.to_text(), about=route.name.to_text())
         self._judge(route.name, route.advertiser, None, route.sequence, member.name)
         self._tell(route, known, now.mono_s)
         self._replicate(route.name, route.advertiser)
@@ -384,7 +394,11 @@ class Rib:
             name = ClaimBody.from_statement(passed_on).subject.name
         except StatementError:
             return  # not even a claim: nothing to name in an answer; the caller counts it
+        who, reason = passed_on.signer.to_text(), error.reason.label
+        self._audit.note(Action.REFUSED, "name", who=who, about=name.to_text(), reason=reason)
         known = self._store.get(name, passed_on.signer)
+        if error.reason is DropReason.REVOKED:
+            self._send_revocations(self._revocations.behind(_revocable(passed_on)), [member.name])
         self._judge(name, passed_on.signer, error.reason, 0 if known is None else known.sequence, member.name)
         has_moved = error.reason is DropReason.STALE and isinstance(known, Route) and known.sender != member.name
         if has_moved and isinstance(known, Route) and self._may_tell(known, _asker(member)):
@@ -411,6 +425,9 @@ class Rib:
         asker = _asker(member)
         if query.watch_s > 0:
             self._watch(query, asker, now.mono_s)
+        if query.revoked is not None:
+            lacked = self._revocations.lacked_by(member.name, query.name, query.revoked, now.mono_s)
+            self._send_revocations(lacked, [member.name])
         routes = [route for route in self._store.routes(query.name) if self._may_tell(route, asker)]
         for route in routes:
             self._answer(route, asker, now.mono_s)
@@ -517,7 +534,7 @@ class Rib:
         upper = self._upstream.rib
         assert upper is not None
         assert name is not None
-        query = Query(name, watch_s)
+        query = Query(name, watch_s, self._policy.revoked.digest_about(name) if watch_s > 0 else None)
         wire = query.to_wire(self._identity.name, self._identity.key, self._identity.membership)
         self._letters.append(Letter(upper, Kind.RIB_REQUEST, wire))
 
@@ -590,6 +607,71 @@ class Rib:
         if isinstance(known, Route) and not known.is_from_above:
             self._replicate(route.name, route.advertiser)  # a peer holds the old place
         self._tell(route, known, now.mono_s, self._above.answered(answer.name, now.mono_s))
+
+    # -- revocations
+
+    def _take_revocation(self, statement: Statement, giver: Name, now: Instant) -> None:
+        """Take a revocation that a neighbour or a relay brought.
+
+        Raises:
+            StatementError: it does not hold, concerns nothing here, or there is no room for it.
+            StoreError: a shared store did not answer.
+        """
+        try:
+            revocation = self._revocations.take(statement, giver, now)
+        except StatementError as error:
+            if error.reason is DropReason.UNCONCERNED:
+                self._pass_revocation_up(statement, giver, now)
+            raise
+        if revocation is None:
+            self._pass_revocation_up(statement, giver, now)  # it is repeated for those that did not know it
+            return
+        who, about = revocation.issuer.name.to_text(), revocation.fingerprint.hex()
+        self._audit.note(Action.REVOKED, "certificate", who=who, about=about)
+        told: dict[Asker, None] = {}
+        closed = self._revocations.closed(revocation, now)
+        if not self._policy.revoked.is_root(revocation.issuer.owner_key):  # switches carry those of roots everywhere
+            for name in dict.fromkeys((revocation.issuer.name, *(route.name for route in closed))):
+                told |= self._concerned_by(name, now.mono_s)
+            if not told:  # it signs in its own name: an owner's successor, or a delegate
+                others = self._store.resting_on(revocation.issuer.owner_key)
+                for name in list(dict.fromkeys(route.name for route in others))[:_NAMES_OF_ISSUER_MAX]:
+                    told |= self._concerned_by(name, now.mono_s)
+            ribs = self._above_and_beside(giver)
+            self._send_revocations([statement.wire], ribs, Kind.RIB_REQUEST)
+            self._send_revocations([statement.wire], [each.name for each in told if each.name not in (giver, *ribs)])
+        for route in closed:
+            self._store.withdraw(route.name, route.advertiser)
+            self._tell_gone(route, now.mono_s)
+
+    def _pass_revocation_up(self, statement: Statement, sender: Name, now: Instant) -> None:
+        """Send a revocation that changes nothing here to the tier above, where it may."""
+        upper = self._upstream.rib
+        is_root = self._policy.revoked.is_root(statement.fields.bytes_("owner"))
+        if upper is None or is_root or self._upstream.has(sender) or sender in self._settings.peers:
+            return
+        if self._revocations.may_pass_up(statement, sender, now):
+            self._send_revocations([statement.wire], [upper], Kind.RIB_REQUEST)
+
+    def _concerned_by(self, name: Name, now_s: float) -> dict[Asker, None]:
+        """Return who brought, holds or watches a name."""
+        told = dict.fromkeys((*self._watches.watchers(name, now_s), *self._holders.watchers(name, now_s)))
+        for route in self._store.routes(name):
+            told |= self._bringer(route)
+        return told
+
+    def _above_and_beside(self, giver: Name) -> list[Name]:
+        """Return the RIBs that a revocation goes to, whatever they asked for: the tier above, and peers."""
+        if self._upstream.has(giver):
+            return list(self._settings.peers)
+        above = [] if self._upstream.rib is None else [self._upstream.rib]
+        return above if giver in self._settings.peers else [*above, *self._settings.peers]
+
+    def _send_revocations(self, wires: Iterable[bytes], to: Iterable[Name], kind: Kind = Kind.RIB_ANSWER) -> None:
+        names = list(to)
+        for wire in wires if names else ():
+            relay = Relay(wire, (), self._identity.membership).to_wire(self._identity.name, self._identity.key)
+            self._letters += [Letter(name, kind, relay) for name in names]
 
     # -- other RIBs of the domain
 
@@ -716,6 +798,17 @@ def _name_in(wire: bytes) -> Name | None:
         return statement.fields.name("name" if statement.type is StatementType.ADVERTISE else "n")
     except StatementError:
         return None
+
+
+def _revocable(statement: Statement) -> list[tuple[bytes, bytes]]:
+    """Return the fingerprints in a claim's evidence, each with every key that may revoke it; nothing is verified."""
+    body = ClaimBody.from_statement(statement)
+    found, issuer_key = [], body.subject.owner_key
+    for wire in body.chain:
+        link = AdCert.from_statement(parse(wire))
+        found += [(link.fingerprint, key) for key in dict.fromkeys((body.subject.owner_key, issuer_key))]
+        issuer_key = link.delegate_key
+    return found
 
 
 def _withdrawal(statement: Statement, now: Instant) -> Fields:

@@ -29,6 +29,7 @@ class Route:
         expires_s: end of the lease, monotonic seconds.
         valid_until_unix_s: ``CLOCK_SKEW_S`` after the claim's evidence runs out; it cannot be played back after that.
         fingerprints: of that evidence; a revocation names one of them.
+        issuers: keys that may revoke something of it, the domain's root apart.
     """
 
     name: Name
@@ -45,6 +46,7 @@ class Route:
     expires_s: float
     valid_until_unix_s: int
     fingerprints: frozenset[bytes]
+    issuers: frozenset[bytes] = frozenset()
 
     @classmethod
     def of(
@@ -74,6 +76,7 @@ class Route:
             expires_s=expires_s,
             valid_until_unix_s=claim.valid_until_unix_s + int(CLOCK_SKEW_S),
             fingerprints=claim.fingerprints,
+            issuers=claim.issuers,
         )
 
     @property

@@ -15,6 +15,7 @@ from gdp.effects import Instant
 from gdp.names import Name
 from gdp.rib.digest_tree import DigestTree
 from gdp.rib.route import Route, Withdrawn
+from gdp.trust.holdings import EvidenceIndex
 
 __all__ = ["MemoryStore", "Store"]
 
@@ -62,8 +63,11 @@ class Store(Protocol):
         Withdrawn ones that are not forgotten count too.
         """
 
-    def resting_on(self, fingerprint: bytes) -> list[Route]:
-        """Return the routes whose evidence includes a certificate; looks at all."""
+    def resting_on(self, mark: bytes) -> list[Route]:
+        """Return the routes whose evidence includes a certificate, by its fingerprint, or one that a key issued."""
+
+    def has_issuer(self, key: bytes) -> bool:
+        """Return whether a route rests on a certificate that this key, 33 bytes, issued."""
 
 
 class MemoryStore:
@@ -76,6 +80,7 @@ class MemoryStore:
         self._ends: list[tuple[float, Name, Name]] = []
         self._forget: list[tuple[int, Name, Name]] = []
         self._size = 0
+        self._evidence = EvidenceIndex[Key]()
         self.changes: set[Key] | None = None  # what changed since a snapshot was told; None: there is none
         self.digests = DigestTree()  # over what replicates: all but what the tier above told, and leases that ended
 
@@ -112,6 +117,7 @@ class MemoryStore:
         if not route.is_from_above:
             self.digests.put(route.name, route.advertiser, route.sequence, is_withdrawn=False)
         self._routes.setdefault(route.name, {})[route.advertiser] = route
+        self._evidence.put((route.name, route.advertiser), route.fingerprints | route.issuers)
         self._count(route.sender, route.advertiser)
         self._size += 1
         heapq.heappush(self._ends, (route.expires_s, route.name, route.advertiser))
@@ -159,10 +165,13 @@ class MemoryStore:
         """Return how many routes are kept that a sender relayed, or a node advertises."""
         return self._counts.get(owner, 0)
 
-    def resting_on(self, fingerprint: bytes) -> list[Route]:
-        """Return the routes whose evidence includes a certificate; looks at all."""
-        every = (route for of_name in self._routes.values() for route in of_name.values())
-        return [route for route in every if fingerprint in route.fingerprints]
+    def resting_on(self, mark: bytes) -> list[Route]:
+        """Return the routes whose evidence includes a certificate, by its fingerprint, or one that a key issued."""
+        return [self._routes[name][advertiser] for name, advertiser in self._evidence.resting_on(mark)]
+
+    def has_issuer(self, key: bytes) -> bool:
+        """Return whether a route rests on a certificate that this key, 33 bytes, issued."""
+        return self._evidence.has(key)
 
     def _take(self, name: Name, advertiser: Name) -> Route | None:
         of_name = self._routes.get(name, {})
@@ -171,6 +180,7 @@ class MemoryStore:
             return None
         if not of_name:
             del self._routes[name]
+        self._evidence.remove((name, advertiser), route.fingerprints | route.issuers)
         self._size -= 1
         self._uncount(route.sender, advertiser)
         self.digests.remove(name, advertiser)

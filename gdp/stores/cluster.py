@@ -191,10 +191,14 @@ class ClusterStore:
             held = self._owners[owner] = {key: end for key, end in held.items() if end > self._now.mono_s}
         return len(held)
 
-    def resting_on(self, fingerprint: bytes) -> list[Route]:
-        """Return the routes in memory whose evidence includes a certificate; others are found out when read."""
+    def resting_on(self, mark: bytes) -> list[Route]:
+        """Return the routes in memory that rest on a certificate, or a key; others are found out when read."""
         every = (route for routes in self._cache.values() for route in routes.values())
-        return [route for route in every if fingerprint in route.fingerprints]
+        return [route for route in every if mark in route.fingerprints or mark in route.issuers]
+
+    def has_issuer(self, key: bytes) -> bool:
+        """Return whether a route in memory rests on a certificate that this key, 33 bytes, issued; looks at all."""
+        return any(key in route.issuers for routes in self._cache.values() for route in routes.values())
 
     def changed(self) -> list[tuple[Name, list[Route]]]:
         """Return the names that other RIBs changed since the last call, each with the routes that were in memory."""

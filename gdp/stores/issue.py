@@ -12,30 +12,41 @@ from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
-from gdp.crypto.certificates import Membership, Role, Root
+from gdp.crypto.certificates import Membership, Role, Root, Unverified
 from gdp.crypto.identity import Identity, NodeKeys, node_metadata
 from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
+from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.stores.files import refuse_existing
+from gdp.stores.audit_log import note_once
+from gdp.stores.files import read_public, refuse_existing
 from gdp.stores.keyring import (
     DELEGATIONS,
     NODE_CERTIFICATE,
+    OWNER_KEY,
+    ROOT_CERTIFICATE,
+    SUCCESSION,
     load_card,
     load_domain,
     load_identity,
     load_node_keys,
     load_owner,
+    load_root,
+    parsed,
     save_delegation,
     save_domain,
     save_identity,
+    save_membership,
     save_node_keys,
     save_owner,
+    storage,
 )
 from gdp.stores.ledger import append_issued
+from gdp.stores.private_keys import Storage
+from gdp.trust.audit import Action
 from gdp.trust.card import Card
 from gdp.trust.delegation import Delegation
 from gdp.trust.grants import SECRET_BYTES
@@ -54,6 +65,9 @@ __all__ = [
     "make_node",
     "make_node_keys",
     "make_owner",
+    "renew",
+    "renew_node",
+    "succeed_owner",
 ]
 
 DAY_S: Final = 86_400
@@ -63,39 +77,100 @@ DELEGATION_DAYS: Final = 365.0
 
 
 def make_domain(
-    directory: Path, label: str, *, days: float = ROOT_DAYS, force: bool = False, unix_s: float | None = None
+    directory: Path,
+    label: str,
+    *,
+    days: float = ROOT_DAYS,
+    key: SigningKey | None = None,
+    passphrase: bytes | None = None,
+    force: bool = False,
+    unix_s: float | None = None,
 ) -> DomainAuthority:
     """Found a trust domain and keep its root in ``directory``.
+
+    Args:
+        key: the root's, if there is one already, as in a token.
+        passphrase: guards the key's file.
 
     Raises:
         LocalError: a wrong label, or there is one already.
     """
-    authority = DomainAuthority.found(label, SigningKey.generate(), Validity.lasting(_now(unix_s), days * DAY_S))
-    save_domain(directory, authority, force=force)
+    validity = Validity.lasting(_now(unix_s), days * DAY_S)
+    authority = DomainAuthority.found(label, key or SigningKey.generate(), validity)
+    save_domain(directory, authority, passphrase=passphrase, force=force)
     return authority
 
 
-def make_owner(directory: Path, *, force: bool = False) -> Owner:
-    """Make an owner's keys and keep them in ``directory``.
+def make_owner(
+    directory: Path, *, key: SigningKey | None = None, passphrase: bytes | None = None, force: bool = False
+) -> Owner:
+    """Make an owner's keys and keep them in ``directory``; ``key`` and ``passphrase`` as for ``make_domain``.
 
     Raises:
         LocalError: there are some already.
     """
-    owner = Owner(SigningKey.generate(), secrets.token_bytes(SECRET_BYTES))
-    save_owner(directory, owner, force=force)
+    owner = Owner(key or SigningKey.generate(), secrets.token_bytes(SECRET_BYTES))
+    save_owner(directory, owner, passphrase=passphrase, force=force)
     return owner
 
 
+def succeed_owner(
+    owner: Path,
+    successor: Path,
+    names: Iterable[Subject],
+    *,
+    days: float,
+    key: SigningKey | None = None,
+    passphrase: bytes | None = None,
+    unix_s: float | None = None,
+) -> Owner:
+    """Let a successor's key delegate names in an owner's place; it is made where there is none.
+
+    The successor has the owner's master secret, so that the topics' secrets stay as they are.
+
+    Args:
+        names: to which it succeeds, in addition to those to which it did before.
+        days: how long; whatever the successor delegates ends then.
+        key, passphrase: of a new successor, as for ``make_domain``.
+
+    Raises:
+        LocalError: no owner there, another owner's name, or a successor of another owner.
+    """
+    present = load_owner(owner)
+    if not (successor / OWNER_KEY).exists():
+        save_owner(
+            successor, Owner(key or SigningKey.generate(), present.master, present.public), passphrase=passphrase
+        )
+    heir = load_owner(successor)
+    if heir.public != present.public or heir.key.public == present.key.public:
+        raise LocalError(f"{successor}: not a successor of {owner}")
+    validity = Validity.lasting(_now(unix_s), days * DAY_S)
+    for given in [present.succeed(heir.key.public, each, validity) for each in names]:
+        save_delegation(successor / SUCCESSION, given, force=True)
+        about = given.name.to_text()
+        note_once(owner, Action.ACCEPTED, "succession", who=given.node.to_text(), about=about, unix_s=_now(unix_s))
+    return load_owner(successor)
+
+
 def make_node_keys(
-    directory: Path, role: Role, label: str, *, more: Mapping[str, str | int] | None = None, force: bool = False
+    directory: Path,
+    role: Role,
+    label: str,
+    *,
+    more: Mapping[str, str | int] | None = None,
+    key: SigningKey | None = None,
+    passphrase: bytes | None = None,
+    force: bool = False,
 ) -> NodeKeys:
     """Make a node's keys and its request for a membership, and keep them in ``directory``.
+
+    ``key`` and ``passphrase`` as for ``make_domain``.
 
     Raises:
         LocalError: wrong metadata, a library without the KEM, or there are some already.
     """
-    keys = NodeKeys.generate(role, label, more)
-    save_node_keys(directory, keys, node_metadata(role, label, more), force=force)
+    keys = NodeKeys.generate(role, label, more, key)
+    save_node_keys(directory, keys, node_metadata(role, label, more), passphrase=passphrase, force=force)
     return keys
 
 
@@ -128,7 +203,7 @@ def admit(domain: Path, request: bytes, *, days: float = MEMBER_DAYS, unix_s: fl
     """
     authority, now = load_domain(domain), _now(unix_s)
     member = authority.admit(request, _within(authority.root, now, days))
-    append_issued(domain, member, now)
+    _issued(domain, member, now)
     return member
 
 
@@ -144,9 +219,60 @@ def admit_node(
     if not force:
         refuse_existing(node / NODE_CERTIFICATE)  # before anything is signed
     identity = load_node_keys(node).join(authority, _within(authority.root, now, days))
-    append_issued(domain, identity.member, now)
+    _issued(domain, identity.member, now)
     save_identity(node, identity, force=force)
     return identity
+
+
+def renew(
+    domain: Path, certificate: bytes, *, days: float = MEMBER_DAYS, unix_s: float | None = None
+) -> Membership:
+    """Return a membership anew, for the same key, role and label; the one that it replaces may have run out.
+
+    Raises:
+        StatementError: it is not one that this domain issued.
+        LocalError: no domain there, or its ledger cannot be written.
+    """
+    authority, now = load_domain(domain), _now(unix_s)
+    stranger = Unverified.from_wire(certificate)
+    present = stranger.verify(authority.root, min(now, stranger.validity.not_after_unix_s))
+    member = authority.renew(present, _within(authority.root, now, days))
+    _issued(domain, member, now)
+    return member
+
+
+def renew_node(
+    domain: Path, node: Path, *, days: float = MEMBER_DAYS, before_days: float | None = None,
+    unix_s: float | None = None,
+) -> Membership | None:
+    """Renew the membership of a node whose directory is at hand; a running node takes it up.
+
+    The node's key is needed for its card alone: a card stays as it was where the key is under a passphrase or in a
+    token.
+
+    Args:
+        before_days: only if it ends within so many days; None: in any case.
+
+    Returns:
+        The new membership, or None: the present one lasts longer.
+
+    Raises:
+        StatementError: it is not one that this domain issued.
+        LocalError: as ``renew``.
+    """
+    now, path = _now(unix_s), node / NODE_CERTIFICATE
+    wire = read_public(path)
+    if before_days is not None:
+        ends_unix_s = parsed(path, Unverified.from_wire, wire).validity.not_after_unix_s
+        if ends_unix_s - now > before_days * DAY_S:
+            return None
+    member = parsed(path, lambda data: renew(domain, data, days=days, unix_s=now), wire)
+    root = load_root(domain / ROOT_CERTIFICATE)
+    if all(each is Storage.PLAIN for each in storage(node).values()):
+        save_identity(node, load_node_keys(node).admitted(member, root), force=True)
+    else:
+        save_membership(node, member, root)
+    return member
 
 
 def install_membership(
@@ -182,7 +308,10 @@ def delegate(
     """
     face = card if isinstance(card, Card) else load_card(card)
     validity = Validity.lasting(_now(unix_s), days * DAY_S)
-    return load_owner(owner).delegate(face, metadata, rights, epochs, validity, may_delegate=may_delegate)
+    given = load_owner(owner).delegate(face, metadata, rights, epochs, validity, may_delegate=may_delegate)
+    who, about = given.node.to_text(), given.name.to_text()
+    note_once(owner, Action.ACCEPTED, "delegation", who=who, about=about, unix_s=_now(unix_s))
+    return given
 
 
 def install_delegation(node: Path, delegation: Delegation, *, force: bool = False, unix_s: float | None = None) -> Path:
@@ -207,6 +336,13 @@ def delegate_route(node: Path, switch: Name, *, days: float, unix_s: float | Non
     """
     now = _now(unix_s)
     return RtCert.make(load_identity(node, now), switch, Validity.lasting(now, days * DAY_S))
+
+
+def _issued(domain: Path, member: Membership, unix_s: float) -> None:
+    """Write a membership into the ledger, without which it is not handed out, and into the audit log."""
+    append_issued(domain, member, unix_s)
+    who, about = member.name.to_text(), member.fingerprint.hex()
+    note_once(domain, Action.ACCEPTED, f"membership {member.role.value}", who=who, about=about, unix_s=unix_s)
 
 
 def _now(unix_s: float | None) -> float:

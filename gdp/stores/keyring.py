@@ -1,9 +1,11 @@
 """Where a domain, an owner and a node keep their keys and proofs: one directory each.
 
-Place: I/O, through ``files``. ``*`` marks what is private (mode 0600)::
+Place: I/O, through ``files`` and ``private_keys``. ``*`` marks what is private (mode 0600); keys may also be under a
+passphrase, or in a token that the file names::
 
     domain/   root.key*  root.crt  issued.jsonl*                          the ledger: see ``ledger``
     owner/    owner.key*  owner.pub  master.key*
+              succession/<name>.delegation*                                of a successor: who let it delegate the name
     node/     node.key*  kem.key*  node.json  node.csr                      before it belongs to a domain
               node.crt  root.crt  node.card                                 once it does
               delegations/<name>.delegation*                                one for each name that it may act on
@@ -20,11 +22,12 @@ from gdp.crypto.certificates import Membership, Role, Root
 from gdp.crypto.identity import Identity, NodeKeys, node_metadata
 from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.kem import KemPrivateKey
-from gdp.crypto.keys import PublicKey, SigningKey
+from gdp.crypto.keys import PublicKey
 from gdp.crypto.x509_form import to_pem
 from gdp.errors import GdpError, LocalError
 from gdp.metadata import Metadata
-from gdp.stores.files import private, public, read_private, read_public, write_all
+from gdp.stores.files import NewFile, private, public, read_private, read_public, write_all
+from gdp.stores.private_keys import Storage, key_file, read_secret, read_signing_key, secret_file, storage_of
 from gdp.trust.card import Card
 from gdp.trust.delegation import Delegation
 from gdp.trust.owner import Owner
@@ -33,9 +36,12 @@ __all__ = [
     "CARD",
     "DELEGATIONS",
     "NODE_CERTIFICATE",
+    "OWNER_KEY",
     "OWNER_PUBLIC",
     "REQUEST",
     "ROOT_CERTIFICATE",
+    "ROOT_KEY",
+    "SUCCESSION",
     "load_card",
     "load_delegation",
     "load_delegations",
@@ -49,8 +55,11 @@ __all__ = [
     "save_delegation",
     "save_domain",
     "save_identity",
+    "save_membership",
     "save_node_keys",
     "save_owner",
+    "storage",
+    "store_again",
 ]
 
 ROOT_KEY: Final = "root.key"
@@ -65,6 +74,9 @@ NODE_CERTIFICATE: Final = "node.crt"
 REQUEST: Final = "node.csr"
 CARD: Final = "node.card"
 DELEGATIONS: Final = "delegations"
+SUCCESSION: Final = "succession"
+_SECRETS: Final = (OWNER_MASTER, NODE_KEM)
+_KEYS: Final = (ROOT_KEY, OWNER_KEY, NODE_KEY, *_SECRETS)
 _DELEGATION_SUFFIX: Final = ".delegation"
 
 _T = TypeVar("_T")
@@ -109,15 +121,17 @@ def load_card(path: Path) -> Card:
     return parsed(path, Card.from_wire, read_public(path))
 
 
-def save_domain(directory: Path, authority: DomainAuthority, *, force: bool = False) -> None:
-    """Write a domain's root key and certificate.
+def save_domain(
+    directory: Path, authority: DomainAuthority, *, passphrase: bytes | None = None, force: bool = False
+) -> None:
+    """Write a domain's root key and certificate; the key under a passphrase, if there is one.
 
     Raises:
         LocalError: they are there already, or the system refuses.
     """
     files = {
-        ROOT_KEY: private(authority.key.to_pem()),
-        ROOT_CERTIFICATE: public(to_pem(authority.root.wire)),
+        ROOT_KEY: key_file(authority.key, passphrase),
+        ROOT_CERTIFICATE: public(authority.root.to_pem()),
     }
     write_all(directory, files, force=force)
 
@@ -128,21 +142,21 @@ def load_domain(directory: Path) -> DomainAuthority:
     Raises:
         LocalError: something is missing, wrong, or readable for others.
     """
-    key = parsed(directory / ROOT_KEY, SigningKey.from_pem, read_private(directory / ROOT_KEY))
+    key = read_signing_key(directory / ROOT_KEY)
     root = load_root(directory / ROOT_CERTIFICATE)
     return parsed(directory, lambda _: DomainAuthority(key, root), b"")
 
 
-def save_owner(directory: Path, owner: Owner, *, force: bool = False) -> None:
-    """Write an owner's keys.
+def save_owner(directory: Path, owner: Owner, *, passphrase: bytes | None = None, force: bool = False) -> None:
+    """Write an owner's keys, under a passphrase, if there is one.
 
     Raises:
         LocalError: they are there already, or the system refuses.
     """
     files = {
-        OWNER_KEY: private(owner.key.to_pem()),
-        OWNER_MASTER: private(owner.master),
-        OWNER_PUBLIC: public(owner.key.public.to_pem()),
+        OWNER_KEY: key_file(owner.key, passphrase),
+        OWNER_MASTER: secret_file(owner.master, passphrase),
+        OWNER_PUBLIC: public(owner.public.to_pem()),
     }
     write_all(directory, files, force=force)
 
@@ -153,13 +167,19 @@ def load_owner(directory: Path) -> Owner:
     Raises:
         LocalError: something is missing, wrong, or readable for others.
     """
-    key = parsed(directory / OWNER_KEY, SigningKey.from_pem, read_private(directory / OWNER_KEY))
-    path = directory / OWNER_MASTER
-    return parsed(path, lambda master: Owner(key, master), read_private(path))
+    key = read_signing_key(directory / OWNER_KEY)
+    public_path, path = directory / OWNER_PUBLIC, directory / OWNER_MASTER
+    founder = load_public_key(public_path) if public_path.exists() else key.public
+    if founder == key.public:
+        return parsed(path, lambda master: Owner(key, master), read_secret(path))
+    links = {each.name: each.chain for each in load_delegations(directory / SUCCESSION)}
+    return parsed(path, lambda master: Owner(key, master, founder, links), read_secret(path))
 
 
-def save_node_keys(directory: Path, keys: NodeKeys, metadata: Metadata, *, force: bool = False) -> None:
-    """Write a node's keys, its metadata and its request for a membership.
+def save_node_keys(
+    directory: Path, keys: NodeKeys, metadata: Metadata, *, passphrase: bytes | None = None, force: bool = False
+) -> None:
+    """Write a node's keys, its metadata and its request for a membership; keys under a passphrase, if there is one.
 
     Raises:
         LocalError: they are there already, the metadata are of another node, or the system refuses.
@@ -168,8 +188,8 @@ def save_node_keys(directory: Path, keys: NodeKeys, metadata: Metadata, *, force
         raise LocalError("the metadata are not those of this node")
     text = json.dumps(dict(metadata), ensure_ascii=False, indent=2, sort_keys=True) + "\n"
     files = {
-        NODE_KEY: private(keys.key.to_pem()),
-        NODE_KEM: private(keys.kem.wire),
+        NODE_KEY: key_file(keys.key, passphrase),
+        NODE_KEM: secret_file(keys.kem.wire, passphrase),
         NODE_METADATA: public(text.encode()),
         REQUEST: public(keys.request()),
     }
@@ -184,8 +204,8 @@ def load_node_keys(directory: Path) -> NodeKeys:
     """
     path = directory / NODE_METADATA
     role, label, digest = parsed(path, _node_metadata, read_public(path))
-    key = parsed(directory / NODE_KEY, SigningKey.from_pem, read_private(directory / NODE_KEY))
-    kem = parsed(directory / NODE_KEM, KemPrivateKey.from_wire, read_private(directory / NODE_KEM))
+    key = read_signing_key(directory / NODE_KEY)
+    kem = parsed(directory / NODE_KEM, KemPrivateKey.from_wire, read_secret(directory / NODE_KEM))
     return NodeKeys(role, label, digest, key, kem)
 
 
@@ -196,11 +216,21 @@ def save_identity(directory: Path, identity: Identity, *, force: bool = False) -
         LocalError: they are there already, or the system refuses.
     """
     files = {
+        ROOT_CERTIFICATE: public(identity.root.to_pem()),
         NODE_CERTIFICATE: public(to_pem(identity.membership)),
-        ROOT_CERTIFICATE: public(to_pem(identity.root.wire)),
         CARD: public(Card.make(identity)),
     }
     write_all(directory, files, force=force)
+
+
+def save_membership(directory: Path, member: Membership, root: Root) -> None:
+    """Replace a node's membership and root; its card stays, which only its key could make anew.
+
+    Raises:
+        LocalError: the system refuses.
+    """
+    files = {ROOT_CERTIFICATE: public(root.to_pem()), NODE_CERTIFICATE: public(to_pem(member.wire))}
+    write_all(directory, files, force=True)
 
 
 def load_identity(directory: Path, unix_s: float) -> Identity:
@@ -252,6 +282,39 @@ def load_delegations(directory: Path) -> list[Delegation]:
         LocalError: one is malformed or readable for others; the text names the file.
     """
     return [load_delegation(path) for path in sorted(directory.glob(f"[!.]*{_DELEGATION_SUFFIX}"))]
+
+
+def storage(directory: Path) -> dict[Path, Storage]:
+    """Return how each private key of a domain, an owner or a node is guarded, by file.
+
+    Raises:
+        LocalError: there is none, or one is readable for others.
+    """
+    found = {directory / name: storage_of(directory / name) for name in _KEYS if (directory / name).exists()}
+    if not found:
+        raise LocalError(f"{directory}: no private key of a domain, an owner or a node is here")
+    return found
+
+
+def store_again(directory: Path, passphrase: bytes | None) -> dict[Path, Storage]:
+    """Put the private keys of a directory under a passphrase, or take it away; return how each is guarded then.
+
+    Each file is replaced as a whole, so that a kill in between leaves each one as it was or as it is to be. What
+    is in a token stays there.
+
+    Raises:
+        LocalError: one does not open with the present passphrase (then nothing is written), or the system refuses.
+    """
+    files: dict[str, NewFile] = {}
+    for path, found in storage(directory).items():
+        if found is Storage.TOKEN:
+            continue
+        if path.name in _SECRETS:
+            files[path.name] = secret_file(read_secret(path), passphrase)
+        else:
+            files[path.name] = key_file(read_signing_key(path), passphrase)
+    write_all(directory, files, force=True)
+    return storage(directory)
 
 
 def _node_metadata(data: bytes) -> tuple[Role, str, bytes]:

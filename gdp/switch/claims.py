@@ -17,12 +17,14 @@ from gdp.frame.kinds import Kind
 from gdp.limits import WITHDRAWAL_MAX_BYTES
 from gdp.names import ZERO, Name
 from gdp.switch.attached import Attached
+from gdp.switch.held import Held
 from gdp.switch.inquirer import Inquirer
 from gdp.switch.outbox import Outbox
 from gdp.switch.places import Places
 from gdp.switch.planter import Planter
 from gdp.switch.relocation import Relocations
 from gdp.switch.unicast import Unicast
+from gdp.trust.audit import Action
 from gdp.trust.claim import ClaimBody
 from gdp.trust.right import HEARS, Right
 from gdp.trust.verifier import ClaimVerifier
@@ -43,16 +45,19 @@ class Claims:
         unicast: Unicast,
         inquirer: Inquirer,
         relocations: Relocations,
+        held: Held,
         outbox: Outbox,
     ) -> None:
         self._identity = identity
         self._verifier = verifier
+        self._audit = verifier.policy.audit
         self._attached = attached
         self._places = places
         self._planter = planter
         self._unicast = unicast
         self._inquirer = inquirer
         self._relocations = relocations
+        self._held = held
         self._outbox = outbox
 
     def take(self, neighbour: Neighbour, statement: Statement, now: Instant) -> None:
@@ -81,6 +86,7 @@ class Claims:
             except StatementError as error:
                 self._refuse(neighbour, statement, error)
                 raise
+            self._held.note_claim(claim, at)
             if is_first:
                 self._places.want(claim.name, now.mono_s, watch=True)
             for place in self._places.of(claim.name, now.mono_s):
@@ -95,7 +101,9 @@ class Claims:
             except StatementError as error:
                 self._refuse(neighbour, statement, error)
                 raise
+            self._held.note_claim(claim, at)
             if known is None or (known.port, known.mac) != at:
+                self._audit.note(Action.ACCEPTED, "name", who=claim.node.to_text(), about=claim.name.to_text())
                 self._unicast.forget(claim.name)
             self._unicast.release(claim.name, now.mono_s)
             self._planter.publisher_attached(claim, now.mono_s)
@@ -115,6 +123,8 @@ class Claims:
             body = ClaimBody.from_statement(statement)
         except StatementError:
             return  # not even a claim: the caller counts it
+        about, reason = body.subject.name.to_text(), error.reason.label
+        self._audit.note(Action.REFUSED, "name", who=neighbour.name.to_text(), about=about, reason=reason)
         self._judge(neighbour, body.subject.name, error.reason, body.sequence)
 
     def _judge(self, neighbour: Neighbour, name: Name, refused: DropReason | None, sequence: int) -> None:

@@ -15,17 +15,18 @@ from typing import Final
 from gdp.control.channel import Channels, Opened
 from gdp.control.presence import Presence
 from gdp.control.query import Answer, Query
-from gdp.control.relay import relayed
+from gdp.control.relay import Relay, relayed
 from gdp.control.verdict import Verdict
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.identity import Identity
-from gdp.crypto.statements import Statement, StatementType
+from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.switch.attached import Attached
 from gdp.switch.evidence import Evidence
+from gdp.switch.held import Held
 from gdp.switch.outbox import Outbox
 from gdp.switch.parked import Parked
 from gdp.switch.paths import Paths
@@ -65,6 +66,7 @@ class Inquirer:
         unicast: Unicast,
         relocations: Relocations,
         evidence: Evidence,
+        held: Held,
         outbox: Outbox,
         presence: PresenceAnswers,
         channels: Channels,
@@ -79,6 +81,7 @@ class Inquirer:
         self._unicast = unicast
         self._relocations = relocations
         self._evidence = evidence
+        self._held = held
         self._outbox = outbox
         self._presence = presence
         self._channels = channels
@@ -131,7 +134,8 @@ class Inquirer:
             self.relay(attachment.claim.wire, now_s)
         questions, given_up = self._places.due(now_s)
         for name, watch_s in questions:
-            query = Query(name, watch_s)
+            is_heard = bool(self._planter.readers(name))
+            query = Query(name, watch_s, self._policy.revoked.digest_about(name) if is_heard else None)
             self._to_rib(query.to_wire(self._identity.name, self._identity.key, self._identity.membership), now_s)
         for name in given_up:
             self._parked.refuse(name, DropReason.NO_ROUTE)
@@ -148,7 +152,7 @@ class Inquirer:
             self.links_changed(now_s)
 
     def relay(self, statement: bytes, now_s: float) -> None:
-        """Pass an attached node's claim or withdrawal on to the RIB."""
+        """Pass an attached node's claim or withdrawal, or a revocation, on to the RIB."""
         self._to_rib(relayed(statement, self._identity, self._policy.transit), now_s)
 
     def _to_rib(self, statement: bytes, now_s: float) -> None:
@@ -195,9 +199,7 @@ class Inquirer:
             statement.verify(member.key)
             self._presence.ask(Presence.from_fields(fields), member.name, statement.wire, now.mono_s)
             return
-        if member.name != statement.signer or not self._was_asked(member, now.mono_s):
-            raise StatementError(DropReason.WRONG_DOMAIN, "an answer from nobody who was asked")
-        statement.verify(member.key)
+        self._check_asked(statement, member, now.mono_s)
         if member.role is Role.SWITCH:
             self._take_context(statement, now)
             return
@@ -215,6 +217,24 @@ class Inquirer:
             self._gone(answer, now.mono_s)
         else:
             self._found(answer, statement.wire, now)
+
+    def revocation_in(self, statement: Statement, now: Instant) -> tuple[Statement, Name]:
+        """Return the revocation, to be verified, that a RIB passed on, and the RIB.
+
+        Raises:
+            StatementError: it is no RIB that was asked, or another statement.
+        """
+        relay = Relay.from_fields(statement.expect(StatementType.RELAY))
+        member = self._policy.verify_membership(relay.membership, now.unix_s)
+        if member.role is not Role.RIB:
+            raise StatementError(DropReason.WRONG_DOMAIN, "a revocation that no RIB passed on")
+        self._check_asked(statement, member, now.mono_s)
+        return parse(relay.statement), member.name
+
+    def _check_asked(self, statement: Statement, member: Membership, now_s: float) -> None:
+        if member.name != statement.signer or not self._was_asked(member, now_s):
+            raise StatementError(DropReason.WRONG_DOMAIN, "an answer from nobody who was asked")
+        statement.verify(member.key)
 
     def verify_answer(self, statement: Statement, now: Instant) -> Place:
         """Return the place in an answer that was passed on; any RIB of a trusted domain may have given it.
@@ -281,6 +301,7 @@ class Inquirer:
         if known is not None and known.sequence > place.sequence:
             place = replace(known, expires_s=max(known.expires_s, place.expires_s))  # the teller lags behind
         has_left = is_ours and attachment is None
+        self._held.note_place(place)
         before = self._places.put(place, now_s, is_ours=is_ours, has_left=has_left)
         if before is None or (before.switch, before.domain) != (place.switch, place.domain):
             self._unicast.forget(place.name)

@@ -12,7 +12,7 @@ The walk of a frame that was handed up::
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
 from gdp.control.boundary import ErrorBoundary
@@ -22,6 +22,7 @@ from gdp.control.greeter import Change, Greeter, LinkPort
 from gdp.control.join import Join
 from gdp.control.neighbour import Neighbour, NeighbourState
 from gdp.control.query import Query
+from gdp.control.revocation_sync import RevocationSync
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
@@ -37,6 +38,7 @@ from gdp.switch.attached import Attached
 from gdp.switch.claims import Claims
 from gdp.switch.evidence import Evidence
 from gdp.switch.flooding import Flooding
+from gdp.switch.held import Held
 from gdp.switch.inquirer import Inquirer
 from gdp.switch.outbox import Outbox
 from gdp.switch.parked import Parked
@@ -94,9 +96,14 @@ class Switch:
             self._outbox,
         )  # fmt: skip
         self._evidence = Evidence(policy, self._verifier)
+        self._held = Held(self.attached, self.places, self.planter)
+        self._sync = RevocationSync(
+            identity, policy.revoked, self.greeter,
+            lambda neighbour, wire: self._outbox.say(neighbour, Kind.REVOKED, wire), settings.first_sequence,
+        )  # fmt: skip
         self._revoker = Revoker(
             self._verifier, self.greeter, self.attached, self.planter, self.unicast, self.places, self._evidence,
-            self._outbox,
+            self._held, self._sync, self._outbox,
         )  # fmt: skip
         self.relocations = Relocations(identity, policy, self.planter, self.unicast, self._outbox)
         self._seen_version = -1
@@ -107,12 +114,13 @@ class Switch:
         self._channels = Channels(identity, policy, settings.random_bytes, accepts=False)
         self.inquirer = Inquirer(
             identity, policy, self._paths, self.attached, self.places, self.parked, self.planter, self.unicast,
-            self.relocations, self._evidence, self._outbox, self._presence, self._channels,
+            self.relocations, self._evidence, self._held, self._outbox, self._presence, self._channels,
         )  # fmt: skip
         self._claims = Claims(
             identity, self._verifier, self.attached, self.places, self.planter, self.unicast, self.inquirer,
-            self.relocations, self._outbox,
+            self.relocations, self._held, self._outbox,
         )  # fmt: skip
+        self._told_rib: Name | None = None  # the RIB that what the operator revoked goes to
         self.boundary = ErrorBoundary()
         self._join_paces = Paces(JOINS_PER_S, JOINS_BURST)
         self._drops: Counter[DropReason] = Counter()
@@ -220,6 +228,8 @@ class Switch:
             self.places.unwatch(topic)
         self.relocations.timeout(now_s)
         self.inquirer.ask(now_s)
+        self._sync.timeout(now_s)
+        self._tell_rib_of_revocations(now_s)
         self._presence.answer(now_s)
 
     def next_timeout(self) -> float | None:
@@ -241,7 +251,10 @@ class Switch:
             self.places.next_expiry(),
             self.relocations.next_timeout(),
             self.inquirer.next_timeout(),
+            self._sync.next_timeout(),
         ]
+        if self.inquirer.rib is not None:
+            times.append(self._revoker.handed_in.next_due())
         if self.unicast.is_refreshing:
             times.append(self._followed_s)  # past: at once
         if self._paths.refused_elsewhere():
@@ -258,9 +271,26 @@ class Switch:
         """Return, once, what is to be sent: nothing from a switch whose identity an older one has."""
         return [] if self.is_displaced else self._outbox.take()
 
-    def _revoke(self, statement: Statement, neighbour: Neighbour | None, now: Instant) -> None:
-        for topic in self._revoker.take(statement, neighbour, now):
+    def _unwatch(self, orphaned: Iterable[Name]) -> None:
+        for topic in orphaned:
             self.places.unwatch(topic)
+
+    def _take_revoked(self, neighbour: Neighbour, statement: Statement, now: Instant) -> None:
+        """Take part in the comparison of revocations with a neighbour."""
+        if statement.type is StatementType.REVOKE:
+            self._unwatch(self._revoker.take_lacking(statement, neighbour, now))
+        else:
+            self._sync.receive(neighbour, statement, now)
+
+    def _tell_rib_of_revocations(self, now_s: float) -> None:
+        """Pass on to the RIB what the operator handed in."""
+        if self.inquirer.rib is None:
+            return
+        if self.inquirer.rib != self._told_rib:
+            self._told_rib = self.inquirer.rib
+            self._revoker.handed_in.say_again(now_s)
+        for wire in self._revoker.due_for_rib(now_s):
+            self.inquirer.relay(wire, now_s)
 
     def _digest_for(self, port: LinkPort) -> bytes:
         return self._flooding.digest_for(port)
@@ -272,7 +302,8 @@ class Switch:
             StatementError: it does not hold.
         """
         self._rest_due_s = None
-        self._revoke(parse(wire), None, now)
+        self._unwatch(self._revoker.hand_in(parse(wire), now))
+        self._tell_rib_of_revocations(now.mono_s)
 
     # -- frames
 
@@ -329,7 +360,9 @@ class Switch:
         elif kind in (Kind.JOIN, Kind.LEAVE):
             self._take_join(neighbour, statement, now)
         elif kind == Kind.REVOKE:
-            self._revoke(statement, neighbour, now)
+            self._unwatch(self._revoker.take(statement, neighbour, now))
+        elif kind == Kind.REVOKED:
+            self._take_revoked(neighbour, statement, now)
         elif kind == Kind.REDIRECT:
             self._redirected(statement, now)
         elif kind == Kind.WHERE:
@@ -363,7 +396,10 @@ class Switch:
             if opened.is_fresh and statement.signer != header.source:
                 raise StatementError(DropReason.UNKNOWN_SENDER, "signed by another than its sender")
             with self.boundary.guard(arrival.via + statement.signer, now.mono_s):
-                if header.kind == Kind.RIB_ANSWER:
+                if header.kind == Kind.RIB_ANSWER and statement.type is StatementType.RELAY:
+                    revocation, rib = self.inquirer.revocation_in(statement, now)
+                    self._unwatch(self._revoker.take_from_rib(revocation, rib, now))
+                elif header.kind == Kind.RIB_ANSWER:
                     self.inquirer.receive(statement, now, is_fresh=opened.is_fresh)
                 else:
                     self._relocated(statement, now)
@@ -391,12 +427,13 @@ class Switch:
         """Greet who came up, and let go of who is gone."""
         neighbour, before = change
         if neighbour.state is NeighbourState.UP:
-            self._revoker.tell_all(neighbour)
+            self._sync.neighbour_up(neighbour, now_s)
             self.planter.neighbour_up((neighbour.port, neighbour.mac), now_s)
             self._seen_version = -1  # it may have another address now: what leads to it is computed anew
             if neighbour.role is Role.SWITCH:
                 self._flooding.sync(neighbour, now_s)
         elif before is NeighbourState.UP:
+            self._sync.neighbour_lost(neighbour)
             if neighbour.role is Role.SWITCH:
                 self._flooding.damping.went((neighbour.port, neighbour.name), now_s)
             self.planter.neighbour_lost((neighbour.port, neighbour.mac), now_s)
@@ -502,5 +539,6 @@ class Switch:
             claim = self._verifier.verify(join.evidence, now.unix_s)
             if claim.right not in HEARS or claim.name != join.topic:
                 raise StatementError(DropReason.NOT_DELEGATED, "a join without a reader's claim")
+            self._held.note_branch(join.topic, join.publisher, (neighbour.port, neighbour.mac), claim)
         if self.planter.join(join, neighbour, now.mono_s):
             self.relocations.redirect_join(join.topic, join.publisher, neighbour, now.mono_s)

@@ -251,24 +251,22 @@ class Planter:
                     branch.fit(self._outbox.mtu_of(port))
             self._restate(tree)
 
-    def claims(self) -> list[tuple[Name, At, Claim]]:
-        """Return the claims of all readers attached here, with their topic and place."""
-        return [
-            (topic, at, reader.claim) for topic, readers in self._readers.items() for at, reader in readers.items()
-        ]
-
-    def doubt(self, proves: Callable[[bytes], bool], until_s: float, now_s: float) -> None:
-        """Let branches whose evidence holds no more end at ``until_s``, unless another reader's is shown by then.
+    def doubt(
+        self, topic: Name, publisher: Name, at: At, proves: Callable[[bytes], bool], until_s: float, now_s: float
+    ) -> None:
+        """Let a branch whose evidence holds no more end at ``until_s``, unless another reader's is shown by then.
 
         The next switch is shown another branch's evidence at once, or when one is shown here.
         """
-        for tree in self.trees.all():
-            for branch in tree.branches.values():
-                if not proves(branch.evidence):
-                    branch.expires_s = min(branch.expires_s, until_s)
-            if not proves(tree.shown):
-                tree.is_doubted, tree.renew_at_s = True, now_s
-            self._plant(tree)
+        tree = self.trees.get(topic, publisher)
+        if tree is None:
+            return
+        branch = tree.branches.get(at)
+        if branch is not None and not proves(branch.evidence):
+            branch.expires_s = min(branch.expires_s, until_s)
+        if not proves(tree.shown):
+            tree.is_doubted, tree.renew_at_s = True, now_s
+        self._plant(tree)
 
     def reroute(self, now_s: float) -> None:
         """Ask anew where the way to a publisher has changed."""

@@ -1,42 +1,53 @@
-"""Taking certificates back: pass the word on, and close what they opened here.
+"""Revocations at a switch: take them, close what rested on them, pass them on to whom they concern.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
-A revocation proves itself, so it is passed to every neighbour of every domain, once; a neighbour that comes up is told
-all that is known. What a revoked certificate had opened ends at once: attachments, readers, and, unless the switch
-below shows another reader within ``GRACE_S``, the branches that rested on it. A revoked neighbour's next hello is
-refused, so that it is gone when it has been silent for long enough.
+A revocation of a trusted domain's root goes to every neighbour, once; neighbours compare what they keep by digests
+(``control/revocation_sync.py``). One of an owner is taken where a certificate of that owner is held, goes on from there
+to the neighbours, and is dropped by those who hold none. What the operator hands in also goes to the RIB, which sends
+it to whoever brought, watches or heard of the name, in every tier.
+
+What a revoked certificate had opened ends at once: attachments, readers, and, unless the switch below shows another
+reader within ``GRACE_S``, the branches that rested on it. A revoked neighbour is let go.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from typing import Final
 
 from gdp.control.greeter import Greeter
 from gdp.control.neighbour import Neighbour
-from gdp.crypto.statements import Statement
+from gdp.control.revocation_sync import RevocationSync
+from gdp.crypto.statements import Statement, parse
 from gdp.effects import Instant
 from gdp.errors import StatementError
 from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.switch.attached import Attached
 from gdp.switch.evidence import Evidence
+from gdp.switch.handed_in import HandedIn
+from gdp.switch.held import AttachedClaim, Held, JoinedBranch, KnownPlace
 from gdp.switch.outbox import Outbox
 from gdp.switch.places import Places
 from gdp.switch.planter import Planter
 from gdp.switch.unicast import Unicast
+from gdp.trust.audit import Action
 from gdp.trust.claim import Claim
+from gdp.trust.revocation import Revocation
+from gdp.trust.revocations import OPERATOR, hash_of
 from gdp.trust.verifier import ClaimVerifier
 
 __all__ = ["Revoker"]
 
 GRACE_S: Final = 0.5
-TOLD_MAX: Final = 4_096  # revocations that a new neighbour is told of
 
 
 class Revoker:
-    """Spreads and applies revocations at one switch."""
+    """Takes, applies and spreads revocations at one switch.
+
+    Attributes:
+        handed_in: those of owners that the operator handed in, for the RIB.
+    """
 
     def __init__(
         self,
@@ -47,59 +58,122 @@ class Revoker:
         unicast: Unicast,
         places: Places,
         evidence: Evidence,
+        held: Held,
+        sync: RevocationSync,
         outbox: Outbox,
     ) -> None:
         self._verifier = verifier
+        self._revoked = verifier.revoked
         self._greeter = greeter
         self._attached = attached
         self._planter = planter
         self._unicast = unicast
         self._places = places
         self._evidence = evidence
+        self._held = held
+        self._sync = sync
         self._outbox = outbox
-        self._told: OrderedDict[bytes, bytes] = OrderedDict()  # fingerprint -> statement
+        self.handed_in = HandedIn()
 
-    def __len__(self) -> int:
-        return len(self._told)
-
-    def take(self, statement: Statement, neighbour: Neighbour | None, now: Instant) -> list[Name]:
-        """Take a revocation, from a neighbour or from this node's operator; return the topics that lost all readers.
+    def take(self, statement: Statement, neighbour: Neighbour, now: Instant) -> list[Name]:
+        """Take a revocation from a neighbour; return the topics that lost all readers here.
 
         Raises:
-            StatementError: it does not hold, or there is no room for it.
+            StatementError: it does not hold, concerns nobody here, or there is no room for it.
         """
-        revocation = self._verifier.revoke(statement.wire, now.unix_s)
+        revocation = self._revoked.take(statement, neighbour.name, now, self._held.has_issuer)
+        return [] if revocation is None else self._spread(revocation, statement, neighbour, now)
+
+    def take_lacking(self, statement: Statement, neighbour: Neighbour, now: Instant) -> list[Name]:
+        """Take a revocation that was lacking here; the other neighbours hear of it by digests.
+
+        Raises:
+            StatementError: as ``take``.
+        """
+        revocation = self._revoked.take(statement, neighbour.name, now, self._held.has_issuer)
         if revocation is None:
             return []
-        self._told[statement.fingerprint] = statement.wire
-        while len(self._told) > TOLD_MAX:
-            self._told.popitem(last=False)
+        self._sync.took(neighbour, hash_of(revocation.issuer.owner_key), now.mono_s)
+        return self._apply(revocation, now)
+
+    def take_from_rib(self, statement: Statement, rib: Name, now: Instant) -> list[Name]:
+        """Take a revocation that a RIB sent.
+
+        Raises:
+            StatementError: as ``take``.
+        """
+        revocation = self._revoked.take(statement, rib, now, self._held.has_issuer)
+        return [] if revocation is None else self._spread(revocation, statement, None, now)
+
+    def hand_in(self, statement: Statement, now: Instant) -> list[Name]:
+        """Take a revocation from this node's operator, whoever issued it.
+
+        Raises:
+            StatementError: it does not hold.
+        """
+        revocation = self._revoked.take(statement, OPERATOR, now, self._held.has_issuer)
+        issued = revocation or Revocation.read(statement)
+        if not self._revoked.is_root(issued.issuer.owner_key):
+            self.handed_in.add(statement.fingerprint, statement.wire, now.mono_s)
+        return [] if revocation is None else self._spread(revocation, statement, None, now)
+
+    def due_for_rib(self, now_s: float) -> list[bytes]:
+        """Return what the RIB is to be told now of what the operator handed in; what has run out is forgotten."""
+        wires = []
+        for fingerprint, wire in self.handed_in.due(now_s):
+            revocation = Revocation.read(parse(wire))
+            if self._revoked.has(revocation.fingerprint, revocation.issuer.owner_key):
+                wires.append(wire)
+            else:
+                self.handed_in.remove(fingerprint)
+        return wires
+
+    def _spread(
+        self, revocation: Revocation, statement: Statement, giver: Neighbour | None, now: Instant
+    ) -> list[Name]:
         for other in self._greeter.all_up():
-            if neighbour is None or (other.port, other.name) != (neighbour.port, neighbour.name):
+            if giver is None or (other.port, other.name) != (giver.port, giver.name):
                 self._outbox.say(other, Kind.REVOKE, statement.wire)
-        return self._apply(now)
+        return self._apply(revocation, now)
 
-    def tell_all(self, neighbour: Neighbour) -> None:
-        """Tell a neighbour that has come up what has been taken back."""
-        for wire in self._told.values():
-            self._outbox.say(neighbour, Kind.REVOKE, wire)
-
-    def _apply(self, now: Instant) -> list[Name]:
-        for attachment in self._attached.all():
-            if not self._holds(attachment.claim, now):
-                self._attached.remove(attachment.claim.name, attachment.claim.node)
-                self._unicast.forget(attachment.claim.name)
-        for place in self._places.all():
-            if not self._evidence.still_holds(place, now):
-                self._places.remove(place.name, place.advertiser, now.mono_s)
-                self._planter.publisher_gone(place.name, place.advertiser)
-                self._unicast.forget(place.name)
-        orphaned = []
-        for topic, at, claim in self._planter.claims():
-            if not self._holds(claim, now) and self._planter.remove_reader(topic, at):
-                orphaned.append(topic)
-        self._planter.doubt(lambda evidence: self._proves(evidence, now), now.mono_s + GRACE_S, now.mono_s)
+    def _apply(self, revocation: Revocation, now: Instant) -> list[Name]:
+        """Close what carries the revoked certificate; return the topics that lost all readers here."""
+        issuer, about = revocation.issuer.name.to_text(), revocation.fingerprint.hex()
+        self._verifier.policy.audit.note(Action.REVOKED, "certificate", who=issuer, about=about)
+        orphaned: list[Name] = []
+        for holder in self._held.resting_on(revocation.fingerprint):
+            if isinstance(holder, AttachedClaim):
+                orphaned += self._close_claim(holder, now)
+            elif isinstance(holder, KnownPlace):
+                self._close_place(holder, now)
+            else:
+                self._doubt(holder, now)
+        self._greeter.recheck(revocation.fingerprint, now)
         return orphaned
+
+    def _close_claim(self, holder: AttachedClaim, now: Instant) -> list[Name]:
+        attachment = self._attached.get(holder.name, holder.node)
+        if attachment is not None and not self._holds(attachment.claim, now):
+            self._attached.remove(holder.name, holder.node)
+            self._unicast.forget(holder.name)
+        claim = self._planter.claim_of(holder.name, holder.at)
+        if claim is None or self._holds(claim, now):
+            return []
+        is_last = self._planter.remove_reader(holder.name, holder.at)
+        for tree in self._planter.trees.of_topic(holder.name):
+            self._doubt(JoinedBranch(tree.topic, tree.publisher, holder.at), now)
+        return [holder.name] if is_last else []
+
+    def _close_place(self, holder: KnownPlace, now: Instant) -> None:
+        place = self._places.get(holder.name, holder.advertiser)
+        if place is not None and not self._evidence.still_holds(place, now):
+            self._places.remove(place.name, place.advertiser, now.mono_s)
+            self._planter.publisher_gone(place.name, place.advertiser)
+            self._unicast.forget(place.name)
+
+    def _doubt(self, branch: JoinedBranch, now: Instant) -> None:
+        proves = lambda evidence: self._proves(evidence, now)  # noqa: E731
+        self._planter.doubt(branch.topic, branch.publisher, branch.at, proves, now.mono_s + GRACE_S, now.mono_s)
 
     def _holds(self, claim: Claim, now: Instant) -> bool:
         try:

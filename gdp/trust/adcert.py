@@ -23,7 +23,7 @@ from gdp.errors import DropReason, StatementError
 from gdp.limits import CHAIN_MAX
 from gdp.names import Name
 from gdp.trust.lru import Lru
-from gdp.trust.revocation import Revocations
+from gdp.trust.revocations import Revocations
 from gdp.trust.right import Right, rights_from_fields, rights_to_wire
 
 __all__ = ["AdCert", "AdCertCache", "Chain"]

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from gdp.crypto.certificates import Membership
+from gdp.crypto.exchange import EXCHANGE_KEY_BYTES
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType
 from gdp.crypto.subject import Subject
@@ -47,6 +48,7 @@ class Claim:
         is_global: whether it climbs to the tier above.
         wire: the bytes that were verified, to be relayed as they are.
         previous: the switch that the node has come from, or ``ZERO``.
+        exchange: the node's X25519 key in this run, for notes to it; empty where it takes none.
     """
 
     subject: Subject
@@ -60,6 +62,7 @@ class Claim:
     is_global: bool
     wire: bytes = field(repr=False)
     previous: Name = ZERO
+    exchange: bytes = b""
 
     @property
     def name(self) -> Name:
@@ -88,6 +91,12 @@ class Claim:
         return min(self.member.not_after_unix_s, self.rtcert.validity.not_after_unix_s, *links)
 
     @property
+    def issuers(self) -> frozenset[bytes]:
+        """Return the keys, 33 bytes each, that may revoke something of the evidence, the domain's root apart."""
+        given = [key for link in self.chain.links for key in (link.subject.owner_key, link.delegate_key)]
+        return frozenset((self.member.key.compressed, *given))
+
+    @property
     def fingerprints(self) -> frozenset[bytes]:
         """Return the fingerprints of all evidence: when one of them is revoked, ask the verifier to ``recheck``."""
         links = [link.fingerprint for link in self.chain.links]
@@ -108,6 +117,7 @@ class ClaimBody:
     chain: tuple[bytes, ...]
     rtcert: bytes
     previous: Name = ZERO
+    exchange: bytes = b""
 
     @classmethod
     def from_statement(cls, statement: Statement) -> ClaimBody:
@@ -119,6 +129,9 @@ class ClaimBody:
         fields = statement.expect(StatementType.ADVERTISE)
         if len(statement.wire) > CLAIM_MAX_BYTES:
             raise StatementError(DropReason.TOO_BIG, f"a claim of {len(statement.wire)} bytes")
+        exchange = fields.bytes_("x")
+        if len(exchange) not in (0, EXCHANGE_KEY_BYTES):
+            raise StatementError(DropReason.MALFORMED, "an exchange key of the wrong length")
         return cls(
             subject=Subject.from_fields(fields, fields.name("name")),
             right=Right.from_wire(fields.text("right")),
@@ -130,6 +143,7 @@ class ClaimBody:
             chain=tuple(fields.byte_strings("chain", CHAIN_MAX)),
             rtcert=fields.bytes_("rt"),
             previous=fields.name("prev") if "prev" in fields else ZERO,
+            exchange=exchange,
         )
 
     def to_fields(self) -> dict[str, object]:
@@ -147,6 +161,7 @@ class ClaimBody:
             "member": self.membership,
             "chain": list(self.chain),
             "rt": self.rtcert,
+            "x": self.exchange,
         }
 
 
@@ -162,6 +177,7 @@ def make_claim(
     is_global: bool,
     chain: Sequence[bytes] = (),
     previous: Name = ZERO,
+    exchange: bytes = b"",
 ) -> bytes:
     """Return a node's signed claim; costs about 50 us.
 
@@ -176,6 +192,7 @@ def make_claim(
         is_global: whether other domains may find it.
         chain: the AdCerts of the delegation.
         previous: the switch that the node was attached to a moment ago, to be told; ``ZERO``: it has not moved.
+        exchange: its X25519 key in this run, for notes to it; empty where it takes none.
 
     Raises:
         LocalError: a lease out of bounds, or more than one statement can carry.
@@ -193,6 +210,7 @@ def make_claim(
         chain=tuple(chain),
         rtcert=rtcert,
         previous=previous,
+        exchange=exchange,
     )
     wire = identity.sign(StatementType.ADVERTISE, body.to_fields())
     if len(wire) > CLAIM_MAX_BYTES:

@@ -121,7 +121,9 @@ class Delegation:
             StatementError: a grant does not hold, or is not for this node and name.
             LocalError: a library without the KEM.
         """
-        opened = {epoch: open_grant(identity, wire) for epoch, wire in self.grants.items()}
+        chain = Chain.walk(self.chain, self.subject, identity.subject, AdCertCache(CHAIN_MAX))
+        givers = [link.delegate_key for link in chain.links[:-1]]
+        opened = {epoch: open_grant(identity, wire, givers) for epoch, wire in self.grants.items()}
         for epoch, grant in opened.items():
             if (grant.name, grant.epoch) != (self.name, epoch):
                 raise StatementError(DropReason.MALFORMED, "a grant for another name or epoch")

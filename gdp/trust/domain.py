@@ -15,8 +15,9 @@ from typing import Final
 from gdp.crypto.certificates import Membership, Root, Unverified
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.names import Name
+from gdp.trust.audit import AuditTrail
 from gdp.trust.lru import Lru
-from gdp.trust.revocation import Revocations
+from gdp.trust.revocations import Revocations
 
 __all__ = ["MEMBERS_REMEMBERED", "Policy"]
 
@@ -46,19 +47,37 @@ class Policy:
     ) -> None:
         roots = {root.domain: root for root in (own, *trusted)}
         self.own: Final = own.domain
-        self.roots: Final[Mapping[Name, Root]] = MappingProxyType(roots)
+        self.audit: Final = AuditTrail()  # of the node whose policy this is
+        self.roots: Mapping[Name, Root] = MappingProxyType(roots)
         self.transit: Final = frozenset(roots if transit is None else {own.domain, *transit})
         if not self.transit <= roots.keys():
             raise LocalError("transit goes through trusted domains only")
-        self.revoked: Final = Revocations(frozenset(root.key.compressed for root in roots.values()))
-        self._by_issuer: dict[bytes, list[Root]] = {}
-        for root in roots.values():
-            self._by_issuer.setdefault(root.distinguished_name, []).append(root)
+        self.revoked: Final = Revocations(_keys_of(roots.values()))
+        self._by_issuer = _by_issuer(roots.values())
         self._members: Lru[Membership] = Lru(remembered)
 
     def trusts(self, domain: Name) -> bool:
         """Return whether members of ``domain`` are believed here."""
         return domain in self.roots
+
+    def renew_roots(self, roots: Iterable[Root]) -> None:
+        """Take on newer roots of the domains that are trusted already, such as those with a successor.
+
+        Raises:
+            LocalError: a domain that is not trusted, or a root that does not descend from the one that is; nothing has
+                changed then.
+        """
+        renewed = dict(self.roots)
+        for root in roots:
+            known = renewed.get(root.domain)
+            if known is None:
+                raise LocalError(f"{root.label}: another domain than those trusted so far: restart the node")
+            if known.key not in [each.key for each in root.lineage]:
+                raise LocalError(f"{root.label}: a root that the present one did not vouch for")
+            renewed[root.domain] = root
+        self.roots = MappingProxyType(renewed)
+        self.revoked.trust(_keys_of(renewed.values()))
+        self._by_issuer = _by_issuer(renewed.values())
 
     def verify_membership(self, wire: bytes, unix_s: float) -> Membership:
         """Return the membership if a trusted domain issued it and it holds now; costs 0.2 ms once, then 2 us.
@@ -87,16 +106,27 @@ class Policy:
         root = self.roots.get(member.domain)
         if root is None:
             raise StatementError(DropReason.WRONG_DOMAIN, "a domain that is not trusted here")
+        if root.key.compressed != member.issuer_key:
+            root = self._predecessor(root, member)
         root.validity.check(unix_s, "domain root")
         member.validity.check(unix_s, "membership")
         if self.revoked.has(member.fingerprint, root.key.compressed):
             raise StatementError(DropReason.REVOKED, "membership")
 
+    def _predecessor(self, root: Root, member: Membership) -> Root:
+        """Return the root that issued a membership before ``root``; each one after it may take the membership back."""
+        for each in reversed(root.lineage):
+            if each.key.compressed == member.issuer_key:
+                return each
+            if self.revoked.has(member.fingerprint, each.key.compressed):
+                raise StatementError(DropReason.REVOKED, "membership")
+        raise StatementError(DropReason.WRONG_DOMAIN, "issued by a root that is not trusted here")
+
     def _verified(self, stranger: Unverified, unix_s: float) -> Membership:
         candidates = [
             root
             for root in self._by_issuer.get(stranger.certificate.issuer, ())
-            if stranger.certificate.issuer_key_id in (b"", root.key_id)
+            if stranger.certificate.issuer_key_id in (b"", *(each.key_id for each in root.lineage))
         ]
         refusal = StatementError(DropReason.WRONG_DOMAIN, "a domain that is not trusted here")
         for root in candidates:  # more than one only where labels are equal and a tool left the key id out
@@ -105,3 +135,14 @@ class Policy:
             except StatementError as error:
                 refusal = error
         raise refusal
+
+
+def _keys_of(roots: Iterable[Root]) -> frozenset[bytes]:
+    return frozenset(each.key.compressed for root in roots for each in root.lineage)
+
+
+def _by_issuer(roots: Iterable[Root]) -> dict[bytes, list[Root]]:
+    found: dict[bytes, list[Root]] = {}
+    for root in roots:
+        found.setdefault(root.distinguished_name, []).append(root)
+    return found

@@ -9,6 +9,8 @@ Source: DESIGN section 4. HPKE (RFC 9180) to the node's key, signed by the owner
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -18,7 +20,7 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 from gdp.crypto.identity import Identity
 from gdp.crypto.kem import KemPublicKey
 from gdp.crypto.keys import PublicKey, SigningKey
-from gdp.crypto.statements import StatementType, parse, sign
+from gdp.crypto.statements import Statement, StatementType, parse, sign
 from gdp.crypto.subject import Subject
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.names import Name
@@ -63,19 +65,17 @@ def make_grant(
     """Return the signed statement that hands an epoch's secret to a node.
 
     Args:
-        key: the owner's.
+        key: the owner's, or that of who may delegate the topic in its place.
         owner_master: the owner's.
-        subject: the topic; ``key`` must own it.
+        subject: the topic.
         epoch: 0 to ``EPOCH_MAX``.
         node: whom it is for.
         kem: that node's public key, from its card.
 
     Raises:
-        LocalError: another owner's topic, an epoch out of bounds, or a library without the KEM.
+        LocalError: an epoch out of bounds, or a library without the KEM.
         StatementError: MALFORMED, the node's public key is none.
     """
-    if subject.owner_key != key.public.compressed:
-        raise LocalError("only a topic's owner grants its secrets")
     secret = topic_secret(owner_master, subject.name, epoch)
     body = {
         **subject.to_fields(),
@@ -86,8 +86,11 @@ def make_grant(
     return sign(StatementType.GRANT, body, subject.name, key)
 
 
-def open_grant(identity: Identity, wire: bytes) -> Grant:
+def open_grant(identity: Identity, wire: bytes, delegates: Collection[bytes] = ()) -> Grant:
     """Return the secret that an owner granted to this node.
+
+    Args:
+        delegates: keys that may delegate the topic in the owner's place, 33 bytes each.
 
     Raises:
         StatementError: MALFORMED, WRONG_NAME, NOT_FOR_US, BAD_SIGNATURE or BAD_TAG.
@@ -100,11 +103,19 @@ def open_grant(identity: Identity, wire: bytes) -> Grant:
     if fields.name("to") != identity.name:
         raise StatementError(DropReason.NOT_FOR_US, "a grant to another node")
     sealed = fields.bytes_("sealed")
-    statement.verify(PublicKey.from_compressed(subject.owner_key))
+    _verify(statement, (subject.owner_key, *delegates))
     secret = identity.kem.open(sealed, _info(subject.name, epoch, identity.name))
     if len(secret) != SECRET_BYTES:
         raise StatementError(DropReason.MALFORMED, f"a secret has {SECRET_BYTES} bytes")
     return Grant(subject.name, epoch, secret)
+
+
+def _verify(statement: Statement, keys: tuple[bytes, ...]) -> None:
+    for key in keys[:-1]:
+        with suppress(StatementError):
+            statement.verify(PublicKey.from_compressed(key))
+            return
+    statement.verify(PublicKey.from_compressed(keys[-1]))
 
 
 def _info(name: Name, epoch: int, node: Name) -> bytes:

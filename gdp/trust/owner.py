@@ -6,15 +6,19 @@ nodes get delegations.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+import hashlib
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import Final
 
-from gdp.crypto.keys import SigningKey
+from gdp.crypto.keys import PublicKey, SigningKey
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
+from gdp.limits import CHAIN_MAX
 from gdp.metadata import Metadata
+from gdp.names import Name
 from gdp.trust.adcert import AdCert
 from gdp.trust.card import Card
 from gdp.trust.delegation import Delegation
@@ -22,16 +26,23 @@ from gdp.trust.grants import SECRET_BYTES, make_grant
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 
-__all__ = ["Owner"]
+__all__ = ["Owner", "successor_subject"]
+
+_SUCCESSOR: Final = b"gdp-owner-successor-1"
 
 
 @dataclass(frozen=True, slots=True)
 class Owner:
     """An owner's key, and the one secret from which those of all its topics come.
 
+    A name is made of its owner's key, so the key of a name never changes. What changes is who acts with it: the owner
+    may let a successor's key delegate its names, one link of a chain for each name.
+
     Args:
-        key: owns names.
+        key: owns names, or succeeded to those of the founder.
         master: 32 random bytes.
+        founder: the key that the names are made of, where it is not ``key``.
+        successions: of a successor: by name, the links from the founder to ``key``.
 
     Raises:
         LocalError: the master secret has another length.
@@ -39,14 +50,54 @@ class Owner:
 
     key: SigningKey
     master: bytes = field(repr=False)
+    founder: PublicKey | None = None
+    successions: Mapping[Name, tuple[bytes, ...]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         if len(self.master) != SECRET_BYTES:
             raise LocalError(f"an owner's master secret has {SECRET_BYTES} bytes")
 
+    @property
+    def public(self) -> PublicKey:
+        """Return the key that names are made of."""
+        return self.key.public if self.founder is None else self.founder
+
+    @property
+    def signer(self) -> Subject:
+        """Return as whom a successor signs."""
+        return successor_subject(self.key.public)
+
     def subject(self, metadata: Metadata) -> Subject:
         """Return the name that this metadata has under this owner, and what proves it."""
-        return Subject.of(metadata, self.key.public.compressed)
+        return Subject.of(metadata, self.public.compressed)
+
+    def succeed(self, successor: PublicKey, subject: Subject, validity: Validity) -> Delegation:
+        """Return what lets a successor's key delegate one name in this one's place.
+
+        Args:
+            subject: the name.
+            validity: how long it may; whatever it delegates ends with it.
+
+        Raises:
+            LocalError: another owner's name, or one that this key did not succeed to.
+        """
+        chain, issuer = self._links(subject)
+        to, rights = successor_subject(successor), frozenset(Right) - {Right.ATTACH}
+        link = AdCert.make(self.key, issuer, subject, to, rights, validity, may_delegate=True)
+        return Delegation(subject, to.name, rights, (*chain, link), MappingProxyType({}))
+
+    def _links(self, subject: Subject) -> tuple[tuple[bytes, ...], Name]:
+        """Return the links from a name's key to this one, and as whom this one issues the next."""
+        if subject.owner_key != self.public.compressed:
+            raise LocalError("another owner's name")
+        if self.founder is None:
+            return (), subject.name
+        links = self.successions.get(subject.name)
+        if links is None:
+            raise LocalError(
+                f"this key did not succeed to {subject.name.to_text()}: gdp cert succeed with the key that did"
+            )
+        return links, self.signer.name
 
     def delegate(
         self,
@@ -73,19 +124,27 @@ class Owner:
             StatementError: MALFORMED, the card's key is none.
         """
         subject = self.subject(metadata)
-        link = AdCert.make(self.key, subject.name, subject, card.subject, rights, validity, may_delegate=may_delegate)
+        chain, issuer = self._links(subject)
+        if len(chain) >= CHAIN_MAX:
+            raise LocalError(f"a chain of more than {CHAIN_MAX} links")
+        link = AdCert.make(self.key, issuer, subject, card.subject, rights, validity, may_delegate=may_delegate)
         grants = {
             epoch: make_grant(self.key, self.master, subject, epoch, card.name, card.kem)
             for epoch in sorted(set(epochs))
         }
-        return Delegation(subject, card.name, frozenset(rights), (link,), MappingProxyType(grants), metadata)
+        return Delegation(subject, card.name, frozenset(rights), (*chain, link), MappingProxyType(grants), metadata)
 
     def revoke(self, subject: Subject, fingerprint: bytes, until_unix_s: int) -> bytes:
-        """Return the statement that takes back an AdCert on one of this owner's names.
+        """Return the statement that takes back an AdCert on one of this owner's names; a successor's: that it issued.
 
         Raises:
             LocalError: another owner's name.
         """
-        if subject.owner_key != self.key.public.compressed:
+        if subject.owner_key != self.public.compressed:
             raise LocalError("only a name's owner takes back what it gave")
-        return Revocation.make(self.key, subject, fingerprint, until_unix_s)
+        return Revocation.make(self.key, subject if self.founder is None else self.signer, fingerprint, until_unix_s)
+
+
+def successor_subject(key: PublicKey) -> Subject:
+    """Return under which name a successor's key stands in a chain."""
+    return Subject(hashlib.sha256(_SUCCESSOR).digest(), key.compressed)

@@ -12,13 +12,13 @@ from typing import Final
 
 from gdp.crypto.certificates import Membership
 from gdp.crypto.fields import check_sequence
-from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.crypto.statements import Statement, parse
 from gdp.errors import DropReason, StatementError
 from gdp.limits import LEASE_MAX_S, LEASE_MIN_S
 from gdp.trust.adcert import AdCertCache, Chain
 from gdp.trust.claim import Claim, ClaimBody
 from gdp.trust.domain import Policy
-from gdp.trust.revocation import Revocation, Revocations
+from gdp.trust.revocations import Revocations
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCertCache
 
@@ -97,6 +97,7 @@ class ClaimVerifier:
             is_global=body.is_global,
             wire=statement.wire,
             previous=body.previous,
+            exchange=body.exchange,
         )
         self._check_evidence(claim, unix_s)
         return claim
@@ -109,19 +110,6 @@ class ClaimVerifier:
         """
         self.policy.check_member(claim.member, unix_s)
         self._check_evidence(claim, unix_s)
-
-    def revoke(self, wire: bytes, unix_s: float) -> Revocation | None:
-        """Take in a revocation; return it if it is news, so that claims on its fingerprint can be rechecked.
-
-        Who may hand revocations in, and how many, is for the caller to bound.
-
-        Raises:
-            StatementError: MALFORMED, WRONG_NAME, BAD_SIGNATURE, EXPIRED or QUOTA.
-        """
-        statement = parse(wire)
-        statement.expect(StatementType.REVOKE)
-        revocation = Revocation.from_statement(statement)
-        return revocation if self.revoked.add(revocation, unix_s) else None
 
     def _chain(self, body: ClaimBody, member: Membership) -> Chain:
         """Return the proof that the member may act on the name, its links verified."""

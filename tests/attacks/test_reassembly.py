@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from os import urandom
+
 from gdp.crypto.envelope import Opener, Sealer, Signer
 from gdp.frame.codec import decode
 from gdp.frame.kinds import Kind
@@ -27,7 +29,7 @@ class Stream:
         )
 
     def frames(self, number: int, message: bytes, signer: Signer = WRITER) -> list[bytes]:
-        sealer = Sealer(SECRET, 1, Kind.DATA, self.source, INCARNATION, self.topic, signer)
+        sealer = Sealer(SECRET, 1, Kind.DATA, self.source, INCARNATION, self.topic, signer, urandom)
         return list(sealer.seal(number, 0, message, MTU))
 
     def give(self, frames: list[bytes]) -> list[Joined]:
@@ -89,6 +91,6 @@ def test_a58_the_largest_message_of_a_lone_source_fits_and_so_do_three() -> None
     assert MESSAGE_MAX_BYTES * 1.3 < JOIN_TOTAL_BYTES / 3 <= JOIN_SOURCE_BYTES
     stream = Stream(Budget(), b"a" * 32)
     message = bytes(MESSAGE_MAX_BYTES)
-    sealer = Sealer(SECRET, 1, Kind.DATA, stream.source, INCARNATION, stream.topic, WRITER)
+    sealer = Sealer(SECRET, 1, Kind.DATA, stream.source, INCARNATION, stream.topic, WRITER, urandom)
     (joined,) = stream.give(list(sealer.seal(1, 0, message, 9_000)))
     assert len(joined.message) == MESSAGE_MAX_BYTES

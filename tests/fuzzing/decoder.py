@@ -20,6 +20,8 @@ class Decoder:
         tokens: words that mean something in its inputs.
         is_cbor: inputs are one item of CBOR, and are mutated as such too.
         size_max: longest input, in bytes.
+        time_max_ms: processor time that an input may take.
+        memory_max: most bytes held at a time, over the length of an input of 64 KiB, or a proportion of that.
     """
 
     name: str
@@ -29,3 +31,5 @@ class Decoder:
     tokens: tuple[bytes, ...] = ()
     is_cbor: bool = False
     size_max: int = 64 << 10
+    time_max_ms: float = 50.0
+    memory_max: float = 4.0

@@ -14,9 +14,11 @@ from fog.host.bundle import read_programs
 from fog.launch.cloud_node import parameters_in
 from fog.providers.local.machine_file import MachineFile
 from fog.supervisor.journal import Journal
+from gdp.crypto.pbes2 import SECRET_LABEL, _parts, protect
 from gdp.errors import ConfigError, LocalError, StoreError
 from gdp.nodes.config import SwitchConfig
 from gdp.nodes.yaml_source import read_yaml
+from gdp.stores.token_uri import TokenUri
 from proxy.config import ProxyConfig
 from proxy.endpoints.bag import BagReader, BagWriter
 from proxy.endpoints.bag_channel import offered_qos
@@ -31,6 +33,7 @@ _BAG_TOKENS: Final = (b"op=\x05", b"op=\x02", b"conn=", b"compression=lz4", b"co
 _QOS: Final = b"- history: 3\n  depth: 1\n  reliability: 1\n  durability: 2\n  deadline: {sec: 1, nsec: 2}\n"
 _CONFIG: Final = b"identity: id\ndomain: {root: r.crt}\niface: a\nexpose:\n - {name: /a, type: a/msg/B, owner: o.pub}\n"
 _TOPICS: Final = "CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format"
+_TOKEN: Final = b"pkcs11:token=a%20b;object=n;id=%01;type=private?module-path=/l.so&pin-source=file:/p"
 _TEXT_MAX: Final = 8_192  # bytes: the readers of YAML are slow
 
 
@@ -142,6 +145,8 @@ DECODERS: Final = (
     ),
     Decoder("journal", _in_file("journal", _journal), (_journal_file(),), (StoreError, LocalError)),
     Decoder("machine-file", _in_file("machine.json", lambda path: MachineFile.read(path.parent)), (_MACHINE,), ()),
+    Decoder("token-uri", lambda data: TokenUri.from_text(data.decode("latin-1")), (_TOKEN,), (LocalError,)),
+    Decoder("pbes2", _parts, (protect(bytes(96), b"p", bytes(32), SECRET_LABEL),), (LocalError,)),
     Decoder("boot", read_programs, (_PROGRAMS,), (LocalError,)),
     Decoder("plan", lambda data: ClusterPlan.from_json(data.decode("latin-1")), (_PLAN,), (LocalError,)),
 )

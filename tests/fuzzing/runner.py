@@ -1,7 +1,7 @@
 """The loop that gives a decoder mutated inputs, and what came of it.
 
-An input that runs lines of this project that none before it ran joins the corpus. Lines are traced in one execution of
-``_TRACE_EVERY``, since tracing slows a decoder down by a factor of ten or more.
+An input that runs steps from line to line that none before it ran joins the corpus. They are traced in one execution
+of ``_TRACE_EVERY``, since tracing slows a decoder down by a factor of ten or more; ``guided.py`` does without that.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any, Final
 from tests.fuzzing.decoder import Decoder
 from tests.fuzzing.mutation import mutated
 
-__all__ = ["CORPUS", "Finding", "HangError", "Outcome", "corpus_of", "fuzz", "keep"]
+__all__ = ["CORPUS", "Finding", "HangError", "Outcome", "corpus_of", "execute", "fuzz", "keep", "minimise"]
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 CORPUS: Final = ROOT / "tests" / "corpus"
@@ -31,8 +31,11 @@ _MEMORY_EVERY: Final = 16
 _MEMORY_LEAST_BYTES: Final = 4 << 10  # a shorter input counts as one of this length
 _CORPUS_MAX: Final = 512
 _KEPT_MAX_BYTES: Final = 4 << 10  # of a file that is added to the corpus
-_KEPT_FILES_MAX: Final = 12  # of one decoder; findings are kept beside
+_KEPT_BYTES: Final = 24 << 10  # of all of one decoder; findings are kept beside
+_COVER: Final = "cover-"  # how names of files begin that are kept for what they run, not because they once broke
 _HANG_S: Final = 10.0
+
+_Step = tuple[str, int, int]  # file, line, the line that ran next in that frame
 
 
 class HangError(BaseException):
@@ -41,10 +44,11 @@ class HangError(BaseException):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """An input for which a decoder raised what it may not."""
+    """An input for which a decoder raised what it may not; ``is_excess``: or took too much time or memory."""
 
     data: bytes
     error: str
+    is_excess: bool = False
 
 
 @dataclass(slots=True)
@@ -86,7 +90,7 @@ def fuzz(decoder: Decoder, seconds: float, seed: int, executions_max: int | None
     rng = random.Random(f"{seed} {decoder.name}")
     outcome = Outcome(decoder)
     corpus = corpus_of(decoder)
-    seen: set[tuple[str, int]] = set()
+    seen: set[_Step] = set()
     for data in corpus:
         _traced(outcome, data, seen)
     deadline_s = time.monotonic() + seconds
@@ -100,36 +104,64 @@ def fuzz(decoder: Decoder, seconds: float, seed: int, executions_max: int | None
             _measured(outcome, data)
         else:
             begun_s = time.thread_time()
-            _execute(outcome, data)
+            execute(outcome, data)
             outcome.slowest_ms = max(outcome.slowest_ms, 1e3 * (time.thread_time() - begun_s))
     return outcome
 
 
 def keep(outcome: Outcome) -> list[Path]:
-    """Write short inputs that ran new lines, and all findings, into the corpus; return the new files."""
+    """Write short inputs that run what no other runs, and all findings, into the corpus; return the new files."""
     folder = CORPUS / outcome.decoder.name
-    small = [data for data in outcome.found if len(data) <= _KEPT_MAX_BYTES]
-    room = max(0, _KEPT_FILES_MAX - len(list(folder.iterdir()))) if folder.is_dir() else _KEPT_FILES_MAX
     written = []
-    for data in [*_minimised(outcome.decoder, small)[:room], *(finding.data for finding in outcome.findings.values())]:
-        path = folder / hashlib.sha256(data).hexdigest()[:16]
-        if not path.exists():
-            folder.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
-            written.append(path)
+    for finding in outcome.findings.values():
+        written += _write(folder / hashlib.sha256(finding.data).hexdigest()[:16], finding.data)
+    held = sum(path.stat().st_size for path in _covers(outcome.decoder))
+    for data in _adding(outcome.decoder, corpus_of(outcome.decoder), outcome.found):
+        held += len(data)
+        if held > _KEPT_BYTES:
+            break
+        written += _write(folder / (_COVER + hashlib.sha256(data).hexdigest()[:16]), data)
     return written
 
 
-def _minimised(decoder: Decoder, inputs: Sequence[bytes]) -> list[bytes]:
-    """Return those inputs, shortest first, that run lines which no other one of them and no seed runs."""
-    seen: set[tuple[str, int]] = set()
+def minimise(decoder: Decoder) -> list[Path]:
+    """Delete kept inputs that run nothing which shorter ones do not run; return the files that went.
+
+    What once broke a decoder stays, and so does what came before inputs were kept for what they run.
+    """
+    covers = {path.read_bytes(): path for path in _covers(decoder)}
+    rest = [data for data in corpus_of(decoder) if data not in covers]
+    needed = set(_adding(decoder, rest, list(covers)))
+    gone = [path for data, path in covers.items() if data not in needed]
+    for path in gone:
+        path.unlink()
+    return gone
+
+
+def _covers(decoder: Decoder) -> list[Path]:
+    return sorted((CORPUS / decoder.name).glob(_COVER + "*"))
+
+
+def _write(path: Path, data: bytes) -> list[Path]:
+    if path.exists():
+        return []
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+    return [path]
+
+
+def _adding(decoder: Decoder, corpus: Sequence[bytes], inputs: Sequence[bytes]) -> list[bytes]:
+    """Return those short inputs, shortest first, that run what neither the corpus nor a shorter one runs."""
+    seen: set[_Step] = set()
     outcome = Outcome(decoder)
-    for data in corpus_of(decoder):
+    for data in corpus:
         _traced(outcome, data, seen)
-    return [data for data in sorted(inputs, key=len) if _traced(outcome, data, seen)]
+    short = sorted((data for data in inputs if len(data) <= _KEPT_MAX_BYTES), key=lambda data: (len(data), data))
+    return [data for data in short if _traced(outcome, data, seen)]
 
 
-def _execute(outcome: Outcome, data: bytes) -> None:
+def execute(outcome: Outcome, data: bytes) -> None:
+    """Give the decoder one input, and count what came of it."""
     outcome.executions += 1
     before = signal.signal(signal.SIGPROF, _hang)
     signal.setitimer(signal.ITIMER_PROF, _HANG_S)
@@ -147,21 +179,29 @@ def _execute(outcome: Outcome, data: bytes) -> None:
         signal.signal(signal.SIGPROF, before)
 
 
-def _traced(outcome: Outcome, data: bytes, seen: set[tuple[str, int]]) -> bool:
-    """Execute; return whether that ran lines that were not seen before."""
+def _traced(outcome: Outcome, data: bytes, seen: set[_Step]) -> bool:
+    """Execute; return whether that ran steps that were not seen before."""
     count = len(seen)
 
     def trace(frame: FrameType, event: str, arg: Any) -> Any:
-        name = frame.f_code.co_filename
-        if not name.startswith(_ROOMS):
+        code = frame.f_code
+        if not code.co_filename.startswith(_ROOMS):
             return None
-        seen.add((name, frame.f_lineno))
-        return trace
+        before = 0
+
+        def step(frame: FrameType, event: str, arg: Any) -> Any:
+            nonlocal before
+            if event == "line":
+                seen.add((code.co_filename, before, frame.f_lineno))
+                before = frame.f_lineno
+            return step
+
+        return step
 
     before = sys.gettrace()
     sys.settrace(trace)
     try:
-        _execute(outcome, data)
+        execute(outcome, data)
     finally:
         sys.settrace(before)
     return len(seen) > count
@@ -170,7 +210,7 @@ def _traced(outcome: Outcome, data: bytes, seen: set[tuple[str, int]]) -> bool:
 def _measured(outcome: Outcome, data: bytes) -> None:
     tracemalloc.start()
     try:
-        _execute(outcome, data)
+        execute(outcome, data)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

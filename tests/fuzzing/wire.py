@@ -14,6 +14,7 @@ from gdp.control.replica import Digest, Entry, Fetch, Inventory, Item, Replicas
 from gdp.crypto import cbor
 from gdp.crypto.certificates import Root, Unverified
 from gdp.crypto.envelope import Opener
+from gdp.crypto.introduction import Introduction
 from gdp.crypto.kem import KemPublicKey
 from gdp.crypto.keys import PublicKey
 from gdp.crypto.note import NoteOpener, NoteSealer
@@ -29,6 +30,7 @@ from gdp.message.report import Missing, Report, ReportFlag
 from gdp.message.status import Start, Status
 from gdp.names import Name
 from gdp.trust.adcert import AdCert
+from gdp.trust.audit import BEGIN, AuditLine
 from gdp.trust.card import Card
 from gdp.trust.claim import ClaimBody
 from gdp.trust.delegation import Delegation
@@ -42,6 +44,8 @@ __all__ = ["DECODERS"]
 
 _A: Final = Name(b"a" * 32)
 _NODE: Final = ROBOT
+_HEIR: Final = SCHOOL.succeed(LAB.key, DAY, NOW)
+_AUDIT: Final = AuditLine(1, NOW, "accepted", "name", "ab", "cd", "", 1, BEGIN).to_line()
 _ENTRY: Final = Entry(b"claim", b"cert", _A, _A, _A, (_A,), 9.0, is_from_above=False)
 _READS: Final[dict[str, tuple[bytes, Callable[[Fields], object]]]] = {
     **{name.replace(" ", "-"): (wire, read) for name, (wire, _, read) in BODIES.items()},
@@ -103,11 +107,15 @@ def _envelope(data: bytes) -> object:
 
 
 def _note(data: bytes) -> object:
-    return NoteOpener(SECRET, Kind.REPORT, SOURCE, 5, TOPIC, TOPIC, 9).open(codec.decode(data), data)
+    return NoteOpener(_KEY, TOPIC, 9).open(codec.decode(data), data)
 
 
 def _note_seed() -> bytes:
-    return NoteSealer(SECRET, 1, Kind.REPORT, SOURCE, 5, TOPIC, TOPIC, 9, count(1)).seal(b"body")
+    return NoteSealer(_KEY, 1, Kind.REPORT, SOURCE, 5, TOPIC, TOPIC, 9, count(1)).seal(b"body")
+
+
+def _introduction() -> bytes:
+    return Introduction.make(_NODE.subject, _NODE.key, 5, 1, _KEY)
 
 
 _REPORT: Final = Report(ReportFlag.NONE, 5, 1, (Missing(5, 1, 2),))
@@ -138,7 +146,8 @@ DECODERS: Final = (
     ),
     Decoder("delegation", Delegation.from_wire, (cbor.encode({"format": ""}),), (StatementError,), is_cbor=True),
     Decoder("card", Card.from_wire, (Card.make(_NODE),), (StatementError,)),
-    Decoder("root", Root.from_wire, (SCHOOL.root.wire,), (StatementError,)),
+    Decoder("root", Root.from_wire, (SCHOOL.root.wire, _HEIR.root.to_pem()), (StatementError,)),
+    Decoder("audit-line", AuditLine.from_line, (_AUDIT,), (LocalError,)),
     Decoder("membership", Unverified.from_wire, (_NODE.membership,), (StatementError,)),
     Decoder("request", read_request, (_NODE.membership,), (StatementError,)),
     Decoder("kem-key", KemPublicKey.from_wire, (_NODE.kem.public.wire,), (StatementError, LocalError)),
@@ -146,6 +155,12 @@ DECODERS: Final = (
     Decoder("public-pem", PublicKey.from_pem, (LAB.key.public.to_pem(),), (LocalError, StatementError)),
     Decoder("envelope", _envelope, tuple(_FRAMES), (RemoteError,)),
     Decoder("note", _note, (_note_seed(),), (RemoteError,)),
+    Decoder(
+        "introduction",
+        lambda data: Introduction.from_wire(data, _NODE.name, 5),
+        (_introduction(),),
+        (StatementError,),
+    ),
     Decoder(
         "keepalive",
         lambda data: open_keepalive(_KEY, data),

@@ -18,7 +18,7 @@ import networkx as nx
 from cryptography.hazmat.primitives.asymmetric import ec
 from hypothesis import strategies as st
 
-from gdp.crypto.keys import SigningKey
+from gdp.crypto.keys import SigningKey, SoftwareKey
 from gdp.limits import DEAD_S, HELLO_S, JOIN_LEASE_S
 from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
 from gdp.testbed.world import World
@@ -160,16 +160,23 @@ def plans(draw: st.DrawFn, faults_max: int = 2) -> Plan:
 
 
 @contextmanager
-def reproducible(seed: int) -> Iterator[None]:
-    """Make keys, and so names, the same for the same seed; and no lease longer than ``LEASE_S``."""
+def reproducible_keys(seed: int) -> Iterator[None]:
+    """Make keys, and so names, the same for the same seed."""
     made = iter(range(1, 1 << 32))
 
     def generate() -> SigningKey:
         digest = hashlib.sha256(b"%d %d" % (seed, next(made))).digest()
-        return SigningKey._of(ec.derive_private_key(int.from_bytes(digest, "big") % (_P256_ORDER - 1) + 1, _CURVE))
+        return SoftwareKey.of(ec.derive_private_key(int.from_bytes(digest, "big") % (_P256_ORDER - 1) + 1, _CURVE))
 
+    with mock.patch.object(SigningKey, "generate", generate):
+        yield
+
+
+@contextmanager
+def reproducible(seed: int) -> Iterator[None]:
+    """Make keys the same for the same seed, and no lease longer than ``LEASE_S``."""
     with (
-        mock.patch.object(SigningKey, "generate", generate),
+        reproducible_keys(seed),
         mock.patch("gdp.switch.link_states.LINK_STATE_LEASE_S", LEASE_S),
         mock.patch("gdp.switch.flooding.LINK_STATE_REFRESH_S", LEASE_S / 3),
     ):

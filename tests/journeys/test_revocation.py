@@ -7,13 +7,72 @@ import pytest
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
+from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
 from gdp.testbed.world import World
 from gdp.trust.delegation import Delegation
 from gdp.trust.revocation import Revocation
-from tests.journeys.flows import ROBOT, SERVER, Tap, flowing, ring
+from tests.journeys.flows import LEASE_S, ROBOT, SERVER, Tap, flowing, ring
 
 HERE = "nuc3"  # where the operator hands the revocation in: neither end's domain
 WITHIN_S = 1.0
+TIERS = {"t": ("t1",), "m": ("m1",), "n": ("n1",), "l": ("l1",), "r": ("r1",)}
+
+
+def three_tiers() -> World:
+    """Return a publisher and a reader in two bottom domains, each below a middle one, and these below the top."""
+    uppers = {"m": "t", "n": "t", "l": "m", "r": "n"}
+    topology = Topology(
+        tuple(Link(*each.split("-")) for each in ("m1-t1", "n1-t1", "l1-m1", "r1-n1")),
+        tuple(DomainPlan(label, switches, uppers.get(label)) for label, switches in TIERS.items()),
+        (
+            *(Attachment(switch, "rib", "rib") for (switch,) in TIERS.values()),
+            Attachment("l1", "proxy", "robot"),
+            Attachment("r1", "proxy", "server"),
+        ),
+    )
+    world = World(topology, lease_s=LEASE_S)
+    assert world.settle()
+    return world
+
+
+def keeps(world: World, fingerprint: bytes, key: bytes) -> set[str]:
+    """Return who keeps a revocation: switches by name, RIBs by domain in capitals, members."""
+    who = {node for node, switch in world.switches.items() if switch._policy.revoked.has(fingerprint, key)}
+    who |= {label.upper() for label, host in world.ribs.items() if host.rib._policy.revoked.has(fingerprint, key)}
+    members = world.members.items()
+    return who | {label for label, each in members if each.attachment._policy.revoked.has(fingerprint, key)}
+
+
+@pytest.mark.parametrize("at", ["l1", "t1", "n1"])
+@pytest.mark.parametrize("end", ["publisher", "reader", "member"])
+def test_a_revocation_closes_a_flow_in_all_of_three_tiers(end: str, at: str) -> None:
+    world = three_tiers()
+    flow = flowing(world, source="l1/robot", readers=("r1/server",))
+    reader = world.members["r1/server"]
+    key, until = world.owner.key.public.compressed, int(world.network.now.unix_s) + 100_000
+    if end == "member":
+        authority, fingerprint = world.authorities["l"], world.identities["l1/robot"].member.fingerprint
+        key = authority.root.key.compressed
+        wire = Revocation.make(authority.key, authority.root.subject, fingerprint, until)
+    else:
+        delegation = flow.topic.delegation
+        if end == "reader":
+            delegation = next(s for s in reader.subscribed() if s.name == flow.topic.name).delegation
+        fingerprint = parse(delegation.chain[-1]).fingerprint
+        wire = world.owner.revoke(delegation.subject, fingerprint, until)
+    world.switches[at].revoke(wire, world.network.now)
+    world.network.touch(at)
+    world.network.run(WITHIN_S)
+    expected = {"L", "M", "T", "N", "R", "l1", "r1"} if end == "publisher" else {"R", "r1"}
+    if end == "member":
+        expected = {*world.switches, *(label.upper() for label in world.ribs), *world.members}
+    assert keeps(world, fingerprint, key) >= expected
+    if end != "reader":
+        assert not reader.feeds_of(flow.topic.name)
+        stored = [host.rib._store.routes(flow.topic.name) for host in world.ribs.values()]
+        assert not any(stored)
+    assert not any(switch.planter.trees.all() for switch in world.switches.values())
+    flow.outlive(nobody=True)
 
 
 def revoke(world: World, delegation: Delegation) -> None:

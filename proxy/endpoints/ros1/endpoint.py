@@ -227,7 +227,8 @@ class Ros1Endpoint:
         self._life += 1
         self._started_s = time.monotonic()
         self._is_answering = False
-        environment = {key: value for key, value in os.environ.items() if key != "ROS_NAMESPACE"}
+        left_out = ("ROS_NAMESPACE", "GDP_PASSPHRASE")
+        environment = {key: value for key, value in os.environ.items() if key not in left_out}
         environment["ROS_MASTER_URI"] = self._master_uri
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, (os.environ.get("PYTHONPATH"), str(_ROOT))))
         arguments = (its.fileno(), self._master_uri, self._node, self._life, delay_s)

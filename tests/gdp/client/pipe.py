@@ -5,16 +5,18 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import count
 from random import Random
 
 from gdp.client.feed import Delivered, Feed, Reader
-from gdp.client.publisher import Publisher, Secrets, Source
+from gdp.client.publisher import Publisher, Secrets
 from gdp.crypto.keys import SigningKey
 from gdp.frame.codec import decode
 from gdp.frame.kinds import Kind
 from gdp.message.memory import Budget
 from gdp.names import Name
+from tests.gdp.client.lives import reader_of, source_of
 
 TOPIC = Name(b"t" * 32)
 WRITER = SigningKey.generate()
@@ -30,7 +32,7 @@ def sequenced(sequence: int, body: bytes) -> bytes:
 def publisher_of(
     *, incarnation: int = 1, secrets: Secrets = SECRETS, reliable: bool = True, depth: int = 0
 ) -> Publisher:
-    source = Source(Name(b"p" * 32), incarnation, WRITER)
+    source = source_of(Name(b"p" * 32), incarnation, WRITER)
     publisher = Publisher(TOPIC, source, secrets, b"what it is", reliable=reliable, depth=depth)
     publisher.tree_stands(1500)
     return publisher
@@ -74,12 +76,14 @@ class Pipe:
         self._order = count()
 
     def join(self, name: bytes, *, incarnation: int = 7, loss: float = 0.0, secrets: Secrets = SECRETS) -> End:
-        return self.attach(Reader(Name(name * 32), incarnation), loss=loss, secrets=secrets)
+        return self.attach(reader_of(name, incarnation), loss=loss, secrets=secrets)
 
     def attach(self, reader: Reader, *, loss: float = 0.0, secrets: Secrets = SECRETS) -> End:
         budget = Budget()
-        publisher = Name(b"p" * 32)
-        feed = Feed(TOPIC, reader, publisher, self.incarnation, WRITER.public, secrets, budget, self.now_s)
+        publisher, exchange = Name(b"p" * 32), self.publisher._source.notes.public
+        feed = Feed(
+            TOPIC, reader, publisher, self.incarnation, WRITER.public, exchange, secrets, budget, self.now_s
+        )
         end = self.ends[reader.name] = End(reader, feed, budget, loss)
         return end
 
@@ -120,10 +124,10 @@ class Pipe:
                 if not end.deaf and len(frame) <= end.mtu:
                     self._send(frame, end, self._to_reader(end, frame))
         for end in self.ends.values():
-            report = end.feed.take_report(self.now_s)
-            if report is not None and not end.mute:
-                self.seen.append(report)
-                self._send(report, end, self._to_publisher(report))
+            notes = end.feed.take_notes(self.now_s)
+            for note in [] if end.mute else notes:
+                self.seen.append(note)
+                self._send(note, end, partial(self.tell, note))
 
     def _send(self, frame: bytes, end: End, arrive: Callable[[], None]) -> None:
         for _ in range(2 if self.random.random() < self.doubled else 1):
@@ -140,5 +144,11 @@ class Pipe:
 
         return arrive
 
-    def _to_publisher(self, report: bytes) -> Callable[[], None]:
-        return lambda: self.publisher.receive_report(decode(report), report, self.now_s)
+    def tell(self, *notes: bytes) -> None:
+        """Give notes to the publisher."""
+        for note in notes:
+            header = decode(note)
+            if header.kind == Kind.INTRODUCTION:
+                self.publisher.receive_introduction(header, note)
+            else:
+                self.publisher.receive_report(header, note, self.now_s)

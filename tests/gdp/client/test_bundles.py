@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from os import urandom
+
 import pytest
 
 from gdp.client.pasts import Past
-from gdp.client.publisher import Publisher, Source
+from gdp.client.publisher import Publisher
 from gdp.crypto.envelope import SIGNATURE_BYTES, Sealer, part_room
 from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import Header, decode
@@ -13,6 +15,7 @@ from gdp.frame.kinds import Flag, Kind
 from gdp.limits import MESSAGE_MAX_BYTES, WINDOW_BYTES
 from gdp.message.bundle import BUNDLE_BYTES, pack
 from gdp.names import Name
+from tests.gdp.client.lives import source_of
 from tests.gdp.client.pipe import SECRETS, TOPIC, WRITER, End, Pipe, publisher_of, sequenced
 
 SMALL = [b"%d " % at * (at % 40) for at in range(2_000)]
@@ -101,9 +104,7 @@ def test_what_waits_for_its_seal_is_not_for_a_reader_that_comes_later() -> None:
     pipe, (end,) = live(publisher_of())
     publish(pipe.publisher, SMALL[:10])
     late = pipe.join(b"b")
-    note = late.feed.take_report(pipe.now_s)
-    assert note is not None
-    pipe.publisher.receive_report(decode(note), note, pipe.now_s)
+    pipe.tell(*late.feed.take_notes(pipe.now_s))
     publish(pipe.publisher, SMALL[10:20])
     pipe.run(2.0)
     assert (end.messages, late.messages) == (SMALL[:20], SMALL[10:20])
@@ -172,7 +173,7 @@ def test_bundles_that_no_longer_fit_the_path_are_bundles_under_their_new_numbers
 @pytest.mark.parametrize("body", [b"", pack([b"x"]) + b"y", pack([b"x" * 9])[:-1]], ids=["empty", "trailing", "cut"])
 def test_a_bundle_that_is_not_exact_is_counted_and_nothing_of_it_delivered(body: bytes) -> None:
     pipe, (end,) = live(publisher_of())
-    sealer = Sealer(SECRETS[1], 1, Kind.DATA, Name(b"p" * 32), 1, TOPIC, WRITER)
+    sealer = Sealer(SECRETS[1], 1, Kind.DATA, Name(b"p" * 32), 1, TOPIC, WRITER, urandom)
     for number, message, flags in ((1, body, Flag.RELIABLE | Flag.BUNDLE), (2, b"next", Flag.RELIABLE)):
         for frame in sealer.seal(number, int(flags), sequenced(number, message), 1_500):
             end.feed.receive(decode(frame), frame, pipe.now_s)
@@ -194,7 +195,7 @@ def test_a_bundle_that_is_lost_counts_as_a_loss() -> None:
 
 
 def test_a_publisher_that_goes_on_where_another_ended_bundles_and_counts_from_its_own_first_message() -> None:
-    source = Source(Name(b"p" * 32), 1, WRITER)
+    source = source_of(Name(b"p" * 32), 1, WRITER)
     publisher = Publisher(TOPIC, source, SECRETS, b"again", reliable=True, past=Past(1_000, 50))
     publisher.tree_stands(1_500)
     pipe, (end,) = live(publisher)

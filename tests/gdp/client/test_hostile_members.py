@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from itertools import count
+from os import urandom
 
 import pytest
 
 from gdp.client.feed import FeedState
 from gdp.crypto.envelope import Sealer, Signer
 from gdp.crypto.keys import SigningKey
-from gdp.crypto.note import NoteSealer
 from gdp.errors import DropReason
 from gdp.frame.codec import decode
 from gdp.frame.kinds import Flag, Kind
@@ -18,6 +17,7 @@ from gdp.message.move import Move
 from gdp.message.report import Missing, Report, ReportFlag
 from gdp.message.status import Status
 from gdp.names import Name
+from tests.gdp.client.lives import Notes, reader_of
 from tests.gdp.client.pipe import SECRETS, TOPIC, WRITER, End, Pipe, publisher_of, sequenced
 
 PUBLISHER = Name(b"p" * 32)
@@ -28,7 +28,8 @@ def forge(
     number: int, message: bytes, *, kind: Kind = Kind.DATA, signer: Signer = MALLORY, mtu: int = 1500
 ) -> list[bytes]:
     """Return what a reader can make: parts that open, under a signature that is not the writer's."""
-    return list(Sealer(SECRETS[1], 1, kind, PUBLISHER, 1, TOPIC, signer).seal(number, Flag.RELIABLE, message, mtu))
+    sealer = Sealer(SECRETS[1], 1, kind, PUBLISHER, 1, TOPIC, signer, urandom)
+    return list(sealer.seal(number, Flag.RELIABLE, message, mtu))
 
 
 def give(pipe: Pipe, end: End, frames: list[bytes]) -> None:
@@ -36,13 +37,9 @@ def give(pipe: Pipe, end: End, frames: list[bytes]) -> None:
         end.feed.receive(decode(frame), frame, pipe.now_s)
 
 
-def notes_of(name: bytes, reports: list[Report]) -> list[bytes]:
-    sealer = NoteSealer(SECRETS[1], 1, Kind.REPORT, name, 5, PUBLISHER, TOPIC, 1, count(1))
-    return [sealer.seal(report.to_wire()) for report in reports]
-
-
-def hello_of(name: bytes) -> bytes:
-    return notes_of(name, [Report(ReportFlag.NEW, 0, 0, ())])[0]
+def notes_of(pipe: Pipe, label: bytes, reports: list[Report]) -> list[bytes]:
+    notes = Notes(reader_of(label), pipe.publisher._source, TOPIC, SECRETS)
+    return [notes.introduction(), *(notes.report(each) for each in reports)]
 
 
 def live() -> tuple[Pipe, End]:
@@ -89,7 +86,7 @@ def test_absurd_numbers_before_the_first_status_do_not_stop_a_feed() -> None:
 def test_messages_that_come_before_the_first_status_are_kept_within_bounds() -> None:
     pipe = Pipe(publisher_of())
     end = pipe.join(b"a")
-    sealer = Sealer(SECRETS[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, WRITER)
+    sealer = Sealer(SECRETS[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, WRITER, urandom)
     for number in range(1, 80):
         give(pipe, end, list(sealer.seal(number, Flag.RELIABLE, sequenced(number, bytes(1 << 20)), 65_000)))
         assert end.budget.held_bytes <= JOIN_SOURCE_BYTES
@@ -100,7 +97,7 @@ def test_messages_that_come_before_the_first_status_are_kept_within_bounds() -> 
 
 def test_messages_behind_a_gap_that_is_never_filled_are_kept_within_bounds() -> None:
     pipe, end = live()
-    sealer = Sealer(SECRETS[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, WRITER)
+    sealer = Sealer(SECRETS[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, WRITER, urandom)
     for number in range(2, 80):
         give(pipe, end, list(sealer.seal(number, Flag.RELIABLE, sequenced(number, bytes(1 << 20)), 65_000)))
         assert end.budget.held_bytes <= JOIN_TOTAL_BYTES
@@ -112,8 +109,7 @@ def test_a_status_of_giant_numbers_costs_a_report_of_the_usual_size() -> None:
     pipe, end = live()
     status = Status(0, (1 << 64) - 1, 0, {}, b"").to_wire()
     give(pipe, end, forge(500, status, kind=Kind.STATUS, signer=WRITER))
-    report = end.feed.take_report(pipe.now_s)
-    assert report is not None
+    (report,) = end.feed.take_notes(pipe.now_s)
     assert len(report) < 3_000
     pipe.publish([b"still here"])
     assert pipe.run(1.0, lambda: end.messages == [b"still here"])
@@ -135,9 +131,9 @@ def test_a_message_whose_number_has_no_next_is_refused_and_ends_nobody(reliable:
     status = Status((1 << 64) - 2, (1 << 64) - 1, 0, {}, b"").to_wire()
     give(pipe, end, forge(500, status, kind=Kind.STATUS, signer=WRITER))
     for number in ((1 << 64) - 2, (1 << 64) - 1):
-        sealer = Sealer(SECRETS[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, WRITER)
+        sealer = Sealer(SECRETS[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, WRITER, urandom)
         give(pipe, end, list(sealer.seal(number, reliable, sequenced(number, b"last"), 1_500)))
-    assert end.feed.take_report(pipe.now_s) is not None
+    assert end.feed.take_notes(pipe.now_s) != []
     assert end.feed.drops[DropReason.MALFORMED] == 1
 
 
@@ -167,8 +163,8 @@ def test_a_reader_that_asks_for_everything_again_and_again_gets_a_flight_in_a_ro
     greedy = [Report(ReportFlag.NEW, 0, 0, ())] + [Report(ReportFlag.NONE, 1, 0, everything)] * 400
     sent = 0
     begun_s = pipe.now_s
-    for note in notes_of(b"m" * 32, greedy):
-        pipe.publisher.receive_report(decode(note), note, pipe.now_s)
+    for note in notes_of(pipe, b"m", greedy):
+        pipe.tell(note)
         sent += sum(map(len, pipe.publisher.take(pipe.now_s)))
         pipe.now_s += 0.0001
     rounds = (pipe.now_s - begun_s) / 0.01 + 1
@@ -179,8 +175,8 @@ def test_a_reader_that_asks_for_everything_again_and_again_gets_a_flight_in_a_ro
 def test_readers_that_say_they_are_new_again_and_again_get_one_status_in_a_while() -> None:
     pipe, _ = live()
     sent = []
-    for note in notes_of(b"m" * 32, [Report(ReportFlag.NEW, 0, 0, ())] * 1_000):
-        pipe.publisher.receive_report(decode(note), note, pipe.now_s)
+    for note in notes_of(pipe, b"m", [Report(ReportFlag.NEW, 0, 0, ())] * 1_000):
+        pipe.tell(note)
         sent += pipe.publisher.take(pipe.now_s)
     assert len(sent) <= 1
 
@@ -188,8 +184,7 @@ def test_readers_that_say_they_are_new_again_and_again_get_one_status_in_a_while
 def test_more_names_than_the_publisher_takes_are_refused() -> None:
     pipe, end = live()
     for at in range(1_100):
-        note = hello_of(at.to_bytes(32, "big"))
-        pipe.publisher.receive_report(decode(note), note, pipe.now_s)
+        pipe.tell(*notes_of(pipe, at.to_bytes(32, "big"), [Report(ReportFlag.NEW, 0, 0, ())]))
     assert pipe.publisher.readers == 1_024
     assert pipe.publisher.drops[DropReason.QUOTA] == 77
     pipe.publish([b"goes on"])
@@ -199,15 +194,13 @@ def test_more_names_than_the_publisher_takes_are_refused() -> None:
 def test_what_an_outsider_sends_leaves_nothing_behind() -> None:
     pipe, end = live()
     strange = {1: b"?" * 32}
-    sealer = Sealer(strange[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, MALLORY)
+    sealer = Sealer(strange[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, MALLORY, urandom)
     held = end.budget.held_bytes
     for number in range(1, 200):
         give(pipe, end, list(sealer.seal(number, Flag.RELIABLE, bytes(3_000), 1500)))
     assert end.budget.held_bytes == held
     assert end.feed.drops == {DropReason.BAD_TAG: 3 * 199}
     for at in range(50):
-        name = at.to_bytes(32, "big")
-        note = NoteSealer(strange[1], 1, Kind.REPORT, name, 5, PUBLISHER, TOPIC, 1, count(1)).seal(b"x")
-        pipe.publisher.receive_report(decode(note), note, pipe.now_s)
+        pipe.tell(*Notes(reader_of(bytes([at])), pipe.publisher._source, TOPIC, strange).hello())
     assert pipe.publisher.readers == 1
-    assert pipe.publisher.drops == {DropReason.BAD_TAG: 50}
+    assert pipe.publisher.drops == {DropReason.BAD_TAG: 50, DropReason.UNKNOWN_SENDER: 50}

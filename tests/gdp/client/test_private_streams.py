@@ -5,25 +5,26 @@ from __future__ import annotations
 import pytest
 
 from gdp.client.pasts import Past, Pasts
-from gdp.client.private import IDLE_S, Life, private_incarnation, private_name
+from gdp.client.private import IDLE_S, Life, Party, private_incarnation, private_name
 from gdp.client.private_streams import STREAMS_MAX, PrivateStreams
-from gdp.client.publisher import Source
 from gdp.errors import LocalError
 from gdp.limits import READER_LEASE_S
 from gdp.names import Name
+from tests.gdp.client.lives import note_keys, source_of
 from tests.gdp.client.pipe import SECRETS, WRITER
 
 SERVICE = Name(b"s" * 32)
-SERVER = Source(Name(b"p" * 32), 5, WRITER)
+SERVER = source_of(Name(b"p" * 32), 5, WRITER)
 CLIENT = Life(Name(b"c" * 32), 7)
+EXCHANGE = note_keys().public
 
 
 def streams_of(pasts: Pasts | None = None) -> PrivateStreams:
     return PrivateStreams(SERVICE, SERVER, SECRETS, Pasts() if pasts is None else pasts, lambda _: None, urgent=False)
 
 
-def client(number: int) -> Life:
-    return Life(Name(number.to_bytes(32, "big")), number)
+def client(number: int) -> Party:
+    return Party(Life(Name(number.to_bytes(32, "big")), number), EXCHANGE)
 
 
 def test_every_end_and_every_life_has_a_stream_of_its_own() -> None:
@@ -65,21 +66,21 @@ def test_a_silent_client_gives_way_to_one_that_asks() -> None:
 def test_an_idle_stream_is_forgotten_and_its_numbers_are_not() -> None:
     pasts = Pasts()
     desk = streams_of(pasts)
-    desk.stream(CLIENT, 1500, 0.0).publish(bytes(60_000))
+    desk.stream(Party(CLIENT, EXCHANGE), 1500, 0.0).publish(bytes(60_000))
     desk.forget_idle(IDLE_S)
     assert len(desk) == 1
     for stream in desk:
         stream.timeout(READER_LEASE_S + 1)
     desk.forget_idle(2 * IDLE_S)
     assert (len(desk), len(pasts)) == (0, 1)
-    assert desk.stream(CLIENT, 1500, 200.0).past == Past(2, 0, 1)
+    assert desk.stream(Party(CLIENT, EXCHANGE), 1500, 200.0).past == Past(2, 0, 1)
 
 
 def test_a_former_life_of_a_client_does_not_close_the_stream_to_its_present_one() -> None:
     desk = streams_of()
-    stream = desk.stream(CLIENT, 1500, 0.0)
+    stream = desk.stream(Party(CLIENT, EXCHANGE), 1500, 0.0)
     desk.forget(CLIENT._replace(incarnation=6))
-    assert desk.stream(CLIENT, 1500, 0.0) is stream
+    assert desk.stream(Party(CLIENT, EXCHANGE), 1500, 0.0) is stream
 
 
 def test_pasts_are_bounded_and_what_is_forgotten_raises_the_floor() -> None:

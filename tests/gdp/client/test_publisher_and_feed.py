@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from os import urandom
+
 import pytest
 
-from gdp.client.feed import FeedState, Reader
+from gdp.client.feed import FeedState
 from gdp.client.publisher import Publisher
 from gdp.crypto.envelope import Sealer
 from gdp.errors import DropReason, LocalError
@@ -12,7 +14,10 @@ from gdp.frame.codec import decode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import READER_LEASE_S
 from gdp.names import Name
+from tests.gdp.client.lives import reader_of
 from tests.gdp.client.pipe import SECRETS, TOPIC, WRITER, Pipe, publisher_of, sequenced
+
+NOTES = (Kind.INTRODUCTION, Kind.REPORT)
 
 MESSAGES = [bytes([at % 251]) * (at * 37 % 6_000) for at in range(200)]
 
@@ -173,7 +178,7 @@ def test_a_reader_that_starts_again_is_welcome_and_its_old_notes_are_not() -> No
 
 def test_notes_of_two_feeds_of_one_reader_never_share_a_nonce() -> None:
     pipe = Pipe(publisher_of())
-    reader = Reader(Name(b"a" * 32), 7)
+    reader = reader_of(b"a")
     pipe.attach(reader)
     pipe.run(1.0)
     pipe.attach(reader)  # its switch took the publisher away, and brought it back
@@ -187,12 +192,14 @@ def test_a_note_to_one_life_of_a_publisher_is_worth_nothing_to_the_next() -> Non
     pipe = Pipe(publisher_of(incarnation=1))
     pipe.join(b"a")
     pipe.run(1.0)
-    notes = [frame for frame in pipe.seen if decode(frame).kind == Kind.REPORT]
-    again = publisher_of(incarnation=2)
-    for note in notes:
-        again.receive_report(decode(note), note, 0.0)
+    notes = {kind: [each for each in pipe.seen if decode(each).kind == kind] for kind in NOTES}
+    again = pipe.publisher = publisher_of(incarnation=2)
+    pipe.tell(*notes[Kind.INTRODUCTION], *notes[Kind.REPORT])
     assert again.readers == 0
-    assert again.drops[DropReason.BAD_TAG] == len(notes)
+    assert again.drops == {
+        DropReason.BAD_TAG: len(notes[Kind.INTRODUCTION]),
+        DropReason.UNKNOWN_SENDER: len(notes[Kind.REPORT]),
+    }
 
 
 def test_a_publisher_that_starts_again_is_another_incarnation() -> None:
@@ -222,11 +229,11 @@ def test_an_older_epoch_still_opens_and_an_unknown_one_is_counted() -> None:
     pipe.publish([b"old key"])
     pipe.run(1.0)
     assert end.messages == [b"old key"]
-    sealer = Sealer(b"2" * 32, 2, Kind.DATA, Name(b"p" * 32), 1, TOPIC, WRITER)
+    sealer = Sealer(b"2" * 32, 2, Kind.DATA, Name(b"p" * 32), 1, TOPIC, WRITER, urandom)
     (frame,) = list(sealer.seal(2, Flag.RELIABLE, sequenced(2, b"new key"), 1500))
     end.feed.receive(decode(frame), frame, pipe.now_s)
     assert [each.message for each in end.feed.take_delivered()] == [b"new key"]
-    sealer = Sealer(b"3" * 32, 3, Kind.DATA, Name(b"p" * 32), 1, TOPIC, WRITER)
+    sealer = Sealer(b"3" * 32, 3, Kind.DATA, Name(b"p" * 32), 1, TOPIC, WRITER, urandom)
     (frame,) = list(sealer.seal(3, Flag.RELIABLE, sequenced(3, b"strange key"), 1500))
     end.feed.receive(decode(frame), frame, pipe.now_s)
     assert end.feed.drops[DropReason.UNKNOWN_EPOCH] == 1

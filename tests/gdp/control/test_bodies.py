@@ -13,6 +13,7 @@ from gdp.control.join import Join
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
 from gdp.control.query import Answer, Query
 from gdp.control.relay import Relay
+from gdp.control.revoked import Lacking, Revoked
 from gdp.control.verdict import Verdict
 from gdp.crypto.statements import Fields, Statement, StatementType, parse, sign
 from gdp.errors import DropReason, StatementError
@@ -26,6 +27,9 @@ JOIN = Join(A, B, C, A, frozenset({A, B}), 1_400, 7.0, b"evidence", b"s" * 8, 99
 LINKS, INSIDE, RIBS = (Adjacency(B, A, 10, 1_500),), (Adjacency(C, A, 3, 1),), (AttachedRib(C, A, bytes(8)),)
 STATE = LinkState(NODE.name, A, Scope.BORDER, 5, LINKS, INSIDE, RIBS, (A, B))
 ANSWER = Answer(A, B, b"claim", C, (A, B), 30.0)
+REVOKED = Revoked(b"s" * 8, 7, ((A, 3, b"d" * 8), (B, 0, bytes(8))))
+BUCKETS = Revoked(b"s" * 8, 8, (), A, tuple(bytes([at]) * 8 for at in range(256)))
+LACKING = Lacking(b"s" * 8, 9, A, (1, 200), (b"i" * 8, b"j" * 8))
 
 Read = Callable[[Fields], object]
 BODIES: dict[str, tuple[bytes, object, Read]] = {
@@ -33,6 +37,14 @@ BODIES: dict[str, tuple[bytes, object, Read]] = {
     "join": (JOIN.to_wire(NODE.name, NODE.key), JOIN, Join.from_fields),
     "link state": (STATE.to_wire(NODE.key, b"cert"), STATE, lambda fields: LinkState.from_fields(fields, NODE.name, A)),
     "query": (Query(A, 20.0).to_wire(NODE.name, NODE.key, b"cert"), Query(A, 20.0), Query.from_fields),
+    "query of a reader": (
+        Query(A, 20.0, b"revoked!").to_wire(NODE.name, NODE.key, b"cert"),
+        Query(A, 20.0, b"revoked!"),
+        Query.from_fields,
+    ),
+    "revoked": (REVOKED.to_wire(NODE.name, NODE.key), REVOKED, Revoked.from_fields),
+    "revoked in buckets": (BUCKETS.to_wire(NODE.name, NODE.key), BUCKETS, Revoked.from_fields),
+    "lacking": (LACKING.to_wire(NODE.name, NODE.key), LACKING, Lacking.from_fields),
     "answer": (ANSWER.to_wire(NODE.name, NODE.key, b"cert"), ANSWER, Answer.from_fields),
     "relay": (
         Relay(b"claim", (A,), b"cert").to_wire(NODE.name, NODE.key),

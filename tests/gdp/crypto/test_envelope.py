@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from os import urandom
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,16 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gdp.crypto.envelope import SIGNATURE_BYTES, TAG_BYTES, Opener, Sealer, part_room, seal_key
+from gdp.crypto.envelope import (
+    SALT_BYTES,
+    SEAL_BYTES,
+    SIGNATURE_BYTES,
+    MessageKeys,
+    Opener,
+    Sealer,
+    part_room,
+    seal_key,
+)
 from gdp.crypto.keys import PublicKey, SigningKey
 from gdp.errors import DropReason, EnvelopeError, LocalError, StatementError
 from gdp.frame.codec import HEADER_BYTES, HOPS_AT, authenticated, decode
@@ -53,7 +63,8 @@ def test_a_published_message_is_sealed_again_to_the_byte_up_to_its_signature(vec
     incarnation, kind = number(vector, "incarnation"), number(vector, "kind")
     source, destination, epoch = of(vector, "source"), of(vector, "destination"), number(vector, "epoch")
     signer = SigningKey.from_pem(FILE["writer"]["private"].encode())
-    sealer = Sealer(of(vector, "secret"), epoch, kind, source, incarnation, destination, signer)
+    salt = of(vector, "salt")
+    sealer = Sealer(of(vector, "secret"), epoch, kind, source, incarnation, destination, signer, lambda _: salt)
     published = [bytes.fromhex(each) for each in texts(vector, "frames")]
     message = of(vector, "message")
     frames = list(sealer.seal(number(vector, "number"), number(vector, "flags"), message, number(vector, "mtu")))
@@ -64,8 +75,9 @@ def test_a_published_message_is_sealed_again_to_the_byte_up_to_its_signature(vec
 @pytest.mark.parametrize("vector", VECTORS, ids=lambda vector: str(vector["what"]))
 def test_every_step_of_a_published_message_comes_out(vector: dict[str, object]) -> None:
     frames = [bytes.fromhex(each) for each in texts(vector, "frames")]
-    aead = AESGCM(of(vector, "key"))
+    aead, salt = AESGCM(of(vector, "message_key")), of(vector, "salt")
     assert key_of(vector) == of(vector, "key")
+    assert len(salt) == SALT_BYTES
     hashed = of(vector, "hash_head")
     message = b""
     for part, frame in enumerate(frames):
@@ -74,8 +86,10 @@ def test_every_step_of_a_published_message_comes_out(vector: dict[str, object]) 
         nonce, aad = bytes.fromhex(texts(vector, "nonces")[part]), bytes.fromhex(texts(vector, "aads")[part])
         assert nonce == header.number.to_bytes(8, "big") + part.to_bytes(4, "big")
         assert aad == authenticated(frame)
-        message += aead.decrypt(nonce, frame[HEADER_BYTES:end], aad)
-        hashed += frame[HEADER_BYTES:end]
+        assert frame[HEADER_BYTES : HEADER_BYTES + SALT_BYTES] == salt
+        sealed = frame[HEADER_BYTES + SALT_BYTES : end]
+        message += aead.decrypt(nonce, sealed, aad)
+        hashed += sealed
     assert message == of(vector, "message")
     assert hashlib.sha256(hashed).digest() == of(vector, "digest")
 
@@ -127,7 +141,7 @@ def test_only_hops_left_may_change_on_the_way() -> None:
                 opener_of(1).open(header, bytes(changed))
 
 
-@pytest.mark.parametrize("length", [0, TAG_BYTES - 1, SIGNATURE_BYTES + TAG_BYTES - 1])
+@pytest.mark.parametrize("length", [0, SEAL_BYTES - 1, SIGNATURE_BYTES + SEAL_BYTES - 1])
 def test_a_part_without_room_for_a_tag_is_truncated(length: int) -> None:
     (frame,) = seal(1, b"short")
     with pytest.raises(EnvelopeError) as caught:
@@ -153,7 +167,7 @@ def test_another_source_incarnation_kind_destination_or_secret_is_another_key() 
 
 
 def test_a_number_is_sealed_once() -> None:
-    sealer = Sealer(SECRET, 1, Kind.DATA, SOURCE, INCARNATION, TOPIC, WRITER)
+    sealer = Sealer(SECRET, 1, Kind.DATA, SOURCE, INCARNATION, TOPIC, WRITER, urandom)
     list(sealer.seal(5, 0, b"x", MTU))
     for again in (5, 4):
         with pytest.raises(LocalError):
@@ -161,12 +175,26 @@ def test_a_number_is_sealed_once() -> None:
 
 
 def test_what_is_above_the_limits_is_refused_before_a_number_is_spent() -> None:
-    sealer = Sealer(SECRET, 1, Kind.DATA, SOURCE, INCARNATION, TOPIC, WRITER)
+    sealer = Sealer(SECRET, 1, Kind.DATA, SOURCE, INCARNATION, TOPIC, WRITER, urandom)
     with pytest.raises(LocalError):
         list(sealer.seal(1, 0, bytes(MESSAGE_MAX_BYTES + SEQUENCE_BYTES + 1), FRAME_MAX_BYTES))
     with pytest.raises(LocalError):
-        list(sealer.seal(1, 0, b"", HEADER_BYTES + TAG_BYTES + SIGNATURE_BYTES))
+        list(sealer.seal(1, 0, b"", HEADER_BYTES + SEAL_BYTES + SIGNATURE_BYTES))
     assert decode(sealer.seal(1, 0, b"", MTU)[0]).hops_left == HOPS_MAX
+
+
+def test_message_keys_are_those_of_xaes_256_gcm() -> None:
+    sealed = MessageKeys(b"\x01" * 32).of(b"ABCDEFGHIJKL").encrypt(b"MNOPQRSTUVWX", b"XAES-256-GCM", b"")
+    assert sealed.hex() == "ce546ef63c9cc60765923609b33a9a1974e96e52daf2fcf7075e2271"  # C2SP, XAES-256-GCM
+
+
+def test_two_copies_of_one_sealer_share_no_key_under_one_number() -> None:
+    copies = [Sealer(SECRET, 1, Kind.DATA, SOURCE, INCARNATION, TOPIC, WRITER, urandom) for _ in range(2)]
+    (first,), (second,) = (list(each.seal(1, 0, b"a message", MTU)) for each in copies)
+    salt = slice(HEADER_BYTES, HEADER_BYTES + SALT_BYTES)
+    assert first[: salt.start] == second[: salt.start]
+    assert first[salt] != second[salt]
+    assert first[salt.stop : salt.stop + 9] != second[salt.stop : salt.stop + 9]
 
 
 def test_a_secret_has_thirty_two_bytes() -> None:

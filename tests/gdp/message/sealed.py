@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from os import urandom
+
 from gdp.crypto.envelope import Opener, Sealer, Signer
 from gdp.crypto.keys import SigningKey
 from gdp.errors import DropReason, EnvelopeError
@@ -23,7 +25,7 @@ MTU = 300  # room for 188 bytes in a part
 def seal(
     number: int, message: bytes, *, signer: Signer = WRITER, mtu: int = MTU, secret: bytes = SECRET
 ) -> list[bytes]:
-    return list(Sealer(secret, 1, Kind.DATA, SOURCE, INCARNATION, TOPIC, signer).seal(number, 0, message, mtu))
+    return list(Sealer(secret, 1, Kind.DATA, SOURCE, INCARNATION, TOPIC, signer, urandom).seal(number, 0, message, mtu))
 
 
 def opener_of(epoch: int) -> Opener:

@@ -8,6 +8,8 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import NodeKeys
 from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
+from gdp.crypto.statements import parse
+from gdp.effects import Instant
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.trust.domain import Policy
 from gdp.trust.revocation import Revocation
@@ -18,6 +20,11 @@ def refusal(policy: Policy, wire: bytes, unix_s: float = NOW) -> DropReason:
     with pytest.raises(StatementError) as caught:
         policy.verify_membership(wire, unix_s)
     return caught.value.reason
+
+
+def take_back(policy: Policy, fingerprint: bytes) -> None:
+    wire = Revocation.make(SCHOOL.key, SCHOOL.root.subject, fingerprint, DAY.not_after_unix_s)
+    assert policy.revoked.take(parse(wire), b"a neighbour", Instant(0.0, NOW), lambda _: False) is not None
 
 
 def test_a_domain_trusts_itself_and_those_it_names() -> None:
@@ -54,14 +61,14 @@ def test_a_remembered_member_still_runs_out() -> None:
 def test_a_remembered_member_can_be_revoked() -> None:
     policy = Policy(SCHOOL.root)
     member = policy.verify_membership(ROBOT.membership, NOW)
-    policy.revoked.add(Revocation(member.fingerprint, SCHOOL.root.subject, DAY.not_after_unix_s), NOW)
+    take_back(policy, member.fingerprint)
     assert refusal(policy, ROBOT.membership) is DropReason.REVOKED
 
 
 def test_a_renewed_member_is_let_in_while_its_old_certificate_stays_out() -> None:
     policy = Policy(SCHOOL.root)
     keys = NodeKeys(ROBOT.role, ROBOT.label, ROBOT.member.digest, ROBOT.key, ROBOT.kem)
-    policy.revoked.add(Revocation(ROBOT.member.fingerprint, SCHOOL.root.subject, DAY.not_after_unix_s), NOW)
+    take_back(policy, ROBOT.member.fingerprint)
     renewed = keys.join(SCHOOL, DAY)
     assert policy.verify_membership(renewed.membership, NOW).name == ROBOT.name
     assert refusal(policy, ROBOT.membership) is DropReason.REVOKED

@@ -45,9 +45,12 @@ def test_another_node_does_not_open_it() -> None:
     assert caught.value.reason is DropReason.NOT_FOR_US
 
 
-def test_only_the_owner_grants() -> None:
-    with pytest.raises(LocalError):
-        make_grant(ROBOT.key, LAB.master, CAMERA, 3, ROBOT.name, ROBOT.kem.public)
+def test_a_grant_by_another_key_than_the_owners_is_refused_but_for_who_may_delegate() -> None:
+    wire = make_grant(GATEWAY.key, LAB.master, CAMERA, 3, ROBOT.name, ROBOT.kem.public)
+    with pytest.raises(StatementError) as caught:
+        open_grant(ROBOT, wire)
+    assert caught.value.reason is DropReason.BAD_SIGNATURE
+    assert open_grant(ROBOT, wire, [GATEWAY.key.public.compressed]).epoch == 3
 
 
 def altered(**changes: object) -> bytes:

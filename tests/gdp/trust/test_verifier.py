@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from gdp.crypto.keys import PublicKey, SigningKey
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.crypto.subject import Subject
+from gdp.effects import Instant
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.metadata import Metadata
 from gdp.names import Name
@@ -260,6 +261,10 @@ def test_a_claim_holds_no_longer_than_its_evidence() -> None:
     assert verifier().verify(claim(chain=[adcert(validity=HOUR)]), NOW).valid_until_unix_s == HOUR.not_after_unix_s
 
 
+def take(at: ClaimVerifier, wire: bytes) -> Revocation | None:
+    return at.revoked.take(parse(wire), b"a neighbour", Instant(0.0, NOW), lambda _: True)
+
+
 def by_owner(fingerprint: bytes) -> bytes:
     return LAB.revoke(CAMERA, fingerprint, UNTIL)
 
@@ -284,7 +289,7 @@ def test_what_is_revoked_closes_what_it_opened(revoke: Callable[[bytes], bytes],
         "AdCert": found.chain.links[0].fingerprint,
         "RtCert": found.rtcert.fingerprint,
     }
-    revocation = at.revoke(revoke(fingerprints[which]), NOW)
+    revocation = take(at, revoke(fingerprints[which]))
     assert revocation is not None
     assert revocation.fingerprint in found.fingerprints
     assert refusal(GOOD, at) is DropReason.REVOKED
@@ -297,14 +302,14 @@ def test_a_stranger_revokes_nothing() -> None:
     at = verifier()
     found = at.verify(GOOD, NOW)
     for fingerprint in found.fingerprints:
-        at.revoke(Revocation.make(STRANGER.key, STRANGER.subject, fingerprint, UNTIL), NOW)
+        take(at, Revocation.make(STRANGER.key, STRANGER.subject, fingerprint, UNTIL))
     assert at.verify(GOOD, NOW) == found
     at.recheck(found, NOW)
 
 
 def test_an_owner_cannot_revoke_a_membership() -> None:
     at = verifier()
-    at.revoke(by_owner(at.verify(GOOD, NOW).member.fingerprint), NOW)
+    take(at, by_owner(at.verify(GOOD, NOW).member.fingerprint))
     assert at.verify(GOOD, NOW).node == ROBOT.name
 
 
@@ -314,7 +319,7 @@ def test_the_owner_and_the_issuer_revoke_a_link_further_down(who: str) -> None:
     wire = claim(chain=[adcert(GATEWAY, may_delegate=True), adcert(issuer=GATEWAY)])
     last = at.verify(wire, NOW).chain.links[1].fingerprint
     statement = by_owner(last) if who == "owner" else Revocation.make(GATEWAY.key, GATEWAY.subject, last, UNTIL)
-    at.revoke(statement, NOW)
+    take(at, statement)
     assert refusal(wire, at) is DropReason.REVOKED
 
 
@@ -322,7 +327,7 @@ def test_a_node_cannot_revoke_the_link_above_its_own() -> None:
     at = verifier()
     wire = claim(chain=[adcert(GATEWAY, may_delegate=True), adcert(issuer=GATEWAY)])
     first = at.verify(wire, NOW).chain.links[0].fingerprint
-    at.revoke(Revocation.make(GATEWAY.key, GATEWAY.subject, first, UNTIL), NOW)
+    take(at, Revocation.make(GATEWAY.key, GATEWAY.subject, first, UNTIL))
     assert at.verify(wire, NOW).node == ROBOT.name
 
 

@@ -1,0 +1,42 @@
+"""``gdp audit``: look at what a node or an authority accepted, refused and revoked.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gdp.cli import options
+from gdp.cli.output import show
+from gdp.errors import LocalError
+from gdp.stores.audit_log import verify_audit
+
+__all__ = ["app"]
+
+app = typer.Typer(no_args_is_help=True, help="Audit logs of switches, RIBs, domains and owners.")
+
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="the folder with audit.jsonl")]
+
+
+@app.callback()
+def audit() -> None:
+    """Keep the sub-command's name, though it is the only one."""
+
+
+@app.command("verify")
+def verify(folder: Folder, as_json: options.Json = False) -> None:
+    """Verify the chain of an audit log, and say how much is in it; a break is named with its file and line.
+
+    \b
+    Example:
+      gdp audit verify /var/lib/gdp/audit
+    """
+    if not folder.is_dir():
+        raise LocalError(f"{folder}: no such folder")
+    found = verify_audit(folder)
+    events = {f"{action} {what}": count for (action, what), count in sorted(found.events.items())}
+    show({"lines": found.lines, "first": found.first, "last hash": found.last_hash, **events}, as_json=as_json)

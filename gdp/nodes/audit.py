@@ -1,0 +1,108 @@
+"""Audit of a running node: its trail, its refusals by reason, and the folder in which they are kept.
+
+Place: shell. A node audits where its configuration names a folder (``audit``), or where systemd gives it one to keep
+state in (``StateDirectory=``, systemd.exec(5)).
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final
+
+from gdp.effects import Instant
+from gdp.errors import DropReason, LocalError
+from gdp.nodes.node_log import LOOK_S
+from gdp.nodes.runtime import Runtime, now
+from gdp.stores.audit_log import AuditLog
+from gdp.trust.audit import Action, AuditTrail
+
+__all__ = ["NodeAudit", "audit_folder", "keep_audit"]
+
+log = logging.getLogger(__name__)
+
+_STATE: Final = "STATE_DIRECTORY"
+_SAID: Final = frozenset(
+    {
+        DropReason.BAD_TAG,
+        DropReason.BAD_SIGNATURE,
+        DropReason.REPLAYED,
+        DropReason.MALFORMED,
+        DropReason.WRONG_NAME,
+        DropReason.BAD_CERTIFICATE,
+        DropReason.WRONG_DOMAIN,
+        DropReason.EXPIRED,
+        DropReason.REVOKED,
+        DropReason.NOT_DELEGATED,
+        DropReason.UNKNOWN_SENDER,
+        DropReason.QUOTA,
+    }
+)  # refusals of what somebody said; losses on the way are no matter of trust
+
+
+def audit_folder(configured: Path | None) -> Path | None:
+    """Return where a node keeps its audit log, or None: it keeps none."""
+    if configured is not None:
+        return configured
+    state = os.environ.get(_STATE, "").split(":")[0]
+    return Path(state) / "audit" if state else None
+
+
+class NodeAudit:
+    """Writes what a trail has to say.
+
+    Args:
+        folder: where to.
+        trail: of the node's policy.
+        drops: what the node dropped, by reason; counts only rise.
+
+    Raises:
+        LocalError: the folder cannot be made.
+    """
+
+    def __init__(self, folder: Path, trail: AuditTrail, drops: Callable[[], Mapping[DropReason, int]]) -> None:
+        self._log = AuditLog(folder)
+        self._trail = trail
+        self._drops = drops
+        self._known = dict.fromkeys(_SAID, 0)
+        self._has_failed = False
+        trail.begin()
+
+    def look(self, now: Instant) -> None:
+        """Write what has happened since the last look."""
+        drops = self._drops()
+        for reason, before in self._known.items():
+            count = drops.get(reason, 0)
+            if count > before:
+                self._trail.note(Action.REFUSED, "statements", reason=reason.label, count=count - before)
+                self._known[reason] = count
+        try:
+            self._log.write(self._trail, now.mono_s, now.unix_s)
+            self._has_failed = False
+        except LocalError as error:
+            if not self._has_failed:
+                log.error("audit log not written reason=%s", error)
+            self._has_failed = True
+
+
+def keep_audit(
+    configured: Path | None,
+    trail: AuditTrail,
+    drops: Callable[[], Mapping[DropReason, int]],
+    runtime: Runtime,
+    stack: ExitStack,
+) -> None:
+    """Have a runtime write a node's audit log, where the node keeps one, until the stack is left.
+
+    Raises:
+        LocalError: the folder cannot be made.
+    """
+    folder = audit_folder(configured)
+    if folder is not None:
+        audit = NodeAudit(folder, trail, drops)
+        runtime.every(LOOK_S, audit.look)
+        stack.callback(lambda: audit.look(now()))
+        log.info("audit log path=%s", folder)

@@ -1,0 +1,123 @@
+"""Renewal of a running node's credentials: its membership and the roots that it trusts, when their files change.
+
+Place: shell; looks at files. Whoever issues replaces ``node.crt``, ``root.crt`` or a root of ``domain.trusts``; the
+node takes them up within ``gdp.nodes.node_log.LOOK_S``, or at once on SIGHUP, and goes on under the same name and
+session. What does not hold is logged, and the node stays with what it has.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+from typing import Final
+
+from gdp.crypto.certificates import Membership
+from gdp.crypto.identity import Identity
+from gdp.effects import Instant
+from gdp.errors import LocalError
+from gdp.nodes.schema import Domain
+from gdp.stores.files import read_public
+from gdp.stores.keyring import NODE_CERTIFICATE, ROOT_CERTIFICATE, load_root, parsed
+from gdp.trust.domain import Policy
+
+__all__ = ["Credentials", "watched_folders"]
+
+log = logging.getLogger(__name__)
+
+_DAY_S: Final = 86_400
+_SOON_S: Final = 7 * _DAY_S
+_PUBLIC: Final = (".crt", ".pem", ".cer")
+_SHARE: Final = 5  # or the last fifth of a shorter validity
+_NodeState = tuple[tuple[int, int, int] | None, ...]
+
+
+class Credentials:
+    """The credential files of one node.
+
+    Args:
+        directory: the node's.
+        domain: the roots' files.
+        identity, policy: what is renewed.
+    """
+
+    def __init__(self, directory: Path, domain: Domain, identity: Identity, policy: Policy) -> None:
+        self._certificate, self._root = directory / NODE_CERTIFICATE, directory / ROOT_CERTIFICATE
+        self._roots = (domain.root, *domain.trusts)
+        self._identity = identity
+        self._policy = policy
+        self._seen = self._state()
+        self._failed = ""
+        self._warned: bytes = b""
+
+    def look(self, now: Instant) -> None:
+        """Take up what has changed since the last look, and warn of a membership that ends soon."""
+        state = self._state()
+        if state != self._seen:
+            self._take_up(now.unix_s, state)
+        self._warn(now.unix_s)
+
+    def seconds_left(self, unix_s: float) -> float:
+        """Return how long the membership holds still; negative: it has run out."""
+        return self._identity.member.not_after_unix_s - unix_s
+
+    def _take_up(self, unix_s: float, state: _NodeState) -> None:
+        """Take files that are replaced one by one: what does not hold yet is tried again, and told the second time."""
+        try:
+            roots = [load_root(path) for path in self._roots]
+            own = load_root(self._root)
+            wire = read_public(self._certificate)
+            member = parsed(self._certificate, lambda data: Membership.from_wire(data, own, unix_s), wire)
+            self._policy.renew_roots(roots)
+            before = self._identity.member
+            self._identity.renew(member, own)
+        except LocalError as error:
+            if self._failed == str(error):
+                log.error("credentials not renewed reason=%s", error)
+                self._seen, self._failed = state, ""
+            else:
+                self._failed = str(error)
+            return
+        self._seen, self._failed = state, ""
+        if member.fingerprint != before.fingerprint:
+            until = member.not_after_unix_s
+            log.info("membership renewed name=%s until_unix_s=%d", self._identity.name.short, until)
+        for root in roots:
+            log.info("root read again domain=%s successions=%d", root.label, len(root.predecessors))
+
+    def _warn(self, unix_s: float) -> None:
+        member = self._identity.member
+        whole = member.not_after_unix_s - member.not_before_unix_s
+        left_s = self.seconds_left(unix_s)
+        if left_s <= min(_SOON_S, whole / _SHARE) and self._warned != member.fingerprint:
+            self._warned = member.fingerprint
+            log.warning("membership ends soon name=%s left_s=%d: run gdp cert renew", self._identity.name.short, left_s)
+
+    def _state(self) -> _NodeState:
+        return tuple(_stamp(path) for path in (self._certificate, self._root, *self._roots))
+
+
+def watched_folders(directory: Path, domain: Domain) -> tuple[Path, ...]:
+    """Return what a node has to be able to read again: folders, since a replaced file is another one.
+
+    Beside the node's own these are folders with nothing but certificates. A root that lies elsewhere, as beside its
+    domain's key, is read at the start, and again only if it was written in place.
+    """
+    roots = (domain.root, *domain.trusts)
+    return tuple(dict.fromkeys([directory, *(path.parent if _is_public(path.parent) else path for path in roots)]))
+
+
+def _is_public(folder: Path) -> bool:
+    try:
+        return all(each.suffix in _PUBLIC and each.is_file() for each in folder.iterdir())
+    except OSError:
+        return False
+
+
+def _stamp(path: Path) -> tuple[int, int, int] | None:
+    """Return what changes when a file is replaced."""
+    try:
+        status = os.stat(path)
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns, status.st_size

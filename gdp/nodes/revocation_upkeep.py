@@ -1,0 +1,93 @@
+"""A node's revocations across its restarts: read at the start, written when there is news.
+
+Layer: I/O.
+"""
+
+from __future__ import annotations
+
+import logging
+from contextlib import ExitStack
+from itertools import islice
+from pathlib import Path
+from typing import Final
+
+from gdp.crypto.statements import parse
+from gdp.effects import Instant
+from gdp.errors import RemoteError
+from gdp.nodes.runtime import Runtime, now
+from gdp.stores.revocation_file import SLICE, RevocationFile
+from gdp.trust.revocations import Revocations
+
+__all__ = ["WRITE_S", "RevocationUpkeep", "load_revocations"]
+
+log = logging.getLogger(__name__)
+
+WRITE_S: Final = 0.05  # between two slices
+
+
+def load_revocations(folder: Path | None, revoked: Revocations, stack: ExitStack) -> RevocationUpkeep:
+    """Return the care of a node's revocations, those of an earlier life taken back; ``stack`` ends it.
+
+    Raises:
+        LocalError: others may write to the folder.
+    """
+    upkeep = RevocationUpkeep(folder, revoked)
+    upkeep.load(now())
+    stack.callback(upkeep.close)
+    return upkeep
+
+
+class RevocationUpkeep:
+    """The care of one node's revocations.
+
+    Args:
+        folder: the node's state folder; None: they are kept in memory only.
+
+    Raises:
+        LocalError: others may write to the folder.
+    """
+
+    def __init__(self, folder: Path | None, revoked: Revocations) -> None:
+        self._file = None if folder is None else RevocationFile(folder)
+        self._revoked = revoked
+
+    def load(self, at: Instant) -> None:
+        """Take back what was kept in an earlier life, each statement verified."""
+        if self._file is None:
+            return
+        refused = 0
+        for row in self._file.load(at.unix_s):
+            try:
+                self._revoked.restore(parse(row.statement), row.giver, at, of_root=row.is_root)
+            except RemoteError:
+                refused += 1
+        self._revoked.changes = set()
+        log.info("revocations read kept=%d refused=%d", len(self._revoked), refused)
+
+    def start(self, runtime: Runtime | None = None) -> None:
+        """Begin to write; after rights were given away, which threads do not share.
+
+        Args:
+            runtime: calls ``work`` from now on; None: the caller does.
+        """
+        if self._file is not None:
+            self._file.start()
+            if runtime is not None:
+                runtime.every(WRITE_S, self.work)
+
+    def work(self, at: Instant) -> None:
+        """Hand one slice of changes to the file, if it is not behind."""
+        del at
+        changes = self._revoked.changes
+        if changes and self._file is not None and self._file.is_ready:
+            keys = list(islice(changes, SLICE))
+            changes.difference_update(keys)
+            self._file.write([(key, self._revoked.kept(key)) for key in keys])
+
+    def close(self) -> None:
+        """Write what is left, and end."""
+        if self._file is None:
+            return
+        while self._revoked.changes and self._file.is_ready:
+            self.work(Instant(0.0, 0.0))
+        self._file.close()

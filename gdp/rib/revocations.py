@@ -1,0 +1,91 @@
+"""Revocations at a RIB: which it keeps, what it closes, and whom it tells.
+
+Sans-I/O. A RIB keeps what trusted domains took back, and what an owner took back of a name that is stored or watched
+here. It tells whoever brought, holds or watches that name, in the tiers above and below, and who asks about the name
+later. What concerns nothing here goes on to the tier above only, at a bounded rate, and is not kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from gdp.crypto.statements import Statement
+from gdp.effects import Instant
+from gdp.errors import StatementError
+from gdp.names import Name
+from gdp.rib.route import Route
+from gdp.rib.store import Store
+from gdp.trust.revocation import Revocation
+from gdp.trust.token_buckets import TokenBuckets
+from gdp.trust.verifier import ClaimVerifier
+
+__all__ = ["RibRevocations"]
+
+_PASSED_PER_S, _PASSED_BURST = 8.0, 128.0  # to the tier above, of one sender
+_TOLD_PER_S, _TOLD_BURST = 64.0, 2_048.0  # to one asker, of what it lacks
+_TOLD_ABOUT_MAX: Final = 1_024  # in one answer
+
+
+class RibRevocations:
+    """Takes revocations for one RIB.
+
+    Args:
+        is_watched: whether somebody watches a name.
+    """
+
+    def __init__(self, verifier: ClaimVerifier, store: Store, is_watched: Callable[[Name], bool]) -> None:
+        self._verifier = verifier
+        self._revoked = verifier.revoked
+        self._store = store
+        self._is_watched = is_watched
+        self._passed = TokenBuckets(_PASSED_PER_S, _PASSED_BURST)
+        self._told = TokenBuckets(_TOLD_PER_S, _TOLD_BURST)
+
+    def take(self, statement: Statement, giver: Name, now: Instant) -> Revocation | None:
+        """Take a revocation; return it if it is news.
+
+        Raises:
+            StatementError: it does not hold, concerns nothing here (UNCONCERNED), or there is no room for it.
+            StoreError: a shared store did not answer.
+        """
+        issued_for = Revocation.read(statement).issuer.name
+        return self._revoked.take(
+            statement, giver, now, lambda key: self._store.has_issuer(key) or self._concerns(issued_for)
+        )
+
+    def closed(self, revocation: Revocation, now: Instant) -> list[Route]:
+        """Return the routes that rest on what was revoked, and hold no more."""
+        closed = []
+        for route in self._store.resting_on(revocation.fingerprint):
+            try:
+                self._verifier.verify(route.claim, now.unix_s)
+            except StatementError:
+                closed.append(route)
+        return closed
+
+    def may_pass_up(self, statement: Statement, sender: Name, now: Instant) -> bool:
+        """Return whether a revocation that is not kept here goes on to the tier above.
+
+        Raises:
+            StatementError: its signature does not hold.
+        """
+        if not self._passed.take(sender, now.mono_s):
+            return False
+        Revocation.from_statement(statement)
+        return True
+
+    def lacked_by(self, asker: Name, name: Name, digest: bytes, now_s: float) -> list[bytes]:
+        """Return what an asker about a name is to be sent, given the digest of what it has."""
+        if digest == self._revoked.digest_about(name):
+            return []
+        wires = self._revoked.about(name)[:_TOLD_ABOUT_MAX]
+        return [wire for wire in wires if self._told.take(asker, now_s)]
+
+    def behind(self, fingerprints: list[tuple[bytes, bytes]]) -> list[bytes]:
+        """Return the statements that took these certificates back, each by its fingerprint and a key that may."""
+        found = (self._revoked.wire(key, fingerprint) for fingerprint, key in fingerprints)
+        return [wire for wire in found if wire is not None]
+
+    def _concerns(self, name: Name) -> bool:
+        return self._is_watched(name) or bool(self._store.routes(name))

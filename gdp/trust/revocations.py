@@ -1,0 +1,431 @@
+"""Revocations that a node keeps: whose it takes, how many, and digests of them.
+
+Sans-I/O. Two kinds have room of their own. Those of *roots*, the trusted domains of the node's policy, are never given
+up for others, and neighbours compare them by digests. Those of *owners* (of names, or nodes that issued a certificate)
+are taken only while a certificate of that key is held here. Each giver, over whom they came, and each issuer has a
+rate and a share. Where a share or the whole is full, whoever holds most gives way to whoever holds less, so that one
+sender's junk takes the place of its own junk only.
+
+A revocation is kept until the certificate would have run out by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from functools import reduce
+from hashlib import blake2b, sha256
+from operator import xor
+from typing import Final, NamedTuple
+
+from gdp.crypto.statements import Statement, StatementType, assemble
+from gdp.crypto.subject import Subject
+from gdp.effects import Instant
+from gdp.errors import DropReason, StatementError
+from gdp.limits import (
+    CERTIFICATE_LIFE_MAX_S,
+    CLOCK_SKEW_S,
+    REVOCATIONS_OF_OWNERS,
+    REVOCATIONS_PER_GIVER,
+    REVOCATIONS_PER_ISSUER,
+    REVOCATIONS_PER_ROOT,
+)
+from gdp.names import Name
+from gdp.trust.revocation import Revocation
+from gdp.trust.token_buckets import TokenBuckets
+
+__all__ = ["BUCKETS", "ID_BYTES", "OPERATOR", "Kept", "KeptKey", "Revocations", "hash_of"]
+
+BUCKETS: Final = 256  # of a root's revocations, by the first byte of the fingerprint
+ID_BYTES: Final = 8
+OPERATOR: Final = b""  # the giver of what this node's own operator hands in: without a rate, never given up
+_ROOTS_PER_S, _ROOTS_BURST = 1_500.0, 4_096.0  # of one giver; a verification costs about 80 us
+_OWNERS_PER_S, _OWNERS_BURST = 16.0, 512.0  # of one giver
+_ISSUER_PER_S, _ISSUER_BURST = 4.0, 256.0  # of one owner
+_FORGED_COST: Final = 64.0  # tokens for a signature that does not hold
+_UNTIL_BYTES: Final = 8
+_SIGNATURE_BYTES: Final = 64
+
+KeptKey = tuple[bytes, bytes]  # the issuer's key, the fingerprint
+
+
+class Kept(NamedTuple):
+    """One revocation as it is kept, for a file."""
+
+    is_root: bool
+    giver: bytes
+    until_unix_s: int
+    wire: bytes
+
+
+@dataclass(slots=True)
+class _Root:
+    """What one root took back. A value: until when (8 bytes), and the signature, or the whole statement.
+
+    Args:
+        root: the hash of its key.
+    """
+
+    root: Name
+    subject: Subject | None = None
+    buckets: list[dict[bytes, bytes]] = field(default_factory=lambda: [{} for _ in range(BUCKETS)])
+    hashes: list[int] = field(default_factory=lambda: [0] * BUCKETS)
+    count: int = 0
+
+
+@dataclass(slots=True)
+class _Owned:
+    """A revocation of an owner."""
+
+    name: Name
+    until_unix_s: int
+    wire: bytes
+    giver: bytes
+
+
+class Revocations:
+    """What has been taken back, as far as this node was told and it matters here.
+
+    Args:
+        root_keys: the trusted domains' compressed keys, those of former roots too.
+        per_root, of_owners, per_issuer, per_giver: bounds, see ``limits``.
+
+    Attributes:
+        changes: keys of what was added or dropped since they were last written down; None: nobody writes.
+    """
+
+    def __init__(
+        self,
+        root_keys: Iterable[bytes],
+        *,
+        per_root: int = REVOCATIONS_PER_ROOT,
+        of_owners: int = REVOCATIONS_OF_OWNERS,
+        per_issuer: int = REVOCATIONS_PER_ISSUER,
+        per_giver: int = REVOCATIONS_PER_GIVER,
+    ) -> None:
+        self._roots: dict[bytes, _Root] = {}
+        self._key_of: dict[Name, bytes] = {}  # by the hash by which neighbours speak of it
+        self.trust(root_keys)
+        self._owners: dict[bytes, dict[bytes, _Owned]] = {}  # by the issuer's key and the fingerprint
+        self._about: dict[Name, dict[KeptKey, None]] = {}  # of owners, by the name that signed
+        self._shares: dict[bytes, dict[bytes, int]] = {}  # how many of owners by giver and issuer's key
+        self._owned = 0
+        self._per_root = per_root
+        self._of_owners = of_owners
+        self._per_issuer = per_issuer
+        self._per_giver = per_giver
+        self._root_rates = TokenBuckets(_ROOTS_PER_S, _ROOTS_BURST)
+        self._owner_rates = TokenBuckets(_OWNERS_PER_S, _OWNERS_BURST)
+        self._issuer_rates = TokenBuckets(_ISSUER_PER_S, _ISSUER_BURST)
+        self._next_end_s = float("inf")  # no revocation ends before, unix seconds
+        self.changes: set[KeptKey] | None = None
+
+    def __len__(self) -> int:
+        return self._owned + sum(root.count for root in self._roots.values())
+
+    def trust(self, root_keys: Iterable[bytes]) -> None:
+        """Count these, too, as trusted domains' keys from now on; what is known stays."""
+        for key in root_keys:
+            if key not in self._roots:
+                self._roots[key] = _Root(hash_of(key))
+                self._key_of[hash_of(key)] = key
+
+    def is_root(self, issuer_key: bytes) -> bool:
+        """Return whether this is the key of a trusted domain."""
+        return issuer_key in self._roots
+
+    def has(self, fingerprint: bytes, issuer_key: bytes) -> bool:
+        """Return whether the holder of ``issuer_key`` took this certificate back."""
+        root = self._roots.get(issuer_key)
+        if root is not None:
+            return fingerprint in root.buckets[fingerprint[0]]
+        of_owner = self._owners.get(issuer_key)
+        return of_owner is not None and fingerprint in of_owner
+
+    def take(
+        self, statement: Statement, giver: bytes, now: Instant, holds: Callable[[bytes], bool]
+    ) -> Revocation | None:
+        """Take a parsed revocation; return it if it is news.
+
+        Args:
+            giver: over whom it came, whose share it counts against: a node's name, or ``OPERATOR``.
+            holds: whether a certificate that a key (33 bytes) issued is held here.
+
+        Raises:
+            StatementError: MALFORMED, WRONG_NAME, EXPIRED, BAD_SIGNATURE, UNCONCERNED (nothing of the issuer is held
+                here; the signature was not looked at) or QUOTA.
+        """
+        revocation = Revocation.read(statement)
+        self._check_end(revocation, now.unix_s)
+        key, is_root = revocation.issuer.owner_key, self.is_root(revocation.issuer.owner_key)
+        if self._until(key, revocation.fingerprint) >= revocation.until_unix_s:
+            if giver == OPERATOR and not is_root:
+                self._pin(key, revocation.fingerprint)
+            return None
+        rates = self._root_rates if is_root else self._owner_rates
+        if giver != OPERATOR:
+            if not rates.take(giver, now.mono_s):
+                raise StatementError(DropReason.QUOTA, "revocations over one neighbour")
+            if not is_root and not holds(key):
+                raise StatementError(DropReason.UNCONCERNED, "a revocation of whom nothing is held here")
+        try:
+            revocation.verify(statement)
+        except StatementError:
+            rates.charge(giver, now.mono_s, _FORGED_COST)
+            raise
+        if giver != OPERATOR and not is_root and not self._issuer_rates.take(key, now.mono_s):
+            raise StatementError(DropReason.QUOTA, "revocations of one owner")
+        self._add(revocation, statement, giver, now.unix_s)
+        return revocation
+
+    def restore(self, statement: Statement, giver: bytes, now: Instant, *, of_root: bool) -> None:
+        """Take back what this node kept in an earlier life: verified, but without a rate.
+
+        Args:
+            of_root: it was kept as a trusted domain's, which the domain must be still.
+
+        Raises:
+            StatementError: as ``take``.
+        """
+        revocation = Revocation.read(statement)
+        if of_root and not self.is_root(revocation.issuer.owner_key):
+            raise StatementError(DropReason.UNCONCERNED, "a domain that is trusted no more")
+        self._check_end(revocation, now.unix_s)
+        revocation.verify(statement)
+        if self._until(revocation.issuer.owner_key, revocation.fingerprint) < revocation.until_unix_s:
+            self._add(revocation, statement, giver, now.unix_s)
+
+    def expire(self, unix_s: float) -> None:
+        """Forget what has run out."""
+        if unix_s < self._next_end_s:
+            return
+        ended = [key for key in self.keys() if self._until(*key) + CLOCK_SKEW_S < unix_s]
+        for key in ended:
+            self._remove(*key)
+        ends = (self._until(*key) for key in self.keys())
+        self._next_end_s = min(ends, default=float("inf")) + CLOCK_SKEW_S
+
+    def keys(self) -> Iterable[KeptKey]:
+        """Yield the key of everything that is kept, that of roots first."""
+        for key, root in self._roots.items():
+            yield from ((key, fingerprint) for bucket in root.buckets for fingerprint in bucket)
+        for key, of_owner in self._owners.items():
+            yield from ((key, fingerprint) for fingerprint in of_owner)
+
+    def kept(self, key: KeptKey) -> Kept | None:
+        """Return what is kept under a key, or None."""
+        issuer_key, fingerprint = key
+        wire = self.wire(issuer_key, fingerprint)
+        if wire is None:
+            return None
+        until_unix_s = self._until(issuer_key, fingerprint)
+        if self.is_root(issuer_key):
+            return Kept(True, OPERATOR, until_unix_s, wire)
+        return Kept(False, self._owners[issuer_key][fingerprint].giver, until_unix_s, wire)
+
+    def wire(self, issuer_key: bytes, fingerprint: bytes) -> bytes | None:
+        """Return the signed statement by which a certificate was taken back, or None."""
+        root = self._roots.get(issuer_key)
+        if root is None:
+            owned = self._owners.get(issuer_key, {}).get(fingerprint)
+            return None if owned is None else owned.wire
+        value = root.buckets[fingerprint[0]].get(fingerprint)
+        return None if value is None else _unpacked(root, fingerprint, value)
+
+    # -- what owners took back, by name
+
+    def about(self, name: Name) -> list[bytes]:
+        """Return what the owner of a name, or the node of that name, took back in that name: signed statements."""
+        return [self._owners[key][fingerprint].wire for key, fingerprint in self._about.get(name, ())]
+
+    def digest_about(self, name: Name) -> bytes:
+        """Return a digest of ``about``; zeros for nothing."""
+        entries = self._about.get(name, ())
+        ids = (_id(fingerprint, self._owners[key][fingerprint].until_unix_s) for key, fingerprint in entries)
+        return reduce(xor, ids, 0).to_bytes(ID_BYTES, "big")
+
+    # -- what roots took back, for neighbours
+
+    def summary(self) -> list[tuple[Name, int, bytes]]:
+        """Return for each root, by the hash of its key, how many it took back, and a digest."""
+        return [
+            (root.root, root.count, reduce(xor, root.hashes).to_bytes(ID_BYTES, "big"))
+            for root in self._roots.values()
+        ]
+
+    def hashes(self, of: Name) -> list[bytes] | None:
+        """Return the digests of a root's buckets; None: it is not trusted."""
+        root = self._root(of)
+        return None if root is None else [each.to_bytes(ID_BYTES, "big") for each in root.hashes]
+
+    def ids(self, of: Name, bucket: int) -> list[bytes]:
+        """Return short ids of a root's revocations in one bucket."""
+        root = self._root(of)
+        entries = {} if root is None else root.buckets[bucket]
+        return [_id(print_, _end_of(value)).to_bytes(ID_BYTES, "big") for print_, value in entries.items()]
+
+    def lacking(self, of: Name, bucket: int, ids: frozenset[bytes]) -> list[KeptKey]:
+        """Return what of a root's bucket is not among these ids."""
+        root = self._root(of)
+        if root is None:
+            return []
+        key = self._key_of[of]
+        return [
+            (key, print_)
+            for print_, value in root.buckets[bucket].items()
+            if _id(print_, _end_of(value)).to_bytes(ID_BYTES, "big") not in ids
+        ]
+
+    def _root(self, of: Name) -> _Root | None:
+        key = self._key_of.get(of)
+        return None if key is None else self._roots[key]
+
+    # -- room
+
+    @staticmethod
+    def _check_end(revocation: Revocation, unix_s: float) -> None:
+        if revocation.until_unix_s + CLOCK_SKEW_S < unix_s:
+            raise StatementError(DropReason.EXPIRED, "a revocation of what has run out")
+        if revocation.until_unix_s > unix_s + CERTIFICATE_LIFE_MAX_S:
+            raise StatementError(DropReason.MALFORMED, "a revocation for longer than any certificate holds")
+
+    def _until(self, issuer_key: bytes, fingerprint: bytes) -> int:
+        """Return until when a revocation counts, or -1."""
+        root = self._roots.get(issuer_key)
+        if root is not None:
+            value = root.buckets[fingerprint[0]].get(fingerprint)
+            return -1 if value is None else _end_of(value)
+        owned = self._owners.get(issuer_key, {}).get(fingerprint)
+        return -1 if owned is None else owned.until_unix_s
+
+    def _add(self, revocation: Revocation, statement: Statement, giver: bytes, unix_s: float) -> None:
+        self.expire(unix_s)
+        issuer_key, fingerprint = revocation.issuer.owner_key, revocation.fingerprint
+        root = self._roots.get(issuer_key)
+        if root is not None:
+            self._add_of_root(root, revocation, statement)
+        else:
+            self._add_of_owner(revocation, statement, giver)
+        self._next_end_s = min(self._next_end_s, revocation.until_unix_s + CLOCK_SKEW_S)
+        if self.changes is not None:
+            self.changes.add((issuer_key, fingerprint))
+
+    def _add_of_root(self, root: _Root, revocation: Revocation, statement: Statement) -> None:
+        fingerprint = revocation.fingerprint
+        before = root.buckets[fingerprint[0]].get(fingerprint)
+        if before is None:
+            if root.count >= self._per_root:
+                raise StatementError(DropReason.QUOTA, "revocations of one domain")
+            root.count += 1
+        else:
+            root.hashes[fingerprint[0]] ^= _id(fingerprint, _end_of(before))
+        root.subject = root.subject or revocation.issuer
+        root.buckets[fingerprint[0]][fingerprint] = _packed(root, revocation, statement)
+        root.hashes[fingerprint[0]] ^= _id(fingerprint, revocation.until_unix_s)
+
+    def _add_of_owner(self, revocation: Revocation, statement: Statement, giver: bytes) -> None:
+        issuer_key, fingerprint = revocation.issuer.owner_key, revocation.fingerprint
+        known = self._owners.get(issuer_key, {}).get(fingerprint)
+        if known is not None:
+            giver = OPERATOR if OPERATOR in (giver, known.giver) else known.giver
+            self._remove(issuer_key, fingerprint)
+        elif giver != OPERATOR:
+            self._make_room(issuer_key, giver)
+        owned = _Owned(revocation.issuer.name, revocation.until_unix_s, statement.wire, giver)
+        self._put_owned(issuer_key, fingerprint, owned)
+
+    def _pin(self, issuer_key: bytes, fingerprint: bytes) -> None:
+        """Let the operator be the giver of what is kept: it never gives way."""
+        owned = self._owners[issuer_key][fingerprint]
+        if owned.giver != OPERATOR:
+            self._remove(issuer_key, fingerprint)
+            self._put_owned(issuer_key, fingerprint, replace(owned, giver=OPERATOR))
+
+    def _put_owned(self, issuer_key: bytes, fingerprint: bytes, owned: _Owned) -> None:
+        self._owners.setdefault(issuer_key, {})[fingerprint] = owned
+        self._about.setdefault(owned.name, {})[issuer_key, fingerprint] = None
+        share = self._shares.setdefault(owned.giver, {})
+        share[issuer_key] = share.get(issuer_key, 0) + 1
+        self._owned += 1
+
+    def _make_room(self, issuer_key: bytes, giver: bytes) -> None:
+        """See that one more of an owner fits.
+
+        Raises:
+            StatementError: QUOTA: who would have to give way holds no more than this giver, or this owner.
+        """
+        if len(self._owners.get(issuer_key, ())) >= self._per_issuer:
+            raise StatementError(DropReason.QUOTA, "revocations of one owner")
+        own = self._shares.get(giver, {})
+        if sum(own.values()) >= self._per_giver and not self._give_way(giver, above=own.get(issuer_key, 0) + 1):
+            raise StatementError(DropReason.QUOTA, "revocations over one neighbour")
+        if self._owned < self._of_owners:
+            return
+        held = sum(own.values()) + 1
+        others = {each: sum(share.values()) for each, share in self._shares.items() if each != OPERATOR}
+        most = max(others, key=lambda each: others[each], default=giver)
+        above = own.get(issuer_key, 0) + 1 if most == giver else 0
+        if (most != giver and others[most] <= held) or not self._give_way(most, above=above):
+            raise StatementError(DropReason.QUOTA, "revocations of owners")
+
+    def _give_way(self, giver: bytes, above: int) -> bool:
+        """Drop the oldest revocation of the owner that has most of a giver's share, if that is more than ``above``."""
+        share = self._shares.get(giver, {})
+        issuer_key = max(share, key=lambda key: share[key], default=None)
+        if issuer_key is None or share[issuer_key] <= above:
+            return False
+        entries = self._owners[issuer_key].items()
+        self._remove(issuer_key, next(fingerprint for fingerprint, owned in entries if owned.giver == giver))
+        return True
+
+    def _remove(self, issuer_key: bytes, fingerprint: bytes) -> None:
+        if self.changes is not None:
+            self.changes.add((issuer_key, fingerprint))
+        root = self._roots.get(issuer_key)
+        if root is not None:
+            value = root.buckets[fingerprint[0]].pop(fingerprint)
+            root.hashes[fingerprint[0]] ^= _id(fingerprint, _end_of(value))
+            root.count -= 1
+            return
+        owned = self._owners[issuer_key].pop(fingerprint)
+        if not self._owners[issuer_key]:
+            del self._owners[issuer_key]
+        del self._about[owned.name][issuer_key, fingerprint]
+        if not self._about[owned.name]:
+            del self._about[owned.name]
+        share = self._shares[owned.giver]
+        share[issuer_key] -= 1
+        if not share[issuer_key]:
+            del share[issuer_key]
+        if not share:
+            del self._shares[owned.giver]
+        self._owned -= 1
+
+
+def hash_of(root_key: bytes) -> Name:
+    """Return the hash by which neighbours speak of a root: a domain may have had several."""
+    return Name(sha256(root_key).digest())
+
+
+def _id(fingerprint: bytes, until_unix_s: int) -> int:
+    hashed = blake2b(fingerprint + until_unix_s.to_bytes(_UNTIL_BYTES, "big"), digest_size=ID_BYTES)
+    return int.from_bytes(hashed.digest(), "big")
+
+
+def _end_of(value: bytes) -> int:
+    return int.from_bytes(value[:_UNTIL_BYTES], "big")
+
+
+def _packed(root: _Root, revocation: Revocation, statement: Statement) -> bytes:
+    """Return what is kept: a statement of the usual form can be put together again from little."""
+    until = revocation.until_unix_s.to_bytes(_UNTIL_BYTES, "big")
+    short = until + statement.signature
+    is_usual = _unpacked(root, revocation.fingerprint, short) == statement.wire
+    return short if is_usual else until + statement.wire
+
+
+def _unpacked(root: _Root, fingerprint: bytes, value: bytes) -> bytes:
+    if len(value) != _UNTIL_BYTES + _SIGNATURE_BYTES or root.subject is None:
+        return value[_UNTIL_BYTES:]
+    body = {**root.subject.to_fields(), "cert": fingerprint, "until": _end_of(value)}
+    return assemble(StatementType.REVOKE, body, root.subject.name, value[_UNTIL_BYTES:])

@@ -1,0 +1,74 @@
+"""What security costs, and what it withstands: one subcommand for each question.
+
+    sudo .venv/bin/python scripts/bench/security.py revocation            # the whole; docs/benchmarks/security.json
+    .venv/bin/python scripts/bench/security.py revocation --part kept     # 10^5 revocations in one process; no root
+    sudo .venv/bin/python scripts/bench/security.py revocation --part closed --rounds 3 --no-save
+
+Each subcommand is a module beside this one that has ``add_arguments(parser)`` and ``run(options)``; ``run`` returns its
+figures, which go under the subcommand's name into the file, and whether every target was met.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from types import ModuleType
+from typing import Final
+
+import security_revocation
+from machine import machine_state
+from peers.process import FailedError
+from report import progress
+
+from gdp.errors import GdpError
+
+OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks" / "security.json"
+COMMANDS: Final[Mapping[str, ModuleType]] = {"revocation": security_revocation}
+
+
+def arguments() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    for name, module in COMMANDS.items():
+        command = commands.add_parser(
+            name, description=module.__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        )
+        module.add_arguments(command)
+        command.add_argument("--json", type=Path, default=OUTPUT, help="where the figures go")
+        command.add_argument("--no-save", action="store_true", help="print only")
+        command.add_argument("--strict", action="store_true", help="exit 1 when a target was missed")
+    return parser
+
+
+def save(path: Path, command: str, figures: Mapping[str, object]) -> None:
+    """Write what one subcommand measured; figures of others, and parts that were not measured now, are kept."""
+    held = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"bench": "security"}
+    before = held.get(command, {})
+    held[command] = {**before, **figures, "machine": asdict(machine_state())}
+    path.write_text(json.dumps(held, indent=1) + "\n", encoding="utf-8")
+
+
+def main() -> None:
+    """Run one subcommand."""
+    options = arguments().parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
+    try:
+        figures, has_met = COMMANDS[options.command].run(options)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except (GdpError, FailedError) as error:
+        progress(f"FAILED {error}")
+        sys.exit(1)
+    if not options.no_save:
+        save(options.json, options.command, figures)
+    sys.exit(options.strict and not has_met)
+
+
+if __name__ == "__main__":
+    main()

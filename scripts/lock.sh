@@ -1,0 +1,25 @@
+#!/usr/bin/env bash
+# Writes the locks of requirements/: each package with version and hashes, for every platform and Python from 3.10 on.
+#
+#   scripts/lock.sh                        newest versions that pyproject.toml allows
+#   scripts/lock.sh --upgrade-package X    X alone; further arguments go to uv
+#
+# Needs uv (pip install uv; UV may name it) and a package index. All locks agree on versions: they are parts of dev.lock.
+set -euo pipefail
+
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+uv=${UV:-uv}
+command -v "$uv" >/dev/null || { printf 'lock: uv is needed (pip install uv)\n' >&2; exit 2; }
+
+# compile <lock> <argument>...
+compile() {
+    local out=requirements/$1
+    shift
+    "$uv" pip compile --quiet --universal --python-version 3.10 --generate-hashes --no-annotate --no-header "$@" -o "$out"
+}
+
+[[ $# -gt 0 ]] || rm -f requirements/dev.lock
+compile dev.lock --all-extras "$@" pyproject.toml
+compile run.lock -c requirements/dev.lock pyproject.toml
+compile ros2.lock -c requirements/dev.lock --extra ros2 pyproject.toml
+compile build.lock -c requirements/dev.lock requirements/build.in

@@ -1,0 +1,29 @@
+"""What the fuzzing of insiders found (tests/insiders): each statement is validly signed, and ends no node."""
+
+from __future__ import annotations
+
+from gdp.control.hello import Hello, Timing
+from gdp.frame.kinds import Kind
+from tests.journeys.flows import ROBOT, flowing, ring
+from tests.journeys.test_attacks import control, still_flows
+
+
+def test_a_hello_of_an_older_life_from_another_address_ends_no_switch() -> None:
+    """The switch let the younger life go by setting back when it was heard, and took that for lateness of its own."""
+    world = ring()
+    flow = flowing(world)
+    world.add_member("nuc1/insider", "nuc1")
+    assert world.settle()
+    insider, nuc1 = world.identities["nuc1/insider"], world.switches["nuc1"]
+    world.network.connect("nuc1", "nuc1/insider").is_up = False  # a second port of it
+    port = max(nuc1.greeter.ports)
+    hello = Hello(
+        b"a nonce!", 1, (nuc1.greeter.ports[port].nonce,), 1_500, bytes(8), insider.membership, Timing(0, 0, 1)
+    )
+    frame = control(Kind.HELLO, hello.to_wire(insider.name, insider.key), source=insider.name)
+    world.network.inject("nuc1", port, frame)
+    world.network.run(3)
+    assert nuc1.greeter._lateness_s == 0
+    assert {world.members[ROBOT].name, world.switches["nuc2"].name} <= {each.name for each in nuc1.greeter.all_up()}
+    still_flows(flow)
+    flow.outlive()

@@ -1,0 +1,60 @@
+"""Attacks with a machine that is snapshotted while it runs, and resumed twice: both copies go on with one state."""
+
+from __future__ import annotations
+
+from itertools import count
+from os import urandom
+
+import pytest
+
+from gdp.crypto.envelope import SALT_BYTES, SIGNATURE_BYTES, Sealer
+from gdp.crypto.note import NoteSealer
+from gdp.frame.codec import HEADER_BYTES
+from gdp.frame.kinds import Kind
+from gdp.names import NAME_BYTES
+from gdp.nodes import membership
+from gdp.nodes.membership import fresh_bytes, incarnation
+from tests.gdp.message.sealed import INCARNATION, SECRET, SOURCE, TOPIC, WRITER
+
+ONE, OTHER = b"the gripper opens, slowly and wide", b"the gripper closes, fast and tight"
+
+
+def xor(a: bytes, b: bytes) -> bytes:
+    return bytes(x ^ y for x, y in zip(a, b, strict=True))
+
+
+def test_a32_copies_of_a_publisher_do_not_repeat_a_nonce() -> None:
+    copies = [Sealer(SECRET, 1, Kind.DATA, SOURCE, INCARNATION, TOPIC, WRITER, urandom) for _ in range(2)]
+    for number in range(1, 100):
+        bodies = [
+            copy.seal(number, 0, message, 1_500)[0][HEADER_BYTES + SALT_BYTES : -SIGNATURE_BYTES - 16]
+            for copy, message in zip(copies, (ONE, OTHER), strict=True)
+        ]
+        assert xor(*bodies) != xor(ONE, OTHER)
+
+
+def test_a32_what_was_drawn_before_the_snapshot_seals_nothing_after_it() -> None:
+    drawn: list[bytes] = []
+    sealer = Sealer(
+        SECRET, 1, Kind.DATA, SOURCE, INCARNATION, TOPIC, WRITER, lambda size: drawn.append(urandom(size)) or drawn[-1]
+    )
+    for number in range(1, 5):
+        assert len(drawn) == number - 1
+        frame = sealer.seal(number, 0, ONE, 1_500)[0]
+        assert frame[HEADER_BYTES : HEADER_BYTES + SALT_BYTES] == drawn[-1]
+
+
+def test_a32_copies_of_a_reader_that_use_one_number_give_no_plaintext_away() -> None:
+    made = [
+        NoteSealer(b"k" * 32, 1, Kind.REPORT, SOURCE, 5, TOPIC, TOPIC, 9, count(7)).seal(body) for body in (ONE, OTHER)
+    ]
+    bodies = [note[HEADER_BYTES + NAME_BYTES : -16] for note in made]
+    assert made[0][:HEADER_BYTES] == made[1][:HEADER_BYTES]
+    assert xor(*bodies) != xor(ONE, OTHER)
+
+
+def test_a32_fresh_bytes_differ_even_where_the_generator_repeats_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(membership.os, "urandom", bytes)
+    assert len({fresh_bytes(8) for _ in range(100)}) == 100
+    assert len({incarnation() for _ in range(100)}) == 100
+    assert {len(fresh_bytes(size)) for size in (8, 32, 64)} == {8, 32, 64}

@@ -1,0 +1,91 @@
+"""The threat model's tables: each answered attack names a test that exists, each open one has none."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import re
+from typing import NamedTuple
+
+from tests.pages import ROOT
+
+PAGE = ROOT / "docs/explanation/threat-model.md"
+RECORDED = frozenset(f"a{number:02}" for number in range(1, 77))  # the attacks that were once run against a commit
+_TEST = re.compile(r"`((?:tests|netns_tests)/[\w/]+\.py)::(test_\w+)`")
+_NAMED = re.compile(r"(?<![a-z0-9])([a-z]\d\d)(?![0-9])")
+
+
+class Row(NamedTuple):
+    """One attack."""
+
+    id: str
+    attacker: str
+    cells: list[str]
+
+
+def _rows(heading: str) -> list[Row]:
+    (part,) = (part for part in re.split(r"^## ", PAGE.read_text(), flags=re.M) if part.startswith(heading + "\n"))
+    lines = [line for line in part.splitlines() if line.startswith("| ")][1:]
+    cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
+    return [Row(row[0], row[1], row) for row in cells]
+
+
+ANSWERED, OPEN = _rows("Attacks that are answered"), _rows("Attacks that are open")
+
+
+@functools.cache
+def _tests_of(path: str) -> frozenset[str]:
+    """Return the names of a module's tests, parametrised ones and those in classes too."""
+    tree = ast.parse((ROOT / path).read_text())
+    functions = (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef))
+    return frozenset(node.name for node in functions if node.name.startswith("test_"))
+
+
+def _named_in(path: str) -> set[str]:
+    """Return the ids of attacks that a module's tests carry in their names: ``test_a01_a02_...``."""
+    heads = (re.match(r"test_((?:[a-z]\d\d_)+)", name) for name in _tests_of(path))
+    return {each for head in heads if head for each in _NAMED.findall(head[1].replace("_", " "))}
+
+
+def test_every_answered_attack_names_a_test_that_exists() -> None:
+    for row in ANSWERED:
+        found = _TEST.findall(row.cells[-1])
+        assert len(row.cells) == 5, row.id
+        assert found, row.id
+        for path, name in found:
+            assert name in _tests_of(path), f"{row.id}: {path}::{name}"
+
+
+def test_ids_are_unique_and_at_least_120_attacks_are_answered() -> None:
+    ids = [row.id for row in (*ANSWERED, *OPEN)]
+    assert len(set(ids)) == len(ids)
+    assert all(re.fullmatch(r"[a-z]\d\d", each) for each in ids)
+    assert len(ANSWERED) >= 120
+
+
+def test_every_recorded_attack_is_answered_or_open() -> None:
+    assert {row.id for row in (*ANSWERED, *OPEN)} >= RECORDED
+
+
+def test_an_open_attack_is_a_recorded_one_or_one_that_the_models_found() -> None:
+    assert {row.id for row in OPEN if not row.id.startswith("x")} <= RECORDED
+    assert all(cell for row in OPEN for cell in row.cells)
+
+
+def test_an_attack_that_a_test_is_named_after_is_not_open() -> None:
+    named = {each: path for path in (ROOT / "tests/attacks").glob("test_*.py") for each in _named_in(str(path))}
+    assert len(named) > 30
+    assert {row.id: named[row.id].name for row in OPEN if row.id in named} == {}
+
+
+def test_every_attacker_of_the_tables_is_introduced() -> None:
+    introduced = {part for row in _rows("Attackers") for part in (row.id, *row.id.split(", "))} | {"snapshot"}
+    for row in (*ANSWERED, *OPEN):
+        role = re.split(r" of another| to be", row.attacker.removeprefix("revoked "))[0]
+        assert role in introduced, row.attacker
+
+
+def test_every_source_is_cited_and_every_citation_has_a_source() -> None:
+    (part,) = (part for part in re.split(r"^## ", PAGE.read_text(), flags=re.M) if part.startswith("Beside others"))
+    table, _, sources = part.partition("Sources:")
+    assert {*re.findall(r"\[(\d+)\]", table)} == {*re.findall(r"^(\d+)\. .*<https://\S+>$", sources, re.M)}

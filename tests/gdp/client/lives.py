@@ -1,0 +1,85 @@
+"""Lives of readers and publishers with keys of their own, and the notes that each can make."""
+
+from __future__ import annotations
+
+import hashlib
+from functools import cache
+from os import urandom
+
+from gdp.client.feed import Reader
+from gdp.client.note_keys import NoteKeys
+from gdp.client.source import Secrets, Source
+from gdp.crypto.envelope import Signer, seal_key
+from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
+from gdp.crypto.introduction import Introduction
+from gdp.crypto.keys import SigningKey
+from gdp.crypto.note import NoteSealer, note_key
+from gdp.crypto.subject import Subject
+from gdp.frame.kinds import Kind
+from gdp.message.report import Report, ReportFlag
+from gdp.names import Name
+
+
+@cache
+def key_of(label: bytes) -> SigningKey:
+    return SigningKey.generate()
+
+
+def subject_of(label: bytes) -> Subject:
+    """Return who the reader of a label is; the same each time."""
+    return Subject(hashlib.sha256(label).digest(), key_of(label).public.compressed)
+
+
+def name_of(label: bytes) -> Name:
+    return subject_of(label).name
+
+
+def note_keys() -> NoteKeys:
+    return NoteKeys(ExchangeKey.from_random(urandom(EXCHANGE_KEY_BYTES)))
+
+
+def source_of(name: Name, incarnation: int, signer: Signer) -> Source:
+    return Source(name, incarnation, signer, urandom, note_keys())
+
+
+def reader_of(label: bytes, incarnation: int = 7, *, started: int | None = None) -> Reader:
+    """Return a life of a reader, by default one that began after those of lower incarnations."""
+    notes, at = note_keys(), incarnation if started is None else started
+    wire = Introduction.make(subject_of(label), key_of(label), incarnation, at, notes.public)
+    return Reader(name_of(label), incarnation, notes, lambda: wire)
+
+
+class Notes:
+    """What one life of a reader can say to a publisher, under any name; by default its own, and the truth."""
+
+    def __init__(
+        self, reader: Reader, publisher: Source, topic: Name, secrets: Secrets, *, as_name: Name | None = None
+    ) -> None:
+        self._reader = reader
+        self._publisher = publisher
+        self._topic = topic
+        self._secrets = secrets
+        self._name = reader.name if as_name is None else as_name
+
+    def introduction(self, epoch: int = 1, wire: bytes | None = None, *, incarnation: int | None = None) -> bytes:
+        life = self._reader.incarnation if incarnation is None else incarnation
+        key = seal_key(self._secrets[epoch], Kind.INTRODUCTION, self._name, life, self._publisher.name)
+        sealer = self._sealer(key, epoch, Kind.INTRODUCTION, life)
+        return sealer.seal(self._reader.introduction() if wire is None else wire)
+
+    def report(self, report: Report, epoch: int = 1, *, incarnation: int | None = None) -> bytes:
+        life = self._reader.incarnation if incarnation is None else incarnation
+        publisher = self._publisher
+        shared = self._reader.notes.shared(publisher.notes.public)
+        ends = self._name, life, publisher.name, publisher.incarnation
+        key = note_key(shared, self._secrets[epoch], Kind.REPORT, *ends, self._topic)
+        return self._sealer(key, epoch, Kind.REPORT, life).seal(report.to_wire())
+
+    def hello(self, epoch: int = 1) -> list[bytes]:
+        """Return the frames by which a reader begins."""
+        return [self.introduction(epoch), self.report(Report(ReportFlag.NEW, 0, 0, ()), epoch)]
+
+    def _sealer(self, key: bytes, epoch: int, kind: Kind, life: int) -> NoteSealer:
+        publisher = self._publisher
+        to = publisher.name, self._topic, publisher.incarnation
+        return NoteSealer(key, epoch, kind, self._name, life, *to, self._reader.note_numbers)

@@ -1,0 +1,691 @@
+"""What hostile members say: statements of every type, well formed and signed by a real key, but meant ill.
+
+A body begins as an honest one would be at this moment of the network: sessions, sequence numbers and names are those
+that its signer knows. Some of its fields then take a hostile value of their own type: a boundary, somebody else's
+name or certificate, an old statement, a list at its maximum. What remains honest is what lets the rest be believed.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import count
+from typing import Any, Final
+
+from gdp.client.feed import FeedState
+from gdp.client.rib_host import RibHost
+from gdp.control.frames import ControlSplitter
+from gdp.control.hello import COOKIE_BYTES, COOKIES_MAX, HEARD_MAX, RIVALS_MAX, RTCERTS_MAX
+from gdp.control.keepalive import seal_keepalive
+from gdp.control.link_state import COST_MAX, LINKS_MAX, MEMBERS_MAX, RIBS_MAX
+from gdp.control.query import TRANSIT_MAX
+from gdp.control.replica import ENTRIES_MAX, FETCH_KEYS_MAX, FETCH_PREFIXES_MAX, INVENTORY_MAX
+from gdp.crypto.envelope import Sealer
+from gdp.crypto.identity import Identity
+from gdp.crypto.statements import StatementType, parse, sign
+from gdp.crypto.validity import Validity
+from gdp.errors import DropReason, LocalError, StatementError
+from gdp.frame.codec import Header, encode
+from gdp.frame.kinds import Flag, Kind
+from gdp.limits import CHAIN_MAX, HOPS_MAX, NACKS_PER_REPORT, SEQUENCE_AHEAD_S
+from gdp.message import bundle
+from gdp.message.loss import GONE_MAX, LostRange
+from gdp.message.move import MOVES_MAX, Move
+from gdp.message.report import Missing, Report, ReportFlag
+from gdp.message.status import STARTS_MAX, Start, Status
+from gdp.names import ZERO, Name
+from gdp.switch.machine import Switch
+from gdp.trust.adcert import AdCert
+from gdp.trust.right import Right
+from gdp.trust.rtcert import RtCert
+from tests.insiders.stage import PERSONAS, Persona, Place, Stage
+
+__all__ = ["Forge", "Utterance"]
+
+_U64: Final = (1 << 64) - 1
+_INTEGERS: Final = (0, 1, 2, 255, 256, 65_535, 65_536, (1 << 24), (1 << 31) - 1, 1 << 32, (1 << 63), _U64 - 1, _U64)
+_NUMBERS: Final = (0.0, -0.0, -1.0, 1e-9, 0.5, 1.0, 24.0, 3_599.5, 3_600.0, 3_600.5, 1e300, float("inf"), float("nan"))
+_TEXTS: Final = ("", "publish", "serve", "call", "read", "attach", "domain", "border", "x" * 300)
+_SIZES: Final = (900, 1_024, 1_025, 8_900, 9_216, 9_217, 12_000, 16_000, 16_300)
+_MAXIMA: Final = {
+    "h": HEARD_MAX, "u": RIVALS_MAX, "y": COOKIES_MAX,
+    "l": LINKS_MAX, "i": LINKS_MAX, "m": MEMBERS_MAX, "x": TRANSIT_MAX, "r": RIBS_MAX,
+    "chain": CHAIN_MAX, "p": FETCH_PREFIXES_MAX, "k": FETCH_KEYS_MAX, "e": ENTRIES_MAX, "rights": 4,
+}  # fmt: skip
+_RIGHTS: Final = tuple(Right)
+_REMEMBERED: Final = 96  # old statements that are said again, or put into others
+
+_Body = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Utterance:
+    """Frames that a persona sends into a port of its neighbour.
+
+    Args:
+        what: type of the statement, or kind of the frame.
+    """
+
+    persona: Persona
+    what: str
+    place: Place
+    frames: tuple[bytes, ...]
+
+    @property
+    def size(self) -> int:
+        """Return its bytes on the link, without Ethernet headers."""
+        return sum(map(len, self.frames))
+
+
+class Forge:
+    """Makes utterances for a stage; the same randomness in the same state makes the same one."""
+
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        world = stage.world
+        self._unknown = tuple(Name(bytes([number]) * 32) for number in range(1, 9))
+        self._nodes = tuple(identity.name for identity in world.identities.values())
+        self._domains = tuple(each.root.domain for each in world.authorities.values())
+        self._topics = (stage.flow.topic.name, *(topic.name for topic in stage.topics.values()))
+        self._names = (*self._nodes, *self._domains, *self._topics, *self._unknown)
+        self._certs = tuple(identity.membership for identity in world.identities.values())
+        self._roots = tuple(authority.root.wire for authority in world.authorities.values())
+        self._old: deque[bytes] = deque(self._recorded(), maxlen=_REMEMBERED)
+        self._numbers = count(int(world.network.now.unix_s * 1_000) + 100_000)
+        self._counters = count(1 << 40)
+        self._splitters = {
+            persona.node: ControlSplitter(stage.identity(persona).name, 77) for persona in PERSONAS
+        }
+        self._sealers: dict[tuple[str, str, int], Any] = {}
+
+    def utter(self, rng: random.Random) -> Utterance | None:
+        """Return what some persona says next, or None where it is cut off."""
+        persona = rng.choice(PERSONAS)
+        places = self._stage.places(persona.node)
+        if not places:
+            return None
+        place = rng.choice(places)
+        if rng.random() < 0.04:  # as a stranger, at somebody else's port
+            ports = self._stage.world.network._nodes[place.node].ports
+            mac = place.mac if rng.random() < 0.5 else b"\x02evil" + bytes([rng.randrange(4)])
+            place = Place(place.node, rng.choice(list(ports)), mac)
+        if rng.random() < 0.12:
+            what, make = rng.choice(_FRAMES)
+            frames = make(self, rng, persona, place)
+            return None if not frames else Utterance(persona, what, place, tuple(frames))
+        type_ = rng.choice(_SPOKEN)
+        kind, destination = self._delivery(rng, type_, place)
+        wire = self._statement(rng, type_, persona, place)
+        if wire is None:
+            return None
+        if kind in (Kind.RIB_REQUEST, Kind.RIB_ANSWER) and rng.random() < 0.8:
+            return self._in_channel(persona, type_, place, destination, wire)
+        try:
+            frames = self._splitters[persona.node].split(kind, wire, 1_500, destination)
+        except LocalError:
+            return None
+        self._old.append(wire)
+        return Utterance(persona, type_.value, place, tuple(frames))
+
+    def _in_channel(
+        self, persona: Persona, type_: StatementType, place: Place, to: Name, wire: bytes
+    ) -> Utterance | None:
+        """Say a statement over the channel of the persona's own machine, or what opens one."""
+        machine = self._stage.machines().get(persona.node)
+        channels = getattr(machine, "_channels", None)
+        if channels is None or to == ZERO:
+            return None
+        if not channels.answer(to, wire):
+            channels.ask(to, wire, self._stage.world.network.now.mono_s)
+        frames: list[bytes] = []
+        for each in channels.take():
+            kind = Kind.RIB_ANSWER if each.is_answer else Kind.RIB_REQUEST
+            frames += self._splitters[persona.node].split(kind, each.wire, 1_500, each.to)
+        self._old.append(wire)
+        return Utterance(persona, type_.value, place, tuple(frames)) if frames else None
+
+    # -- statements
+
+    def _statement(self, rng: random.Random, type_: StatementType, persona: Persona, place: Place) -> bytes | None:
+        if rng.random() < 0.04:
+            return rng.choice(self._old)
+        identity = self._stage.identity(persona)
+        body = _BODIES[type_](self, rng, identity, place)
+        if rng.random() < 0.6:
+            for _ in range(rng.choice((1, 1, 1, 2, 3))):
+                self._spoil(rng, body)
+        if rng.random() < 0.05:
+            body["zz"] = bytes(max(rng.choice(_SIZES) - 1_200 + rng.randrange(-2, 3), 0))
+        signer, key = identity.name, identity.key
+        if type_ is StatementType.REVOKE and rng.random() < 0.3:
+            owner = self._stage.world.owner.key
+            return self._signed(type_, {**body, "owner": owner.public.compressed}, self._topics[1], owner)
+        if rng.random() < 0.03:
+            signer = self._name(rng)
+        return self._signed(type_, body, signer, key)
+
+    @staticmethod
+    def _signed(type_: StatementType, body: Mapping[str, object], signer: Name, key: Any) -> bytes | None:
+        try:
+            return sign(type_, body, signer, key)
+        except LocalError:  # no CBOR, or too long
+            return None
+
+    def _spoil(self, rng: random.Random, body: _Body) -> None:
+        key = rng.choice(list(body))
+        chance = rng.random()
+        if chance < 0.03:
+            del body[key]
+            body["y"] = 0
+        elif chance < 0.06:
+            body[key] = rng.choice((None, True, -1, 1.5, "", b"", [], {}, [[]], [b""]))
+        else:
+            body[key] = self._hostile(rng, key, body[key])
+
+    def _hostile(self, rng: random.Random, key: str, value: Any) -> Any:
+        if isinstance(value, bool):
+            return not value
+        if isinstance(value, int):
+            return rng.choice((*_INTEGERS, max(value - 1, 0), min(value + 1, _U64), *self._far_numbers()))
+        if isinstance(value, float):
+            return rng.choice(_NUMBERS)
+        if isinstance(value, str):
+            return rng.choice(_TEXTS)
+        if isinstance(value, list):
+            return self._hostile_list(rng, key, value)
+        if isinstance(value, dict):
+            spoilt = dict(value)
+            if spoilt:
+                self._spoil(rng, spoilt)
+            return spoilt
+        if isinstance(value, bytes):
+            if len(value) == 32:
+                return self._name(rng)
+            if len(value) <= 16:
+                return rng.choice((bytes(len(value)), b"\xff" * len(value), rng.randbytes(len(value)), b""))
+            if len(value) == 33:
+                return rng.choice([identity.key.public.compressed for identity in self._identities()])
+            return rng.choice((self._cert, self._old_one, self._cut, self._root))(rng, value)
+        return value
+
+    def _hostile_list(self, rng: random.Random, key: str, value: list[Any]) -> list[Any]:
+        most = _MAXIMA.get(key, 64)
+        items = value or [self._name(rng)]
+        chance = rng.random()
+        if chance < 0.15:
+            return []
+        if chance < 0.4:
+            at = rng.randrange(len(items))
+            return [*items[:at], self._hostile(rng, key, items[at]), *items[at + 1 :]]
+        size = rng.choice((1, 2, most - 1, most, most + 1))
+        if chance < 0.6:
+            return (items * (size // len(items) + 1))[:size]  # all the same
+        return [self._like(rng, rng.choice(items)) for _ in range(size)]
+
+    def _like(self, rng: random.Random, item: Any) -> Any:
+        """Return another item of the same form, with new names in it."""
+        if isinstance(item, bytes) and len(item) == 32:
+            return rng.choice((self._name(rng), Name(rng.randbytes(32))))
+        if isinstance(item, bytes) and len(item) > 64:
+            return item if rng.random() < 0.5 else rng.randbytes(64) + item[64:]
+        if isinstance(item, bytes):
+            return rng.randbytes(len(item))
+        if isinstance(item, list):
+            return [self._like(rng, each) for each in item]
+        if isinstance(item, int) and not isinstance(item, bool):
+            return rng.choice((1, item, COST_MAX))
+        return item
+
+    def _cert(self, rng: random.Random, _: bytes) -> bytes:
+        return rng.choice(self._certs)
+
+    def _root(self, rng: random.Random, _: bytes) -> bytes:
+        return rng.choice(self._roots)
+
+    def _old_one(self, rng: random.Random, _: bytes) -> bytes:
+        return rng.choice(self._old)
+
+    def _cut(self, rng: random.Random, value: bytes) -> bytes:
+        return value[: rng.randrange(len(value))]
+
+    def _far_numbers(self) -> tuple[int, ...]:
+        now_ms = int(self._stage.world.network.now.unix_s * 1_000)
+        limit = now_ms + int(SEQUENCE_AHEAD_S * 1_000)
+        return now_ms, now_ms - 3_600_000, limit - 1, limit, limit + 1
+
+    def _name(self, rng: random.Random) -> Name:
+        chance = rng.random()
+        if chance < 0.06:
+            return ZERO
+        return Name(rng.randbytes(32)) if chance < 0.2 else rng.choice(self._names)
+
+    def _identities(self) -> list[Identity]:
+        return list(self._stage.world.identities.values())
+
+    def _recorded(self) -> list[bytes]:
+        """Return statements that honest nodes made: claims that switches hold."""
+        switches = self._stage.world.switches.values()
+        return [each.claim.wire for switch in switches for each in switch.attached.all()]
+
+    # -- honest bodies
+
+    def _nonce(self, place: Place) -> bytes:
+        return self._stage.nonce_at(place)
+
+    def _own_nonce(self, identity: Identity, place: Place) -> bytes:
+        persona = next(each for each in PERSONAS if self._stage.identity(each).name == identity.name)
+        return self._stage.own_nonce(persona, place)
+
+    def _own_life(self, identity: Identity, rng: random.Random) -> bytes:
+        """Return the life of the persona's machine most of the time, or an older or a newer one."""
+        machine = next((each for each in self._stage.machines().values() if each.name == identity.name), None)
+        greeter = getattr(machine, "greeter", None) or getattr(getattr(machine, "attachment", None), "greeter", None)
+        life = bytes(16) if greeter is None else greeter._life
+        return life if rng.random() < 0.9 else rng.choice((bytes(16), b"\xff" * 16, rng.randbytes(16)))
+
+    def _hello(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        nonce = rng.choice((bytes([1]) * 8, bytes([2]) * 8, rng.randbytes(8)))
+        validity = self._lasting()
+        switches = [each.name for each in self._stage.world.switches.values()]
+        rtcerts = [RtCert.make(identity, rng.choice(switches), validity) for _ in range(rng.choice((0, 1, 2)))]
+        return {
+            "n": nonce, "s": next(self._counters), "h": [self._nonce(place)] if rng.random() < 0.8 else [],
+            "m": 1_500, "d": rng.choice((bytes(8), rng.randbytes(8))), "c": identity.membership,
+            "k": rng.choice(([1_000, 1_000, 3], [0, 0, 1], [1, 1, 1], [60_000, 60_000, 255])),
+            "x": rng.choice((b"", bytes(32), b"\xff" * 32, rng.randbytes(32))), "b": self._own_life(identity, rng),
+            "u": [self._nonce(place)] if rng.random() < 0.1 else [], "r": rtcerts[:RTCERTS_MAX],
+            "y": [self._nonce(place) + rng.randbytes(COOKIE_BYTES)] if rng.random() < 0.2 else [],
+        }  # fmt: skip
+
+    def _link_state(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        world = self._stage.world
+        own = identity.root.domain
+
+        def adjacency() -> list[Any]:
+            other = rng.choice(self._identities())
+            return [other.name, other.root.domain, rng.choice((1, 10, 100, COST_MAX)), rng.choice((1, 576, 1_500))]
+
+        def rib() -> list[Any]:
+            other = rng.choice([identity, *(world.identities[f"rib:{label}"] for label in world.ribs)])
+            accomplice = self._stage.identity(rng.choice(PERSONAS))  # no honest node signs what it did not say
+            proof = RtCert.make(rng.choice((identity, accomplice)), identity.name, self._lasting())
+            other = accomplice if rng.random() < 0.3 else other
+            return [other.name, other.root.domain, rng.randbytes(8), rng.randbytes(16), other.membership, proof]
+
+        return {
+            "o": rng.choice(("domain", "border")), "s": next(self._numbers),
+            "l": [adjacency() for _ in range(rng.choice((0, 1, 3, 8)))],
+            "i": [adjacency() for _ in range(rng.choice((0, 0, 1, 3)))],
+            "r": [rib() for _ in range(rng.choice((0, 1, 2)))],
+            "m": [rng.choice(self._nodes) for _ in range(rng.choice((0, 1, 4)))],
+            "z": rng.random() < 0.2, "b": self._own_life(identity, rng),
+            "e": int(world.network.now.unix_s),
+            "u": [rng.choice(self._nodes)] if rng.random() < 0.2 else [], "c": identity.membership,
+            **({"d": own} if rng.random() < 0.01 else {}),
+        }  # fmt: skip
+
+    def _join(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        world = self._stage.world
+        switch = rng.choice([each for each in self._identities() if each.role.value == "switch"])
+        claims = [each for each in self._old if b"read" in each or b"serve" in each or b"call" in each]
+        topic = rng.choice(self._topics)
+        right = rng.choice((Right.READ, Right.READ, Right.SERVE, Right.CALL))
+        evidence = rng.choice(claims) if claims and rng.random() < 0.3 else self._claim_of(rng, identity, topic, right)
+        return {
+            "n": topic, "p": rng.choice(self._nodes),
+            "w": switch.name, "d": switch.root.domain,
+            "x": sorted({*self._domains, identity.root.domain}), "m": rng.choice((1_500, 576, 1, 9_000)),
+            "l": rng.choice((0.0, 1.0, 7.0, 3_600.0)), "e": evidence, "i": self._nonce(place),
+            "s": next(self._numbers), "v": rng.choice((0, int(world.network.now.unix_s * 1_000), next(self._numbers))),
+            "b": rng.choice((ZERO, ZERO, rng.choice(self._nodes))), "o": self._own_nonce(identity, place),
+        }  # fmt: skip
+
+    def _claim(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        right = rng.choice(_RIGHTS)
+        return self._claim_body(rng, identity, rng.choice(self._topics), right, self._switch_at(rng, place))
+
+    def _claim_body(
+        self, rng: random.Random, identity: Identity, topic: Name, right: Right, switch: Name
+    ) -> _Body:
+        """Return a claim on the node's own name, on a topic by its delegation, or on a name of its own making."""
+        now = self._stage.world.network.now.unix_s
+        subject, chain = identity.subject, []
+        mine = [each for key, each in self._stage.topics.items() if each.delegation.node == identity.name]
+        chance = rng.random()
+        if right is Right.ATTACH:
+            pass
+        elif mine and chance < 0.6:
+            delegation = rng.choice(mine).delegation
+            subject, chain = delegation.subject, list(delegation.chain)
+        else:  # a name that this node owns: as many as it likes
+            own = type(subject)(rng.randbytes(32), identity.key.public.compressed)
+            subject = own
+            if chance < 0.75:
+                validity = Validity(int(now) - 10, int(now) + 1_000)
+                chain = [
+                    AdCert.make(identity.key, own.name, own, identity.subject, list(_RIGHTS)[:3], validity)
+                ] if Right.ATTACH not in list(_RIGHTS)[:3] else []
+        return {
+            **subject.to_fields(), "name": subject.name, "right": right.value, "seq": next(self._numbers),
+            "inc": rng.choice((1, 7, next(self._counters))), "x": rng.choice((b"", bytes(32), rng.randbytes(32))),
+            "lease": rng.choice((1_000, 6_000, 24_000, 3_600_000)),
+            "global": rng.random() < 0.5, "member": identity.membership, "chain": chain,
+            "rt": RtCert.make(identity, switch, self._lasting()),
+            **({"prev": self._switch_at(rng, None)} if rng.random() < 0.2 else {}),
+        }  # fmt: skip
+
+    def _claim_of(self, rng: random.Random, identity: Identity, topic: Name, right: Right) -> bytes:
+        body = self._claim_body(rng, identity, topic, right, self._switch_at(rng, None))
+        if rng.random() < 0.2:
+            self._spoil(rng, body)
+        return self._signed(StatementType.ADVERTISE, body, identity.name, identity.key) or b""
+
+    def _switch_at(self, rng: random.Random, place: Place | None) -> Name:
+        switches = self._stage.world.switches
+        if place is not None and place.node in switches and rng.random() < 0.9:
+            return switches[place.node].name
+        return rng.choice(list(switches.values())).name
+
+    def _withdraw(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        own = (identity.name, *self._topics)
+        return {"n": rng.choice(own), "right": rng.choice(_RIGHTS).value, "s": next(self._numbers)}
+
+    def _inner(self, rng: random.Random, identity: Identity) -> bytes:
+        """Return a claim or a withdrawal, of this node or of another insider, to be put into something."""
+        other = self._stage.identity(rng.choice(PERSONAS)) if rng.random() < 0.5 else identity
+        chance = rng.random()
+        if chance < 0.2:
+            return rng.choice(self._old)
+        if chance < 0.35:
+            body = self._withdraw(rng, other, Place("", 0, b""))
+            return self._signed(StatementType.WITHDRAW, body, other.name, other.key) or b""
+        switch = self._relay_switch(rng, identity)
+        body = self._claim_body(rng, other, rng.choice(self._topics), rng.choice(_RIGHTS), switch)
+        return self._signed(StatementType.ADVERTISE, body, other.name, other.key) or b""
+
+    def _relay_switch(self, rng: random.Random, identity: Identity) -> Name:
+        is_switch = identity.role.value == "switch"
+        return identity.name if is_switch and rng.random() < 0.8 else self._switch_at(rng, None)
+
+    def _relay(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        return {
+            "q": self._inner(rng, identity), "x": list(self._domains),
+            "d": rng.choice((b"", rng.choice(self._domains))), "c": identity.membership,
+        }  # fmt: skip
+
+    def _query(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        watch_s = rng.choice((0.0, 0.0, 1.0, 24.0, 3_600.0))
+        return {"n": rng.choice((*self._topics, self._name(rng))), "w": watch_s, "c": identity.membership}
+
+    def _answer(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        claim, name, advertiser = b"", rng.choice((*self._topics, *self._nodes)), rng.choice(self._nodes)
+        chance = rng.random()
+        if chance < 0.6:
+            claim = self._inner(rng, identity)
+            try:
+                statement = parse(claim)
+                name, advertiser = Name(statement.fields.bytes_("name", 32)), statement.signer
+            except StatementError:
+                pass
+        elif chance < 0.8:
+            advertiser = name
+        return {
+            "n": name, "a": advertiser, "q": claim, "s": rng.choice((0, next(self._numbers))),
+            "d": rng.choice(self._domains), "x": list(self._domains), "l": rng.choice((0.0, 0.5, 6.0, 3_600.0)),
+            "c": identity.membership,
+        }  # fmt: skip
+
+    def _verdict(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        return {
+            "n": rng.choice((*self._topics, *self._nodes)), "a": rng.choice(self._nodes),
+            "r": rng.choice((255, *(int(each) for each in DropReason), 200)), "s": next(self._numbers),
+            "c": identity.membership,
+        }  # fmt: skip
+
+    def _presence(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        return {
+            "n": rng.choice(self._nodes), "i": rng.randrange(40), "w": self._switch_at(rng, None),
+            "q": rng.random() < 0.5, "y": rng.random() < 0.5, "c": identity.membership,
+        }  # fmt: skip
+
+    def _digest(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        return {
+            "p": rng.choice((b"", b"\x00", bytes(2))), "h": rng.choice((rng.randbytes(8), rng.randbytes(2_048))),
+            "z": rng.random() < 0.5, "c": identity.membership,
+        }  # fmt: skip
+
+    def _fetch(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        prefixes = [rng.choice((b"", rng.randbytes(1), rng.randbytes(2))) for _ in range(rng.choice((0, 1, 16)))]
+        keys = [rng.choice(self._names) + rng.choice(self._nodes) for _ in range(rng.choice((0, 1, 64)))]
+        return {"p": prefixes, "k": keys, "c": identity.membership}
+
+    def _inventory(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        def item() -> bytes:
+            number = rng.choice((0, 1, _U64, next(self._numbers)))
+            return self._name(rng) + rng.choice(self._nodes) + number.to_bytes(8, "big") + bytes([rng.randrange(2)])
+
+        items = [item() for _ in range(rng.choice((0, 1, 8, INVENTORY_MAX)))]
+        return {"i": items, "z": rng.random() < 0.5, "c": identity.membership}
+
+    def _replicas(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        def entry() -> _Body:
+            unix_s = int(self._stage.world.network.now.unix_s)
+            spoken = {
+                "q": self._inner(rng, identity), "m": rng.choice((b"", rng.choice(self._certs))),
+                "w": rng.choice(self._nodes), "d": rng.choice(self._domains), "v": rng.choice(self._domains),
+                "x": list(self._domains), "l": rng.choice((0.0, 6.0, 3_600.0)), "u": rng.random() < 0.3,
+                "t": rng.choice((0, unix_s + 100, _U64)),
+            }  # fmt: skip
+            if rng.random() < 0.3:
+                self._spoil(rng, spoken)
+            return spoken
+
+        return {
+            "e": [entry() for _ in range(rng.choice((0, 1, 1, 3)))], "z": rng.random() < 0.5,
+            "c": identity.membership,
+        }  # fmt: skip
+
+    def _revoke(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        unix_s = int(self._stage.world.network.now.unix_s)
+        member = rng.choice(self._identities()).member
+        until = rng.choice((unix_s, unix_s + 100, _U64, 0, member.validity.not_after_unix_s))
+        return {
+            **identity.subject.to_fields(), "cert": rng.choice((rng.randbytes(32), member.fingerprint)), "until": until
+        }
+
+    def _open(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        to = rng.choice([host.name for host in self._stage.world.ribs.values()])
+        return {"k": rng.randbytes(32), "w": to, "c": identity.membership, "p": bytes(rng.choice((0, 700, 8_000)))}
+
+    def _accept(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        to = rng.choice(self._nodes)
+        return {
+            "o": rng.randbytes(32), "i": rng.randbytes(8), "k": rng.randbytes(32), "w": to, "c": identity.membership
+        }
+
+    def _adcert(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        return dict(parse(AdCert.make(
+            identity.key, identity.name, identity.subject, rng.choice(self._identities()).subject,
+            [Right.READ, Right.PUBLISH], self._lasting(),
+        )).body)  # fmt: skip
+
+    def _rtcert(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        return {"switch": self._switch_at(rng, None), **self._lasting().to_fields()}
+
+    def _card(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        return {"member": identity.membership, "kem": identity.kem.public.wire}
+
+    def _grant(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        return {**identity.subject.to_fields(), "to": rng.choice(self._nodes), "epoch": 1, "sealed": bytes(1_168)}
+
+    def _lasting(self) -> Validity:
+        unix_s = int(self._stage.world.network.now.unix_s)
+        return Validity(unix_s // 600 * 600 - 600, unix_s // 600 * 600 + 1_800)
+
+    # -- on their way
+
+    def _delivery(self, rng: random.Random, type_: StatementType, place: Place) -> tuple[int, Name]:
+        """Return the kind of frame that carries a statement, and whom it is for."""
+        if rng.random() < 0.03:
+            return rng.choice(tuple(Kind)), rng.choice((ZERO, self._name(rng)))
+        kind = rng.choice(_KINDS[type_])
+        if kind >= Kind.HELLO:
+            return kind, ZERO
+        world = self._stage.world
+        if kind == Kind.RIB_REQUEST:
+            return kind, rng.choice([host.name for host in world.ribs.values()])
+        hosts: list[Switch | RibHost] = [*world.switches.values()]
+        if kind == Kind.RIB_ANSWER:
+            hosts += world.ribs.values()
+        return kind, rng.choice(hosts).name
+
+    # -- frames that carry no statement
+
+    def _header(self, rng: random.Random, kind: int, to: Name, source: Name, length: int) -> Header:
+        return Header(kind, Flag.LAST, HOPS_MAX, 1, length, next(self._counters), 0, 1, 77, to, source)
+
+    def _keepalive(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
+        """Return a keepalive sealed with the key of the persona's own session."""
+        machine = self._stage.machines().get(persona.node)
+        greeter = getattr(machine, "greeter", None) or getattr(getattr(machine, "attachment", None), "greeter", None)
+        sessions = [each.keepalives for each in greeter.all_up() if each.keepalives] if greeter else []
+        if not sessions:
+            return []
+        number = rng.choice((*_INTEGERS, next(self._counters)))
+        source = self._stage.identity(persona).name
+        header = Header(Kind.KEEPALIVE, Flag.LAST, HOPS_MAX, 0, 26, number, 0, 1, 77, ZERO, source)
+        key = rng.choice(sessions).out_key
+        return [seal_keepalive(key, header, rng.randrange(256), rng.choice((0, 1, 3, 255)), rng.randbytes(8))]
+
+    def _miss(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
+        """Return a frame to some name, in the persona's or another's name."""
+        source = rng.choice((self._stage.identity(persona).name, self._name(rng)))
+        kind = rng.choice((Kind.DATA, Kind.REPORT, Kind.STATUS, Kind.RIB_REQUEST, Kind.ECHO_REPLY))
+        payload = bytes(rng.choice((0, 1, 100, 1_300)))
+        header = self._header(rng, kind, self._name(rng), source, len(payload))
+        return [encode(header._replace(hops_left=rng.choice((0, 1, 2, HOPS_MAX, 255)))) + payload]
+
+    def _echo(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
+        source = rng.choice((self._stage.identity(persona).name, self._name(rng)))
+        payload = bytes(rng.choice((0, 100, 1_300)))
+        to = rng.choice((self._switch_at(rng, place), self._name(rng)))
+        return [encode(self._header(rng, Kind.ECHO_REQUEST, to, source, len(payload))) + payload]
+
+    def _report(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
+        """Return a hostile note of a reader's own feed, by the key that it agreed with its publisher."""
+        member = self._stage.world.members.get(persona.node)
+        feeds = [] if member is None else [each for each in member.feeds() if each.state is FeedState.LIVE]
+        if not feeds:
+            return []
+        missing = tuple(
+            Missing(self._number(rng), *(rng.choice((0, 1, 1 << 17, 0xFFFF_FFFF)) for _ in range(2)))
+            for _ in range(rng.choice((0, 1, NACKS_PER_REPORT)))
+        )
+        report = Report(
+            rng.choice(tuple(ReportFlag)), self._number(rng), rng.choice((0, 1, 0xFFFF_FFFF)), missing,
+            self._number(rng), self._number(rng),
+        )  # fmt: skip
+        feed = rng.choice(feeds)
+        return [feed._note(feed._epoch).seal(report.to_wire())]
+
+    def _status(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
+        """Return what a publisher or a server says of its stream."""
+        identity = self._stage.identity(persona)
+        found = self._secret(rng, identity)
+        if found is None:
+            return []
+        topic, epoch, secret = found
+        readers = [self._stage.world.members[label] for label in ("nuc2/reader", "nuc4/alien", "evil/guest")]
+        starts = {
+            bytes(rng.choice(readers).name): Start(
+                rng.choice(readers).attachment._incarnation, self._number(rng), self._number(rng), self._number(rng)
+            )
+            for _ in range(rng.choice((0, 1, 3)))
+        }
+        if rng.random() < 0.05:
+            starts |= {rng.randbytes(32): Start(1, 1, 1) for _ in range(STARTS_MAX - len(starts))}
+        sent = self._number(rng)
+        status = Status(
+            rng.choice((0, 1, sent, max(sent - 1, 0))), sent, rng.choice((0, 1, 0xFFFF_FFFF)), starts,
+            rng.choice((b"", b"described", bytes(1_000))),
+            tuple(Move(self._number(rng) % (1 << 60), rng.choice((0, 1, 1 << 32)), self._number(rng) % (1 << 61))
+                  for _ in range(rng.choice((0, 0, 1, MOVES_MAX)))),
+            self._number(rng), self._number(rng),
+            tuple(LostRange(first, first + rng.choice((0, 1, 1 << 40)), rng.randrange(1, 4))  # type: ignore[arg-type]
+                  for first in (self._number(rng) % (1 << 62) for _ in range(rng.choice((0, 0, 1, GONE_MAX))))),
+        )  # fmt: skip
+        return self._sealed(rng, identity, topic, epoch, secret, Kind.STATUS, status.to_wire())
+
+    def _data(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
+        identity = self._stage.identity(persona)
+        found = self._secret(rng, identity)
+        if found is None:
+            return []
+        body = self._number(rng).to_bytes(8, "big") + rng.randbytes(rng.choice((0, 1, 200, 5_000)))
+        if rng.random() < 0.3:
+            body = self._number(rng).to_bytes(8, "big") + bundle.pack([b"a"] * rng.choice((1, 3, 200)))
+        return self._sealed(rng, identity, *found, Kind.DATA, body)
+
+    def _sealed(
+        self, rng: random.Random, identity: Identity, topic: Name, epoch: int, secret: bytes, kind: Kind, body: bytes
+    ) -> list[bytes]:
+        members = self._stage.world.members.values()
+        own = next((each for each in members if each.name == identity.name), None)
+        incarnation = 1 if own is None else own.attachment._incarnation
+        number = self._number(rng) if rng.random() < 0.2 else next(self._numbers)
+        sealer = Sealer(secret, epoch, kind, identity.name, incarnation, topic, identity.key, rng.randbytes)
+        flags = rng.choice((0, Flag.RELIABLE, Flag.RELIABLE | Flag.LATCHED, Flag.BUNDLE | Flag.RELIABLE, 0xFE))
+        try:
+            frames = list(sealer.seal(min(number, _U64 - 1), int(flags), body, 1_400))
+        except LocalError:
+            return []
+        if len(frames) > 1 and rng.random() < 0.3:
+            frames.pop(rng.randrange(len(frames)))
+        return frames
+
+    def _secret(self, rng: random.Random, identity: Identity) -> tuple[Name, int, bytes] | None:
+        mine = [each for each in self._stage.topics.values() if each.delegation.node == identity.name]
+        if not mine:
+            return None
+        topic = rng.choice(mine)
+        epoch, secret = next(iter(topic.secrets.items()))
+        return topic.name, epoch, secret
+
+    def _number(self, rng: random.Random) -> int:
+        return rng.choice((0, 1, 2, 3, 100, next(self._numbers), (1 << 63), _U64 - 2, _U64 - 1, _U64))
+
+
+_T = StatementType
+_Make = Callable[[Forge, random.Random, Identity, Place], _Body]
+_BODIES: Final[dict[StatementType, _Make]] = {
+    _T.HELLO: Forge._hello, _T.LINK_STATE: Forge._link_state, _T.JOIN: Forge._join, _T.ADVERTISE: Forge._claim,
+    _T.WITHDRAW: Forge._withdraw, _T.RELAY: Forge._relay, _T.QUERY: Forge._query, _T.ANSWER: Forge._answer,
+    _T.VERDICT: Forge._verdict, _T.PRESENCE: Forge._presence, _T.DIGEST: Forge._digest, _T.FETCH: Forge._fetch,
+    _T.INVENTORY: Forge._inventory, _T.REPLICAS: Forge._replicas, _T.REVOKE: Forge._revoke,
+    _T.OPEN: Forge._open, _T.ACCEPT: Forge._accept,
+    _T.ADCERT: Forge._adcert, _T.RTCERT: Forge._rtcert, _T.CARD: Forge._card, _T.GRANT: Forge._grant,
+}  # fmt: skip
+_K = Kind
+_KINDS: Final[dict[StatementType, tuple[Kind, ...]]] = {
+    _T.HELLO: (_K.HELLO,), _T.LINK_STATE: (_K.LINK_STATE,), _T.JOIN: (_K.JOIN, _K.JOIN, _K.LEAVE),
+    _T.ADVERTISE: (_K.ADVERTISE,), _T.WITHDRAW: (_K.WITHDRAW,),
+    _T.RELAY: (_K.RIB_REQUEST, _K.RIB_REQUEST, _K.RELOCATE, _K.REDIRECT), _T.QUERY: (_K.RIB_REQUEST, _K.WHERE),
+    _T.ANSWER: (_K.RIB_ANSWER, _K.RIB_ANSWER, _K.VERDICT, _K.REDIRECT), _T.VERDICT: (_K.VERDICT, _K.RIB_ANSWER),
+    _T.PRESENCE: (_K.RIB_ANSWER, _K.RIB_REQUEST, _K.VERDICT), _T.DIGEST: (_K.RIB_REQUEST,),
+    _T.FETCH: (_K.RIB_REQUEST,), _T.INVENTORY: (_K.RIB_REQUEST,), _T.REPLICAS: (_K.RIB_REQUEST,),
+    _T.REVOKE: (_K.REVOKE,), _T.ADCERT: (_K.ADVERTISE,), _T.RTCERT: (_K.ADVERTISE,), _T.CARD: (_K.ADVERTISE,),
+    _T.GRANT: (_K.VERDICT,), _T.OPEN: (_K.RIB_REQUEST,), _T.ACCEPT: (_K.RIB_ANSWER,),
+}  # fmt: skip
+_RARE: Final = {_T.ADCERT, _T.RTCERT, _T.CARD, _T.GRANT}
+_SPOKEN: Final = tuple(each for each in _BODIES for _ in range(1 if each in _RARE else 6))
+_FRAMES: Final[tuple[tuple[str, Callable[[Forge, random.Random, Persona, Place], list[bytes]]], ...]] = (
+    ("keepalive", Forge._keepalive),
+    ("frame", Forge._miss),
+    ("echo", Forge._echo),
+    ("note", Forge._report),
+    ("status", Forge._status),
+    ("data", Forge._data),
+)
+assert set(_BODIES) == set(StatementType)

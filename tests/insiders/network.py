@@ -1,0 +1,70 @@
+"""A network in memory that knows which frames were drawn by what a hostile member said."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from gdp.effects import Transmit
+from gdp.frame.codec import ETHER_BYTES
+from gdp.testbed.memory import MemoryNetwork
+
+__all__ = ["Echo", "TracingNetwork"]
+
+
+@dataclass(slots=True)
+class Echo:
+    """What one utterance drew, from all nodes, as far as frames drew it; timers are nobody's.
+
+    Attributes:
+        sent: bytes after the Ethernet header that machines sent, by node.
+        forwarded: bytes that data planes forwarded, copies of multicast included.
+    """
+
+    sent: Counter[str] = field(default_factory=Counter)
+    forwarded: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def most(self) -> int:
+        """Return the bytes that the busiest machine sent."""
+        return max(self.sent.values(), default=0)
+
+
+class TracingNetwork(MemoryNetwork):
+    """Frames that a machine sends while it takes a traced frame are traced, too, wherever they lead.
+
+    Attributes:
+        echo: of what is being delivered now; None: of nothing that is traced.
+    """
+
+    echo: Echo | None = None
+    _is_machine = False  # what enters a link now is of a machine
+
+    def _push(self, at_s: float, action: Callable[[], None]) -> None:
+        echo = self.echo
+        super()._push(at_s, action if echo is None else lambda: self._under(echo, action))
+
+    def _under(self, echo: Echo, action: Callable[[], None]) -> None:
+        self.echo = echo
+        try:
+            action()
+        finally:
+            self.echo = None
+
+    def _arm(self, name: str) -> None:
+        echo, self.echo = self.echo, None
+        super()._arm(name)
+        self.echo = echo
+
+    def _transmit(self, node: Any, transmit: Transmit) -> None:
+        self._is_machine = True
+        super()._transmit(node, transmit)
+        self._is_machine = False
+
+    def _send(self, wired: Any, frame: bytes) -> None:
+        if self.echo is not None:
+            counts = self.echo.sent if self._is_machine else self.echo.forwarded
+            counts[wired[1].node] += len(frame) - ETHER_BYTES
+        super()._send(wired, frame)

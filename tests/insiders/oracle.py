@@ -1,0 +1,51 @@
+"""An ideal signature scheme in place of ECDSA, so that making and checking statements costs little.
+
+A signature is BLAKE2b over SHA-256 of the data, keyed by the public key. It is deterministic, 64 bytes long, and
+nobody but the harness can make one: what a verifier decides is the same as with ECDSA, but for malleated signatures
+and points that are no point. Certificates (X.509) keep their real signatures and their real verification.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from unittest import mock
+
+from gdp.crypto.keys import SIGNATURE_BYTES, PublicKey, SigningKey, SoftwareKey
+from gdp.errors import DropReason, StatementError
+
+__all__ = ["signing_oracle"]
+
+
+def _signature(compressed: bytes, digest: bytes) -> bytes:
+    return hashlib.blake2b(digest, digest_size=SIGNATURE_BYTES, key=compressed).digest()
+
+
+def _sign(self: SigningKey, data: bytes) -> bytes:
+    return _signature(self.public.compressed, hashlib.sha256(data).digest())
+
+
+def _sign_digest(self: SigningKey, digest: bytes) -> bytes:
+    return _signature(self.public.compressed, digest)
+
+
+def _verify(self: PublicKey, signature: bytes, data: bytes) -> None:
+    _verify_digest(self, signature, hashlib.sha256(data).digest())
+
+
+def _verify_digest(self: PublicKey, signature: bytes, digest: bytes) -> None:
+    if signature != _signature(self.compressed, digest):
+        raise StatementError(DropReason.BAD_SIGNATURE)
+
+
+@contextmanager
+def signing_oracle() -> Iterator[None]:
+    """Replace ECDSA of statements and messages, in this process, for as long as this lasts."""
+    with (
+        mock.patch.object(SoftwareKey, "sign", _sign),
+        mock.patch.object(SoftwareKey, "sign_digest", _sign_digest),
+        mock.patch.object(PublicKey, "verify", _verify),
+        mock.patch.object(PublicKey, "verify_digest", _verify_digest),
+    ):
+        yield

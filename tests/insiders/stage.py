@@ -1,0 +1,254 @@
+"""The stage of the insiders: a network in memory in which some members of every kind are hostile.
+
+::
+
+    school:    nuc1 ---- nuc2        evil (hostile switch) at nuc1 and nuc2; hostile RIB at evil
+    backbone:          nuc3          upper RIB
+    cloud:             nuc4          far (hostile switch) at nuc3 and nuc4; hostile RIB at far
+    stranger:          x1 at nuc2    no domain of the others trusts it
+
+The good flow goes from nuc1/robot to nuc4/server; no insider has a right on its topic, and none is on its way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from gdp.client.member import Member, Topic
+from gdp.client.rib_host import RibHost
+from gdp.control.greeter import LinkPort
+from gdp.crypto.identity import Identity
+from gdp.limits import RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX
+from gdp.rib.machine import RibSettings
+from gdp.switch.machine import Switch
+from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
+from gdp.testbed.world import World
+from gdp.trust.domain import Policy
+from gdp.trust.revocation import Revocation
+from gdp.trust.right import Right
+from tests.journeys.flows import Flow
+
+__all__ = ["GOOD", "PERSONAS", "PROMISE_S", "Persona", "Place", "Stage"]
+
+PROMISE_S: Final = 3.0  # within which a message of an established flow arrives
+GOOD: Final = ("nuc1/robot", "nuc4/server")
+_TRUSTED: Final = ("school", "backbone", "cloud")
+_LEASE_S: Final = 6.0
+_TOPIC, _SERVICE = "/noise", "/work"
+_PARTS: Final = {
+    "nuc1/insider": ((_TOPIC, Right.PUBLISH), (_SERVICE, Right.SERVE)),
+    "nuc2/reader": ((_TOPIC, Right.READ),),
+    "nuc4/alien": ((_TOPIC, Right.READ), (_SERVICE, Right.CALL)),
+    "evil/guest": ((_TOPIC, Right.READ), (_SERVICE, Right.SERVE)),
+}
+
+_TOPOLOGY: Final = Topology(
+    links=(
+        Link("nuc1", "nuc2"),
+        Link("nuc2", "nuc3"),
+        Link("nuc3", "nuc4"),
+        Link("evil", "nuc1"),
+        Link("evil", "nuc2"),
+        Link("far", "nuc3"),
+        Link("far", "nuc4"),
+        Link("x1", "nuc2"),
+    ),
+    domains=(
+        DomainPlan("school", ("nuc1", "nuc2", "evil"), upper="backbone"),
+        DomainPlan("backbone", ("nuc3",)),
+        DomainPlan("cloud", ("nuc4", "far"), upper="backbone"),
+        DomainPlan("stranger", ("x1",)),
+    ),
+    attachments=(
+        Attachment("nuc2", "rib", "rib"),
+        Attachment("evil", "rib", "rib2"),
+        Attachment("nuc3", "rib", "rib"),
+        Attachment("nuc4", "rib", "rib"),
+        Attachment("far", "rib", "rib2"),
+        Attachment("x1", "rib", "rib"),
+        Attachment("nuc1", "proxy", "robot"),
+        Attachment("nuc4", "proxy", "server"),
+        Attachment("nuc1", "proxy", "insider"),
+        Attachment("nuc2", "proxy", "outcast"),
+        Attachment("nuc4", "proxy", "alien"),
+        Attachment("nuc2", "proxy", "reader"),
+        Attachment("evil", "proxy", "guest"),
+        Attachment("x1", "proxy", "mallory"),
+    ),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Persona:
+    """A hostile member.
+
+    Args:
+        node: what it is called in the network.
+        identity: label in ``World.identities``.
+        may_break: whether its office lets it hurt the good flow: RIBs of the flow's domains say where names are.
+    """
+
+    node: str
+    identity: str
+    may_break: bool = False
+
+
+PERSONAS: Final = (
+    Persona("nuc1/insider", "nuc1/insider"),  # publishes the topic, serves the service
+    Persona("nuc2/reader", "nuc2/reader"),
+    Persona("nuc4/alien", "nuc4/alien"),  # reads and calls, of another trusted domain
+    Persona("nuc2/outcast", "nuc2/outcast"),  # its membership is revoked
+    Persona("x1/mallory", "x1/mallory"),
+    Persona("evil", "evil"),
+    Persona("far", "far"),
+    Persona("x1", "x1"),
+    Persona("evil/rib2", "rib:school#2", may_break=True),
+    Persona("far/rib2", "rib:cloud#2", may_break=True),
+    Persona("nuc3/rib", "rib:backbone", may_break=True),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A port of a node, and the address from which its neighbour there speaks."""
+
+    node: str
+    port: int
+    mac: bytes
+
+
+@dataclass(slots=True)
+class Stage:
+    """The network, settled: topics flow, a service works, one member is revoked.
+
+    Attributes:
+        rib_limits: names of one sender, and watches, that each RIB keeps.
+        flow: the good one.
+        topics: what the insiders may do with their topic and their service, by label and right.
+    """
+
+    seed: int
+    rib_limits: tuple[int, int] = (RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX)
+    world: World = field(init=False)
+    flow: Flow = field(init=False)
+    topics: dict[str, Topic] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.world = world = World(
+            _TOPOLOGY,
+            self.seed,
+            hello_s=1.0,
+            dead_s=3.6,
+            lease_s=_LEASE_S,
+            keepalive_ms=1_000,
+            trusts=dict.fromkeys(_TRUSTED, _TRUSTED) | {"stranger": ("stranger", *_TRUSTED)},
+        )
+        names, watches = self.rib_limits
+        for host in world.ribs.values():
+            settings = host.rib._settings
+            host.rib._settings = RibSettings(
+                settings.upper, settings.peers, names_per_sender=names, watches=watches
+            )
+            host.rib._watches._maximum = host.rib._holders._maximum = watches
+        world.settle(8.0)
+        source, sink = GOOD
+        topic = world.topic("/good", world.members[source], [Right.PUBLISH])
+        publisher = world.members[source].advertise(topic, b"described", reliable=True)
+        world.network.touch(source)
+        self.flow = Flow(world, "/good", source, topic, publisher)
+        self.flow.read_by(sink)
+        self.join_in()
+        world.network.run(3.0)
+        self.revoke("nuc2/outcast")
+        world.network.run(2.0)
+
+    def join_in(self) -> None:
+        """Let the insiders' members publish, read, serve and call."""
+        for label in _PARTS:
+            self.take_part_again(label)
+
+    def take_part_again(self, label: str) -> None:
+        """Let a member do what it is here for, as far as it does not."""
+        member = self.world.members[label]
+        claimed = {each.right for each in member.attachment.claims}
+        for name, right in _PARTS.get(label, ()):
+            if right in claimed:
+                continue
+            topic = self.topics.get(f"{label} {right.value}") or self.world.topic(name, member, [right])
+            self.topics[f"{label} {right.value}"] = topic
+            if right is Right.PUBLISH:
+                member.advertise(topic, b"described", reliable=True)
+            elif right is Right.READ:
+                member.subscribe(topic)
+            elif right is Right.SERVE:
+                member.serve(topic, b"served")
+            else:
+                member.call(topic, b"called")
+        self.world.network.touch(label)
+
+    def publish(self, message: bytes) -> None:
+        """Let the insiders' publisher publish, and their server answer whom it hears."""
+        member = self.world.members["nuc1/insider"]
+        for publisher in member.publishers():
+            publisher.publish(message)
+        service = self.topics["nuc1/insider serve"].name
+        for client in member.heard(service):
+            member.answer(service, client, message)
+        member.flush(self.world.network.now.mono_s)
+        self.world.network.touch("nuc1/insider")
+
+    def revoke(self, label: str) -> None:
+        """Have nuc1's operator take a member's membership back."""
+        world = self.world
+        member = world.identities[label].member
+        authority = world.authorities["school"]
+        wire = Revocation.make(
+            authority.key, authority.root.subject, member.fingerprint, member.validity.not_after_unix_s
+        )
+        world.switches["nuc1"].revoke(wire, world.network.now)
+        world.network.touch("nuc1")
+
+    def identity(self, persona: Persona) -> Identity:
+        """Return a persona's keys and membership."""
+        return self.world.identities[persona.identity]
+
+    def places(self, node: str) -> list[Place]:
+        """Return where a node's frames come in: a port of each of its neighbours."""
+        ports = self.world.network._nodes[node].ports.values()
+        return [Place(far.node, far.port, own.mac) for cable, own, far in ports if cable.is_up]
+
+    def machines(self) -> dict[str, Switch | RibHost | Member]:
+        """Return every machine that is alive, by node."""
+        world = self.world
+        ribs = {world.rib_node(label): host for label, host in world.ribs.items()}
+        machines: dict[str, Switch | RibHost | Member] = {**world.switches, **ribs, **world.members}
+        return {node: each for node, each in machines.items() if world.network._nodes[node].is_alive}
+
+    def nonce_at(self, place: Place) -> bytes:
+        """Return the nonce that a port says in its hellos."""
+        port = self._port_at(place)
+        return bytes(8) if port is None else port.nonce
+
+    def own_nonce(self, persona: Persona, place: Place) -> bytes:
+        """Return the nonce of the persona's own port that leads to a place."""
+        ports = self.world.network._nodes[persona.node].ports
+        index = next((i for i, (_, _, far) in ports.items() if (far.node, far.port) == (place.node, place.port)), -1)
+        port = self._port_at(Place(persona.node, index, b""))
+        return bytes(8) if port is None else port.nonce
+
+    def believes(self, persona: Persona, place: Place) -> bool:
+        """Return whether a node believes a persona: its domain is trusted there, and it is not revoked."""
+        domain = self.identity(persona).root.domain
+        machine = self.machines().get(place.node)
+        holder = machine if isinstance(machine, Switch) or machine is None else machine.attachment
+        policy: Policy | None = None if holder is None else holder._policy
+        is_revoked = persona.node == "nuc2/outcast"
+        return policy is not None and policy.trusts(domain) and not is_revoked
+
+    def _port_at(self, place: Place) -> LinkPort | None:
+        machine = self.machines().get(place.node)
+        if machine is None:
+            return None
+        greeter = machine.greeter if isinstance(machine, Switch) else machine.attachment.greeter
+        return greeter.ports.get(place.port)

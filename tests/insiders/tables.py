@@ -1,0 +1,67 @@
+"""Every table of a machine, and how long it may get."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+from gdp.client.private_streams import STREAMS_MAX
+from gdp.client.readers import READERS_MAX
+from gdp.limits import JOIN_MESSAGES_MAX, PARKED_FRAMES_MAX, REPLAY_WINDOW_MESSAGES
+from gdp.rib.replication import QUEUE_MAX
+from gdp.switch.places import QUESTIONS_MAX, USES_MAX
+
+__all__ = ["GENERAL_MAX", "LIMITS", "sizes"]
+
+GENERAL_MAX: Final = 4_096  # what remembers peers, sessions or old statements keeps no more than this
+LIMITS: Final[Mapping[str, int]] = {
+    "Places._questions": QUESTIONS_MAX + USES_MAX,
+    "Parked._by_name": PARKED_FRAMES_MAX,
+    "Readers._by_name": READERS_MAX,
+    "PrivateStreams._streams": STREAMS_MAX,
+    "_Peer.keys": QUEUE_MAX,
+    "_Peer.prefixes": QUEUE_MAX,
+    "JoinBuffer._unfinished": JOIN_MESSAGES_MAX,
+    "ReplayWindow._finished": REPLAY_WINDOW_MESSAGES,
+}
+_CONTAINERS: Final = (dict, list, set, frozenset, deque)
+_DEEP_ITEMS: Final = 64  # of one container, that are looked into
+_ROOMS: Final = "gdp."
+
+
+def sizes(machine: object) -> Counter[str]:
+    """Return the longest of each kind of table below a machine, by ``Class.attribute``."""
+    found: Counter[str] = Counter()
+    seen: set[int] = set()
+    waiting: list[tuple[str, object]] = [("", machine)]
+    while waiting:
+        where, value = waiting.pop()
+        if id(value) in seen:
+            continue
+        seen.add(id(value))
+        if isinstance(value, _CONTAINERS):
+            if len(value) > found[where]:
+                found[where] = len(value)
+            waiting += [(where, each) for each in _first(value)]
+        elif type(value).__module__.startswith(_ROOMS) and not isinstance(value, type | bytes | int | str | tuple):
+            name = type(value).__name__
+            waiting += [(f"{name}.{key}", each) for key, each in _attributes(value)]
+    return found
+
+
+def _first(value: Any) -> Iterator[object]:
+    items = value.values() if isinstance(value, dict) else value
+    for at, each in enumerate(items):
+        if at >= _DEEP_ITEMS:
+            break
+        yield each
+
+
+def _attributes(value: object) -> Iterator[tuple[str, object]]:
+    yield from getattr(value, "__dict__", {}).items()
+    for kind in type(value).__mro__:
+        slots = kind.__dict__.get("__slots__", ())
+        for key in (slots,) if isinstance(slots, str) else slots:
+            if hasattr(value, key):
+                yield key, getattr(value, key)

@@ -1,0 +1,341 @@
+"""One trial of the insiders: a journey brings the network into some state, then hostile members speak.
+
+A ``Plan`` prints itself; given back to ``Trial`` it happens again, keys included. Each act and each utterance is drawn
+from a number of its own, so that those that do not matter can be left out (``shrunk``).
+
+What must hold all the time: no error of our own leaves a machine; no table grows beyond its bound; what an utterance
+draws is in proportion to its bytes; and, where no insider's office lets it do harm, the good flow delivers in time.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Final
+from unittest import mock
+
+from gdp.errors import LocalError
+from tests.insiders.forge import Forge, Utterance
+from tests.insiders.network import Echo, TracingNetwork
+from tests.insiders.oracle import signing_oracle
+from tests.insiders.stage import GOOD, PERSONAS, PROMISE_S, Stage
+from tests.insiders.tables import GENERAL_MAX, LIMITS, sizes
+from tests.journeys.networks import reproducible_keys
+
+__all__ = ["BrokenError", "Figures", "Plan", "Trial", "prepared", "shrunk"]
+
+STRANGERS_MAX: Final = 1.0  # bytes drawn for each byte of somebody unproven
+_LOOK_EVERY: Final = 500  # utterances between two looks at the tables
+_GOOD_EVERY: Final = 100  # ... and between two messages of the good flow
+_PAUSES_S: Final = (*[0.0005] * 20, *[0.002] * 20, 0.02, 0.2)
+_HEALED_S: Final = 12.0  # leases, once all works again
+
+
+class BrokenError(AssertionError):
+    """An invariant does not hold."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What happens.
+
+    Args:
+        seed: of keys and network.
+        acts: of the journey; each draws one event.
+        words: each draws one utterance.
+        is_stormy: acts may hit any node, and go on between utterances; the good flow is then not watched.
+    """
+
+    seed: int
+    acts: tuple[int, ...]
+    words: tuple[int, ...]
+    is_stormy: bool = False
+
+
+@dataclass
+class Figures:
+    """What was counted; trials add up.
+
+    Attributes:
+        worst: highest ratio of the bytes that one machine sent to the bytes said, with both, by what was said and
+            whether its sender was proven.
+        said, drawn: bytes in all, by the same; what the busiest machine sent each time.
+        slowest: seconds of processor time of the slowest delivery, by what was said.
+        spent: seconds of processor time in all, by what was said; ``count`` so many.
+        tables: longest of each.
+    """
+
+    count: Counter[str] = field(default_factory=Counter)
+    said: Counter[str] = field(default_factory=Counter)
+    drawn: Counter[str] = field(default_factory=Counter)
+    worst: dict[str, tuple[float, int, int]] = field(default_factory=dict)
+    slowest: dict[str, float] = field(default_factory=dict)
+    spent: Counter[str] = field(default_factory=Counter)
+    tables: Counter[str] = field(default_factory=Counter)
+    drops: Counter[str] = field(default_factory=Counter)
+
+    def add(self, other: Figures) -> None:
+        """Add what another trial counted."""
+        for mine, its in (
+            (self.count, other.count), (self.said, other.said), (self.drawn, other.drawn), (self.spent, other.spent),
+            (self.drops, other.drops),
+        ):  # fmt: skip
+            mine.update(its)
+        self.tables |= other.tables
+        for key, worst in other.worst.items():
+            self.worst[key] = max(worst, self.worst.get(key, (0.0, 0, 0)))
+        for key, slow_s in other.slowest.items():
+            self.slowest[key] = max(slow_s, self.slowest.get(key, 0.0))
+
+
+@contextmanager
+def prepared(seed: int) -> Iterator[None]:
+    """Let stages have keys by a seed, the signing oracle and a tracing network."""
+    with ExitStack() as stack:
+        stack.enter_context(reproducible_keys(seed))
+        stack.enter_context(signing_oracle())
+        stack.enter_context(mock.patch("gdp.testbed.world.MemoryNetwork", TracingNetwork))
+        yield
+
+
+class Trial:
+    """Runs a plan; ``stage`` is made within ``prepared`` unless given (a settled one of the same seed)."""
+
+    def __init__(self, plan: Plan, stage: Stage | None = None) -> None:
+        self.plan = plan
+        self.stage = stage or Stage(plan.seed)
+        self.forge = Forge(self.stage)
+        self.figures = Figures()
+        self.at: Utterance | str | None = None  # what happens now
+        self._sent = 0
+        self._got: list[bytes] = []
+        self._open: list[tuple[float, bytes]] = []  # messages of the good flow under way, with their deadlines
+        self._cut: list[str] = []
+
+    def run(self) -> Figures:
+        """Let it happen.
+
+        Raises:
+            BrokenError: an invariant does not hold.
+            Exception: an error of ours that a machine did not contain.
+        """
+        for number in self.plan.acts:
+            self._act(random.Random(number))
+        for number, word in enumerate(self.plan.words):
+            rng = random.Random(word)
+            if self.plan.is_stormy and rng.random() < 0.01:
+                self._act(rng)
+            self._speak(rng)
+            if number % _LOOK_EVERY == _LOOK_EVERY - 1:
+                self._check_tables()
+            if not self.plan.is_stormy and number % _GOOD_EVERY == _GOOD_EVERY - 1:
+                self._send_good()
+        self._check_tables()
+        if self.plan.is_stormy:
+            self._heal()
+        else:
+            self._settle_good()
+        for machine in self.stage.machines().values():
+            self.figures.drops.update({reason.label: count for reason, count in machine.drops().items()})
+        return self.figures
+
+    # -- hostile members
+
+    def _speak(self, rng: random.Random) -> None:
+        stage = self.stage
+        utterance = self.forge.utter(rng)
+        if utterance is None:
+            return
+        if not self.plan.is_stormy and utterance.persona.may_break:
+            return
+        self.at = utterance
+        echo, network, place = Echo(), stage.world.network, utterance.place
+        assert isinstance(network, TracingNetwork)
+        is_proven = stage.believes(utterance.persona, place)
+        begun_s = time.process_time()
+        network.echo = echo
+        for frame in utterance.frames:
+            network.inject(place.node, place.port, frame, place.mac)
+        network.echo = None
+        spent_s = time.process_time() - begun_s
+        network.run(rng.choice(_PAUSES_S))
+        self._note(utterance, echo, spent_s, is_proven=is_proven)
+
+    def _note(self, utterance: Utterance, echo: Echo, spent_s: float, *, is_proven: bool) -> None:
+        figures = self.figures
+        what, size, drawn = utterance.what, utterance.size, echo.most
+        key = what if is_proven else f"{what}, unproven"
+        figures.count[what] += 1
+        figures.said[key] += size
+        figures.drawn[key] += drawn
+        figures.worst[key] = max((drawn / size, drawn, size), figures.worst.get(key, (0.0, 0, 0)))
+        figures.spent[what] += spent_s  # type: ignore[assignment]
+        figures.slowest[what] = max(spent_s, figures.slowest.get(what, 0.0))
+        if not is_proven and drawn > STRANGERS_MAX * size:
+            raise BrokenError(f"{size} bytes of somebody unproven draw {drawn}: {utterance.what}")
+
+    # -- what must hold
+
+    def _check_tables(self) -> None:
+        for node, machine in self.stage.machines().items():
+            found = sizes(machine)
+            self.figures.tables |= found
+            for table, size in found.items():
+                if size > LIMITS.get(table, GENERAL_MAX):
+                    raise BrokenError(f"{table} of {node} holds {size}")
+
+    def _send_good(self) -> None:
+        flow = self.stage.flow
+        self._look_at_good()
+        self._sent += 1
+        message = b"good %d" % self._sent
+        flow.publish(message)
+        self._open.append((flow.world.network.now.mono_s + PROMISE_S, message))
+
+    def _look_at_good(self) -> None:
+        """Raise if the first message that is still under way should have come."""
+        flow = self.stage.flow
+        flow.collect()
+        got = [each.message for each in flow.got[GOOD[1]]]
+        flow.got[GOOD[1]].clear()
+        self._got += got
+        here = set(self._got[-64:])
+        self._open = [each for each in self._open if each[1] not in here]
+        now_s = flow.world.network.now.mono_s
+        if self._open and self._open[0][0] < now_s:
+            raise BrokenError(f"{self._open[0][1]!r} of the good flow did not arrive within {PROMISE_S} s")
+
+    def _settle_good(self) -> None:
+        self._send_good()
+        network = self.stage.world.network
+        for _ in range(8):
+            network.run(PROMISE_S / 4)
+            self._look_at_good()
+
+    def _heal(self) -> None:
+        """Repair every cable and let leases end, so that all timers that were armed fire."""
+        world, network = self.stage.world, self.stage.world.network
+        for cable in [*world.cables.values(), *world.leads.values()]:
+            if not cable.is_up:
+                network.set_link(cable, up=True)
+        network.run(_HEALED_S)
+
+    # -- the journey
+
+    def _act(self, rng: random.Random) -> None:
+        acts = _ACTS if self.plan.is_stormy else _CALM_ACTS
+        act = rng.choice(acts)
+        self.at = act.__name__
+        act(self, rng)
+        self.stage.world.network.run(rng.choice((0.0, 0.001, 0.1, 0.5, 2.0)))
+
+    def _hostile_member(self, rng: random.Random) -> str:
+        return rng.choice(("nuc1/insider", "nuc2/reader", "nuc4/alien", "evil/guest", "x1/mallory"))
+
+    def _cut_cable(self, rng: random.Random) -> None:
+        world = self.stage.world
+        cables = list(world.cables.values()) + list(world.leads.values())
+        world.network.set_link(rng.choice(cables), up=False)
+
+    def _mend_cable(self, rng: random.Random) -> None:
+        world = self.stage.world
+        down = [each for each in [*world.cables.values(), *world.leads.values()] if not each.is_up]
+        if down:
+            world.network.set_link(rng.choice(down), up=True)
+
+    def _cut_insider(self, rng: random.Random) -> None:
+        world = self.stage.world
+        cable = world.leads[self._hostile_member(rng)]
+        world.network.set_link(cable, up=False)
+        world.network.call(rng.choice((0.05, 1.0, 5.0)), lambda: world.network.set_link(cable, up=True))
+
+    def _restart_insider(self, rng: random.Random) -> None:
+        self.stage.world.restart_member(self._hostile_member(rng))
+
+    def _restart_hostile_switch(self, rng: random.Random) -> None:
+        self.stage.world.restart_switch(rng.choice(("evil", "far", "x1")))
+
+    def _restart_hostile_rib(self, rng: random.Random) -> None:
+        self.stage.world.restart_rib(rng.choice(("school#2", "cloud#2")))
+
+    def _restart_any(self, rng: random.Random) -> None:
+        world = self.stage.world
+        if rng.random() < 0.5:
+            world.restart_switch(rng.choice(list(world.switches)))
+        else:
+            world.restart_rib(rng.choice(list(world.ribs)))
+
+    def _leave(self, rng: random.Random) -> None:
+        label = self._hostile_member(rng)
+        member = self.stage.world.members[label]
+        for claimed in member.attachment.claims:
+            member.unsubscribe(claimed.subject.name)
+            member.withdraw(claimed.subject.name)
+        self.stage.world.network.touch(label)
+
+    def _join_in(self, rng: random.Random) -> None:
+        """Take part anew, where it does not any more."""
+        for label in ("nuc1/insider", "nuc2/reader", "nuc4/alien", "evil/guest"):
+            self.stage.take_part_again(label)
+
+    def _roam(self, rng: random.Random) -> None:
+        self.stage.world.roam(rng.choice(("nuc1/insider", "nuc2/reader", "nuc4/alien")), rng.choice(("nuc2", "nuc3")))
+
+    def _wait(self, rng: random.Random) -> None:
+        self.stage.world.network.run(rng.choice((0.3, 1.0, 4.0, 9.0)))
+
+    def _publish(self, rng: random.Random) -> None:
+        self.stage.publish(rng.randbytes(rng.choice((0, 100, 3_000, 40_000))))
+
+    def _resize(self, rng: random.Random) -> None:
+        world = self.stage.world
+        world.network.set_mtu(world.leads[self._hostile_member(rng)], rng.choice((576, 1_500, 9_000)))
+
+
+_Act = Callable[[Trial, random.Random], None]
+_CALM_ACTS: Final[tuple[_Act, ...]] = (
+    Trial._cut_insider, Trial._restart_insider, Trial._restart_hostile_switch, Trial._restart_hostile_rib,
+    Trial._leave, Trial._join_in, Trial._join_in, Trial._roam, Trial._wait, Trial._publish, Trial._resize,
+)  # fmt: skip
+_ACTS: Final[tuple[_Act, ...]] = (
+    *_CALM_ACTS, Trial._cut_cable, Trial._mend_cable, Trial._mend_cable, Trial._restart_any
+)
+
+
+def broken(plan: Plan, stage: Stage | None = None) -> Exception | None:
+    """Run a plan; return what broke, or None. An error of the harness's own is none."""
+    try:
+        Trial(plan, stage).run()
+    except LocalError as error:
+        return None if "wants to be called" not in str(error) else error
+    except Exception as error:
+        return error
+    return None
+
+
+def shrunk(plan: Plan, fails: Callable[[Plan], bool], budget_s: float = 120.0) -> Plan:
+    """Return a plan with acts and words left out that the fault does not need (delta debugging)."""
+    until_s = time.monotonic() + budget_s
+    for part in ("words", "acts"):
+        items: Sequence[int] = getattr(plan, part)
+        size = max(len(items) // 2, 1)
+        while items and time.monotonic() < until_s:
+            at, has_changed = 0, False
+            while at < len(items) and time.monotonic() < until_s:
+                less = (*items[:at], *items[at + size :])
+                smaller = replace(plan, **{part: less})
+                if fails(smaller):
+                    plan, items, has_changed = smaller, less, True
+                else:
+                    at += size
+            if size == 1 and not has_changed:
+                break
+            size = max(size // 2, 1)
+    return plan
+
+
+__all__ += ["PERSONAS", "broken"]

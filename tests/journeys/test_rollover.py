@@ -1,0 +1,128 @@
+"""Memberships that run out, a domain's root and an owner's key are replaced while messages flow, and none is lost."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+
+from gdp.client.member import Topic
+from gdp.crypto.keys import SigningKey
+from gdp.crypto.validity import Validity
+from gdp.limits import CLOCK_SKEW_S
+from gdp.testbed.world import World
+from gdp.trust.card import Card
+from gdp.trust.domain import Policy
+from gdp.trust.owner import Owner
+from gdp.trust.right import Right
+from tests.journeys.flows import ROBOT, SERVER, Flow, flowing, ring
+
+LASTS_S = 60  # of a short membership
+MESSAGES = 300  # one a second: past the ends of five memberships
+
+
+def unix_s(world: World) -> int:
+    return int(world.network.now.unix_s)
+
+
+def renew_all(world: World, lasts_s: int) -> None:
+    """Issue every membership anew, by the present root of its domain."""
+    for identity in world.identities.values():
+        authority = next(each for each in world.authorities.values() if each.root.domain == identity.member.domain)
+        validity = Validity(unix_s(world), unix_s(world) + lasts_s)
+        identity.renew(authority.renew(identity.member, validity), authority.root)
+
+
+def policies(world: World) -> list[Policy]:
+    switches = [each._policy for each in world.switches.values()]
+    ribs = [each.attachment._policy for each in world.ribs.values()]
+    return [*switches, *ribs, *(each.attachment._policy for each in world.members.values())]
+
+
+def stream(flow: Flow, count: int = MESSAGES) -> None:
+    flow.stream(count, 1.0, size=100)
+
+
+@pytest.mark.momentary("memberships end here, and with them whatever rests on them")
+def test_memberships_that_are_renewed_in_time_cost_no_message() -> None:
+    flow = flowing(ring())
+    renew_all(flow.world, LASTS_S)
+    stream(flow)
+    for again in range(1, MESSAGES // 40 + 1):
+        flow.world.network.call(again * 40.0, lambda: renew_all(flow.world, LASTS_S))
+    assert flow.world.network.run(MESSAGES + 30, lambda: flow.has(SERVER, MESSAGES))
+    assert flow.numbers(SERVER) == list(range(MESSAGES))
+
+
+@pytest.mark.momentary("memberships end here, and with them whatever rests on them")
+def test_without_renewal_the_same_flow_ends() -> None:
+    flow = flowing(ring())
+    renew_all(flow.world, LASTS_S)
+    stream(flow)
+    assert not flow.world.network.run(MESSAGES + 30, lambda: flow.has(SERVER, MESSAGES))
+    flow.collect()
+    assert LASTS_S <= len(flow.numbers(SERVER)) <= LASTS_S + CLOCK_SKEW_S + 30
+
+
+@pytest.mark.momentary("a root ends here, and with it whatever rests on it")
+def test_a_domains_root_rolls_over_without_a_lost_message() -> None:
+    flow = flowing(ring())
+    world, network = flow.world, flow.world.network
+    retires = unix_s(world) + 60
+    heirs = {
+        label: authority.succeed(SigningKey.generate(), world.validity, retires)
+        for label, authority in world.authorities.items()
+    }
+
+    def finish() -> None:
+        world.authorities.update(heirs)
+
+    roots = {each.root.domain: each.root for each in heirs.values()}
+    for index, policy in enumerate(policies(world)):  # one node after the other
+        network.call(1.0 + index, partial(policy.renew_roots, [roots[domain] for domain in policy.roots]))
+    network.call(30.0, finish)
+    for index, identity in enumerate(world.identities.values()):
+        authority = next(each for each in heirs.values() if each.root.domain == identity.member.domain)
+        member = authority.renew(identity.member, world.validity)
+        network.call(31.0 + index, partial(identity.renew, member, authority.root))
+    stream(flow)  # until the old root has been dead for two minutes, clocks' differences included
+    assert MESSAGES > 60 + CLOCK_SKEW_S + 100
+    assert network.run(MESSAGES + 30, lambda: flow.has(SERVER, MESSAGES))
+    assert flow.numbers(SERVER) == list(range(MESSAGES))
+
+
+@pytest.mark.momentary("a root ends here, and with it whatever rests on it")
+def test_who_was_not_renewed_is_out_when_the_old_root_retires() -> None:
+    flow = flowing(ring())
+    world, network = flow.world, flow.world.network
+    heirs = {
+        label: authority.succeed(SigningKey.generate(), world.validity, unix_s(world) + 60)
+        for label, authority in world.authorities.items()
+    }
+    roots = {each.root.domain: each.root for each in heirs.values()}
+    for policy in policies(world):
+        policy.renew_roots([roots[domain] for domain in policy.roots])
+    stream(flow)
+    assert not network.run(MESSAGES + 30, lambda: flow.has(SERVER, MESSAGES))
+
+
+def given(flow: Flow, owner: Owner, label: str, right: Right) -> Topic:
+    """Return the flow's topic for a member, as this owner delegates it."""
+    identity, metadata = flow.world.identities[label], flow.topic.delegation.metadata
+    assert metadata is not None
+    delegation = owner.delegate(Card.from_wire(Card.make(identity)), metadata, [right], [1], flow.world.validity)
+    return Topic(delegation, {epoch: grant.secret for epoch, grant in delegation.open(identity).items()})
+
+
+def test_an_owners_key_rolls_over_without_a_lost_message() -> None:
+    flow = flowing(ring())
+    world, network = flow.world, flow.world.network
+    key = SigningKey.generate()
+    links = world.owner.succeed(key.public, flow.topic.delegation.subject, world.validity)
+    heir = Owner(key, world.owner.master, world.owner.public, {links.name: links.chain})
+    flow.stream(200, 0.02)
+    network.call(1.0, lambda: world.members[SERVER].renew(given(flow, heir, SERVER, Right.READ)))
+    network.call(2.0, lambda: flow.member.renew(given(flow, heir, ROBOT, Right.PUBLISH)))
+    assert network.run(20, lambda: flow.has(SERVER, 200))
+    assert flow.numbers(SERVER) == list(range(200))
+    flow.outlive()

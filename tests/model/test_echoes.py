@@ -1,0 +1,53 @@
+"""The attacks that the models find (docs/model), played against the code."""
+
+from __future__ import annotations
+
+import pytest
+
+from gdp.control.join import Join
+from gdp.control.neighbour import NeighbourState
+from gdp.crypto.statements import parse
+from gdp.errors import StatementError
+from gdp.limits import DEAD_S, HELLO_S
+from gdp.names import ZERO
+from tests.gdp.control.members import greeter, node
+from tests.gdp.control.test_greeter import A, B, forged, greet, hear, hellos
+
+MALLORY = node("mallory")
+_REASON = "an echo is a bare nonce: a member can say another's nonce as its own (docs/model/README.md, H2 and J2)"
+
+
+@pytest.mark.xfail(strict=True, reason=_REASON)
+def test_a_neighbour_that_heard_our_nonce_from_another_member_only_does_not_come_up() -> None:
+    one, two = greeter(A, 1), greeter(B, 2)
+    hellos(one, 0.0)  # two never hears these
+    nonce = one.ports[0].nonce
+    hear(two, forged(MALLORY, nonce=nonce), 0.0, mac=b"\x02mall\x00")
+    for hello in hellos(two, HELLO_S):
+        hear(one, hello, HELLO_S)
+    assert B.name in one.ports[0].neighbours, "its hello is a good one"
+    assert one.ports[0].neighbours[B.name].state is not NeighbourState.UP
+
+
+@pytest.mark.xfail(strict=True, reason=_REASON)
+def test_a_join_to_another_member_that_said_our_nonce_is_not_taken() -> None:
+    one, two = greeter(A, 1), greeter(B, 2)
+    greet(one, two, 0.0)
+    ours = two.ports[0].nonce
+    hear(one, forged(MALLORY, nonce=ours), 1.0, mac=b"\x02mall\x00")
+    theirs = one.ports[0].neighbours[MALLORY.name]
+    # What ``one`` signs for Mallory, as the planter makes it: the session is the nonce of Mallory's hellos.
+    join = Join(B.name, B.name, B.name, B.member.domain, frozenset(), 1_500, 5.0, b"", theirs.nonce, 1, 0, ZERO)
+    wire = join.to_wire(A.name, A.key)
+    with pytest.raises(StatementError):
+        two.ports[0].take_join(Join.from_fields(parse(wire).fields), A.name)
+
+
+@pytest.mark.xfail(strict=True, raises=StatementError, reason="ended sessions are remembered by nonce, not by name too")
+def test_a_member_that_said_anothers_nonce_with_a_high_number_does_not_shut_it_out() -> None:
+    one, two = greeter(A, 1), greeter(B, 2)
+    (hello,) = hellos(two, 0.0)
+    hear(one, forged(MALLORY, sequence=2**63, nonce=two.ports[0].nonce), 0.0, mac=b"\x02mall\x00")
+    one.expire(2 * DEAD_S)  # the member falls silent, and its session is remembered
+    hear(one, hello, 2 * DEAD_S)
+    assert B.name in one.ports[0].neighbours

@@ -1,0 +1,381 @@
+"""Locks, audit, bill of materials and signed checksums: what is installed and released is what was meant."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import uuid
+import zipfile
+from importlib.metadata import Distribution, PackageNotFoundError, distributions, version
+from pathlib import Path
+from typing import Any
+
+import audit
+import pytest
+import release
+import sbom
+from advisories import AdvisoryError, is_affected, read_advisories
+from locks import LockError, Pin, read_lock
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from gdp.stores.issue import make_owner
+from tests.pages import ROOT
+
+if sys.version_info >= (3, 11):
+    import tomllib
+
+LOCKS = {path.name: read_lock(path) for path in sorted((ROOT / "requirements").glob("*.lock"))}
+HASH = "0a" * 32
+PINNED = f"alpha==1.2 \\\n    --hash=sha256:{HASH}\nbeta==2.0 ; python_version >= '3' --hash=sha256:{HASH}\n"
+
+needs_toml = pytest.mark.skipif(sys.version_info < (3, 11), reason="this Python has no tomllib")
+
+
+def _has_backend() -> bool:
+    try:
+        return int(version("setuptools").partition(".")[0]) >= 77
+    except PackageNotFoundError:
+        return False
+
+
+needs_backend = pytest.mark.skipif(not _has_backend(), reason="setuptools is older than requirements/dev.lock has it")
+
+
+_INFO = ("METADATA", "RECORD")
+
+
+def lock(folder: Path, text: str = PINNED) -> Path:
+    path = folder / "test.lock"
+    path.write_text(text)
+    return path
+
+
+def install(folder: Path, name: str, at: str, meta: str = "") -> Path:
+    """Install a package of one file as pip would; return that file."""
+    module, info = folder / f"{name}.py", folder / f"{name}-{at}.dist-info"
+    info.mkdir(parents=True)
+    module.write_text(f"NAME = {name!r}\n")
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {at}\n{meta}")
+    digest = base64.urlsafe_b64encode(hashlib.sha256(module.read_bytes()).digest()).rstrip(b"=").decode()
+    lines = [f"{name}.py,sha256={digest},{module.stat().st_size}", *(f"{info.name}/{each},," for each in _INFO)]
+    (info / "RECORD").write_text("\n".join(lines) + "\n")
+    return module
+
+
+def found(folder: Path) -> list[Distribution]:
+    return list(distributions(path=[str(folder)]))
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Path:
+    """A folder of packages in which alpha and beta are installed as pinned."""
+    folder = tmp_path / "site"
+    install(folder, "alpha", "1.2", "License-Expression: MIT\nRequires-Dist: Beta>=1\n")
+    install(folder, "beta", "2.0", "Classifier: License :: OSI Approved :: BSD License\n")
+    return folder
+
+
+def run(capsys: pytest.CaptureFixture[str], site: Path, *words: str | Path) -> tuple[int, list[tuple[str, str]]]:
+    """Audit a folder; return the exit code, and kind and name of each finding."""
+    code = audit.main([*map(str, words), "--json"], found(site))
+    return code, [(each["kind"], each["name"]) for each in json.loads(capsys.readouterr().out or "[]")]
+
+
+def test_every_lock_is_a_part_of_the_one_for_development() -> None:
+    assert LOCKS.keys() == {"build.lock", "dev.lock", "ros2.lock", "run.lock"}
+    known = {(pin.name, pin.version): pin.hashes for pin in LOCKS["dev.lock"]}
+    for name, pins in LOCKS.items():
+        assert pins
+        assert [pin for pin in pins if known.get((pin.name, pin.version)) != pin.hashes] == [], name
+
+
+@needs_toml
+@pytest.mark.parametrize(("name", "extras"), [("run.lock", ()), ("ros2.lock", ("ros2",)), ("dev.lock", None)])
+def test_each_dependency_is_pinned_in_a_version_that_is_allowed(name: str, extras: tuple[str, ...] | None) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    optional = project["optional-dependencies"]
+    chosen = optional if extras is None else extras
+    wanted = [*project["dependencies"], *(each for extra in chosen for each in optional[extra])]
+    versions: dict[str, list[str]] = {}
+    for pin in LOCKS[name]:
+        versions.setdefault(pin.name, []).append(pin.version)
+    for requirement in map(Requirement, wanted):
+        pinned = versions.get(canonicalize_name(requirement.name), [])
+        assert pinned, requirement
+        assert all(requirement.specifier.contains(each, prereleases=True) for each in pinned), requirement
+
+
+def test_setup_installs_by_hash_alone() -> None:
+    lines = [line.strip() for line in (ROOT / "scripts/setup.sh").read_text().splitlines() if "pip install" in line]
+    (installs,) = (line for line in lines if line.startswith("pip()"))
+    assert "--no-deps" in installs
+    assert [line for line in lines if "venv/bin/python" in line and line != installs] == []
+    calls = re.findall(r"! pip ([^|;]+?)(?: \|\||;)", (ROOT / "scripts/setup.sh").read_text())
+    assert [call.split()[0] for call in calls] == ["--require-hashes", "--require-hashes", "--no-build-isolation"]
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["alpha", "alpha==1.2", f"alpha>=1 --hash=sha256:{HASH}", "alpha==1 --hash=md5:00", f"-e . --hash=sha256:{HASH}"],
+)
+def test_a_lock_with_a_line_that_pins_nothing_is_refused(line: str, tmp_path: Path) -> None:
+    with pytest.raises(LockError, match=r"test\.lock:4: "):
+        read_lock(lock(tmp_path, f"{PINNED}{line}\n"))
+
+
+def test_what_is_installed_as_pinned_has_no_findings(capsys: pytest.CaptureFixture[str], site: Path) -> None:
+    assert run(capsys, site, "--lock", lock(site)) == (0, [])
+
+
+def test_what_the_lock_does_not_pin_is_reported(capsys: pytest.CaptureFixture[str], site: Path) -> None:
+    install(site, "gamma", "3")
+    install(site, "pip", "26")  # comes with every virtual environment
+    assert run(capsys, site, "--lock", lock(site)) == (1, [("not-pinned", "gamma")])
+
+
+def test_what_a_pinned_package_carries_is_pinned_with_it(capsys: pytest.CaptureFixture[str], site: Path) -> None:
+    install(site, "gamma", "3")
+    record = site / "alpha-1.2.dist-info/RECORD"
+    record.write_text(record.read_text() + "gamma-3.dist-info/METADATA,,\n")
+    assert run(capsys, site, "--lock", lock(site)) == (0, [])
+
+
+def test_another_version_than_the_pinned_one_is_reported(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    install(tmp_path, "alpha", "1.3")
+    install(tmp_path, "beta", "2")  # 2 is 2.0
+    assert run(capsys, tmp_path, "--lock", lock(tmp_path)) == (1, [("other-version", "alpha")])
+
+
+def test_a_pin_of_another_platform_counts_for_nothing(capsys: pytest.CaptureFixture[str], site: Path) -> None:
+    elsewhere = PINNED.replace("python_version >= '3'", "sys_platform == 'win32'")
+    assert run(capsys, site, "--lock", lock(site, elsewhere)) == (1, [("not-pinned", "beta")])
+
+
+def test_a_file_that_was_changed_or_deleted_after_its_installation_is_reported(
+    capsys: pytest.CaptureFixture[str], site: Path
+) -> None:
+    (site / "alpha.py").write_text("import os\n")
+    (site / "beta.py").unlink()
+    assert run(capsys, site, "--lock", lock(site)) == (1, [("changed-file", "alpha"), ("missing-file", "beta")])
+
+
+def test_an_archive_whose_hash_no_pin_has_is_reported(capsys: pytest.CaptureFixture[str], site: Path) -> None:
+    wheels = site.parent / "wheels"
+    wheels.mkdir()
+    (wheels / "alpha-1.2-py3-none-any.whl").write_bytes(b"as meant")
+    (wheels / "beta-2.0-py3-none-any.whl").write_bytes(b"exchanged")
+    pinned = PINNED.replace(HASH, hashlib.sha256(b"as meant").hexdigest())
+    code, findings = run(capsys, site, "--lock", lock(site, pinned), "--archives", wheels)
+    assert (code, findings) == (1, [("unknown-archive", "beta-2.0-py3-none-any.whl")])
+
+
+def advisory(*ranges: tuple[str, str], versions: tuple[str, ...] = (), **other: Any) -> dict[str, Any]:
+    affected = {
+        "package": {"ecosystem": "PyPI", "name": "Al_pha"},
+        "ranges": [{"type": "ECOSYSTEM", "events": [{kind: at} for kind, at in ranges]}],
+        "versions": list(versions),
+    }
+    return {"id": "PYSEC-0000-1", "affected": [affected], **other}
+
+
+@pytest.mark.parametrize(
+    ("given", "is_hit"),
+    [
+        (advisory(("introduced", "0")), True),
+        (advisory(("introduced", "0"), ("fixed", "1.2")), False),
+        (advisory(("introduced", "0"), ("fixed", "1.2.1")), True),
+        (advisory(("introduced", "1.2"), ("fixed", "1.3")), True),
+        (advisory(("introduced", "1.2.post1")), False),
+        (advisory(("introduced", "0"), ("last_affected", "1.2")), True),
+        (advisory(("introduced", "0"), ("last_affected", "1.1")), False),
+        (advisory(("fixed", "1.1"), ("introduced", "0"), ("introduced", "1.2rc1")), True),
+        (advisory(versions=("1.2.0",)), True),
+        (advisory(versions=("1.20",)), False),
+        (advisory(("introduced", "0"), ("fixed", "no version")), True),
+        ({"id": "X", "affected": [{"package": {"ecosystem": "npm", "name": "al-pha"}, "versions": ["1.2"]}]}, False),
+        ({"id": "X", "affected": [{"package": {"ecosystem": "PyPI", "name": "other"}, "versions": ["1.2"]}]}, False),
+        ({"id": "X"}, False),
+    ],
+)
+def test_an_advisory_hits_the_versions_that_it_says(given: dict[str, Any], is_hit: bool) -> None:
+    assert is_affected(given, "al-pha", "1.2") is is_hit
+
+
+def test_a_known_hole_of_what_is_installed_is_reported(capsys: pytest.CaptureFixture[str], site: Path) -> None:
+    holes = site.parent / "holes"
+    (holes / "alpha").mkdir(parents=True)
+    hole = advisory(("introduced", "0"), summary="reads too far")
+    hole["affected"][0]["package"]["name"] = "alpha"
+    (holes / "alpha/PYSEC-0000-1.json").write_text(json.dumps(hole))
+    (holes / "withdrawn.json").write_text(json.dumps({**hole, "withdrawn": "2026-01-01T00:00:00Z"}))
+    assert audit.main(["--lock", str(lock(site)), "--advisories", str(holes)], found(site)) == 1
+    line = capsys.readouterr().out.splitlines()[0]
+    assert line.split(maxsplit=2) == ["advisory", "alpha", "1.2: PYSEC-0000-1 reads too far"]
+
+
+@pytest.mark.parametrize("text", ["", "no json", "[1]", '{"affected": []}', "[]"])
+def test_a_file_of_no_advisories_is_not_taken_for_good_news(
+    text: str, site: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = site.parent / "holes.json"
+    path.write_text(text)
+    assert audit.main(["--lock", str(lock(site)), "--advisories", str(path)], found(site)) == 2
+    assert str(path) in capsys.readouterr().err
+
+
+def test_advisories_may_stand_one_a_line(tmp_path: Path) -> None:
+    path = tmp_path / "all.jsonl"
+    path.write_text(json.dumps(advisory()) + "\n" + json.dumps(advisory()) + "\n")
+    assert len(read_advisories(path)) == 2
+    with pytest.raises(AdvisoryError):
+        read_advisories(tmp_path / "none.json")
+
+
+def test_a_bill_lists_each_pin_with_its_hashes_licence_and_needs(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(site))
+    pins = [*read_lock(lock(site)), Pin("gamma", "3", "", frozenset({HASH}))]
+    document = sbom.bill(pins, "gdp-ros", "0.1.0", ["alpha"], 0)
+    parts = {each["name"]: each for each in document["components"]}
+    assert (document["bomFormat"], document["specVersion"]) == ("CycloneDX", "1.6")
+    assert list(parts) == ["alpha", "beta", "gamma"]
+    assert parts["alpha"]["licenses"] == [{"expression": "MIT"}]
+    assert parts["beta"]["licenses"] == [{"license": {"name": "BSD License"}}]
+    assert "licenses" not in parts["gamma"]
+    assert parts["alpha"]["externalReferences"][0]["hashes"] == [{"alg": "SHA-256", "content": HASH}]
+    assert {each["ref"]: each["dependsOn"] for each in document["dependencies"]} == {
+        "pkg:pypi/gdp-ros@0.1.0": ["pkg:pypi/alpha@1.2"],
+        "pkg:pypi/alpha@1.2": ["pkg:pypi/beta@2.0"],
+        "pkg:pypi/beta@2.0": [],
+        "pkg:pypi/gamma@3": [],
+    }
+    assert document["metadata"]["timestamp"] == "1970-01-01T00:00:00+00:00"
+
+
+@needs_toml
+def test_the_bill_of_a_lock_is_whole_and_the_same_each_time(tmp_path: Path) -> None:
+    outs = [tmp_path / "one.json", tmp_path / "two.json"]
+    for out in outs:
+        assert sbom.main(["--lock", str(ROOT / "requirements/run.lock"), "-o", str(out)]) == 0
+    assert outs[0].read_bytes() == outs[1].read_bytes()
+    document = json.loads(outs[0].read_text())
+    refs = [each["bom-ref"] for each in document["components"]]
+    assert sorted(refs) == sorted({f"pkg:pypi/{pin.name}@{pin.version}" for pin in LOCKS["run.lock"]})
+    assert {ref for each in document["dependencies"] for ref in each["dependsOn"]} <= set(refs)
+    assert uuid.UUID(document["serialNumber"].removeprefix("urn:uuid:")).version == 5
+    direct = next(each for each in document["dependencies"] if each["ref"].startswith("pkg:pypi/gdp-ros@"))
+    assert any(each.startswith("pkg:pypi/cryptography@") for each in direct["dependsOn"])
+
+
+@pytest.fixture
+def signed(tmp_path: Path) -> tuple[Path, Path]:
+    """A signed folder of two files, and the keys."""
+    folder, keys = tmp_path / "dist", tmp_path / "keys"
+    folder.mkdir()
+    make_owner(keys)
+    (folder / "a-1.whl").write_bytes(b"a wheel")
+    (folder / "run.lock").write_text(PINNED)
+    release.write_sums(folder)
+    release.sign(folder, keys / "owner.key")
+    return folder, keys
+
+
+def verified(signed: tuple[Path, Path]) -> int:
+    folder, keys = signed
+    return release.main(["verify", "--key", str(keys / "owner.pub"), str(folder)])
+
+
+def test_a_signed_release_verifies(signed: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    assert verified(signed) == 0
+    assert capsys.readouterr().out.splitlines() == ["a-1.whl: verified", "run.lock: verified"]
+
+
+@pytest.mark.parametrize("name", ["a-1.whl", "run.lock", "SHA256SUMS", "SHA256SUMS.sig"])
+@pytest.mark.parametrize("how", ["changed", "deleted"])
+def test_a_release_with_a_file_changed_or_deleted_does_not_verify(
+    signed: tuple[Path, Path], name: str, how: str
+) -> None:
+    path = signed[0] / name
+    if how == "deleted":
+        path.unlink()
+    else:
+        data = bytearray(path.read_bytes())
+        data[-2] ^= 1
+        path.write_bytes(data)
+    assert verified(signed) == 1
+
+
+def test_a_file_that_was_added_does_not_pass_for_a_part_of_the_release(
+    signed: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (signed[0] / "b-1.whl").write_bytes(b"another wheel")
+    assert verified(signed) == 1
+    assert "b-1.whl is not listed" in capsys.readouterr().err
+
+
+def test_a_release_signed_by_another_does_not_verify(signed: tuple[Path, Path], tmp_path: Path) -> None:
+    make_owner(tmp_path / "other")
+    release.sign(signed[0], tmp_path / "other/owner.key")
+    assert verified(signed) == 1
+
+
+@pytest.mark.parametrize("line", ["{0}  ../a-1.whl", "{0}  a-1.whl\n{0}  a-1.whl", "{0} *a-1.whl", ""])
+def test_checksums_that_mean_something_else_are_not_signed(signed: tuple[Path, Path], line: str) -> None:
+    folder, keys = signed
+    (folder / "SHA256SUMS").write_text(line.format(HASH) + "\n")
+    assert release.main(["sign", "--key", str(keys / "owner.key"), str(folder)]) == 1
+
+
+def test_a_key_that_others_can_read_signs_nothing(
+    signed: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, keys = signed
+    (keys / "owner.key").chmod(0o644)
+    assert release.main(["sign", "--key", str(keys / "owner.key"), str(folder)]) == 2
+    assert "owner.key" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
+def test_openssl_and_sha256sum_verify_a_release_too(signed: tuple[Path, Path]) -> None:
+    folder, keys = signed
+    words = ["openssl", "dgst", "-sha256", "-verify", str(keys / "owner.pub"), "-signature"]
+    words += ["SHA256SUMS.sig", "SHA256SUMS"]
+    assert subprocess.run(words, cwd=folder, capture_output=True, text=True, check=True).stdout.strip() == "Verified OK"
+    subprocess.run(["sha256sum", "--check", "--strict", "SHA256SUMS"], cwd=folder, capture_output=True, check=True)
+
+
+@needs_toml
+@needs_backend
+def test_a_commit_is_built_to_the_same_bytes_each_time_without_what_is_not_committed(tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    (root / "small").mkdir(parents=True)
+    (root / "small/__init__.py").write_text("WORD = 'committed'\n")
+    (root / "pyproject.toml").write_text(
+        '[build-system]\nrequires = ["setuptools"]\nbuild-backend = "setuptools.build_meta"\n'
+        '[project]\nname = "small"\nversion = "1"\ndependencies = ["alpha"]\n[tool.setuptools]\npackages = ["small"]\n'
+    )
+    (root / "requirements").mkdir()
+    (root / "requirements/run.lock").write_text(PINNED)
+    shutil.copytree(ROOT / "scripts/supply", root / "scripts/supply", ignore=shutil.ignore_patterns("__pycache__"))
+    git = ["git", "-C", str(root), "-c", "user.name=a", "-c", "user.email=a@example.org"]
+    for words in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "first"]):
+        subprocess.run([*git, *words], check=True)
+    (root / "small/__init__.py").write_text("WORD = 'not committed'\n")
+    for out in ("one", "two"):
+        release.build(tmp_path / out, root)
+    names = ["SHA256SUMS", "run.lock", "sbom.cdx.json", "small-1-py3-none-any.whl", "small-1.tar.gz"]
+    assert sorted(path.name for path in (tmp_path / "one").iterdir()) == names
+    for name in names:
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes(), name
+    with zipfile.ZipFile(tmp_path / "one/small-1-py3-none-any.whl") as wheel:
+        assert wheel.read("small/__init__.py") == b"WORD = 'committed'\n"
+    with tarfile.open(tmp_path / "one/small-1.tar.gz") as sdist:
+        assert {(each.uid, each.uname, each.mode & 0o022) for each in sdist.getmembers()} == {(0, "", 0)}
+    with pytest.raises(release.ReleaseError, match="not empty"):
+        release.build(tmp_path / "one", root)
