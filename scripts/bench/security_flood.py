@@ -79,6 +79,8 @@ class Phase:
         restart_s: from the kill of a neighbour until it is a neighbour again.
         lost: neighbours that any switch lost.
         memory_mib: resident memory of the switch in the middle at the end.
+        backlog_drops: frames of any link that this machine lost before any switch saw them: all namespaces share the
+            queue of their processor (``net.core.netdev_max_backlog``). Where there are some, losses prove nothing.
     """
 
     goodput: float
@@ -86,6 +88,7 @@ class Phase:
     restart_s: float
     lost: int
     memory_mib: float
+    backlog_drops: int
 
 
 def plan() -> Plan:
@@ -142,6 +145,12 @@ def processor_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) * _TICK_S
 
 
+def backlog_drops() -> int:
+    """Return how many frames processors have dropped so far, their queue being full; ``net/core/net-procfs.c``."""
+    lines = Path("/proc/net/softnet_stat").read_text().splitlines()
+    return sum(int(line.split()[1], 16) for line in lines)
+
+
 def lost(overlay: Overlay) -> int:
     """Return how often any switch has lost a neighbour so far."""
     texts = [text for node in overlay.plan.switches for _, text in overlay.logs(f"switch {node}")]
@@ -182,13 +191,17 @@ def phase(overlay: Overlay, seconds: float) -> Phase:
     pid = overlay.pid(f"switch {_VICTIM}")
     counted(overlay)
     before_s, before_lost, begun_s = processor_s(pid), lost(overlay), time.monotonic()
+    before_drops = backlog_drops()
     time.sleep(seconds)
     core = (processor_s(pid) - before_s) / (time.monotonic() - begun_s)
     memory = memory_mib(pid)
     published, delivered = counted(overlay)
     time.sleep(1.0)  # a switch logs what it lost each half second
     losses = lost(overlay) - before_lost
-    return Phase(delivered / max(published, 1), core, restart_s(overlay), losses, memory)
+    for node in overlay.plan.switches if losses else ():
+        progress(f"{node}:\n{overlay.log_tail(f'switch {node}', 6)}")
+    drops = backlog_drops() - before_drops
+    return Phase(delivered / max(published, 1), core, restart_s(overlay), losses, memory, drops)
 
 
 def measure(
@@ -255,7 +268,7 @@ def main() -> None:
     verified = verifications_hz()
     rate = options.rate or TIMES * verified
     console = Console(width=120)
-    heads = ("plane", "hellos", "goodput, ratio", "lost", "memory, MiB", "core", "restart, s")
+    heads = ("plane", "hellos", "goodput, ratio", "lost", "memory, MiB", "core", "restart, s", "backlog drops")
     table = Table(*heads, title=f"{rate:,.0f} hellos a second")
     saved: dict[str, object] = {"machine": asdict(state), "verified_hz": verified, "rate_hz": rate}
     try:
@@ -288,6 +301,7 @@ def _row(rounds: Sequence[dict[str, Phase]]) -> list[str]:
         f"{grown:+.1f}, at most +{GOAL_MEMORY_MIB:g}",
         f"{cores[0]:.2f} -> {cores[1]:.2f}",
         f"{restarts[0]:.1f} -> {restarts[1]:.1f}",
+        " ".join(str(each["flooded"].backlog_drops) for each in rounds),
     ]
 
 

@@ -50,11 +50,11 @@ def main() -> None:
         if due < _BATCH:
             time.sleep(_BATCH / told["rate"])
             continue
-        for _ in range(min(due // _BATCH, 64)):
+        for _ in range(min(due // _BATCH, 8)):
             chosen = [frames[(at + each) % len(frames)] for each in range(_BATCH)]
             sent += batch.send(sink, chosen, _BROADCAST + sources[(at // _BATCH) % len(sources)], drops)
             at += _BATCH
-        if due > told["rate"] / 10:
+        if due > told["rate"] / 100:
             begun_s += (due - _BATCH) / told["rate"]  # what could not be sent in time is not caught up with
     say(sent=sent, seconds=time.monotonic() - begun_s)
 
