@@ -3,7 +3,9 @@
 Three switches in a row, each a process in a namespace of its own; a topic goes from a member at the first to a member
 at the last one. A stranger on the link between the first and the middle one plays hellos to the middle one, from
 10,000 invented addresses: with certificates of its own (``fresh``), recorded ones of members (``recorded``), and with a
-member's certificate and a wrong signature (``wrong``). The rate is ten times what this machine verifies in a second.
+member's certificate and a wrong signature (``wrong``). Broadcast data, which no switch reads, is the control
+(``noise``): what it disturbs is the machine, on which the flood takes a core. The rate is ten times what this machine
+verifies in a second.
 A calm phase before each flood is what it is compared with. At the end of each phase the first switch is killed and
 started again: how long until the middle one has it for a neighbour?
 
@@ -46,6 +48,7 @@ from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.validity import Validity
 from gdp.errors import GdpError
+from gdp.frame.codec import KIND_AT
 from gdp.frame.kinds import Kind
 from gdp.ports.link import LinkWatch
 from gdp.stores.keyring import load_identity
@@ -58,7 +61,7 @@ OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks" / "s
 GOAL_MEMORY_MIB: Final = 16.0
 GOAL_GOODPUT: Final = 0.9
 TIMES: Final = 10  # what a core verifies
-KINDS: Final = ("fresh", "recorded", "wrong")
+KINDS: Final = ("fresh", "recorded", "wrong", "noise")
 SETTLE_S: Final = 6.0
 FLOW: Final = Flow("/flood/good", "p", ("r",), reliable=False, hz=200.0, size=1_000)
 _FRAMES: Final = 2_000
@@ -121,7 +124,10 @@ def hellos(kind: str, overlay: Overlay) -> list[bytes]:
             for number in range(_FRAMES // 10)
         ]
     key = SigningKey.generate() if kind == "wrong" else None
-    return [frame for number in range(_FRAMES) for frame in _hello(members[number % len(members)], key)]
+    frames = [frame for number in range(_FRAMES) for frame in _hello(members[number % len(members)], key)]
+    if kind != "noise":
+        return frames
+    return [each[:KIND_AT] + bytes([Kind.DATA]) + each[KIND_AT + 1 :] for each in frames]
 
 
 def _hello(member: Identity, key: SigningKey | None) -> list[bytes]:
