@@ -495,6 +495,22 @@ class Forge:
             **identity.subject.to_fields(), "cert": rng.choice((rng.randbytes(32), member.fingerprint)), "until": until
         }
 
+    def _revoked(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        domains = rng.sample(self._domains, rng.randrange(len(self._domains) + 1))
+        hashes = rng.choice((b"", rng.randbytes(2_048)))
+        return {
+            "i": self._nonce(place), "s": next(self._numbers),
+            "p": [[each, rng.choice((0, 1, 100, _U64)), rng.choice((bytes(8), rng.randbytes(8)))] for each in domains],
+            "d": rng.choice(self._domains) if hashes else b"", "h": hashes,
+        }  # fmt: skip
+
+    def _lacking(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        buckets = rng.sample(range(256), rng.choice((0, 1, 256)))
+        return {
+            "i": self._nonce(place), "s": next(self._numbers), "d": rng.choice(self._domains), "b": bytes(buckets),
+            "k": rng.randbytes(8 * rng.choice((0, 1, 1_500))),
+        }  # fmt: skip
+
     def _open(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         to = rng.choice([host.name for host in self._stage.world.ribs.values()])
         return {"k": rng.randbytes(32), "w": to, "c": identity.membership, "p": bytes(rng.choice((0, 700, 8_000)))}
@@ -664,7 +680,7 @@ _BODIES: Final[dict[StatementType, _Make]] = {
     _T.WITHDRAW: Forge._withdraw, _T.RELAY: Forge._relay, _T.QUERY: Forge._query, _T.ANSWER: Forge._answer,
     _T.VERDICT: Forge._verdict, _T.PRESENCE: Forge._presence, _T.DIGEST: Forge._digest, _T.FETCH: Forge._fetch,
     _T.INVENTORY: Forge._inventory, _T.REPLICAS: Forge._replicas, _T.REVOKE: Forge._revoke,
-    _T.OPEN: Forge._open, _T.ACCEPT: Forge._accept,
+    _T.OPEN: Forge._open, _T.ACCEPT: Forge._accept, _T.REVOKED: Forge._revoked, _T.LACKING: Forge._lacking,
     _T.ADCERT: Forge._adcert, _T.RTCERT: Forge._rtcert, _T.CARD: Forge._card, _T.GRANT: Forge._grant,
 }  # fmt: skip
 _K = Kind
@@ -677,6 +693,7 @@ _KINDS: Final[dict[StatementType, tuple[Kind, ...]]] = {
     _T.FETCH: (_K.RIB_REQUEST,), _T.INVENTORY: (_K.RIB_REQUEST,), _T.REPLICAS: (_K.RIB_REQUEST,),
     _T.REVOKE: (_K.REVOKE,), _T.ADCERT: (_K.ADVERTISE,), _T.RTCERT: (_K.ADVERTISE,), _T.CARD: (_K.ADVERTISE,),
     _T.GRANT: (_K.VERDICT,), _T.OPEN: (_K.RIB_REQUEST,), _T.ACCEPT: (_K.RIB_ANSWER,),
+    _T.REVOKED: (_K.REVOKED,), _T.LACKING: (_K.REVOKED,),
 }  # fmt: skip
 _RARE: Final = {_T.ADCERT, _T.RTCERT, _T.CARD, _T.GRANT}
 _SPOKEN: Final = tuple(each for each in _BODIES for _ in range(1 if each in _RARE else 6))
