@@ -56,7 +56,7 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType
 from gdp.effects import BROADCAST, Arrival, Instant, Transmit
 from gdp.errors import DropReason, FrameError, StatementError
-from gdp.frame.codec import HEADER_BYTES, Header
+from gdp.frame.codec import HEADER_BYTES, Header, decode
 from gdp.frame.kinds import Kind
 from gdp.limits import DEAD_S, HELLO_IDLE, HELLO_S, MTU_MIN_BYTES
 from gdp.message.replay import ReplayWindow
@@ -397,7 +397,7 @@ class Greeter:
             return None
         hello, member = self._verified(port, arrival, statement, now)
         proof = self._proof_of_place(hello, member)
-        received_bytes = max(len(arrival.frame), HEADER_BYTES + len(statement.wire))
+        received_bytes = _received_bytes(arrival, statement)
         self._refuse_rival(port, hello, member.name, (arrival.mac, received_bytes), now.mono_s)
         self.rivals.take(member.name, hello.life)
         is_two_way = port.nonce in hello.heard
@@ -808,3 +808,10 @@ class Greeter:
         before = neighbour.state
         neighbour.state = TRANSITIONS[before, event]
         return None if neighbour.state is before else (neighbour, before)
+
+
+def _received_bytes(arrival: Arrival, statement: Statement) -> int:
+    """Return the bytes of all frames of a statement whose last one to come has arrived, its padding included."""
+    header = decode(arrival.frame)
+    padding = len(arrival.frame) - HEADER_BYTES - header.length
+    return header.parts * HEADER_BYTES + len(statement.wire) + max(padding, 0)

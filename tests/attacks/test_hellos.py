@@ -20,7 +20,7 @@ from gdp.errors import DropReason, RemoteError
 from gdp.frame.codec import HEADER_BYTES, decode
 from gdp.frame.kinds import Kind
 from gdp.limits import HELLO_S
-from tests.gdp.control.members import at, node
+from tests.gdp.control.members import at, hello_in, node
 from tests.gdp.control.members import greeter as new_greeter
 
 A, B = node("a"), node("b")
@@ -258,7 +258,7 @@ def test_a22_a_hello_of_an_earlier_life_played_at_another_port_lets_no_neighbour
     link.ends[1]._life = bytes(15) + b"\x02"
     link.run(6.0)
     old = Hello(b"n" * 8, 9, (), 1_500, bytes(8), B.membership, life=bytes(15) + b"\x01").to_wire(B.name, B.key)
-    one.receive(Arrival(1, mac_of(1), b""), parse(old), at(link.now_s))
+    one.receive(hello_in(old, 1, mac_of(1)), parse(old), at(link.now_s))
     one.expire(link.now_s)
     (known,) = (each for each in one.ports[0].neighbours.values())
     assert known.state is NeighbourState.UP

@@ -9,8 +9,9 @@ from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.validity import Validity
-from gdp.effects import Instant
+from gdp.effects import Arrival, Instant
 from gdp.frame.codec import HEADER_BYTES, decode
+from gdp.frame.kinds import Kind
 from gdp.trust.domain import Policy
 
 UNIX_S = 1_800_000_000
@@ -53,3 +54,9 @@ def greeter(identity: Identity, salt: int, policy: Policy = POLICY) -> Greeter:
 def statement_of(frame: bytes) -> bytes:
     """Return what a frame carries, without its padding."""
     return frame[HEADER_BYTES : HEADER_BYTES + decode(frame).length]
+
+
+def hello_in(statement: bytes, port: int = 0, mac: bytes = b"\x02far\x00\x00", padded_bytes: int = 0) -> Arrival:
+    """Return the arrival of a hello in one frame, with zeros behind up to ``padded_bytes``."""
+    (frame,) = ControlSplitter(bytes(32), 1).split(Kind.HELLO, statement, 60_000)
+    return Arrival(port, mac, frame.ljust(padded_bytes, b"\0"))

@@ -14,12 +14,11 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import parse
 from gdp.crypto.validity import Validity
-from gdp.effects import Arrival
 from gdp.errors import DropReason, StatementError
 from gdp.limits import DEAD_S, HELLO_S
 from gdp.names import ZERO, Name
 from gdp.trust.domain import Policy
-from tests.gdp.control.members import CLOUD, ELSEWHERE, SCHOOL, UNIX_S, YEAR, at, greeter, node, statement_of
+from tests.gdp.control.members import CLOUD, ELSEWHERE, SCHOOL, UNIX_S, YEAR, at, greeter, hello_in, node, statement_of
 
 A, B = node("a"), node("b")
 UP = NeighbourState.UP
@@ -31,7 +30,7 @@ def hellos(of: Greeter, now_s: float) -> list[bytes]:
 
 
 def hear(listener: Greeter, statement: bytes, now_s: float, mac: bytes = b"\x02far\x00\x00") -> Change | None:
-    return listener.receive(Arrival(0, mac, bytes(PADDED_BYTES)), parse(statement), at(now_s))
+    return listener.receive(hello_in(statement, mac=mac, padded_bytes=PADDED_BYTES), parse(statement), at(now_s))
 
 
 def refusal(listener: Greeter, statement: bytes, now_s: float = 0.0) -> DropReason:
@@ -184,8 +183,9 @@ def test_a_neighbour_whose_certificate_runs_out_falls_silent() -> None:
     short = node("short", validity=Validity(YEAR.not_before_unix_s, UNIX_S + 10))
     hear(one, forged(short, heard=(one.ports[0].nonce,)), 0.0)
     assert len(one.all_up()) == 1
+    late = forged(short, sequence=2)
     with pytest.raises(StatementError) as caught:
-        one.receive(Arrival(0, b"\x02far\x00\x00", b""), parse(forged(short, sequence=2)), at(0.5, UNIX_S + 4_000))
+        one.receive(hello_in(late), parse(late), at(0.5, UNIX_S + 4_000))
     assert caught.value.reason is DropReason.EXPIRED
 
 

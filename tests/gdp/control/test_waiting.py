@@ -74,7 +74,7 @@ def test_a_neighbour_that_does_not_answer_is_told_from_one_that_is_no_switch(rol
     alone, other = attachment(), greeter(node("other", role), 2)
     alone.greeter.add_port(0, bytes(6), 1_500, 10, 0.0)
     for hello in other.take(0.0):
-        alone.greeter.receive(Arrival(0, b"\2far\0\0", b""), parse(statement_of(hello.frames[0])), at(0.0))
+        alone.greeter.receive(Arrival(0, b"\2far\0\0", hello.frames[0]), parse(statement_of(hello.frames[0])), at(0.0))
     assert reasons(alone) == [reason]
 
 
@@ -83,7 +83,7 @@ def test_a_neighbour_of_a_domain_that_is_not_trusted_is_named_while_it_is_heard(
     alone.greeter.add_port(0, bytes(6), 1_500, 10, 0.0)
     (hello,) = stranger.take(0.0)
     with pytest.raises(StatementError):
-        alone.greeter.receive(Arrival(0, b"\2far\0\0", b""), parse(statement_of(hello.frames[0])), at(0.0))
+        alone.greeter.receive(Arrival(0, b"\2far\0\0", hello.frames[0]), parse(statement_of(hello.frames[0])), at(0.0))
     (wait,) = attachment_waits(alone, HELLO_S)
     assert wait == Wait(WaitReason.STRANGER, 0, ELSEWHERE.root.label, refused=DropReason.WRONG_DOMAIN)
     assert reasons(alone, 10.0) == [WaitReason.NO_NEIGHBOUR]
@@ -124,5 +124,5 @@ def test_the_domain_of_a_trusted_member_is_not_a_stranger() -> None:
     alone, other = attachment(), greeter(node("other", domain=CLOUD), 2)
     alone.greeter.add_port(0, bytes(6), 1_500, 10, 0.0)
     (hello,) = other.take(0.0)
-    alone.greeter.receive(Arrival(0, b"\2far\0\0", b""), parse(statement_of(hello.frames[0])), at(0.0))
+    alone.greeter.receive(Arrival(0, b"\2far\0\0", hello.frames[0]), parse(statement_of(hello.frames[0])), at(0.0))
     assert reasons(alone) == [WaitReason.ONE_WAY]
