@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gdp.control.hello import NONCE_BYTES
+from gdp.control.hello import ECHO_BYTES, NONCE_BYTES
 from gdp.control.query import TRANSIT_MAX
 from gdp.crypto.fields import Fields
 from gdp.crypto.keys import SigningKey
@@ -30,7 +30,7 @@ class Join:
         mtu: smallest on the way down from here, in bytes after the Ethernet header.
         lease_s: how long the branch stands unless renewed; 0 takes it down (LEAVE).
         evidence: the signed claim of a reader further down; whoever passes a join on checks it.
-        session: nonce of the receiver's port, as its hellos say it.
+        session: echo of the receiver's port (``echo_of``), so that no other member can hand the join on to it.
         sequence: rises with every join and leave of the sender within its session.
         version: sequence number of the publisher's claim that ``switch`` was read from; the newest decides.
         backup_for: the switch below that has the tree another way, and wants copies only while that way is broken;
@@ -87,7 +87,7 @@ class Join:
             fields.uint("m", FRAME_MAX_BYTES),
             fields.number("l", 0, LEASE_MAX_S),
             fields.bytes_("e"),
-            fields.bytes_("i", NONCE_BYTES),
+            fields.bytes_("i", ECHO_BYTES),
             fields.uint("s"),
             fields.uint("v"),
             fields.optional_name("b"),

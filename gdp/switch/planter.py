@@ -482,7 +482,7 @@ class Planter:
         sessions = self._outbox.sessions_with(above[0], name)
         if sessions is None:
             return  # it is gone, and with it what it knew of us
-        own_session, session = sessions
+        own_session, its_echo = sessions
         self._sequence += 1
         join = Join(
             tree.topic,
@@ -493,7 +493,7 @@ class Planter:
             mtu,
             lease_s,
             evidence,
-            session,
+            its_echo,
             self._sequence,
             tree.version,
             backup_for,

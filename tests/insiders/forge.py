@@ -274,6 +274,9 @@ class Forge:
     def _nonce(self, place: Place) -> bytes:
         return self._stage.nonce_at(place)
 
+    def _echo(self, place: Place) -> bytes:
+        return self._stage.echo_at(place)
+
     def _own_nonce(self, identity: Identity, place: Place) -> bytes:
         persona = next(each for each in PERSONAS if self._stage.identity(each).name == identity.name)
         return self._stage.own_nonce(persona, place)
@@ -291,11 +294,11 @@ class Forge:
         switches = [each.name for each in self._stage.world.switches.values()]
         rtcerts = [RtCert.make(identity, rng.choice(switches), validity) for _ in range(rng.choice((0, 1, 2)))]
         return {
-            "n": nonce, "s": next(self._counters), "h": [self._nonce(place)] if rng.random() < 0.8 else [],
+            "n": nonce, "s": next(self._counters), "h": [self._echo(place)] if rng.random() < 0.8 else [],
             "m": 1_500, "d": rng.choice((bytes(8), rng.randbytes(8))), "c": identity.membership,
             "k": rng.choice(([1_000, 1_000, 3], [0, 0, 1], [1, 1, 1], [60_000, 60_000, 255])),
             "x": rng.choice((b"", bytes(32), b"\xff" * 32, rng.randbytes(32))), "b": self._own_life(identity, rng),
-            "u": [self._nonce(place)] if rng.random() < 0.1 else [], "r": rtcerts[:RTCERTS_MAX],
+            "u": [self._echo(place)] if rng.random() < 0.1 else [], "r": rtcerts[:RTCERTS_MAX],
             "y": [self._nonce(place) + rng.randbytes(COOKIE_BYTES)] if rng.random() < 0.2 else [],
         }  # fmt: skip
 
@@ -337,7 +340,7 @@ class Forge:
             "n": topic, "p": rng.choice(self._nodes),
             "w": switch.name, "d": switch.root.domain,
             "x": sorted({*self._domains, identity.root.domain}), "m": rng.choice((1_500, 576, 1, 9_000)),
-            "l": rng.choice((0.0, 1.0, 7.0, 3_600.0)), "e": evidence, "i": self._nonce(place),
+            "l": rng.choice((0.0, 1.0, 7.0, 3_600.0)), "e": evidence, "i": self._echo(place),
             "s": next(self._numbers), "v": rng.choice((0, int(world.network.now.unix_s * 1_000), next(self._numbers))),
             "b": rng.choice((ZERO, ZERO, rng.choice(self._nodes))), "o": self._own_nonce(identity, place),
         }  # fmt: skip
@@ -499,7 +502,7 @@ class Forge:
         domains = rng.sample(self._domains, rng.randrange(len(self._domains) + 1))
         hashes = rng.choice((b"", rng.randbytes(2_048)))
         return {
-            "i": self._nonce(place), "s": next(self._numbers),
+            "i": self._echo(place), "s": next(self._numbers),
             "p": [[each, rng.choice((0, 1, 100, _U64)), rng.choice((bytes(8), rng.randbytes(8)))] for each in domains],
             "d": rng.choice(self._domains) if hashes else b"", "h": hashes,
         }  # fmt: skip
@@ -507,7 +510,7 @@ class Forge:
     def _lacking(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         buckets = rng.sample(range(256), rng.choice((0, 1, 256)))
         return {
-            "i": self._nonce(place), "s": next(self._numbers), "d": rng.choice(self._domains), "b": bytes(buckets),
+            "i": self._echo(place), "s": next(self._numbers), "d": rng.choice(self._domains), "b": bytes(buckets),
             "k": rng.randbytes(8 * rng.choice((0, 1, 1_500))),
         }  # fmt: skip
 
