@@ -32,10 +32,11 @@ class Join:
         evidence: the signed claim of a reader further down; whoever passes a join on checks it.
         session: echo of the receiver's port (``echo_of``), so that no other member can hand the join on to it.
         sequence: rises with every join and leave of the sender within its session.
-        version: sequence number of the publisher's claim that ``switch`` was read from; the newest decides.
+        version: sequence number of ``proof``; the newest decides.
         backup_for: the switch below that has the tree another way, and wants copies only while that way is broken;
             ``ZERO`` in an ordinary join. Source: the secondary join of RFC 7431.
         sender_session: nonce of the sender's port.
+        proof: the signed claim of the publisher, which says that it is at ``switch``; empty in a leave.
     """
 
     topic: Name
@@ -51,6 +52,7 @@ class Join:
     version: int = 0
     backup_for: Name = ZERO
     sender_session: bytes = bytes(NONCE_BYTES)
+    proof: bytes = b""
 
     def to_wire(self, signer: Name, key: SigningKey) -> bytes:
         """Return the signed statement."""
@@ -68,6 +70,7 @@ class Join:
             "v": self.version,
             "b": self.backup_for,
             "o": self.sender_session,
+            "c": self.proof,
         }
         return sign(StatementType.JOIN, body, signer, key)
 
@@ -92,4 +95,5 @@ class Join:
             fields.uint("v"),
             fields.optional_name("b"),
             fields.bytes_("o", NONCE_BYTES),
+            fields.bytes_("c"),
         )

@@ -27,7 +27,7 @@ def test_x01_a_neighbour_that_heard_our_nonce_from_another_member_only_does_not_
     assert one.ports[0].neighbours[B.name].state is not NeighbourState.UP
 
 
-def test_x01_a_join_to_another_member_that_said_our_nonce_is_not_taken() -> None:
+def test_x05_a_join_to_another_member_that_said_our_nonce_is_not_taken() -> None:
     one, two = greeter(A, 1), greeter(B, 2)
     greet(one, two, 0.0)
     ours = two.ports[0].nonce
