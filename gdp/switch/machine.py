@@ -541,9 +541,7 @@ class Switch:
         statement.verify(neighbour.key)
         self.greeter.ports[neighbour.port].take_join(join, neighbour)
         if join.lease_s > 0:
-            claim = self._verifier.verify(join.evidence, now.unix_s)
-            if claim.right not in HEARS or claim.name != join.topic:
-                raise StatementError(DropReason.NOT_DELEGATED, "a join without a reader's claim")
+            claim = self._evidence.of_join(join, now)
             if neighbour.role is Role.LEAF and claim.switch != neighbour.name:
                 raise StatementError(DropReason.THROUGH_LEAF, "a leaf that joins for a node of another switch")
             self._held.note_branch(join.topic, join.publisher, (neighbour.port, neighbour.mac), claim)

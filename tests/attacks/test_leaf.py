@@ -171,7 +171,7 @@ def test_l04_a_leaf_that_joins_for_a_reader_elsewhere_gets_no_copies() -> None:
     assert neighbour is not None
     join = Join(
         tree.topic, tree.publisher, left.name, left._policy.own, tree.allowed, 1_500, 5.0, tree.evidence,
-        left.greeter.ports[1].nonce, 1 << 50, sender_session=neighbour.nonce,
+        left.greeter.ports[1].echo, 1 << 50, tree.version, sender_session=neighbour.nonce, proof=tree.proof,
     )  # fmt: skip
     tap = Tap("left", "leaf")
     world.network.taps.append(tap)
