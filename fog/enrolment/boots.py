@@ -3,8 +3,8 @@
 Place: I/O, through ``members``. Every file names others relative to itself, so it does not matter where they will lie.
 ::
 
-    machine   [node ...] -- ROS graph of its own -- [proxy] -- [switch] -- iface        towards the gateway
-                                                                  `-- uplink            while it is the gateway
+    machine   [node ...] -- ROS graph of its own -- [proxy] -- [leaf] -- iface          towards the gateway
+                                        of a replica gateway   [switch] -- uplink       while it is the gateway
     gateway   ifaces -- [switch] -- ifaces
     robot     ROS graph of the robot -- [proxy] -- [switch] -- uplink                   and [rib], and the watch
 """
@@ -80,13 +80,15 @@ def machine_boot(
         days: how long its papers hold.
         shares_host: whether other machines run on the same host.
         lease_s: of its claims.
-        uplink: the device that it has while it is the gateway of its group; empty: it never is.
+        uplink: the device that it has while it is the gateway of its group, for which it has to be a switch; empty: it
+            never is, and its switch is a leaf.
 
     Raises:
         LocalError: as ``Authority.enrol``.
     """
     title = f"{plan.name}-{name}"
-    switch = authority.enrol(Role.SWITCH, title, days=days)
+    role = Role.SWITCH if uplink else Role.LEAF  # only a gateway carries what is not its own
+    switch = authority.enrol(role, title, days=days)
     proxy = authority.enrol(Role.PROXY, title, plan.carried, days=days)
     domain = 1 + int(name[1:]) % _DOMAINS
     ports = [{"iface": iface}, *([{"iface": uplink, "optional": True}] if uplink else [])]

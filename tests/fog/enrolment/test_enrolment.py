@@ -17,9 +17,11 @@ from fog.enrolment.robot_side import forget_rules, introduce, processes_of
 from fog.hardware import Hardware
 from fog.host.bundle import install
 from fog.site import open_site
+from gdp.crypto.certificates import Role
 from gdp.crypto.statements import parse
 from gdp.errors import LocalError
 from gdp.nodes.config import RibConfig, SwitchConfig
+from gdp.nodes.membership import load_member
 from gdp.stores.issue import make_domain, make_owner
 from gdp.stores.keyring import load_identity, load_owner
 from gdp.trust.revocation import Revocation
@@ -52,6 +54,18 @@ def test_a_machine_boots_with_files_that_the_nodes_take(authority: Authority, tm
     switch = SwitchConfig.load(tmp_path / "home" / "switch.yaml")
     assert (switch.attach, [port.iface for port in switch.ports]) == (("proxy0",), ["eth0"])
     assert [(rule.name, rule.encoding) for rule in config.expose] == [("/plan", "cbor"), ("/map", "json")]
+
+
+@pytest.mark.parametrize(("uplink", "role"), [("", Role.LEAF), ("up", Role.SWITCH)])
+def test_a_machine_is_a_leaf_unless_it_may_become_the_gateway(
+    authority: Authority, tmp_path: Path, uplink: str, role: Role
+) -> None:
+    boot, _ = machine_boot(
+        authority, CLUSTER, "m7", lambda _: ("run",), iface="eth0", days=1.0, shares_host=True, uplink=uplink
+    )
+    install(tmp_path / "home", boot)
+    config = SwitchConfig.load(tmp_path / "home" / "switch.yaml")
+    assert load_member(config.identity, config.domain, Role.SWITCH)[0].role is role
 
 
 def test_a_machine_may_give_what_is_carried_and_nothing_else(authority: Authority, tmp_path: Path) -> None:
