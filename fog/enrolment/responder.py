@@ -179,7 +179,7 @@ def _verified(identifier: bytes, kept: Kept, asked: Request) -> list[Holder]:
         seat, holder = planned.seat, read_request(application.request)
         digest = node_metadata(seat.role, seat.label).digest()
         if (holder.unit, holder.label, holder.subject.digest) != (seat.role.value, seat.label, digest):
-            raise StatementError(DropReason.WRONG_NAME, f"{holder.unit} {holder.label!r}, not {seat.label!r}")
+            raise StatementError(DropReason.WRONG_NAME, f"{holder.unit[:16]!r} {holder.label!r}, not {seat.label!r}")
         application.verify(holder.key, identifier)
         holders.append(holder)
     return holders

@@ -17,7 +17,7 @@ import sqlite3
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from enum import Enum
 from pathlib import Path
 from typing import Final
@@ -76,14 +76,14 @@ class Kept:
         is_reported: a misuse was reported; nothing more is answered.
     """
 
-    token: bytes
+    token: bytes = field(repr=False)
     cluster: str
     machine: str
     seats: tuple[PlannedSeat, ...]
     expires_unix_s: float
     until_unix_s: float
     keys: bytes | None
-    answer: bytes | None
+    answer: bytes | None = field(repr=False)
     papers: Papers | None
     is_reported: bool
 

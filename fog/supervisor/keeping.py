@@ -46,7 +46,7 @@ def supervise(site: Site, *, stays: bool = False, lock: int | None = None) -> No
         lock: descriptor of the lock, where it was taken already.
 
     Raises:
-        LocalError: another one lives, or the provider cannot be had.
+        LocalError: another one lives, the provider cannot be had, or machines have nowhere to enrol: a port is taken.
     """
     with (
         held(site, lock),

@@ -41,7 +41,8 @@ from gdp.trust.enrolment import (
     answer_bytes,
     apply,
     open_answer,
-    token_id,
+    open_request,
+    seal_answer,
 )
 from tests.fog.enrolment.desk import CLUSTER, Desk, Machine, made_desk
 from tests.fog.providers.test_aws import Cloud, aws, cloud, spec
@@ -312,24 +313,38 @@ def test_a52_an_observer_who_replays_a_request_learns_nothing_and_changes_nothin
     assert reports(desk.tickets) == [Report.ENROLLED]
 
 
+class Impostor:
+    """Stands in the way of a machine, has read its user data, and lacks the responder's private key."""
+
+    def __init__(self, ticket: Ticket, answer: bytes) -> None:
+        self._ticket, self._answer = ticket, answer
+        self.asked = 0
+
+    def is_expected(self, _: bytes) -> bool:
+        return True
+
+    def answer(self, request: bytes, _: float) -> bytes:
+        self.asked += 1
+        with pytest.raises(StatementError):
+            open_request(KemPrivateKey.generate(), request)
+        return seal_answer(self._ticket.token, request, bytes(32), self._answer)
+
+    def flush(self) -> None:
+        pass
+
+
 def test_a52_who_knows_the_token_alone_cannot_answer_in_the_launchers_place(desk: Desk, tmp_path: Path) -> None:
-    """The impostor has read user data and stands in the way: it lacks the responder's private key."""
     ticket = desk.ticket()
     install(tmp_path / "home", desk.boot(ticket=ticket))
-    (tmp_path / "other").mkdir()
-    with made_desk(tmp_path / "other") as impostor:
-        own = impostor.ticket()
-        impostor.tickets._file.execute("UPDATE tickets SET token = ?, id = ?", (ticket.token, token_id(ticket.token)))
-        assert own.seats == ticket.seats
-        bound = impostor.socket
-        with impostor.listening(), pytest.raises(LocalError, match="refuses"):
-            enrol(_redirected(tmp_path / "home", ticket, f"unix:{bound}"), patience_s=0.3)
+    machine = Machine(ticket)
+    request = machine.request()
+    forged = machine.opened(request, asked(desk, request)).to_wire()
+    impostor = Impostor(ticket, forged)
+    desk.responder = impostor  # type: ignore[assignment]
+    with desk.listening(), pytest.raises(LocalError, match="an answer that the responder did not make"):
+        enrol(tmp_path / "home", patience_s=0.5)
+    assert impostor.asked
     assert not list((tmp_path / "home").rglob("node.crt"))
-
-
-def _redirected(home: Path, ticket: Ticket, address: str) -> Path:
-    (home / TICKET_FILE).write_bytes(replace(ticket, addresses=(address,)).to_json())
-    return home
 
 
 # what costs nothing
