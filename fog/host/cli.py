@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -46,6 +47,7 @@ def machine(home: Home, json: Json = False, verbose: Verbose = False, await_go: 
         if (home / TICKET_FILE).exists():
             from fog.host.enrolment import enrol  # what it imports no later start needs
 
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1, signal.SIGUSR2})  # for the host, soon
             enrol(home.resolve())
         reason = asyncio.run(host.run())
         if json:
