@@ -7,12 +7,14 @@ from dataclasses import replace
 
 import pytest
 
+from gdp.control.frames import ControlSplitter
 from gdp.control.join import Join
 from gdp.control.query import Query
 from gdp.control.relay import Relay
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.subject import Subject
+from gdp.crypto.validity import Validity
 from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
 from gdp.frame.codec import Header, encode
@@ -24,8 +26,9 @@ from gdp.rib.machine import Rib, RibSettings
 from gdp.rib.store import MemoryStore
 from gdp.switch.attached import Attached
 from gdp.testbed.world import World
-from gdp.trust.claim import Claim
+from gdp.trust.claim import Claim, make_claim
 from gdp.trust.domain import Policy
+from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
 from tests.gdp.trust.world import CLOUD, DAY, GATEWAY, NOW, ROBOT, SCHOOL, SWITCH, claim, verifier
 from tests.journeys.flows import ROBOT as ROBOT_AT
@@ -77,6 +80,40 @@ def test_a15_a_nodes_claims_are_bounded_and_cost_the_same_however_many_there_are
     attached.put(verifier().verify(others, NOW), 1, b"n", 0.0)
     assert len(attached.due(0.0)) == ATTACHED_MAX // 2 + 1
     assert attached.due(0.1) == []
+
+
+def test_a15_claims_and_withdrawals_beyond_a_neighbours_pace_draw_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gdp.switch.machine.CLAIMS_PER_S", 10.0)
+    monkeypatch.setattr("gdp.switch.machine.CLAIMS_BURST", 20.0)
+    world = ring()
+    other = world.add_member("nuc1/other", "nuc1")
+    assert world.network.run(5, lambda: other.attachment.is_attached)
+    nuc1, robot = world.switches["nuc1"], world.identities[ROBOT_AT]
+    incarnation = world.members[ROBOT_AT].attachment._incarnation
+    sequence = int(world.network.now.unix_s * 1_000) + 100_000
+    rtcert = RtCert.make(robot, nuc1.name, Validity.lasting(world.network.now.unix_s, 600))
+    port = _port_of(world, "nuc1", ROBOT_AT)
+    tap = Tap("nuc1", "nuc2")
+    world.network.taps.append(tap)
+
+    def say(numbers: range) -> int:
+        before = len(tap.frames)
+        for number in numbers:
+            wire = make_claim(
+                robot, Right.PUBLISH, _subject(f"/own{number}", robot), rtcert=rtcert, sequence=sequence + number,
+                incarnation=incarnation, lease_s=20.0, is_global=True,
+            )  # fmt: skip
+            for frame in ControlSplitter(robot.name, number).split(Kind.ADVERTISE, wire, 1_400):
+                world.network.inject("nuc1", port, frame, mac_of(world, "nuc1", port))
+        return len(tap.frames) - before
+
+    assert say(range(1, 30)) > 0
+    assert say(range(30, 200)) == 0
+    assert nuc1.drops()[DropReason.QUOTA] >= 170
+    late = advertise(world, "/late", "nuc1/other")
+    late.read_by(SERVER)
+    assert world.network.run(3, lambda: late.is_read_by(1))
+    late.outlive()
 
 
 def renamed(one: Claim, name: Name) -> Claim:
