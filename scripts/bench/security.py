@@ -21,6 +21,7 @@ from types import ModuleType
 from typing import Final
 
 import security_amplification
+import security_insiders
 import security_replays
 import security_revocation
 from machine import machine_state
@@ -34,6 +35,7 @@ COMMANDS: Final[Mapping[str, ModuleType]] = {
     "revocation": security_revocation,
     "amplification": security_amplification,
     "replays": security_replays,
+    "insiders": security_insiders,
 }
 
 

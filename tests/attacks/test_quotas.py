@@ -9,6 +9,7 @@ import pytest
 
 from gdp.control.frames import ControlSplitter
 from gdp.control.join import Join
+from gdp.control.link_state import LinkState, Scope
 from gdp.control.query import Query
 from gdp.control.relay import Relay
 from gdp.crypto.certificates import Role
@@ -66,6 +67,50 @@ def test_a14_a_proxy_watches_nothing_at_a_rib() -> None:
     at = rib()
     watch(at, CLOUD_PROXY, 1)
     assert (at.watching, at.refusals) == (0, {DropReason.NOT_DELEGATED: 1})
+
+
+def test_a12_what_a_members_questions_draw_from_a_rib_is_paced_in_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gdp.rib.machine.ANSWER_BYTES_PER_S", 1_000.0)
+    monkeypatch.setattr("gdp.rib.machine.ANSWER_BYTES_BURST", 30_000.0)
+    at = rib()
+    for number in range(3):
+        tell(at, claim(subject=_subject(f"/own{number}"), chain=[]))
+    at.take()
+    name = _subject("/own1").name
+    for by in (SWITCH, CLOUD_SWITCH):
+        drawn = said = 0
+        for _ in range(100):
+            wire = Query(name, 0.0).to_wire(by.name, by.key, by.membership)
+            at.receive(wire, by.name, START)
+            said += len(wire)
+            drawn += sum(len(letter.statement) for letter in at.take())
+        assert 15_000 < drawn <= 30_000 < said
+    assert at.refusals[DropReason.QUOTA] >= 150
+
+
+def test_a07_link_states_of_one_origin_are_flooded_at_a_pace(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gdp.switch.flooding.LINK_STATES_PER_S", 10.0)
+    monkeypatch.setattr("gdp.switch.flooding.LINK_STATES_BURST", 20.0)
+    world = ring()
+    flow = flowing(world)
+    liar, sequence = world.identities["nuc2"], int(world.network.now.unix_s * 1_000) + 100_000
+    tap = Tap("nuc1", "nuc5")
+    world.network.taps.append(tap)
+    for number in range(200):
+        state = LinkState(
+            liar.name, liar.root.domain, Scope.BORDER, sequence + number, (), (), (),
+            said_unix_s=int(world.network.now.unix_s),
+        )  # fmt: skip
+        frames = ControlSplitter(liar.name, 1 << 40).split(
+            Kind.LINK_STATE, state.to_wire(liar.key, liar.membership), 1_400
+        )
+        for frame in frames:
+            world.network.inject("nuc1", _port_of(world, "nuc1", "nuc2"), frame, mac_of(world, "nuc1", 0))
+    assert 0 < tap.count(Kind.LINK_STATE) <= 21
+    assert world.switches["nuc1"].drops()[DropReason.QUOTA] >= 170
+    world.network.run(15)
+    still_flows(flow)
+    flow.outlive()
 
 
 def test_a15_a_nodes_claims_are_bounded_and_cost_the_same_however_many_there_are() -> None:

@@ -382,7 +382,8 @@ class Forge:
                 ] if Right.ATTACH not in list(_RIGHTS)[:3] else []
         return {
             **subject.to_fields(), "name": subject.name, "right": right.value, "seq": next(self._numbers),
-            "inc": int.from_bytes(self._own_life(identity, rng)[8:], "big"), "x": rng.choice((b"", bytes(32), rng.randbytes(32))),
+            "inc": int.from_bytes(self._own_life(identity, rng)[8:], "big"),
+            "x": rng.choice((b"", bytes(32), rng.randbytes(32))),
             "lease": rng.choice((1_000, 6_000, 24_000, 3_600_000)),
             "global": rng.random() < 0.5, "member": identity.membership, "chain": chain,
             "rt": RtCert.make(identity, switch, self._lasting()),
