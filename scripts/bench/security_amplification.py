@@ -245,7 +245,8 @@ def _spoken(speaker: str, kind: str, times: int, seconds: float) -> Meter:
 
 def _say(stage: Stage, forge: Forge, rng: random.Random, persona: Persona, kind: str) -> int:
     """Say one word; return its bytes."""
-    places = stage.places(persona.node)
+    is_stranger = persona.node == SPEAKERS["stranger"]
+    places = [each for each in stage.places(persona.node) if stage.believes(persona, each) is not is_stranger]
     place = rng.choice(places)
     if kind == _RECORDED:
         frames: tuple[bytes, ...] = (rng.choice(_record),)
