@@ -49,7 +49,7 @@ NACKS_PER_REPORT: Final = 24  # ranges: a report, sealed and alone in its frame,
 
 # Control plane
 CONTROL_MAX_BYTES: Final = 16 << 10  # one statement with its evidence
-CLAIM_MAX_BYTES: Final = 9 << 10  # with its evidence: a relay, an answer or a join around it must fit one statement
+CLAIM_MAX_BYTES: Final = 6_500  # with its evidence: a relay or an answer around one, a join around two fit a statement
 WITHDRAWAL_MAX_BYTES: Final = 1 << 10
 SEQUENCE_AHEAD_S: Final = 366 * 86_400.0  # sequence numbers are wall-clock milliseconds, at most so far ahead
 RECORD_OVERHEAD_BYTES: Final = 33  # what a channel puts around a statement: head and tag

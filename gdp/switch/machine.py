@@ -536,9 +536,7 @@ class Switch:
         statement.verify(neighbour.key)
         self.greeter.ports[neighbour.port].take_join(join, neighbour)
         if join.lease_s > 0:
-            claim = self._verifier.verify(join.evidence, now.unix_s)
-            if claim.right not in HEARS or claim.name != join.topic:
-                raise StatementError(DropReason.NOT_DELEGATED, "a join without a reader's claim")
+            claim = self._evidence.of_join(join, now)
             self._held.note_branch(join.topic, join.publisher, (neighbour.port, neighbour.mac), claim)
         if self.planter.join(join, neighbour, now.mono_s):
             self.relocations.redirect_join(join.topic, join.publisher, neighbour, now.mono_s)

@@ -135,7 +135,7 @@ class Planter:
             allowed = (self._policy.transit & place.transit) | {self._policy.own, place.domain}
             tree = self._tree(place.name, place.advertiser, allowed)
             if place.sequence >= tree.version:
-                self._place_at(tree, place.switch, place.domain, place.sequence)
+                self._place_at(tree, place.switch, place.domain, place.sequence, place.claim)
                 tree.allowed = allowed
             branch = Branch(reader.expires_s, self._outbox.mtu_of(at[0]), reader.claim.wire)
             if not self._put_branch(tree, at, branch):
@@ -149,14 +149,15 @@ class Planter:
         """Take in that a publisher claims its topic here: trees that pass here are asked of itself at once."""
         tree = self.trees.get(claim.name, claim.node)
         if tree is not None:
-            self._place_at(tree, self._identity.name, self._policy.own, max(claim.sequence, tree.version))
+            version = max(claim.sequence, tree.version)
+            self._place_at(tree, self._identity.name, self._policy.own, version, claim.wire)
             tree.renew_at_s = now_s
 
     def publisher_moved(self, place: Place, now_s: float) -> None:
         """Let the tree of a publisher follow it, if it passes here and its readers let it pass there."""
         tree = self.trees.get(place.name, place.advertiser)
         if tree is not None and place.sequence >= tree.version and place.domain in tree.allowed:
-            self._place_at(tree, place.switch, place.domain, place.sequence)
+            self._place_at(tree, place.switch, place.domain, place.sequence, place.claim)
             self._follow(tree, now_s)
 
     def below(self, topic: Name, publisher: Name) -> list[At]:
@@ -198,6 +199,8 @@ class Planter:
             raise StatementError(DropReason.WRONG_DOMAIN, "a tree that must not pass here")
         if join.backup_for != ZERO and neighbour.domain != self._policy.own:
             raise StatementError(DropReason.WRONG_DOMAIN, "a backup for another domain")
+        if self._paths.domain_of(join.switch) not in (None, join.domain):
+            raise StatementError(DropReason.WRONG_DOMAIN, "the publisher's switch is of another domain")
         tree = self._tree(join.topic, join.publisher, join.allowed)
         before = tree.branches.get(at)
         if before is not None and _is_overtaken(join, before):
@@ -207,7 +210,7 @@ class Planter:
         is_behind = join.version < tree.version
         is_same_place = (tree.switch, tree.domain) == (join.switch, join.domain) or is_behind
         if join.version >= tree.version:
-            self._place_at(tree, join.switch, join.domain, join.version)
+            self._place_at(tree, join.switch, join.domain, join.version, join.proof)
             tree.allowed = join.allowed
         branch = Branch(
             now_s + min(join.lease_s, JOIN_LEASE_S), join.mtu, join.evidence, join.mtu, join.sequence,
@@ -434,12 +437,12 @@ class Planter:
             return  # what a domain does to survive is its own matter
         self._say(tree, tree.above, tree.above_name, tree.asked_mtu, JOIN_LEASE_S, evidence, backup_for=backup_for)
 
-    def _place_at(self, tree: Tree, switch: Name, domain: Name, version: int) -> None:
+    def _place_at(self, tree: Tree, switch: Name, domain: Name, version: int, proof: bytes) -> None:
         """Take in where a tree's publisher is; where that is news, the one above is left before another is asked."""
         if (tree.switch, tree.domain) != (switch, domain):
             self._leave_former(tree)
             tree.has_moved = True
-        tree.switch, tree.domain, tree.version = switch, domain, version
+        tree.switch, tree.domain, tree.version, tree.proof = switch, domain, version, proof
 
     def _part_from_above(self, tree: Tree, now_s: float, *, keep: bool) -> None:
         """Leave the one above: at once, or where the way to the same place has changed, after a while."""
@@ -482,7 +485,7 @@ class Planter:
         sessions = self._outbox.sessions_with(above[0], name)
         if sessions is None:
             return  # it is gone, and with it what it knew of us
-        own_session, session = sessions
+        own_session, its_echo = sessions
         self._sequence += 1
         join = Join(
             tree.topic,
@@ -493,11 +496,12 @@ class Planter:
             mtu,
             lease_s,
             evidence,
-            session,
+            its_echo,
             self._sequence,
             tree.version,
             backup_for,
             own_session,
+            tree.proof if lease_s else b"",
         )
         kind = Kind.JOIN if lease_s else Kind.LEAVE
         self._outbox.say_at(*above, kind, join.to_wire(self._identity.name, self._identity.key))

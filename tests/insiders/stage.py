@@ -18,6 +18,7 @@ from typing import Final
 from gdp.client.member import Member, Topic
 from gdp.client.rib_host import RibHost
 from gdp.control.greeter import LinkPort
+from gdp.control.hello import ECHO_BYTES
 from gdp.crypto.identity import Identity
 from gdp.limits import RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX
 from gdp.rib.machine import RibSettings
@@ -229,6 +230,11 @@ class Stage:
         """Return the nonce that a port says in its hellos."""
         port = self._port_at(place)
         return bytes(8) if port is None else port.nonce
+
+    def echo_at(self, place: Place) -> bytes:
+        """Return how others refer to a port's session."""
+        port = self._port_at(place)
+        return bytes(ECHO_BYTES) if port is None else port.echo
 
     def own_nonce(self, persona: Persona, place: Place) -> bytes:
         """Return the nonce of the persona's own port that leads to a place."""
