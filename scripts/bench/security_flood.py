@@ -79,6 +79,8 @@ class Phase:
         memory_mib: resident memory of the switch in the middle at the end.
         backlog_drops: frames of any link that this machine lost before any switch saw them: all namespaces share the
             queue of their processor (``net.core.netdev_max_backlog``). Where there are some, losses prove nothing.
+        waited: seconds for which switches were ready to run and had no core, of each second, summed over all. Nothing
+            that a switch does about a flood makes that less; the control shows how much of it is the machine's.
     """
 
     goodput: float
@@ -87,6 +89,7 @@ class Phase:
     lost: int
     memory_mib: float
     backlog_drops: int
+    waited: float
 
 
 def plan() -> Plan:
@@ -146,6 +149,12 @@ def processor_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) * _TICK_S
 
 
+def waited_s(overlay: Overlay) -> float:
+    """Return how long all switches have waited for a core so far (schedstat, proc(5))."""
+    pids = [overlay.pid(f"switch {node}") for node in overlay.plan.switches]
+    return sum(int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) for pid in pids) / 1e9
+
+
 def backlog_drops() -> int:
     """Return how many frames processors have dropped so far, their queue being full; ``net/core/net-procfs.c``."""
     lines = Path("/proc/net/softnet_stat").read_text().splitlines()
@@ -192,9 +201,10 @@ def phase(overlay: Overlay, seconds: float) -> Phase:
     pid = overlay.pid(f"switch {_VICTIM}")
     counted(overlay)
     before_s, before_lost, begun_s = processor_s(pid), lost(overlay), time.monotonic()
-    before_drops = backlog_drops()
+    before_drops, before_waited_s = backlog_drops(), waited_s(overlay)
     time.sleep(seconds)
-    core = (processor_s(pid) - before_s) / (time.monotonic() - begun_s)
+    took_s = time.monotonic() - begun_s
+    core, waited = (processor_s(pid) - before_s) / took_s, (waited_s(overlay) - before_waited_s) / took_s
     memory = memory_mib(pid)
     published, delivered = counted(overlay)
     time.sleep(1.0)  # a switch logs what it lost each half second
@@ -202,7 +212,7 @@ def phase(overlay: Overlay, seconds: float) -> Phase:
     for node in overlay.plan.switches if losses else ():
         progress(f"{node}:\n{overlay.log_tail(f'switch {node}', 6)}")
     drops = backlog_drops() - before_drops
-    return Phase(delivered / max(published, 1), core, restart_s(overlay), losses, memory, drops)
+    return Phase(delivered / max(published, 1), core, restart_s(overlay), losses, memory, drops, waited)
 
 
 def measure(
@@ -268,8 +278,8 @@ def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
     runs.sweep()
     verified = verifications_hz()
     rate = options.rate or TIMES * verified
-    heads = ("plane", "hellos", "goodput, ratio", "lost", "memory, MiB", "core", "restart, s", "backlog drops")
-    table = Table(*heads, title=f"{rate:,.0f} hellos a second")
+    heads = ("goodput, ratio", "lost", "memory, MiB", "core", "restart, s", "backlog drops", "waited")
+    table = Table("plane", "hellos", *heads, title=f"{rate:,.0f} hellos a second")
     saved: dict[str, object] = {"verified_hz": verified, "rate_hz": rate}
     has_met = True
     for plane in options.planes:
@@ -281,7 +291,7 @@ def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
             kind: [{name: asdict(each) for name, each in pair.items()} for pair in rounds]
             for kind, rounds in found.items()
         }
-    Console(width=120).print(table)
+    Console(width=140).print(table)
     return saved, has_met
 
 
@@ -300,15 +310,17 @@ def _has_met(rounds: Sequence[dict[str, Phase]]) -> bool:
 
 def _row(rounds: Sequence[dict[str, Phase]]) -> list[str]:
     ratios, grown = _ratios(rounds), _grown_mib(rounds)
-    losses = sum(each["flooded"].lost for each in rounds)
+    losses = [sum(each[name].lost for each in rounds) for name in ("calm", "flooded")]
     cores = [statistics.median(each[name].core for each in rounds) for name in ("calm", "flooded")]
+    waits = [statistics.median(each[name].waited for each in rounds) for name in ("calm", "flooded")]
     restarts = [statistics.median(each[name].restart_s for each in rounds) for name in ("calm", "flooded")]
     return [
         f"{statistics.median(ratios):.3f} ({min(ratios):.3f}-{max(ratios):.3f}), to reach {GOAL_GOODPUT}",
-        f"{losses}, to reach 0",
+        f"{losses[0]} -> {losses[1]}, to reach 0",
         f"{grown:+.1f}, at most +{GOAL_MEMORY_MIB:g}",
         f"{cores[0]:.2f} -> {cores[1]:.2f}",
         f"{restarts[0]:.1f} -> {restarts[1]:.1f}",
         " ".join(str(each["flooded"].backlog_drops) for each in rounds),
+        f"{waits[0]:.2f} -> {waits[1]:.2f}",
     ]
 
