@@ -23,8 +23,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Final
 
+import security_amplification
 import security_cost
 import security_flood
+import security_insiders
+import security_replays
 import security_revocation
 import security_rotation
 from machine import MachineState, machine_state
@@ -39,6 +42,9 @@ COMMANDS: Final[Mapping[str, ModuleType]] = {
     "rotation": security_rotation,
     "cost": security_cost,
     "flood": security_flood,
+    "amplification": security_amplification,
+    "replays": security_replays,
+    "insiders": security_insiders,
 }
 
 
