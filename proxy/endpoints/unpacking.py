@@ -21,7 +21,7 @@ if sys.version_info >= (3, 14):
 else:
     from backports import zstd
 
-__all__ = ["CHUNK_MAX_BYTES", "SalvageError", "bound_rosbags", "check_file", "unpack"]
+__all__ = ["CHUNK_MAX_BYTES", "SalvageError", "bound_rosbags", "check_file", "file_max_bytes", "unpack"]
 
 CHUNK_MAX_BYTES: Final = 64 << 20  # unpacked; more than twice the largest message that can travel
 _FILE_RATIO_MAX: Final = 100  # unpacked bytes for each byte of a compressed file, beside the first 64 MiB
@@ -65,6 +65,11 @@ def unpack(compression: str, data: bytes, size: int | None = None) -> bytes:
     return unpacked
 
 
+def file_max_bytes(size: int) -> int:
+    """Return how long a file may become that is unpacked from ``size`` bytes."""
+    return CHUNK_MAX_BYTES + _FILE_RATIO_MAX * size
+
+
 def check_file(path: Path) -> None:
     """Refuse a file of zstd that would fill the disk: one that unpacks to more than any recording does.
 
@@ -72,7 +77,7 @@ def check_file(path: Path) -> None:
         SalvageError: it does, or is no zstd.
         OSError: it cannot be read.
     """
-    limit = CHUNK_MAX_BYTES + _FILE_RATIO_MAX * path.stat().st_size
+    limit = file_max_bytes(path.stat().st_size)
     count = 0
     try:
         with zstd.open(path, "rb") as file:

@@ -18,7 +18,7 @@ from rosbags.rosbag2 import storage_mcap
 from rosbags.rosbag2.reader import zstd
 
 from gdp.errors import ConfigError, LocalError
-from proxy.endpoints.bag import BagReader
+from proxy.endpoints.bag_decoder import BagDecoder
 from tests.attacks.work import lines_run
 
 BOMB_BYTES = 320 << 20
@@ -93,7 +93,7 @@ def memory_of(work: Callable[[], Any]) -> int:
 def read(path: Path) -> int:
     """Return how many messages a recording gives, -1 where it is refused."""
     try:
-        with BagReader(path) as bag:
+        with BagDecoder(path) as bag:
             return sum(1 for _ in bag.messages())
     except ConfigError:
         return -1
@@ -140,7 +140,7 @@ def test_a28_a_folder_of_compressed_messages_or_files_unpacks_within_bounds(tmp_
         connection.execute("INSERT INTO messages VALUES (1, 1, 1, ?)", (bomb,))
         connection.execute("INSERT INTO messages VALUES (2, 1, 2, ?)", (zstd.compress(b"abcd"),))
     connection.close()
-    with BagReader(path) as bag:
+    with BagDecoder(path) as bag:
         messages = list(bag.messages())
         assert [message.raw for message in messages] == [b"abcd"]
         assert "more than" in bag.unread
@@ -149,7 +149,7 @@ def test_a28_a_folder_of_compressed_messages_or_files_unpacks_within_bounds(tmp_
     (path / "metadata.yaml").write_text(about.format("FILE"))
     (path / "f_0.db3.zstd").write_bytes(bomb)
     with pytest.raises(ConfigError, match="unpacks to more"):
-        BagReader(path)
+        BagDecoder(path)
 
 
 @pytest.mark.parametrize("suffix", [".db3", ".db"])
@@ -168,7 +168,7 @@ def test_a29_a_database_with_views_or_virtual_tables_is_refused(
 ) -> None:
     path = database(tmp_path / f"a{suffix}", *statements)
     with pytest.raises(ConfigError, match=r"cannot be read"):
-        BagReader(path)
+        BagDecoder(path)
 
 
 @pytest.mark.parametrize("suffix", [".db3", ".db"])

@@ -20,8 +20,9 @@ from gdp.nodes.config import SwitchConfig
 from gdp.nodes.yaml_source import read_yaml
 from gdp.stores.token_uri import TokenUri
 from proxy.config import ProxyConfig
-from proxy.endpoints.bag import BagReader, BagWriter
+from proxy.endpoints.bag import BagWriter
 from proxy.endpoints.bag_channel import offered_qos
+from proxy.endpoints.bag_decoder import BagDecoder
 from proxy.serial.channel import Channel
 from tests.fuzzing.decoder import Decoder
 
@@ -50,7 +51,7 @@ def _in_file(name: str, read: Callable[[Path], object]) -> Callable[[bytes], obj
 
 
 def _bag(path: Path) -> object:
-    with BagReader(path) as bag:
+    with BagDecoder(path) as bag:
         return sum(len(message.raw) for message in bag.messages())
 
 
