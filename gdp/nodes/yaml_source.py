@@ -16,6 +16,7 @@ from typing import Final, TypeAlias
 import yaml
 
 from gdp.errors import ConfigError
+from gdp.stores.bounded import read_at_most
 
 __all__ = ["ConfigFileError", "KeyPath", "Plain", "YamlSource", "read_yaml"]
 
@@ -80,7 +81,7 @@ def read_yaml(path: Path) -> YamlSource:
     """
     try:
         with path.open("rb") as file:
-            raw = file.read(_FILE_MAX_BYTES + 1)
+            raw = read_at_most(file, _FILE_MAX_BYTES)
     except OSError as error:
         raise ConfigError(str(path), "", f"a readable file is expected: {error.strerror}") from error
     if len(raw) > _FILE_MAX_BYTES:
