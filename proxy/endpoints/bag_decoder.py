@@ -21,7 +21,8 @@ from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag1 import ReaderError as ReaderError1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import ReaderError as ReaderError2
-from ruamel.yaml import YAML
+from rosbags.rosbag2 import metadata as rosbag2_metadata
+from rosbags.rosbag2 import reader as rosbag2_reader
 from ruamel.yaml.error import YAMLError
 
 from gdp.errors import ConfigError, LocalError
@@ -29,6 +30,7 @@ from proxy.endpoints import salvage_mcap, salvage_ros1, salvage_sqlite
 from proxy.endpoints.bag_channel import from_connection
 from proxy.endpoints.bag_source import Message, Source
 from proxy.endpoints.joined import JoinedSource
+from proxy.endpoints.plain_yaml import BoundedYaml, load_plain
 from proxy.endpoints.sqlite_guard import guarded
 from proxy.endpoints.unpacked import UnpackedSource
 from proxy.endpoints.unpacking import bound_rosbags, check_file
@@ -189,7 +191,7 @@ def _compression(metadata: Path) -> str:
         return ""
     if metadata.stat().st_size > _METADATA_MAX_BYTES:
         raise LocalError(f"{metadata.name} has more than {_METADATA_MAX_BYTES} bytes")
-    match YAML(typ="safe").load(metadata.read_text()):
+    match load_plain(metadata.read_text()):
         case {"rosbag2_bagfile_information": {"compression_mode": str(mode)}}:
             return mode.lower()
     return ""
@@ -264,6 +266,8 @@ class _Rosbag2Source(_IndexedSource):
 
 
 bound_rosbags()
+rosbag2_reader.YAML = BoundedYaml  # type: ignore[attr-defined]
+rosbag2_metadata.YAML = BoundedYaml  # type: ignore[attr-defined]
 
 
 def _key(connection: Connection) -> tuple[int, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+import contextlib
 import functools
 import sqlite3
 import struct
@@ -18,6 +19,7 @@ from rosbags.rosbag2 import storage_mcap
 from rosbags.rosbag2.reader import zstd
 
 from gdp.errors import ConfigError, LocalError
+from proxy.endpoints.bag_channel import offered_qos
 from proxy.endpoints.bag_decoder import BagDecoder
 from tests.attacks.work import lines_run
 
@@ -210,3 +212,36 @@ def test_a66_qos_that_is_no_yaml_of_ours_is_refused_as_a_recording(tmp_path: Pat
         connection.execute("INSERT INTO topics VALUES (1, '/t', 'a/msg/B', 'cdr', ?)", (qos,))
     connection.close()
     assert read(path) in (0, -1)
+
+
+@pytest.mark.parametrize("opening", ["[", "{", "- ", "[&a ", "? "])
+def test_b08_qos_of_nothing_but_openings_costs_little(opening: str) -> None:
+    with lines_run(30_000), contextlib.suppress(LocalError):
+        offered_qos(opening * (8_000 // len(opening)))
+
+
+def test_b08_metadata_of_nothing_but_openings_cost_little(tmp_path: Path) -> None:
+    (tmp_path / "metadata.yaml").write_text("[" * 8_000)
+    database(tmp_path / "a_0.db3", TOPICS, MESSAGES)
+    with lines_run(30_000):
+        assert read(tmp_path) == -1
+
+
+@pytest.mark.parametrize("suffix", ["bag", "mcap"])
+def test_b09_a_record_that_is_longer_than_its_file_reserves_no_memory(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a.{suffix}"
+    if suffix == "bag":
+        head = b"op=\3"
+        fields = b"".join(
+            struct.pack("<I", len(each)) + each
+            for each in (head, b"index_pos=" + struct.pack("<Q", 13), b"conn_count=\1\0\0\0", b"chunk_count=\1\0\0\0")
+        )
+        path.write_bytes(b"#ROSBAG V2.0\n" + text(fields) + struct.pack("<I", 0xFFFFFFF0) + bytes(100))
+        data = bytearray(path.read_bytes())
+        at = data.index(b"index_pos=") + 10
+        data[at : at + 8] = struct.pack("<Q", len(data) - 104)  # the index begins with a record of 4 GB
+        path.write_bytes(data)
+    else:
+        footer = record(2, struct.pack("<QQI", 8, 0, 0))
+        path.write_bytes(MAGIC + struct.pack("<BQ", 1, 1 << 31) + bytes(100) + footer + MAGIC)
+    assert memory_of(lambda: read(path)) < 1 << 20
