@@ -24,7 +24,8 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement
 from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
-from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_REFRESH_S
+from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_REFRESH_S, LINK_STATES_BURST, LINK_STATES_PER_S
+from gdp.message.token_bucket import Paces
 from gdp.names import Name
 from gdp.switch.damping import Damping
 from gdp.switch.link_states import LinkStates
@@ -87,6 +88,7 @@ class Flooding:
         self.paths = Paths(identity.name, self._domain, self.link_states)
         self.damping = Damping()
         self._rtcerts = RtCertCache(_RTCERTS_REMEMBERED)
+        self._paces = Paces(LINK_STATES_PER_S, LINK_STATES_BURST)
         self.drops: Counter[DropReason] = Counter()  # RIBs in link states that are not believed
         self._said: dict[Scope, tuple[object, ...]] = {}
         self._refresh_at_s: dict[Scope, float] = {}  # each by itself: news in one scope renew nothing of the other
@@ -131,6 +133,8 @@ class Flooding:
         if state.origin == self._identity.name:
             self._outdo(state, now.mono_s)
             return False
+        if not self._paces.take(state.origin, now.mono_s):
+            raise StatementError(DropReason.QUOTA, "link states of one origin")  # digests bring the last one later
         proven = tuple(rib for rib in state.ribs if self._is_placed(rib, state, now.unix_s))
         if not self.link_states.put(replace(state, ribs=proven), statement.wire, now.mono_s):
             return False

@@ -31,7 +31,7 @@ from gdp.effects import Arrival, Instant, Transmit
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
 from gdp.frame.codec import HEADER_BYTES, Header, decode, encode
 from gdp.frame.kinds import CONTROL_FROM, Kind
-from gdp.limits import HOPS_MAX, JOINS_BURST, JOINS_PER_S
+from gdp.limits import CLAIMS_BURST, CLAIMS_PER_S, HOPS_MAX, JOINS_BURST, JOINS_PER_S
 from gdp.message.token_bucket import Paces
 from gdp.names import Name
 from gdp.switch.attached import Attached
@@ -123,6 +123,7 @@ class Switch:
         self._told_rib: Name | None = None  # the RIB that what the operator revoked goes to
         self.boundary = ErrorBoundary()
         self._join_paces = Paces(JOINS_PER_S, JOINS_BURST)
+        self._claim_paces = Paces(CLAIMS_PER_S, CLAIMS_BURST)
         self._drops: Counter[DropReason] = Counter()
         self._rest_due_s: float | None = None  # when something other than the greeter is due; None: to be looked up
 
@@ -358,10 +359,11 @@ class Switch:
             if not neighbour.role.is_switch:
                 raise StatementError(DropReason.NOT_DELEGATED, "only switches speak of links")
             self._flooding.receive(neighbour, statement, now)
-        elif kind == Kind.ADVERTISE:
-            self._claims.take(neighbour, statement, now)
-        elif kind == Kind.WITHDRAW:
-            self._claims.withdraw(neighbour, statement, now)
+        elif kind in (Kind.ADVERTISE, Kind.WITHDRAW):
+            if not self._claim_paces.take(neighbour.name, now.mono_s):
+                raise StatementError(DropReason.QUOTA, "claims of one neighbour")  # it is told nothing: that costs, too
+            take = self._claims.take if kind == Kind.ADVERTISE else self._claims.withdraw
+            take(neighbour, statement, now)
         elif kind in (Kind.JOIN, Kind.LEAVE):
             self._take_join(neighbour, statement, now)
         elif kind == Kind.REVOKE:
