@@ -43,7 +43,7 @@ from gdp.trust.right import HEARS, Right
 from gdp.trust.rtcert import RtCert
 from tests.insiders.stage import PERSONAS, Persona, Place, Stage
 
-__all__ = ["Forge", "Utterance"]
+__all__ = ["KINDS_OF_WORDS", "Forge", "Utterance"]
 
 _U64: Final = (1 << 64) - 1
 _INTEGERS: Final = (0, 1, 2, 255, 256, 65_535, 65_536, (1 << 24), (1 << 31) - 1, 1 << 32, (1 << 63), _U64 - 1, _U64)
@@ -113,18 +113,31 @@ class Forge:
             mac = place.mac if rng.random() < 0.5 else b"\x02evil" + bytes([rng.randrange(4)])
             place = Place(place.node, rng.choice(list(ports)), mac)
         if rng.random() < 0.12:
-            what, make = rng.choice(_FRAMES)
-            frames = make(self, rng, persona, place)
-            return None if not frames else Utterance(persona, what, place, tuple(frames))
+            return self.say(rng, persona, rng.choice(_FRAMES)[0], place)
         type_ = rng.choice(_SPOKEN)
         kind, destination = self._delivery(rng, type_, place)
         wire = self._statement(rng, type_, persona, place)
-        if wire is None:
-            return None
+        return None if wire is None else self._sent(rng, persona, type_, place, kind, destination, wire)
+
+    def say(self, rng: random.Random, persona: Persona, what: str, place: Place) -> Utterance | None:
+        """Return something well formed: a statement of a type, or a frame of a kind, as in ``KINDS_OF_WORDS``."""
+        for each, make in _FRAMES:
+            if each == what:
+                frames = make(self, rng, persona, place)
+                return Utterance(persona, what, place, tuple(frames)) if frames else None
+        type_, identity = StatementType(what), self._stage.identity(persona)
+        kind, destination = self._delivery(rng, type_, place)
+        wire = self._signed(type_, _BODIES[type_](self, rng, identity, place), identity.name, identity.key)
+        return None if wire is None else self._sent(rng, persona, type_, place, kind, destination, wire)
+
+    def _sent(
+        self, rng: random.Random, persona: Persona, type_: StatementType, place: Place, kind: int, to: Name, wire: bytes
+    ) -> Utterance | None:
+        """Return a statement in frames, in a channel most of the time where it belongs in one."""
         if kind in (Kind.RIB_REQUEST, Kind.RIB_ANSWER) and rng.random() < 0.8:
-            return self._in_channel(persona, type_, place, destination, wire)
+            return self._in_channel(persona, type_, place, to, wire)
         try:
-            frames = self._splitters[persona.node].split(kind, wire, 1_500, destination)
+            frames = self._splitters[persona.node].split(kind, wire, 1_500, to)
         except LocalError:
             return None
         self._old.append(wire)
@@ -388,7 +401,8 @@ class Forge:
                 ] if Right.ATTACH not in list(_RIGHTS)[:3] else []
         return {
             **subject.to_fields(), "name": subject.name, "right": right.value, "seq": next(self._numbers),
-            "inc": rng.choice((1, 7, next(self._counters))), "x": rng.choice((b"", bytes(32), rng.randbytes(32))),
+            "inc": int.from_bytes(self._own_life(identity, rng)[8:], "big"),
+            "x": rng.choice((b"", bytes(32), rng.randbytes(32))),
             "lease": rng.choice((1_000, 6_000, 24_000, 3_600_000)),
             "global": rng.random() < 0.5, "member": identity.membership, "chain": chain,
             "rt": RtCert.make(identity, switch, self._lasting()),
@@ -725,3 +739,4 @@ _FRAMES: Final[tuple[tuple[str, Callable[[Forge, random.Random, Persona, Place],
     ("data", Forge._data),
 )
 assert set(_BODIES) == set(StatementType)
+KINDS_OF_WORDS: Final = (*(each.value for each in StatementType), *(what for what, _ in _FRAMES))

@@ -134,6 +134,7 @@ class Stage:
     world: World = field(init=False)
     flow: Flow = field(init=False)
     topics: dict[str, Topic] = field(default_factory=dict)
+    _rib_nodes: dict[str, str] = field(init=False)
 
     def __post_init__(self) -> None:
         self.world = world = World(
@@ -145,6 +146,7 @@ class Stage:
             keepalive_ms=1_000,
             trusts=dict.fromkeys(_TRUSTED, _TRUSTED) | {"stranger": ("stranger", *_TRUSTED)},
         )
+        self._rib_nodes = {label: world.rib_node(label) for label in world.ribs}
         names, watches = self.rib_limits
         for host in world.ribs.values():
             settings = host.rib._settings
@@ -222,7 +224,7 @@ class Stage:
     def machines(self) -> dict[str, Switch | RibHost | Member]:
         """Return every machine that is alive, by node."""
         world = self.world
-        ribs = {world.rib_node(label): host for label, host in world.ribs.items()}
+        ribs = {self._rib_nodes[label]: host for label, host in world.ribs.items()}
         machines: dict[str, Switch | RibHost | Member] = {**world.switches, **ribs, **world.members}
         return {node: each for node, each in machines.items() if world.network._nodes[node].is_alive}
 
