@@ -4,8 +4,8 @@ Place: I/O, through ``members``. A machine's boot has no key, only the ticket wi
 Every file names others relative to itself, so it does not matter where they will lie.
 ::
 
-    machine   [node ...] -- ROS graph of its own -- [proxy] -- [switch] -- iface        towards the gateway
-                                                                  `-- uplink            while it is the gateway
+    machine   [node ...] -- ROS graph of its own -- [proxy] -- [leaf] -- iface          towards the gateway
+                                        of a replica gateway   [switch] -- uplink       while it is the gateway
     gateway   ifaces -- [switch] -- ifaces
     robot     ROS graph of the robot -- [proxy] -- [switch] -- uplink                   and [rib], and the watch
 """
@@ -62,11 +62,15 @@ class RobotDevices:
     watch: str
 
 
-def machine_seats(plan: ClusterPlan, name: str) -> tuple[PlannedSeat, PlannedSeat]:
-    """Return what a machine of a cluster is to be: a switch, and a proxy that gives what is carried."""
+def machine_seats(plan: ClusterPlan, name: str, *, is_gateway: bool = False) -> tuple[PlannedSeat, PlannedSeat]:
+    """Return what a machine of a cluster is to be: a leaf, and a proxy that gives what is carried.
+
+    Args:
+        is_gateway: it may become the gateway of its group. Then it is a switch, for it carries what is not its own.
+    """
     title = f"{plan.name}-{name}"
-    proxy = Seat(PROXY, Role.PROXY, title)
-    return PlannedSeat(Seat(SWITCH, Role.SWITCH, title)), PlannedSeat(proxy, plan.carried)
+    switch = Seat(SWITCH, Role.SWITCH if is_gateway else Role.LEAF, title)
+    return PlannedSeat(switch), PlannedSeat(Seat(PROXY, Role.PROXY, title), plan.carried)
 
 
 def machine_boot(

@@ -297,7 +297,8 @@ class Supervisor:
         self._troubles.pop(resting, None)
         offer = choice.offer
         spec = MachineSpec(plan.name, self._journal.next_machine(plan.name), offer)
-        ticket, until_unix_s = self._ticket(plan, spec.name, now_s)
+        uplink = self._uplink_iface(offer.region)
+        ticket, until_unix_s = self._ticket(plan, spec.name, now_s, is_gateway=bool(uplink))
         boot = machine_boot(
             self._site.authority,
             plan,
@@ -307,7 +308,7 @@ class Supervisor:
             iface=self._site.machine_iface,
             lease_s=self._site.lease_s,
             shares_host=self._provider.name == "local",
-            uplink=self._uplink_iface(offer.region),
+            uplink=uplink,
         )
         record = Record(spec, wanted, Papers("", until_unix_s), now_s)
         records.append(record)
@@ -315,8 +316,11 @@ class Supervisor:
         self._put(record, "asked", detail, now_s)
         self._acts.begin(plan.name, spec.name, "create", partial(self._provider.create, spec, boot))
 
-    def _ticket(self, plan: ClusterPlan, name: str, now_s: float) -> tuple[Ticket, float]:
+    def _ticket(self, plan: ClusterPlan, name: str, now_s: float, *, is_gateway: bool) -> tuple[Ticket, float]:
         """Return a new machine's ticket, and until when what is issued for it will hold.
+
+        Args:
+            is_gateway: the machine may become the gateway of its group.
 
         Raises:
             LocalError: no domain there, or its root has run out.
@@ -328,7 +332,7 @@ class Supervisor:
         ticket = self._tickets.issue(
             plan.name,
             name,
-            machine_seats(plan, name),
+            machine_seats(plan, name, is_gateway=is_gateway),
             secrets.token_bytes(TOKEN_BYTES),
             addresses=[self._site.enrolment_url],
             unix_s=now_s,

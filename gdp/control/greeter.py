@@ -440,6 +440,7 @@ class Greeter:
         known.cookie = b"" if is_new_session else known.cookie
         known.sequence, known.digest, known.greeted_s = hello.sequence, hello.digest, now.mono_s
         known.member, known.checked_s, known.life = member, now.mono_s, hello.life
+        known.role = member.role  # a root may have made a leaf of a switch
         had_proof, known.proof = known.proof is not None, proof
         self._note_clash(port, known, hello, now.mono_s)
         self._alive(known, now.mono_s)
@@ -479,6 +480,10 @@ class Greeter:
         if member.name != statement.signer:
             raise StatementError(DropReason.BAD_CERTIFICATE, "a hello under another's certificate")
         statement.verify(member.key)
+        roles = member.role, self._identity.role
+        if Role.LEAF in roles and all(each.is_switch for each in roles) and member.domain != self._identity.root.domain:
+            port.strangers.note(hello.membership, DropReason.THROUGH_LEAF, now.mono_s)
+            raise StatementError(DropReason.THROUGH_LEAF, "a leaf joins switches of its own domain only")
         return hello, member
 
     def _admit(self, port: LinkPort, arrival: Arrival, signer: Name, hello: Hello, now_s: float) -> None:
@@ -800,7 +805,7 @@ class Greeter:
         """Return a RIB's RtCerts for the switches that it hears on a port."""
         if self._rtcert_for is None:
             return ()
-        heard = [each for each in port.neighbours.values() if each.role is Role.SWITCH]
+        heard = [each for each in port.neighbours.values() if each.role.is_switch]
         switches = sorted((not each.is_proven, each.name) for each in heard)
         return tuple(self._rtcert_for(name) for _, name in switches[:RTCERTS_MAX])
 

@@ -254,7 +254,7 @@ class Rib:
     def _take_relay(self, statement: Statement, now: Instant) -> None:
         relay = Relay.from_fields(statement.fields)
         member = self._sender(relay.membership, statement, now)
-        if member.role not in (Role.SWITCH, Role.RIB):
+        if not (member.role.is_switch or member.role is Role.RIB):
             raise StatementError(DropReason.WRONG_DOMAIN, "relays are switches or RIBs")
         statement.verify(member.key)
         passed_on = parse(relay.statement)
@@ -266,7 +266,7 @@ class Rib:
             return
         try:
             claim = self._verifier.verify_statement(passed_on, now.unix_s)
-            if member.role is Role.SWITCH and claim.switch != member.name:
+            if member.role.is_switch and claim.switch != member.name:
                 raise StatementError(DropReason.NOT_DELEGATED, "the RtCert names another switch than the relay")
             if relay.domain is not None and not self._policy.trusts(relay.domain):
                 raise StatementError(DropReason.WRONG_DOMAIN, "a claim of a domain that is not trusted")
@@ -421,7 +421,7 @@ class Rib:
     def _take_query(self, statement: Statement, now: Instant) -> None:
         fields = statement.fields
         member = self._sender(fields.bytes_("c"), statement, now)
-        if member.role not in (Role.SWITCH, Role.RIB):
+        if not (member.role.is_switch or member.role is Role.RIB):
             raise StatementError(DropReason.NOT_DELEGATED, "only switches and RIBs ask")
         statement.verify(member.key)
         query = Query.from_fields(fields)
@@ -789,7 +789,7 @@ class Rib:
             self._tell_gone(route, now.mono_s, by=entry.sender)
 
     def _is_own_switch(self, member: Membership) -> bool:
-        return member.role is Role.SWITCH and member.domain == self._policy.own
+        return member.role.is_switch and member.domain == self._policy.own
 
     def _sender(self, membership: bytes, statement: Statement, now: Instant) -> Membership:
         member = self._policy.verify_membership(membership, now.unix_s)

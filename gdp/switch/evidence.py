@@ -9,7 +9,6 @@ from __future__ import annotations
 from gdp.control.join import Join
 from gdp.control.query import Answer
 from gdp.control.relay import Relay
-from gdp.crypto.certificates import Role
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
@@ -53,7 +52,7 @@ class Evidence:
         """
         relay = Relay.from_fields(statement.expect(StatementType.RELAY))
         member = self._policy.verify_membership(relay.membership, now.unix_s)
-        if member.name != statement.signer or member.role is not Role.SWITCH:
+        if member.name != statement.signer or not member.role.is_switch:
             raise StatementError(DropReason.BAD_CERTIFICATE, "a relay that is not from a switch")
         statement.verify(member.key)
         claim = self._verifier.verify_statement(parse(relay.statement), now.unix_s)

@@ -3,6 +3,9 @@
     sudo .venv/bin/python scripts/bench/security.py revocation            # the whole; docs/benchmarks/security.json
     .venv/bin/python scripts/bench/security.py revocation --part kept     # 10^5 revocations in one process; no root
     sudo .venv/bin/python scripts/bench/security.py revocation --part closed --rounds 3 --no-save
+    .venv/bin/python scripts/bench/security.py rotation                   # messages lost while epochs change; no root
+    sudo .venv/bin/python scripts/bench/security.py cost                  # beside the commit before; minutes
+    sudo .venv/bin/python scripts/bench/security.py flood                 # hellos of a stranger; half an hour
 
 Each subcommand is a module beside this one that has ``add_arguments(parser)`` and ``run(options)``; ``run`` returns its
 figures, which go under the subcommand's name into the file, and whether every target was met.
@@ -21,10 +24,13 @@ from types import ModuleType
 from typing import Final
 
 import security_amplification
+import security_cost
+import security_flood
 import security_insiders
 import security_replays
 import security_revocation
-from machine import machine_state
+import security_rotation
+from machine import MachineState, machine_state
 from peers.process import FailedError
 from report import progress
 
@@ -33,6 +39,9 @@ from gdp.errors import GdpError
 OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks" / "security.json"
 COMMANDS: Final[Mapping[str, ModuleType]] = {
     "revocation": security_revocation,
+    "rotation": security_rotation,
+    "cost": security_cost,
+    "flood": security_flood,
     "amplification": security_amplification,
     "replays": security_replays,
     "insiders": security_insiders,
@@ -54,17 +63,17 @@ def arguments() -> argparse.ArgumentParser:
     return parser
 
 
-def save(path: Path, command: str, figures: Mapping[str, object]) -> None:
+def save(path: Path, command: str, figures: Mapping[str, object], state: MachineState) -> None:
     """Write what one subcommand measured; figures of others, and parts that were not measured now, are kept."""
     held = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"bench": "security"}
     before = held.get(command, {})
-    held[command] = {**before, **figures, "machine": asdict(machine_state())}
+    held[command] = {**before, **figures, "machine": asdict(state)}
     path.write_text(json.dumps(held, indent=1) + "\n", encoding="utf-8")
 
 
 def main() -> None:
     """Run one subcommand."""
-    options = arguments().parse_args()
+    options, state = arguments().parse_args(), machine_state()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
     try:
         figures, has_met = COMMANDS[options.command].run(options)
@@ -74,7 +83,7 @@ def main() -> None:
         progress(f"FAILED {error}")
         sys.exit(1)
     if not options.no_save:
-        save(options.json, options.command, figures)
+        save(options.json, options.command, figures, state)
     sys.exit(options.strict and not has_met)
 
 

@@ -5,20 +5,17 @@ one best-effort topic to two readers. Every ``--rotate-s`` each member is grante
 publisher half a second later; the epoch before the last is taken from all. At the end every message has to be at every
 reader, once and in order. Once nothing is published any more, readers try the epoch before as well; that is refused.
 
-    python scripts/bench/security_rotation.py                         # 100,000 messages, a new epoch every 5 s
-    python scripts/bench/security_rotation.py --messages 5000 --loss 0.01
+    .venv/bin/python scripts/bench/security.py rotation                          # 100,000 messages, an epoch each 5 s
+    .venv/bin/python scripts/bench/security.py rotation --messages 5000 --loss 0.01 --no-save
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 from typing import Final
 
 from rich.console import Console
@@ -31,6 +28,8 @@ from gdp.testbed.topology import ring5
 from gdp.testbed.world import World
 from gdp.trust.card import Card
 from gdp.trust.right import Right
+
+__all__ = ["add_arguments", "run"]
 
 ROBOT: Final = "nuc1/robot"
 READERS: Final = ("nuc5/server", "nuc3/desk")
@@ -143,15 +142,16 @@ class Rotation:
         return Counter({reason.label: count for reason, count in self.world.members[ROBOT].drops().items()})
 
 
-def main() -> int:
-    """Print the table; return 1 if something was lost that may not be."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """State the subcommand's options."""
     parser.add_argument("--messages", type=int, default=100_000, help="on both topics together, to each reader")
     parser.add_argument("--rate", type=float, default=2_000.0, help="messages a second of virtual time")
     parser.add_argument("--rotate-s", type=float, default=5.0, help="seconds of an epoch")
     parser.add_argument("--loss", type=float, default=0.0, help="share of frames that each link loses")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to this file")
-    options = parser.parse_args()
+
+
+def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
+    """Print the table; return the figures, and whether nothing was lost that may not be."""
     rotation = Rotation(options.loss)
     accounts = rotation.run(options.messages, options.rate, options.rotate_s)
     table = Table(title=f"{rotation.epoch} epochs of {options.rotate_s:g} s")
@@ -163,13 +163,10 @@ def main() -> int:
     Console().print(table)
     refused = rotation.refused()
     Console().print(f"refused by the publisher: {dict(refused) or 'nothing'}")
-    if options.json is not None:
-        figures = {"epochs": rotation.epoch, "topics": accounts, "refused": dict(refused)}
-        options.json.write_text(json.dumps(figures, indent=2) + "\n")
     may_lose = {stream.name for stream in rotation.streams if not stream.reliable and options.loss}
     kept = [account for name, account in accounts.items() if name not in may_lose]
-    return int(any(account["lost"] or account["out of order or twice"] for account in kept))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    figures: dict[str, object] = {
+        "messages": options.messages, "rotate_s": options.rotate_s, "loss": options.loss, "epochs": rotation.epoch,
+        "topics": accounts, "refused": dict(refused),
+    }  # fmt: skip
+    return figures, not any(account["lost"] or account["out of order or twice"] for account in kept)

@@ -1,4 +1,4 @@
-"""A stranger on a link that floods it with hellos: a process of its own, started by ``security_flood.py``.
+"""A stranger on a link that floods it with hellos: a process of its own, started by ``security.py flood``.
 
 Place: shell; one packet socket. Its only argument is JSON: ``iface``; ``frames``, a file of frames from the header on,
 each behind its length (4 bytes); ``rate`` a second; ``seconds``; ``source``, an address, or nothing for many invented

@@ -53,12 +53,14 @@ class Desk:
     def socket(self) -> Path:
         return self.folder / "enrolment" / "socket"
 
-    def ticket(self, name: str = "m7", *, address: str = "", minutes: float = 10.0) -> Ticket:
+    def ticket(
+        self, name: str = "m7", *, address: str = "", minutes: float = 10.0, is_gateway: bool = False
+    ) -> Ticket:
         now_s = time.time()
         return self.tickets.issue(
             CLUSTER.name,
             name,
-            machine_seats(CLUSTER, name),
+            machine_seats(CLUSTER, name, is_gateway=is_gateway),
             secrets.token_bytes(TOKEN_BYTES),
             addresses=[address or f"unix:{self.socket}"],
             unix_s=now_s,
@@ -82,9 +84,9 @@ class Desk:
         with closing(Listener(listening or bind_unix(self.socket), self.responder)) as made:
             yield made
 
-    def enrol(self, home: Path, name: str = "m7") -> None:
+    def enrol(self, home: Path, name: str = "m7", *, is_gateway: bool = False) -> None:
         """Be a machine at its first start."""
-        install(home, self.boot(name))
+        install(home, self.boot(name, self.ticket(name, is_gateway=is_gateway)))
         with self.listening():
             assert enrol(home)
 

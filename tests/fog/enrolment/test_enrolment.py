@@ -19,9 +19,11 @@ from fog.enrolment.robot_side import forget_rules, introduce, processes_of
 from fog.host.bundle import install
 from fog.host.enrolment import enrol
 from fog.site import open_site
+from gdp.crypto.certificates import Role
 from gdp.crypto.statements import parse
 from gdp.errors import LocalError
 from gdp.nodes.config import RibConfig, SwitchConfig
+from gdp.nodes.membership import load_member
 from gdp.stores.keyring import load_identity, load_owner
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
@@ -47,6 +49,13 @@ def test_a_machine_boots_with_files_that_the_nodes_take(desk: Desk, tmp_path: Pa
     switch = SwitchConfig.load(tmp_path / "home" / "switch.yaml")
     assert (switch.attach, [port.iface for port in switch.ports]) == (("proxy0",), ["eth0"])
     assert [(rule.name, rule.encoding) for rule in config.expose] == [("/plan", "cbor"), ("/map", "json")]
+
+
+def test_a_machine_is_a_leaf_unless_it_may_become_the_gateway(desk: Desk, tmp_path: Path) -> None:
+    for name, is_gateway, role in (("m1", False, Role.LEAF), ("m2", True, Role.SWITCH)):
+        desk.enrol(tmp_path / name, name, is_gateway=is_gateway)
+        config = SwitchConfig.load(tmp_path / name / "switch.yaml")
+        assert load_member(config.identity, config.domain, Role.SWITCH)[0].role is role
 
 
 def test_a_machine_may_give_what_is_carried_and_nothing_else(desk: Desk, tmp_path: Path) -> None:

@@ -1,0 +1,269 @@
+"""What security costs: this tree beside an earlier commit, in turn, round by round.
+
+ends         processor time to seal and sign a message, to open and verify it, in 100 and 10,000 bytes; advertisements
+             that one RIB takes in a second (``security_cost_end.py``): the best of many short blocks, in turn
+forwarding   one switch in namespaces: frames a second of the plane ``kernel``, flat out, and processor time of a frame
+             at the plane ``raw``, at a steady rate
+messages     ``bundles.py`` as each tree has it: real processes over three switches, 20 reliable topics, 100 bytes, with
+             as many messages as come to be confirmed; with bundles, and with one seal a message
+trips        ``messages.py`` as each tree has it, on the plane ``raw``: a message there and a small answer back
+
+The other commit is checked out beside (``git worktree``), and removed after. Asked is that no median is worse by more
+than 5 %. A ratio is taken in each round, since what slows a round slows both.
+
+    sudo .venv/bin/python scripts/bench/security.py cost
+    .venv/bin/python scripts/bench/security.py cost --part ends --rounds 9      # no root
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Final
+
+from bundles import BUNDLES, CPU, OVERLOAD, RATE, SINGLE
+from chains import Chain
+from contenders import Plane
+from machine import machine_state, thread_s
+from peers.figures import MEDIAN
+from peers.process import FailedError
+from report import Goal, Rounds, progress, show
+
+from gdp.testbed.runs import Runs
+
+__all__ = ["add_arguments", "run"]
+
+BASE: Final = "49da3d8"  # the last commit before the work on security
+HERE: Final = "this tree"
+BEFORE: Final = "before"
+ASKED: Final = 0.05
+SIZES: Final = (128, 1_400)
+_TREE: Final = Path(__file__).resolve().parents[2]
+_BLOCKS: Final = 40  # of 100 messages, at each tree in turn
+_BLOCKS_SLOW: Final = 8
+_STEADY_HZ: Final = 20_000.0
+_TRY_S: Final = 0.5
+_TRIES: Final = 3
+_PATIENCE_S: Final = 300.0
+
+Figures = dict[tuple[str, str], float]  # by case and column; those of a rate end with "/s"
+Trees = Mapping[str, Path]
+Part = Callable[[Trees, argparse.Namespace], dict[str, Figures]]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """State the subcommand's options."""
+    parser.add_argument("--part", action="append", choices=list(PARTS), help="this part only; may be repeated")
+    parser.add_argument("--base", default=BASE, help="the commit to compare with (default: %(default)s)")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=3.0, help="of a figure of messages (default: %(default)s)")
+
+
+def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
+    """Measure; return the figures, and whether nothing is dearer than was asked."""
+    figures: dict[str, object] = {}
+    has_met = True
+    state = machine_state()
+    with _checked_out(options.base) as base:
+        for part in options.part or PARTS:
+            over = Rounds()
+            for number in range(options.rounds):
+                progress(f"{part}, round {number + 1} of {options.rounds}")
+                turns = [(BEFORE, base), (HERE, _TREE)]
+                for who, figures_of in PARTS[part](dict(turns[:: 1 if number % 2 else -1]), options).items():
+                    for (case, column), value in figures_of.items():
+                        over.add(who, case, column, value)
+            goals = _goals(over)
+            show(f"Cost of security: {part}", state, {"rounds": options.rounds, BEFORE: options.base}, over, goals)
+            has_met = has_met and all(goal.reached is not False for goal in goals)
+            figures[part] = {
+                BEFORE: options.base,
+                "rounds": over.values,
+                "ratios": {goal.what: str(goal.got) for goal in goals},
+                "reached": {goal.what: goal.reached for goal in goals},
+            }
+    return figures, has_met
+
+
+def _goals(over: Rounds) -> list[Goal]:
+    goals = []
+    for case in over.cases():
+        for column in over.columns(case):
+            is_rate = column.endswith("/s")
+            asked = 1 - ASKED if is_rate else 1 + ASKED
+            what = f"{case}, {column}: {HERE} / {BEFORE}"
+            goals.append(over.ratio(what, HERE, BEFORE, case, column, asked, at_most=not is_rate))
+    return goals
+
+
+@contextmanager
+def _checked_out(commit: str) -> Iterator[Path]:
+    """Check a commit out beside this tree while within."""
+    with tempfile.TemporaryDirectory() as folder:
+        tree = Path(folder) / "tree"
+        git = ["git", "-C", str(_TREE), "worktree"]
+        made = subprocess.run([*git, "add", "--detach", str(tree), commit], capture_output=True, text=True, check=False)
+        if made.returncode:
+            raise FailedError(f"git worktree add {commit}: {made.stderr.strip()}")
+        try:
+            yield tree
+        finally:
+            subprocess.run([*git, "remove", "--force", str(tree)], check=True)
+
+
+def _environment(tree: Path) -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(tree)}
+
+
+def _output(tree: Path, *argv: str) -> str:
+    """Run a script with the packages of a tree; return what it printed.
+
+    Raises:
+        FailedError: it failed.
+    """
+    done = subprocess.run(
+        [sys.executable, *argv],
+        env=_environment(tree), capture_output=True, text=True, timeout=_PATIENCE_S, check=False,
+    )  # fmt: skip
+    if done.returncode:
+        raise FailedError(f"{' '.join(argv)}: {done.stderr[-300:]}")
+    return done.stdout
+
+
+# -- parts
+
+
+def _ends(trees: Trees, _: argparse.Namespace) -> dict[str, Figures]:
+    script = str(Path(__file__).with_name("security_cost_end.py"))
+    found: dict[str, Figures] = {who: {} for who in trees}
+    with ExitStack() as undo:
+        ends = {
+            who: undo.enter_context(
+                subprocess.Popen(
+                    [sys.executable, script], env=_environment(tree), text=True,
+                    stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                )
+            )
+            for who, tree in trees.items()
+        }  # fmt: skip
+        names = [json.loads(_line(end)) for end in ends.values()][-1]  # each says it; all say the same
+        for name in names:
+            best = max if name.endswith("/s") else min
+            for _block in range(_BLOCKS_SLOW if name.endswith("/s") else _BLOCKS):
+                for who, end in ends.items():
+                    value, key = float(_line(end, name)), ("ends", name)
+                    found[who][key] = best(value, found[who].get(key, value))
+        for end in ends.values():
+            assert end.stdin is not None
+            end.stdin.close()
+    return found
+
+
+def _line(end: subprocess.Popen[str], asked: str | None = None) -> str:
+    """Return the next line of a process, which may be asked for something first.
+
+    Raises:
+        FailedError: it ended.
+    """
+    assert end.stdin is not None
+    assert end.stdout is not None
+    if asked is not None:
+        end.stdin.write(asked + "\n")
+        end.stdin.flush()
+    line = end.stdout.readline()
+    if not line:
+        raise FailedError("security_cost_end.py ended")
+    return line
+
+
+def _forwarding(tree: Path, _: argparse.Namespace) -> Figures:
+    found: Figures = {}
+    runs = Runs()
+    runs.sweep()
+    with Chain(runs, 1, 1_500) as chain:
+        for name in ("kernel", "raw"):
+            plane = Plane(name, processes=name == "raw")
+            with _packages_of(tree):
+                standing = plane.stand(chain)
+            with standing:
+                for size in SIZES:
+                    wire = plane.wire(chain, size)
+                    if name == "kernel":
+                        tries = [chain.attempt(wire, [], None, _TRY_S) for _ in range(_TRIES)]
+                        found[f"one switch, {size:,} B", "kernel: frames/s"] = max(each.rate for each in tries)
+                        continue
+                    (switch,) = plane.workers()
+                    costs = []
+                    for _ in range(_TRIES):
+                        before_s = thread_s(switch.pid)
+                        got = chain.attempt(wire, [], _STEADY_HZ, _TRY_S).got
+                        costs.append(1e6 * (thread_s(switch.pid) - before_s) / got)
+                    found[f"one switch, {size:,} B", "raw: CPU us/frame"] = min(costs)
+    return found
+
+
+@contextmanager
+def _packages_of(tree: Path) -> Iterator[None]:
+    """Have processes that are started meanwhile use the packages of a tree."""
+    before = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = str(tree)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONPATH"]
+        else:
+            os.environ["PYTHONPATH"] = before
+
+
+def _own_bench(tree: Path, name: str, *argv: str) -> Mapping[str, Mapping[str, Mapping[str, list[float | None]]]]:
+    """Run a bench of a tree for one round; return its figures by contender, case and column."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "figures.json"
+        _output(tree, str(tree / "scripts" / "bench" / name), "--rounds", "1", "--json", str(out), *argv)
+        found: Mapping[str, Mapping[str, Mapping[str, list[float | None]]]] = json.loads(out.read_text())["rounds"]
+        return found
+
+
+def _messages(tree: Path, options: argparse.Namespace) -> Figures:
+    found = _own_bench(tree, "bundles.py", "--no-plot", "--seconds", str(options.seconds))
+    figures: Figures = {}
+    for who in (BUNDLES, SINGLE):
+        for column in (RATE, *CPU):
+            value = found[who][OVERLOAD][column][0]
+            if value is None:
+                raise FailedError(f"bundles.py of {tree} has no {column}")
+            figures[f"100 B, overload, {who}", column] = value
+    return figures
+
+
+def _trips(tree: Path, _: argparse.Namespace) -> Figures:
+    sizes = [word for size in (100, 10_000) for word in ("--size", str(size))]
+    cut = ["--only", "gdp-raw", "--mtu", "1500", "--offloads", "off", "--encoding", "cdr", "--count", "100"]
+    found = _own_bench(tree, "messages.py", *cut, *sizes)
+    return {
+        (case, column): value
+        for cases in found.values()
+        for case, columns in cases.items()
+        for column, (value,) in columns.items()
+        if column == MEDIAN and value is not None
+    }
+
+
+def _one_by_one(measure: Callable[[Path, argparse.Namespace], Figures]) -> Part:
+    return lambda trees, options: {who: measure(tree, options) for who, tree in trees.items()}
+
+
+PARTS: Final[Mapping[str, Part]] = {
+    "ends": _ends,
+    "forwarding": _one_by_one(_forwarding),
+    "messages": _one_by_one(_messages),
+    "trips": _one_by_one(_trips),
+}
