@@ -11,6 +11,8 @@ counts, and *towards* are the bytes sent into its link.
 Rates and bursts of the grants are made smaller for this (``GRANTS``), so that the first rate is as much for every kind;
 what a byte beyond them draws does not depend on how many they pay.
 
+Rows of earlier runs stay in the file until they are measured again.
+
     .venv/bin/python scripts/bench/security.py amplification
     .venv/bin/python scripts/bench/security.py amplification --speakers proxy --kinds withdraw query --no-save
 """
@@ -18,6 +20,7 @@ what a byte beyond them draws does not depend on how many they pay.
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import multiprocessing
 import random
@@ -120,7 +123,9 @@ def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
     """Measure every speaker with every kind."""
     logging.disable(logging.CRITICAL)
     ErrorBoundary.reraises = True
-    rows = list(_measured(options))
+    measured = list(_measured(options))
+    new = {(row.speaker, row.kind) for row in measured}
+    rows = [*(row for row in _held(options.json) if (row.speaker, row.kind) not in new), *measured]
     table = Table(title="Bytes drawn for each byte said", title_justify="left")
     for heading in ("speaker", "kind", "said, bytes", "plain", "beyond its grants", "towards it", "met"):
         table.add_column(heading, justify="left" if heading in ("speaker", "kind") else "right")
@@ -137,6 +142,12 @@ def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
         "target_strangers": GOAL_STRANGER, "rows": [asdict(row) for row in rows],
     }  # fmt: skip
     return figures, all(map(_is_met, rows))
+
+
+def _held(path: Path) -> list[Row]:
+    """Return the rows that earlier runs measured."""
+    saved = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    return [Row(**row) for row in saved.get("amplification", {}).get("rows", [])]
 
 
 def _decisive(row: Row) -> float:

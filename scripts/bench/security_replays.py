@@ -5,9 +5,10 @@ that has withdrawn its topic, and one that is revoked, on the in-memory network,
 link is recorded: while all come up, at work, while a link is cut, a RIB restarts, a node moves, withdraws or is
 revoked. Then nothing, one process or all of them restart, after seconds or, all being off, after hours or days, with
 their clocks right, or nearly an hour behind or ahead. RIBs begin with their snapshot and switches with the revocations
-that they kept. Right from the start of each, recordings are played back: single frames, all parts of a statement, and
+that they kept. Right from the start of each recordings are played back: single frames, all parts of a statement, and
 stretches of a link in their order, at the port where they came in or at any other one, under the address of the
-neighbour there, their own, or a stranger's.
+neighbour there, their own, or a stranger's. Where a reader or a server has restarted, whom it hears is silent
+meanwhile, and every second recording is of what it heard of it.
 
 *Accepted* is what the oracle (``Domain.found``) sees after that and ``QUIET_S`` more:
 
@@ -79,10 +80,11 @@ ROBOT, READER, CLIENT, SERVER = "a/robot", "c/reader", "a/client", "c/server"
 ROAMER, GHOST, OUTCAST = "a/roamer", "a/ghost", "b/outcast"
 GAPS_S: Final = (0.0, 0.0, 60.0, 3_000.0, 7_000.0, 15_000.0, 86_400.0, 5 * 86_400.0)
 CLOCKS_S: Final = (0.0, 0.0, 0.0, -3_000.0, 3_000.0)
-RESTARTS: Final = ("nothing", ROBOT, READER, CLIENT, SERVER, ROAMER, "switch a", "switch b", "switch c", "rib home",
-                   "rib away", "all", "all", "all")  # fmt: skip
-BATCH: Final = 500
-_BATCHES: Final = 6  # of one network
+RESTARTS: Final = ("nothing", ROBOT, READER, READER, CLIENT, SERVER, SERVER, ROAMER, "switch a", "switch b", "switch c",
+                   "rib home", "rib away", "all", "all", "all")  # fmt: skip
+SILENT: Final = {READER: ROBOT, SERVER: CLIENT}  # whose frames do not come, while those that hear them start
+BATCH: Final = 1_000
+_BATCHES: Final = 8  # of one network
 _LEASE_S: Final = 6.0
 _TOPOLOGY: Final = Topology(
     links=(Link("a", "b"), Link("b", "c")),
@@ -208,10 +210,7 @@ class Domain:
         assert world.settle(SETTLE_S)
         self._begin_flows()
         self._live_through()
-        self.network.records = None
-        for number, each in enumerate(self.records):
-            self.groups.setdefault(each.statement, []).append(each)
-            self.kinds.setdefault(each.kind, []).append(number)
+        self._index(0)
 
     # -- what is recorded
 
@@ -258,6 +257,25 @@ class Domain:
             network.run(0.2)
         network.run(2.0)
         self.forget()
+
+    def record_more(self) -> None:
+        """Record how a reader and a server of the present lives begin and work."""
+        first, self.network.records = len(self.records), self.records
+        for what in (READER, SERVER):
+            self.restart(what)
+        self._is_settled(SETTLE_S)
+        for _ in range(5):
+            self.say()
+            self.network.run(0.1)
+        self.network.run(1.0)
+        self._index(first)
+        self.delivered()
+
+    def _index(self, first: int) -> None:
+        self.network.records = None
+        for number, each in enumerate(self.records[first:], first):
+            self.groups.setdefault(each.statement, []).append(each)
+            self.kinds.setdefault(each.kind, []).append(number)
 
     # -- what happens
 
@@ -340,13 +358,17 @@ class Domain:
         for label in (ROBOT, ROAMER, READER, CLIENT, SERVER):
             self._take_part(label)
 
-    def play(self, tries: int, counts: Counter[str], *, is_live: bool) -> Iterator[None]:
-        """Play back so many frames; yield now and then."""
+    def play(self, tries: int, counts: Counter[str], *, is_live: bool, to: str | None = None) -> Iterator[None]:
+        """Play back so many frames; yield now and then. ``to``: half of them are of what that member heard."""
         done = 0
+        heard = [each for each in self.records if each.node == to and each.kind in (Kind.STATUS, Kind.DATA)]
         while done < tries:
             first = self.rng.choice(self.kinds[self.rng.choice(list(self.kinds))])
             chance = self.rng.random()
-            if chance < 0.5:
+            if heard and self.rng.random() < 0.5:
+                begin = max(self.rng.randrange(len(heard)), len(heard) - self.rng.randrange(1, 100))
+                chosen = heard[begin : begin + 30]
+            elif chance < 0.5:
                 chosen = self.records[first : first + 1]
             elif chance < 0.8:
                 chosen = self.groups[self.records[first].statement][:64]
@@ -362,7 +384,7 @@ class Domain:
                 self.network.inject(node, port, each.frame, mac)
                 counts[Kind(each.kind).name.lower()] += 1
                 done += 1
-                self.network.run(self.rng.choice((0.0, 0.0, 0.0002, 0.001)))
+                self.network.run(self.rng.choice((0.0, 0.001, 0.005) if heard else (0.0, 0.0, 0.0002, 0.001)))
             if self.rng.random() < 0.02:
                 self.network.run(self.rng.choice((0.1, 0.5)))
             if is_live and self.rng.random() < 0.03:
@@ -601,6 +623,7 @@ def _episode(domain: Domain, tries: int, counts: Counter[str], restarts: Counter
         if broken := domain.settle():
             found += [f"{text}, before it: {each}" for each in broken]
             break
+        domain.record_more()
         domain.before = domain.state()
         at_once = rng.randrange(size) if rng.random() < 0.7 else 0
         if what == "all":
@@ -608,8 +631,13 @@ def _episode(domain: Domain, tries: int, counts: Counter[str], restarts: Counter
             domain.restart_all(gap_s, lambda aheads=aheads: rng.choice(aheads))  # type: ignore[misc]
         else:
             domain.restart(what, ahead_s)
-        for _ in domain.play(at_once, counts, is_live=False):
+        silent = SILENT.get(what)
+        if silent is not None:
+            domain.network.freeze(silent)  # who sits in a link lets nothing of its own through meanwhile
+        for _ in domain.play(at_once, counts, is_live=False, to=what if silent else None):
             pass
+        if silent is not None:
+            domain.network.thaw(silent)
         seen = domain.settle()
         for _ in domain.play(size - at_once, counts, is_live=True):
             pass
