@@ -113,7 +113,8 @@ def test_calls_go_on_while_machines_are_taken_and_killed_and_the_supervisor_is(f
         caller.kill()
         caller.wait()
     events = [json.loads(line) for line in fog.run("status", "--events", "--json", "-n", "200").splitlines()]
-    assert {"taken", "notice", "draining"} <= {each["what"] for each in events}
+    assert {"enrolled", "taken", "notice", "draining"} <= {each["what"] for each in events}
+    assert "alarm" not in {each["what"] for each in events}
     assert [each["what"] for each in events].count("reconciled") == 2
     assert all(each["since_unix_s"] <= each["unix_s"] for each in events if each["what"] in ("taken", "notice"))
     assert "ready" in fog.run("logs", first, "node")

@@ -5,9 +5,10 @@ Place: command.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -19,7 +20,7 @@ from gdp.cli.node import Check, Config, Json, Verbose, emit, emit_wait, failing_
 from gdp.errors import LocalError
 from proxy.checking import check_proxy
 from proxy.config import ProxyConfig
-from proxy.endpoints.bag import BagReader
+from proxy.endpoints.bag import BagLimits, BagReader, RecordingError
 from proxy.held import Held
 from proxy.node import GOODBYE_S, ProxyNode, open_topics, renew_topics, run_node
 from proxy.outbound import Outbound
@@ -40,6 +41,14 @@ def replay(
     config: Config,
     rate: Annotated[float, typer.Option(min=0.0, help="1: as recorded; 0: as fast as readers confirm.")] = 1.0,
     wait_readers: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for a reader of every topic.")] = 15.0,
+    memory: Annotated[
+        int | None,
+        typer.Option(min=64, metavar="MIB", help="Memory to decode the recording; 1 to 4 GiB, by its length."),
+    ] = None,
+    cpu: Annotated[
+        float | None,
+        typer.Option(min=1.0, metavar="SECONDS", help="Processor time to decode it; 30 s and 2 s for each MiB."),
+    ] = None,
     check: Check = False,
     json: Json = False,
     verbose: Verbose = False,
@@ -47,18 +56,31 @@ def replay(
     """Replay a recording's exposed topics onto the overlay with the recorded timing.
 
     Exit 1: a message of a reliable topic was not confirmed by every reader of it, or had none, latched or not; or was
-    too large, or the overlay refused a topic. Best effort is sent, and confirmed by nobody.
+    too large, or the overlay refused a topic; or the recording takes more memory or time than it may. Best effort is
+    sent, and confirmed by nobody.
     """
     set_up_logging(verbose=verbose)
-    with failing_clearly():
+    limits = BagLimits(None if memory is None else memory << 20, cpu)
+    with failing_clearly(), _failing_decoder():
         settings = ProxyConfig.load(config)
-        with BagReader(bag) as reader:
+        with BagReader(bag, limits) as reader:
             if check:
                 check_proxy(settings, json=json)
                 return
             with run_node(settings, emit_wait if json else None) as node:
                 is_complete = _replay(node, reader, settings, rate, wait_readers, json=json)
     raise typer.Exit(0 if is_complete else 1)
+
+
+@contextlib.contextmanager
+def _failing_decoder() -> Iterator[None]:
+    """Turn the end of the process that decodes into one line on standard error and exit code 1."""
+    try:
+        yield
+    except RecordingError as error:
+        hint = f" (see --{error.limit})" if error.limit else ""
+        typer.echo(f"error: {error}{hint}", err=True)
+        raise typer.Exit(1) from error
 
 
 def _replay(

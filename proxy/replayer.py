@@ -115,7 +115,7 @@ class Replayer:
         """Play to the end; return False when the node was stopped before."""
         begun_s = time.monotonic()
         first_ns: int | None = None
-        for channel, stamp_ns, raw in self._bag.messages():
+        for channel, stamp_ns, raw in self._bag.messages(self._goes_on):
             if not self._outbound.is_exposed(channel):
                 continue
             first_ns = stamp_ns if first_ns is None else first_ns
@@ -128,7 +128,7 @@ class Replayer:
             if self._outbound.publish(channel, raw):
                 self._count(channel, raw)
             self._step(0.0)
-        return True
+        return not self._node.runtime.is_stopped
 
     def finish(self) -> bool:
         """Wait until readers have confirmed what they may get; return False when they stop to, or when stopped."""
@@ -150,6 +150,11 @@ class Replayer:
         played.sent_bytes += len(raw)
         played.by_channel[channel] += 1
         played.bytes_by_channel[channel] += len(raw)
+
+    def _goes_on(self) -> bool:
+        """Let the node work while the recording is waited for; return whether it was not stopped."""
+        self._step(0.0)
+        return not self._node.runtime.is_stopped
 
     def _work_until(self, due_s: float) -> None:
         while time.monotonic() < due_s and not self._node.runtime.is_stopped:

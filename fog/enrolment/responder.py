@@ -65,7 +65,7 @@ class Responder:
         Raises:
             StoreError: the tickets cannot be read now.
         """
-        if self._tickets.find(identifier) is not None:
+        if self._tickets.knows(identifier):
             return True
         self._refuse("no such ticket")
         return False

@@ -156,6 +156,11 @@ class Tickets:
             )
         return Ticket(tuple(addresses), self.responder.public, token, tuple(each.seat for each in seats))
 
+    def knows(self, identifier: bytes) -> bool:
+        """Return whether there is a ticket of this id."""
+        with self._translated(), self._lock:
+            return self._file.execute("SELECT 1 FROM tickets WHERE id = ?", (identifier,)).fetchone() is not None
+
     def find(self, identifier: bytes) -> Kept | None:
         """Return the ticket of this id."""
         query = (

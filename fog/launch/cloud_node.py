@@ -14,6 +14,7 @@ from fog.launch.description import LaunchConfiguration, Node, Parameters, Text, 
 from fog.launch.parameter_yaml import BYTES_MAX, read_parameters
 from fog.launch.ros_args import named, parameters_of_file, parameters_of_map, remapped
 from gdp.errors import LocalError
+from gdp.stores.bounded import read_at_most
 
 __all__ = ["cloud_node", "parameter_rule", "parameters_in"]
 
@@ -53,7 +54,7 @@ def parameters_in(path: Path, name: str | None, namespace: str | None, *, has_tu
     """
     try:
         with path.open("rb") as file:
-            raw = file.read(BYTES_MAX + 1)
+            raw = read_at_most(file, BYTES_MAX)
     except OSError as error:
         raise LocalError(f"parameters: {path}: {error.strerror}") from error
     try:

@@ -12,6 +12,7 @@ from typing import Final
 import yaml
 
 from gdp.errors import LocalError
+from gdp.nodes.yaml_source import LOADER
 
 __all__ = ["BYTES_MAX", "DEPTH_MAX", "read_parameters"]
 
@@ -35,7 +36,7 @@ def read_parameters(text: str, where: str, *, has_tuples: bool = False) -> objec
         raise LocalError(f"{where}: {size} bytes; parameters have at most {BYTES_MAX}")
     try:
         _refuse_aliases(text, where)
-        document: object = yaml.load(text, _WithTuples if has_tuples else yaml.SafeLoader)
+        document: object = yaml.load(text, _WithTuples if has_tuples else LOADER)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = None if mark is None else mark.line
@@ -47,7 +48,7 @@ def read_parameters(text: str, where: str, *, has_tuples: bool = False) -> objec
 
 def _refuse_aliases(text: str, where: str) -> None:
     depth = 0
-    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+    for event in yaml.parse(text, Loader=LOADER):
         line = event.start_mark.line if event.start_mark else None
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if isinstance(event, yaml.AliasEvent):
@@ -64,7 +65,7 @@ def _list(loader: yaml.SafeLoader, node: yaml.SequenceNode) -> list[object]:
     return list(loader.construct_sequence(node))
 
 
-class _WithTuples(yaml.SafeLoader):
+class _WithTuples(LOADER):  # type: ignore[misc]
     """Reads ``!!python/tuple`` as a list."""
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.stores.bounded import read_at_most
 
 __all__ = ["FILE_MAX_BYTES", "pinned", "read_requirements"]
 
@@ -50,7 +51,7 @@ def read_requirements(path: Path) -> bytes:
     """
     try:
         with path.open("rb") as file:
-            raw = file.read(FILE_MAX_BYTES + 1)
+            raw = read_at_most(file, FILE_MAX_BYTES)
         text = raw.decode()
     except OSError as error:
         raise LocalError(f"{path}: {error.strerror}") from error

@@ -37,6 +37,7 @@ class Needs:
         tcp_ports: on which it listens, and it connects to none by TCP; None: any.
         starts_programs: whether it starts some; they get no capability.
         spared_calls: system calls of ``seccomp.denied`` that it makes.
+        only_reads: it opens no socket, starts no process or thread, sends no signal, and marks no file.
     """
 
     capabilities: frozenset[Capability] = frozenset()
@@ -45,6 +46,7 @@ class Needs:
     tcp_ports: tuple[int, ...] | None = None
     starts_programs: bool = False
     spared_calls: frozenset[str] = frozenset()
+    only_reads: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +83,7 @@ def confine(needs: Needs) -> Rights:
     try:
         prctl(_NO_NEW_PRIVS, 1)
         version = landlock.restrict(needs.writes, needs.reads, needs.tcp_ports, may_execute=needs.starts_programs)
-        has_filter = seccomp.refuse(needs.spared_calls)
+        has_filter = seccomp.refuse(needs.spared_calls, is_reader=needs.only_reads)
     except OSError as error:
         log.warning("rights kept reason=%s landlock=%d seccomp=%s", error.strerror, version, has_filter)
     try:

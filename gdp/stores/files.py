@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.stores.bounded import read_at_most
 from gdp.stores.ownership import refuse_foreign_file, refuse_shared_folder
 
 __all__ = ["FILE_MAX_BYTES", "NewFile", "private", "public", "read_private", "read_public", "refuse_existing"]
@@ -127,7 +128,7 @@ def _read(path: Path, *, is_private: bool = False) -> bytes:
             if is_private:
                 refuse_foreign_file(path, os.fstat(file.fileno()))
                 refuse_shared_folder(path.parent)
-            data = file.read(FILE_MAX_BYTES + 1)
+            data = read_at_most(file, FILE_MAX_BYTES)
     except OSError as error:
         if is_private and error.errno == errno.ELOOP:
             raise LocalError(f"{path}: is a link; name the private file itself") from error

@@ -26,6 +26,7 @@ from rosbags.rosbag2.metadata import parse_qos
 from ruamel.yaml.error import YAMLError
 
 from gdp.errors import LocalError
+from proxy.endpoints.plain_yaml import load_plain
 from proxy.endpoints.unpacking import SalvageError
 from proxy.serial.channel import Channel, DefinitionFormat, Qos
 from proxy.serial.standard import standard_definition, type_hash
@@ -106,6 +107,8 @@ def offered_qos(profiles: object) -> list[RosbagsQos]:
     """
     if isinstance(profiles, str) and len(profiles) > _QOS_TEXT_MAX:
         raise SalvageError(f"QoS profiles of {len(profiles)} characters")
+    if isinstance(profiles, str):
+        profiles = load_plain(profiles)
     try:
         return parse_qos(profiles)  # type: ignore[arg-type]
     except (ReaderError, YAMLError, ArithmeticError, AttributeError, LookupError, RecursionError) as error:

@@ -1,68 +1,34 @@
-"""Read a recording: ROS 1 bag, sqlite3, MCAP, alone or as a rosbag2 folder; also one that ends in the middle.
+"""Reader of a recording that anyone may have made: a process without rights decodes it, within limits.
 
-Place: I/O, reading only. What is whole is read by rosbags; what is not, by a walk from its beginning (``salvage_*``).
-Errors: a recording that cannot be read at all raises ``ConfigError`` naming the file and why; a loss is reported in
-``unread``.
+Place: I/O, through that process. What it says is checked like the recording: a decoder that was taken over can give
+wrong messages, as the recording could, and no more. The pipe bounds how far it works ahead.
+Errors: a recording that cannot be read raises ``ConfigError`` naming the file and why; a decoder that ends before its
+work, or falls silent, raises ``RecordingError``.
 """
 
 from __future__ import annotations
 
-import struct
-import sys
+import contextlib
+import stat
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Final
 
-import apsw
-from rosbags.interfaces import Connection
-from rosbags.rosbag1 import Reader as Reader1
-from rosbags.rosbag1 import ReaderError as ReaderError1
-from rosbags.rosbag2 import Reader as Reader2
-from rosbags.rosbag2 import ReaderError as ReaderError2
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
-
-from gdp.errors import ConfigError, LocalError
-from proxy.endpoints import salvage_mcap, salvage_ros1, salvage_sqlite
-from proxy.endpoints.bag_channel import from_connection
-from proxy.endpoints.bag_source import Message, Source
-from proxy.endpoints.joined import JoinedSource
-from proxy.endpoints.sqlite_guard import guarded
-from proxy.endpoints.unpacked import UnpackedSource
-from proxy.endpoints.unpacking import bound_rosbags, check_file
+from gdp.errors import ConfigError, LocalError, RemoteError
+from proxy.endpoints.bag_limits import BagLimits
+from proxy.endpoints.bag_process import BagProcess, Cost, RecordingError, StoppedError
+from proxy.endpoints.bag_source import Message
+from proxy.endpoints.bag_stream import FailedError, FrameReader, RefusedError
+from proxy.endpoints.unpacking import file_max_bytes
+from proxy.printable import printable
 from proxy.serial.channel import Channel
-from proxy.serial.schema import DefinitionError, UnparsedError, parse
-
-if sys.version_info >= (3, 14):
-    from compression import zstd
-else:
-    from backports import zstd
 
 __all__ = ["BagReader"]
 
-# What rosbags and the libraries under it raise for a file that is not as it should be.
-_FOREIGN: Final = (
-    ReaderError1,
-    ReaderError2,
-    OSError,
-    EOFError,
-    ValueError,
-    LookupError,
-    TypeError,
-    AssertionError,
-    RuntimeError,
-    ArithmeticError,
-    AttributeError,
-    MemoryError,
-    YAMLError,
-    LocalError,
-    struct.error,
-    apsw.Error,
-    zstd.ZstdError,
-)
-_METADATA_MAX_BYTES: Final = 1 << 20
-_STORAGE: Final = ("*.mcap", "*.db3")
+_SQLITE: Final = b"SQLite format 3\0"
+_Waiting = Callable[[], bool]
 
 
 class BagReader:
@@ -70,51 +36,70 @@ class BagReader:
 
     Args:
         path: a ``.bag``, ``.mcap`` or ``.db3`` file, or a rosbag2 folder.
+        limits: what its decoder may take.
+
+    Attributes:
+        count: messages that ``messages`` will give, as far as known before.
+        counts: messages of each channel; None where the recording has no index that says it.
+        unread: why some messages could not be read, and about how many; empty where all could. Final after
+            ``messages``.
 
     Raises:
         ConfigError: it cannot be read.
+        RecordingError: its decoder failed.
     """
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(self, path: Path | str, limits: BagLimits | None = None) -> None:
         self.path = Path(path)
-        try:
-            self._source = _open(self.path)
-        except _FOREIGN as error:
-            raise ConfigError(str(self.path), "", f"cannot be read: {_reason(error)}") from error
-        try:
-            for channel in self._source.channels:
-                _check(self.path, channel)
-        except ConfigError:
-            self._source.close()
-            raise
+        self.unread = ""
+        self._frames = FrameReader()
+        self._is_stopped = False
+        with contextlib.ExitStack() as stack:
+            try:
+                size = _bytes_of(self.path)
+                scratch = _scratch(self.path, stack)
+            except OSError as error:
+                raise ConfigError(str(self.path), "", f"cannot be read: {error.strerror}") from error
+            self._process = BagProcess(self.path, _cost(limits or BagLimits(), size), scratch)
+            stack.callback(self._process.close)
+            with self._checked():
+                self.count, self.counts = self._frames.open(self._process.take)
+            self._stack = stack.pop_all()
 
     @property
     def channels(self) -> list[Channel]:
         """Every topic of every publisher, in the recording's order."""
-        return self._source.channels
+        return self._frames.channels
 
-    @property
-    def count(self) -> int:
-        """Messages that ``messages`` will give, as far as known before."""
-        return self._source.count
+    def messages(self, waiting: _Waiting | None = None) -> Iterator[Message]:
+        """Yield (channel index, stamp in ns, bytes) in time order; a file that ends early is no error.
 
-    @property
-    def counts(self) -> list[int] | None:
-        """Messages of each channel; None where the recording has no index that says it."""
-        return self._source.counts if isinstance(self._source, _IndexedSource) else None
+        One iterator at a time: the next one uses up what an earlier one left.
 
-    @property
-    def unread(self) -> str:
-        """Why some messages could not be read, and about how many; empty where all could. Final after ``messages``."""
-        return self._source.unread
+        Args:
+            waiting: called some times a second while the decoder works; returns whether to go on. After a no, the
+                recording gives nothing more.
 
-    def messages(self) -> Iterator[Message]:
-        """Yield (channel index, stamp in ns, bytes) in time order; never raises for a file that ends early."""
-        return self._source.messages()
+        Raises:
+            ConfigError, RecordingError: the decoder failed.
+        """
+        if self._is_stopped:
+            return
+
+        def take(size: int) -> bytes:
+            return self._process.take(size, waiting)
+
+        try:
+            with self._checked():
+                self._frames.skip(take)
+                self._process.ask()
+                self.unread = printable((yield from self._frames.messages(take)))
+        except StoppedError:
+            self._is_stopped = True
 
     def close(self) -> None:
-        """Close the files."""
-        self._source.close()
+        """End the decoder."""
+        self._stack.close()
 
     def __enter__(self) -> BagReader:
         return self
@@ -124,137 +109,42 @@ class BagReader:
     ) -> None:
         self.close()
 
-
-def _check(path: Path, channel: Channel) -> None:
-    """Refuse a definition that cannot be read; one that is absent or unusual only makes its messages opaque."""
-    try:
-        parse(channel.type_name, channel.definition, channel.definition_format, channel.ros)
-    except UnparsedError as error:
-        raise ConfigError(str(path), "", f"cannot be read: topic {channel.topic}: {error}") from error
-    except DefinitionError:
-        return
-
-
-def _reason(error: BaseException) -> str:
-    text = str(error.strerror) if isinstance(error, OSError) and error.strerror else str(error)
-    return " ".join(text.split())[:300] or type(error).__name__
-
-
-def _open(path: Path) -> Source:
-    if path.is_dir():
-        return _open_folder(path)
-    with path.open("rb") as file:
-        magic = file.read(16)
-    if not magic:
-        raise LocalError("the file is empty")
-    if magic.startswith(b"#ROSBAG"):
-        return _open_ros1(path)
-    if magic.startswith(salvage_mcap.MAGIC):
-        if path.suffix == ".mcap" and salvage_mcap.is_indexed(path):
-            return _Rosbag2Source(path)
-        return salvage_mcap.scan(path)
-    if magic.startswith(salvage_sqlite.MAGIC):
-        if path.suffix == ".db3" and salvage_sqlite.is_whole(path):
-            return _Rosbag2Source(path)
-        return salvage_sqlite.SqliteSource(path)
-    raise LocalError("neither a ROS 1 bag nor MCAP nor sqlite3")
-
-
-def _open_folder(path: Path) -> Source:
-    storage = sorted(file for pattern in _STORAGE for file in path.glob(pattern))
-    compression = _compression(path / "metadata.yaml")
-    if compression == "message":  # each one is unpacked here, within bounds
-        return UnpackedSource(JoinedSource([_open(file) for file in storage]))
-    if compression == "file":
-        for file in path.glob("*.zstd"):
-            check_file(file)
-    if (path / "metadata.yaml").exists() and all(map(_is_whole, storage)):
-        return _Rosbag2Source(path)
-    if not storage:
-        raise LocalError("the folder has neither metadata.yaml nor a storage file")
-    return JoinedSource([_open(file) for file in storage])
-
-
-def _compression(metadata: Path) -> str:
-    """Return what a folder says of its compression: ``message``, ``file``, or anything else for none."""
-    if not metadata.exists():
-        return ""
-    if metadata.stat().st_size > _METADATA_MAX_BYTES:
-        raise LocalError(f"{metadata.name} has more than {_METADATA_MAX_BYTES} bytes")
-    match YAML(typ="safe").load(metadata.read_text()):
-        case {"rosbag2_bagfile_information": {"compression_mode": str(mode)}}:
-            return mode.lower()
-    return ""
-
-
-def _is_whole(storage: Path) -> bool:
-    if storage.suffix == ".mcap":
-        return salvage_mcap.is_indexed(storage)
-    return salvage_sqlite.is_whole(storage)
-
-
-def _open_ros1(path: Path) -> Source:
-    try:
-        return _Rosbag1Source(path)
-    except _FOREIGN:
-        return salvage_ros1.scan(path)  # no index, or one that the file ends in
-
-
-class _IndexedSource:
-    """A recording whose index rosbags can read."""
-
-    def __init__(self, connections: list[Connection], count: int) -> None:
-        self.channels = [from_connection(connection) for connection in connections]
-        self.count = count
-        self.counts = [connection.msgcount for connection in connections]
-        self.unread = ""
-        self._index = {_key(connection): index for index, connection in enumerate(connections)}
-
-    def _messages(self, read: Callable[[], Iterator[tuple[Connection, int, bytes]]]) -> Iterator[Message]:
-        given = 0
+    @contextlib.contextmanager
+    def _checked(self) -> Iterator[None]:
+        """Turn what the decoder says of its end, and what it says wrongly, into errors that name the recording."""
         try:
-            for connection, stamp_ns, raw in read():
-                if isinstance(raw, int | str):
-                    raise ReaderError2("a message that is not bytes")
-                yield Message(self._index[_key(connection)], stamp_ns, bytes(raw))
-                given += 1
-        except _FOREIGN as error:
-            self.unread = f"after {given} of {self.count} messages: {_reason(error)}"
-
-
-class _Rosbag1Source(_IndexedSource):
-    def __init__(self, path: Path) -> None:
-        self._reader = Reader1(path)
-        self._reader.open()
-        super().__init__(self._reader.connections, self._reader.message_count)
-
-    def messages(self) -> Iterator[Message]:
-        return self._messages(self._reader.messages)
-
-    def close(self) -> None:
-        self._reader.close()
-
-
-class _Rosbag2Source(_IndexedSource):
-    def __init__(self, path: Path) -> None:
-        self._reader = Reader2(path)
-        with guarded():
-            self._reader.open()
-        try:
-            super().__init__(self._reader.connections, self._reader.message_count)
-        except _FOREIGN:
-            self._reader.close()
+            yield
+        except RefusedError as error:
+            raise ConfigError(str(self.path), "", printable(str(error))) from error
+        except FailedError as error:
+            why = printable(str(error))
+            if not why:
+                raise self._process.lacks("memory") from error
+            raise RecordingError(self.path, f"its decoder failed: {why}") from error
+        except RecordingError:
             raise
-
-    def messages(self) -> Iterator[Message]:
-        return self._messages(self._reader.messages)
-
-    def close(self) -> None:
-        self._reader.close()
+        except (LocalError, RemoteError) as error:
+            raise RecordingError(self.path, f"its decoder said what makes no sense: {error}") from error
 
 
-bound_rosbags()
+def _cost(limits: BagLimits, size: int) -> Cost:
+    return Cost(limits.memory_for(size), limits.cpu_s_for(size), limits.wait_s_for(size), file_max_bytes(size))
 
 
-def _key(connection: Connection) -> tuple[int, str]:
-    return connection.id, connection.topic
+def _bytes_of(path: Path) -> int:
+    """Return the length of a recording's files."""
+    found = path.stat()
+    if stat.S_ISDIR(found.st_mode):
+        return sum(entry.stat().st_size for entry in path.iterdir() if entry.is_file())
+    if not stat.S_ISREG(found.st_mode):
+        raise ConfigError(str(path), "", "cannot be read: neither a file nor a folder")
+    return found.st_size
+
+
+def _scratch(path: Path, stack: contextlib.ExitStack) -> Path | None:
+    """Return a folder for copies, where the decoder may need some: of databases, and of compressed files."""
+    if not path.is_dir():
+        with path.open("rb") as file:
+            if file.read(len(_SQLITE)) != _SQLITE:
+                return None
+    return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gdp-recording-")))

@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 from urllib.parse import quote
 
 import apsw
@@ -42,7 +42,10 @@ def _missing_bytes(path: Path) -> int:
     return max(0, size * count - path.stat().st_size)
 
 
-def _whole_pages(path: Path) -> tuple[tempfile.TemporaryDirectory[str] | None, Path]:
+_Copy: TypeAlias = "tempfile.TemporaryDirectory[str] | None"
+
+
+def _whole_pages(path: Path) -> tuple[_Copy, Path]:
     """Return a copy without the last, broken page, which SQLite would fill up with zeros and take for data."""
     size, _ = _pages(path)
     whole = path.stat().st_size // max(1, size) * size
@@ -52,6 +55,17 @@ def _whole_pages(path: Path) -> tuple[tempfile.TemporaryDirectory[str] | None, P
     copy = Path(folder.name) / path.name
     shutil.copyfile(path, copy)
     os.truncate(copy, whole)
+    return folder, copy
+
+
+def _with_index(path: Path) -> tuple[_Copy, Path]:
+    """Return a copy of a database and its journal where the index of that is not there: SQLite would write it."""
+    if not _journal(path).exists() or path.with_name(path.name + "-shm").exists():
+        return None, path
+    folder = tempfile.TemporaryDirectory(prefix="journal-")
+    copy = Path(folder.name) / path.name
+    shutil.copyfile(path, copy)
+    shutil.copyfile(_journal(path), _journal(copy))
     return folder, copy
 
 
@@ -80,8 +94,8 @@ class SqliteSource:
         self._tally = Tally()
         self._tally.missing_bytes = _missing_bytes(path)
         self._tally.walked_bytes = path.stat().st_size
-        self._copy, file = _whole_pages(path) if self._tally.missing_bytes else (None, path)
-        mode = "mode=ro" if _journal(path).exists() and file == path else "immutable=1"
+        self._copy, file = _whole_pages(path) if self._tally.missing_bytes else _with_index(path)
+        mode = "mode=ro" if _journal(file).exists() else "immutable=1"
         flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
         try:
             self._db = apsw.Connection(f"file:{quote(str(file))}?{mode}", flags=flags)

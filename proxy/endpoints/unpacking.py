@@ -6,12 +6,16 @@ Layer: I/O, reading only. rosbags decompresses without a bound; ``bound_rosbags`
 from __future__ import annotations
 
 import bz2
+import os
 import sys
+from io import BytesIO
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final
 
 from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
+from rosbags.rosbag1 import ReaderError as ReaderError1
 from rosbags.rosbag1 import reader as rosbag1_reader
+from rosbags.rosbag2 import ReaderError as ReaderError2
 from rosbags.rosbag2 import storage_mcap
 
 from gdp.errors import LocalError
@@ -21,10 +25,11 @@ if sys.version_info >= (3, 14):
 else:
     from backports import zstd
 
-__all__ = ["CHUNK_MAX_BYTES", "SalvageError", "bound_rosbags", "check_file", "unpack"]
+__all__ = ["CHUNK_MAX_BYTES", "SalvageError", "bound_rosbags", "check_file", "file_max_bytes", "unpack"]
 
 CHUNK_MAX_BYTES: Final = 64 << 20  # unpacked; more than twice the largest message that can travel
 _FILE_RATIO_MAX: Final = 100  # unpacked bytes for each byte of a compressed file, beside the first 64 MiB
+_ASKED_BYTES: Final = 4 << 10  # may be asked for without a look at the file's length
 _WINDOW_LOG_MAX: Final = 26  # memory of a zstd decoder: 64 MiB
 
 
@@ -65,6 +70,11 @@ def unpack(compression: str, data: bytes, size: int | None = None) -> bytes:
     return unpacked
 
 
+def file_max_bytes(size: int) -> int:
+    """Return how long a file may become that is unpacked from ``size`` bytes."""
+    return CHUNK_MAX_BYTES + _FILE_RATIO_MAX * size
+
+
 def check_file(path: Path) -> None:
     """Refuse a file of zstd that would fill the disk: one that unpacks to more than any recording does.
 
@@ -72,7 +82,7 @@ def check_file(path: Path) -> None:
         SalvageError: it does, or is no zstd.
         OSError: it cannot be read.
     """
-    limit = CHUNK_MAX_BYTES + _FILE_RATIO_MAX * path.stat().st_size
+    limit = file_max_bytes(path.stat().st_size)
     count = 0
     try:
         with zstd.open(path, "rb") as file:
@@ -85,8 +95,33 @@ def check_file(path: Path) -> None:
 
 
 def bound_rosbags() -> None:
-    """Have rosbags unpack within the same bounds."""
+    """Have rosbags unpack within the same bounds, and read no record that is longer than its file."""
+    rosbag1_reader.read_bytes = _read_bytes
+    storage_mcap.read_exact = _read_exact
     storage_mcap.DECOMPRESSORS["lz4"] = lambda data, size: unpack("lz4", data, size)
     storage_mcap.DECOMPRESSORS["zstd"] = lambda data, size: unpack("zstd", data, size)
     rosbag1_reader.decompressors["bz2"] = lambda data: unpack("bz2", data)
     rosbag1_reader.decompressors["lz4"] = lambda data: unpack("lz4", data)
+
+
+def _read_bytes(src: BinaryIO, size: int) -> bytes:
+    """Read so many bytes of a ROS 1 bag, or of a chunk."""
+    data = _read_there(src, size)
+    if len(data) != size:
+        raise ReaderError1(f"a record of {size} bytes is longer than what holds it")
+    return data
+
+
+def _read_exact(bio: BinaryIO, size: int) -> bytes:
+    """Read so many bytes of an MCAP file, or of a chunk."""
+    data = _read_there(bio, size)
+    if len(data) != size:
+        raise ReaderError2(f"a record of {size} bytes is longer than what holds it")
+    return data
+
+
+def _read_there(file: BinaryIO, size: int) -> bytes:
+    """Read at most so many bytes; a file reserves memory for what is asked for, also beyond its end."""
+    if size > _ASKED_BYTES and not isinstance(file, BytesIO):
+        size = max(0, min(size, os.fstat(file.fileno()).st_size - file.tell()))
+    return file.read(size)

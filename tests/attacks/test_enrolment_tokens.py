@@ -140,13 +140,13 @@ def test_a52_a_token_admits_one_machine_as_it_was_planned(desk: Desk) -> None:
     machine = Machine(desk.ticket())
     request = machine.request()
     got = members(desk, machine, request, asked(desk, request))
-    assert [(each.role, each.label) for each in got] == [(Role.SWITCH, "c-m7"), (Role.PROXY, "c-m7")]
+    assert [(each.role, each.label) for each in got] == [(Role.LEAF, "c-m7"), (Role.PROXY, "c-m7")]
     assert all(each.not_after_unix_s <= time.time() + 86_401 for each in got)
     (news,) = desk.tickets.news()
     assert news.report is Report.ENROLLED
     assert news.papers is not None
     assert news.papers.fingerprints == tuple(each.fingerprint.hex() for each in got)
-    assert verify_audit(desk.authority.domain).events["accepted", "membership switch"] == 1
+    assert verify_audit(desk.authority.domain).events["accepted", "membership leaf"] == 1
 
 
 def test_a52_who_uses_a_token_after_the_machine_gets_nothing_and_is_reported(desk: Desk) -> None:
@@ -252,6 +252,14 @@ def test_a52_a_machine_becomes_nothing_but_what_was_planned(desk: Desk, role: Ro
     before = (desk.authority.domain / "issued.jsonl").exists()
     assert asked(desk, machine.request()) == REFUSED
     assert (desk.authority.domain / "issued.jsonl").exists() == before
+    assert reports(desk.tickets) == [Report.MISUSED]
+
+
+@pytest.mark.parametrize("role", [Role.SWITCH, Role.RIB])
+def test_l09_a_machine_that_is_to_be_a_leaf_becomes_no_switch(desk: Desk, role: Role) -> None:
+    ticket = desk.ticket()
+    proxy = NodeKeys.generate(ticket.seats[1].role, ticket.seats[1].label)
+    assert asked(desk, Machine(ticket, [NodeKeys.generate(role, ticket.seats[0].label), proxy]).request()) == REFUSED
     assert reports(desk.tickets) == [Report.MISUSED]
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sqlite3
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -17,6 +19,8 @@ from fog.launch.load import load
 from fog.providers.local.machine_file import MachineFile
 from fog.supervisor.journal import Journal
 from gdp.errors import ConfigError, GdpError, LocalError, StoreError
+from gdp.nodes.yaml_source import read_yaml
+from tests.attacks.work import lines_run
 
 DEEP = b"[" * 200_000
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
@@ -44,7 +48,7 @@ def test_a59_a_parameter_file_that_unrolls_is_refused_with_its_line(tmp_path: Pa
         (b"n: {ros__parameters: {a: 0x" + b"f" * 20_000 + b"}}", "64 bits"),
         (b"n: {ros__parameters: {a: " + b"9" * 20_000 + b"}}", "YAML is expected|64 bits"),
         (b'n: {ros__parameters: {"a\\0": 1}}', "zero byte"),
-        (b'n: {ros__parameters: {a: "\\ud800"}}', "surrogate"),
+        (b'n: {ros__parameters: {a: "\\ud800"}}', "surrogate|invalid Unicode"),
     ],
     ids=["long", "bytes", "syntax", "date", "deep", "hex", "digits", "zero", "surrogate"],
 )
@@ -132,3 +136,25 @@ def test_a_journal_that_is_no_database_is_named(tmp_path: Path) -> None:
     path.write_bytes(json.dumps({"a": 1}).encode() * 100)
     with pytest.raises(GdpError, match=str(path)):
         Journal(path)
+
+
+def test_b09_a_short_configuration_takes_little_memory(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text("a: 1\n")
+    read_yaml(path)
+    tracemalloc.start()
+    try:
+        read_yaml(path)
+        assert tracemalloc.get_traced_memory()[1] < 128 << 10
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("opening", ["[", "{", "[a,", "- "])
+def test_b08_a_configuration_of_nothing_but_openings_costs_little(tmp_path: Path, opening: str) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text(opening * (8_000 // len(opening)))
+    with lines_run(100_000), contextlib.suppress(ConfigError):
+        read_yaml(path)
+    with lines_run(100_000), contextlib.suppress(LocalError):
+        parameters_in(path, "n", "/")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+import contextlib
 import functools
 import sqlite3
 import struct
@@ -18,7 +19,8 @@ from rosbags.rosbag2 import storage_mcap
 from rosbags.rosbag2.reader import zstd
 
 from gdp.errors import ConfigError, LocalError
-from proxy.endpoints.bag import BagReader
+from proxy.endpoints.bag_channel import offered_qos
+from proxy.endpoints.bag_decoder import BagDecoder
 from tests.attacks.work import lines_run
 
 BOMB_BYTES = 320 << 20
@@ -93,7 +95,7 @@ def memory_of(work: Callable[[], Any]) -> int:
 def read(path: Path) -> int:
     """Return how many messages a recording gives, -1 where it is refused."""
     try:
-        with BagReader(path) as bag:
+        with BagDecoder(path) as bag:
             return sum(1 for _ in bag.messages())
     except ConfigError:
         return -1
@@ -140,7 +142,7 @@ def test_a28_a_folder_of_compressed_messages_or_files_unpacks_within_bounds(tmp_
         connection.execute("INSERT INTO messages VALUES (1, 1, 1, ?)", (bomb,))
         connection.execute("INSERT INTO messages VALUES (2, 1, 2, ?)", (zstd.compress(b"abcd"),))
     connection.close()
-    with BagReader(path) as bag:
+    with BagDecoder(path) as bag:
         messages = list(bag.messages())
         assert [message.raw for message in messages] == [b"abcd"]
         assert "more than" in bag.unread
@@ -149,7 +151,7 @@ def test_a28_a_folder_of_compressed_messages_or_files_unpacks_within_bounds(tmp_
     (path / "metadata.yaml").write_text(about.format("FILE"))
     (path / "f_0.db3.zstd").write_bytes(bomb)
     with pytest.raises(ConfigError, match="unpacks to more"):
-        BagReader(path)
+        BagDecoder(path)
 
 
 @pytest.mark.parametrize("suffix", [".db3", ".db"])
@@ -168,7 +170,7 @@ def test_a29_a_database_with_views_or_virtual_tables_is_refused(
 ) -> None:
     path = database(tmp_path / f"a{suffix}", *statements)
     with pytest.raises(ConfigError, match=r"cannot be read"):
-        BagReader(path)
+        BagDecoder(path)
 
 
 @pytest.mark.parametrize("suffix", [".db3", ".db"])
@@ -210,3 +212,36 @@ def test_a66_qos_that_is_no_yaml_of_ours_is_refused_as_a_recording(tmp_path: Pat
         connection.execute("INSERT INTO topics VALUES (1, '/t', 'a/msg/B', 'cdr', ?)", (qos,))
     connection.close()
     assert read(path) in (0, -1)
+
+
+@pytest.mark.parametrize("opening", ["[", "{", "- ", "[&a ", "? "])
+def test_b08_qos_of_nothing_but_openings_costs_little(opening: str) -> None:
+    with lines_run(30_000), contextlib.suppress(LocalError):
+        offered_qos(opening * (8_000 // len(opening)))
+
+
+def test_b08_metadata_of_nothing_but_openings_cost_little(tmp_path: Path) -> None:
+    (tmp_path / "metadata.yaml").write_text("[" * 8_000)
+    database(tmp_path / "a_0.db3", TOPICS, MESSAGES)
+    with lines_run(30_000):
+        assert read(tmp_path) == -1
+
+
+@pytest.mark.parametrize("suffix", ["bag", "mcap"])
+def test_b09_a_record_that_is_longer_than_its_file_reserves_no_memory(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a.{suffix}"
+    if suffix == "bag":
+        head = b"op=\3"
+        fields = b"".join(
+            struct.pack("<I", len(each)) + each
+            for each in (head, b"index_pos=" + struct.pack("<Q", 13), b"conn_count=\1\0\0\0", b"chunk_count=\1\0\0\0")
+        )
+        path.write_bytes(b"#ROSBAG V2.0\n" + text(fields) + struct.pack("<I", 0xFFFFFFF0) + bytes(100))
+        data = bytearray(path.read_bytes())
+        at = data.index(b"index_pos=") + 10
+        data[at : at + 8] = struct.pack("<Q", len(data) - 104)  # the index begins with a record of 4 GB
+        path.write_bytes(data)
+    else:
+        footer = record(2, struct.pack("<QQI", 8, 0, 0))
+        path.write_bytes(MAGIC + struct.pack("<BQ", 1, 1 << 31) + bytes(100) + footer + MAGIC)
+    assert memory_of(lambda: read(path)) < 1 << 20

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import sqlite3
 import tempfile
@@ -15,13 +16,16 @@ from fog.launch.cloud_node import parameters_in
 from fog.providers.local.machine_file import MachineFile
 from fog.supervisor.journal import Journal
 from gdp.crypto.pbes2 import SECRET_LABEL, _parts, protect
-from gdp.errors import ConfigError, LocalError, StoreError
+from gdp.errors import ConfigError, LocalError, RemoteError, StoreError
 from gdp.nodes.config import SwitchConfig
 from gdp.nodes.yaml_source import read_yaml
 from gdp.stores.token_uri import TokenUri
 from proxy.config import ProxyConfig
-from proxy.endpoints.bag import BagReader, BagWriter
+from proxy.endpoints.bag import BagWriter
 from proxy.endpoints.bag_channel import offered_qos
+from proxy.endpoints.bag_decoder import BagDecoder
+from proxy.endpoints.bag_source import Message
+from proxy.endpoints.bag_stream import FrameReader, Kind, frame_head, message_head, opened_to
 from proxy.serial.channel import Channel
 from tests.fuzzing.decoder import Decoder
 
@@ -50,7 +54,7 @@ def _in_file(name: str, read: Callable[[Path], object]) -> Callable[[bytes], obj
 
 
 def _bag(path: Path) -> object:
-    with BagReader(path) as bag:
+    with BagDecoder(path) as bag:
         return sum(len(message.raw) for message in bag.messages())
 
 
@@ -68,6 +72,18 @@ def _journal(path: Path) -> object:
         return [journal.clusters(), journal.events(), [journal.machines(each.plan.name) for each in journal.clusters()]]
     finally:
         journal.close()
+
+
+def _frames(data: bytes) -> object:
+    pipe = io.BytesIO(data)
+
+    def take(size: int) -> bytes:
+        if len(piece := pipe.read(min(size, len(data)))) < size:
+            raise LocalError("the pipe is closed")
+        return piece
+
+    reader = FrameReader()
+    return reader.open(take), sum(len(message.raw) for message in reader.messages(take))
 
 
 def _qos(data: bytes) -> object:
@@ -118,6 +134,13 @@ _METADATA: Final = b"""rosbag2_bagfile_information:
   topics_with_message_count:
     - {topic_metadata: {name: /t, type: a/msg/B, serialization_format: cdr, offered_qos_profiles: ""}, message_count: 0}
 """
+_PARTS: Final = (
+    (Kind.CHANNEL, Channel("/t", "a/msg/B", 2, "", "int8 a\n", "msg").to_wire()),
+    (Kind.OPENED, opened_to(2, [2])),
+    (Kind.BLOCK, b"".join(message_head(Message(0, at, b"abc")) + b"abc" for at in range(2))),
+    (Kind.END, b"the file ends"),
+)
+_FRAMES: Final = b"".join(frame_head(kind, len(data)) + data for kind, data in _PARTS)
 _PROGRAMS: Final = json.dumps({"programs": [{"name": "a", "argv": ["b"], "environment": {}}]}).encode()
 _PLAN: Final = json.dumps({"name": "a", "nodes": [], "machines": [], "carried": []}).encode()
 _MACHINE: Final = json.dumps({"spec": {"offer": {"hardware": {}}}, "started_unix_s": 1, "gateway": ""}).encode()
@@ -131,6 +154,7 @@ DECODERS: Final = (
     Decoder("db3", _in_file("a.db3", _bag), (_database(),), _REFUSED, _SQLITE),
     Decoder("db3-scan", _in_file("a.dat", _bag), (_database(),), _REFUSED, _SQLITE),
     Decoder("bag-folder", _in_file("metadata.yaml", _folder), (_METADATA,), _REFUSED, _YAML, size_max=_TEXT_MAX),
+    Decoder("bag-stream", _frames, (_FRAMES,), (LocalError, RemoteError)),
     Decoder("qos", _qos, (_QOS,), (LocalError,), _YAML, size_max=_TEXT_MAX),
     Decoder("yaml", _in_file("a.yaml", read_yaml), (_CONFIG,), _REFUSED, _YAML, size_max=_TEXT_MAX),
     Decoder("proxy-config", _in_file("p.yaml", ProxyConfig.load), (_CONFIG,), _REFUSED, _YAML, size_max=_TEXT_MAX),

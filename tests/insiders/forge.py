@@ -616,7 +616,7 @@ class Forge:
         header = self._header(rng, kind, self._name(rng), source, len(payload))
         return [encode(header._replace(hops_left=rng.choice((0, 1, 2, HOPS_MAX, 255)))) + payload]
 
-    def _echo(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
+    def _echo_request(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
         source = rng.choice((self._stage.identity(persona).name, self._name(rng)))
         payload = bytes(rng.choice((0, 100, 1_300)))
         to = rng.choice((self._switch_at(rng, place), self._name(rng)))
@@ -733,7 +733,7 @@ _SPOKEN: Final = tuple(each for each in _BODIES for _ in range(1 if each in _RAR
 _FRAMES: Final[tuple[tuple[str, Callable[[Forge, random.Random, Persona, Place], list[bytes]]], ...]] = (
     ("keepalive", Forge._keepalive),
     ("frame", Forge._miss),
-    ("echo", Forge._echo),
+    ("echo", Forge._echo_request),
     ("note", Forge._report),
     ("status", Forge._status),
     ("data", Forge._data),

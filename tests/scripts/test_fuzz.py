@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from tests.fuzzing.decoder import Decoder
+from tests.fuzzing.record import Tried, add
 from tests.fuzzing.registry import DECODERS
-from tests.fuzzing.runner import corpus_of, fuzz
+from tests.fuzzing.runner import Outcome, corpus_of, fuzz
 from tests.pages import ROOT
 
 SCRIPT = ROOT / "scripts" / "fuzz.py"
@@ -64,3 +65,11 @@ def test_the_script_ends_with_a_table(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     assert "2 decoders, 0 with a foreign exception" in done.stdout
     assert "Examples" in run("--help").stdout
+
+
+def test_executions_of_several_runs_add_up(tmp_path: Path) -> None:
+    path = tmp_path / "executions.json"
+    first, second = Outcome(DECODERS[0], 10, 1, 0, 3.0, 0.5), Outcome(DECODERS[0], 5, 0, 1, 2.0, 1.5)
+    add([first], path)
+    assert add([second], path) == {DECODERS[0].name: Tried(15, 1, 3.0, 1.5)}
+    assert add([], path) == {DECODERS[0].name: Tried(15, 1, 3.0, 1.5)}

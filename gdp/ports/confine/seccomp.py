@@ -1,4 +1,4 @@
-"""seccomp: system calls that no node makes once it is up, refused with EPERM.
+"""seccomp: system calls that no node makes once it is up, or that a mere reader of files does not, refused with EPERM.
 
 Place: I/O. Source: seccomp(2); include/uapi/linux/seccomp.h, filter.h, audit.h. A deny list, for ROS middleware and
 Python's libraries differ in what they call. Calls of another architecture (32 bit, x32) are refused altogether.
@@ -15,7 +15,7 @@ from typing import Final
 
 from gdp.ports.confine.system import call
 
-__all__ = ["denied", "refuse"]
+__all__ = ["READER", "denied", "refuse"]
 
 _FILTER, _TSYNC = 1, 1  # SECCOMP_SET_MODE_FILTER, SECCOMP_FILTER_FLAG_TSYNC
 _LOAD, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x15, 0x35, 0x06  # BPF_LD|W|ABS, JMP|JEQ|K, JMP|JGE|K, RET|K
@@ -72,24 +72,72 @@ _NUMBERS: Final = {  # of x86_64, of aarch64
     "unshare": (272, 97),
     "userfaultfd": (323, 282),
 }
+_READER: Final = {  # network, processes, signals, memory beyond its limit, marks of files, which Landlock leaves open
+    "chmod": (90, None),
+    "chown": (92, None),
+    "clone": (56, 220),
+    "clone3": (435, 435),
+    "connect": (42, 203),
+    "execve": (59, 221),
+    "execveat": (322, 281),
+    "fchmod": (91, 52),
+    "fchmodat": (268, 53),
+    "fchmodat2": (452, 452),
+    "fchown": (93, 55),
+    "fchownat": (260, 54),
+    "fork": (57, None),
+    "fremovexattr": (199, 16),
+    "fsetxattr": (190, 7),
+    "futimesat": (261, None),
+    "kill": (62, 129),
+    "lchown": (94, None),
+    "lremovexattr": (198, 15),
+    "lsetxattr": (189, 6),
+    "memfd_create": (319, 279),
+    "memfd_secret": (447, 447),
+    "mq_open": (240, 180),
+    "msgget": (68, 186),
+    "pidfd_open": (434, 434),
+    "pidfd_send_signal": (424, 424),
+    "prctl": (157, 167),
+    "prlimit64": (302, 261),
+    "removexattr": (197, 14),
+    "rt_sigqueueinfo": (129, 138),
+    "rt_tgsigqueueinfo": (297, 240),
+    "setpriority": (141, 140),
+    "setrlimit": (160, 164),
+    "setxattr": (188, 5),
+    "shmget": (29, 194),
+    "socket": (41, 198),
+    "socketpair": (53, 199),
+    "tgkill": (234, 131),
+    "tkill": (200, 130),
+    "utime": (132, None),
+    "utimensat": (280, 88),
+    "utimes": (235, None),
+    "vfork": (58, None),
+}
+READER: Final = frozenset(_READER)  # calls that are refused to a process that only reads files and writes to a pipe
 
 
-def denied(machine: str, spared: Iterable[str] = ()) -> dict[str, int]:
+def denied(machine: str, spared: Iterable[str] = (), *, is_reader: bool = False) -> dict[str, int]:
     """Return the calls that are refused, by name, with their numbers on a machine; empty: it is not known here.
 
     Args:
         machine: as ``uname -m`` says.
         spared: names of calls that are needed after all.
+        is_reader: those of ``READER``, too.
     """
     if machine not in _MACHINES:
         return {}
     column = list(_MACHINES).index(machine)
     left = set(spared)
-    numbers = {name: each[column] for name, each in _NUMBERS.items() if name not in left}
+    listed = {**_NUMBERS, **(_READER if is_reader else {})}
+    numbers = {name: each[column] for name, each in listed.items() if name not in left}
     return {name: number for name, number in numbers.items() if number is not None}
 
 
-def refuse(spared: Iterable[str] = ()) -> bool:
+def refuse(spared: Iterable[str] = (), *, is_reader: bool = False) -> bool:
     """Refuse the calls of ``denied`` to all threads of this process; return False: the machine is not known.
 
     The thread must have ``no_new_privs``, or CAP_SYS_ADMIN.
@@ -98,7 +146,7 @@ def refuse(spared: Iterable[str] = ()) -> bool:
         OSError: the system refuses.
     """
     machine = platform.machine()
-    numbers = sorted(denied(machine, spared).values())
+    numbers = sorted(denied(machine, spared, is_reader=is_reader).values())
     if not numbers:
         return False
     architecture, seccomp = _MACHINES[machine]

@@ -62,7 +62,7 @@ def test_an_empty_file_holds_no_keys(tmp_path: Path) -> None:
         ("a: *x\n", "1:4: anchors and aliases are not accepted"),
         ("a: !!python/name:os 1\n", "1:4: tags such as tag:yaml.org,2002:python/name:os are not accepted"),
         ("? [a]\n: 1\n", "1:3: a key is a text"),
-        ("a: [1, 2\n", "2:1: YAML is expected: expected ',' or ']', but got '<stream end>'"),
+        ("a: [1, 2\n", "2:1: YAML is expected: did not find expected ',' or ']'"),
         ("a: 1\n--- \nb: 1\n", "2:1: YAML is expected: but found another document"),
         ("[" * 100, "1:33: nested deeper than 32"),
     ],

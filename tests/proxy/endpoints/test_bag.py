@@ -13,6 +13,7 @@ from rosbags.rosbag2 import Writer as Writer2
 
 from gdp.errors import ConfigError, LocalError
 from proxy.endpoints.bag import BagReader, BagWriter, Message
+from proxy.endpoints.bag_decoder import BagDecoder
 from proxy.serial.channel import Channel, Qos, RosVersion
 from tests.proxy.recordings import READABLE, UNREADABLE, recording
 
@@ -248,6 +249,23 @@ def test_a_journal_that_was_never_folded_in_is_read(tmp_path: Path) -> None:
     assert unread == ""
 
 
+def test_a_journal_without_its_index_is_read_and_nothing_is_written_beside_it(tmp_path: Path) -> None:
+    shutil.copy(recording("rosbag2_test") / "rosbag2_test_0.db3", tmp_path / "a.db3")
+    before = len(read(tmp_path / "a.db3")[0])
+    db = sqlite3.connect(tmp_path / "a.db3")
+    db.execute("PRAGMA journal_mode=WAL")
+    db.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES(1, 1, ?)", (b"late",))
+    db.commit()
+    (tmp_path / "copy").mkdir()
+    for name in ("a.db3", "a.db3-wal"):
+        shutil.copy(tmp_path / name, tmp_path / "copy" / name)
+    db.close()
+    messages, unread = read(tmp_path / "copy" / "a.db3")
+    assert len(messages) == before + 1
+    assert unread == ""
+    assert {each.name for each in (tmp_path / "copy").iterdir()} == {"a.db3", "a.db3-wal"}
+
+
 def test_damage_inside_a_whole_file_is_reported_and_not_raised(tmp_path: Path) -> None:
     sent = numbered(2, 20_000)
     storage = compressed_mcap(tmp_path / "a", sent)
@@ -304,7 +322,8 @@ def test_a_recording_cut_anywhere_near_its_beginning_never_raises_anything_else(
         for size in [*range(0, 60), *range(start, min(len(whole), start + 1_500), 3)]:
             (tmp_path / f"short{name}").write_bytes(whole[:size])
             try:
-                read(tmp_path / f"short{name}")
+                with BagDecoder(tmp_path / f"short{name}") as bag:
+                    list(bag.messages())
             except ConfigError:
                 continue
 

@@ -1,0 +1,224 @@
+"""Frames from the process that decodes a recording to the one that uses it.
+
+Layer: sans-I/O. A frame is a kind (1 byte), a length (4 bytes, little-endian) and so many bytes. The using side
+believes nothing of what comes: each length and number is checked.
+
+```
+ CHANNEL   one description, as peers send it           one for each channel, before OPENED
+ OPENED    messages (8), has_counts (1), counts (8 each)
+ BLOCK     {channel (4), stamp in ns (8), size (4), bytes} ...   above 128 KiB: exactly one message
+ END       why some messages could not be read, UTF-8
+ REFUSED   why it is no recording, UTF-8               the last frame
+ FAILED    the decoder's error, UTF-8; empty: it lacks memory   the last frame
+```
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Generator, Iterator, Sequence
+from enum import IntEnum
+from typing import Final, TypeAlias
+
+from gdp.errors import LocalError
+from proxy.endpoints.bag_source import Message
+from proxy.serial.channel import CHANNEL_MAX_BYTES, Channel
+
+__all__ = [
+    "BLOCK_BYTES",
+    "CHANNELS_MAX",
+    "CHANNELS_MAX_BYTES",
+    "FailedError",
+    "FrameReader",
+    "Kind",
+    "RefusedError",
+    "Take",
+    "frame_head",
+    "message_head",
+    "opened_to",
+    "text_to",
+]
+
+BLOCK_BYTES: Final = 128 << 10  # small messages are collected up to so many
+CHANNELS_MAX: Final = 16_384
+CHANNELS_MAX_BYTES: Final = 32 << 20  # of all descriptions
+MESSAGE_MAX_BYTES: Final = 256 << 20  # eight times the largest that can travel; more is the memory of a small robot
+_TEXT_MAX: Final = 4_096
+
+_HEAD: Final = struct.Struct("<BI")
+_MESSAGE: Final = struct.Struct("<IqI")
+_OPENED: Final = struct.Struct("<Q?")
+_COUNT: Final = struct.Struct("<Q")
+
+
+class Kind(IntEnum):
+    """What a frame holds."""
+
+    CHANNEL = 1
+    OPENED = 2
+    BLOCK = 3
+    END = 4
+    REFUSED = 5
+    FAILED = 6
+
+
+_LONGEST: Final = {
+    Kind.CHANNEL: CHANNEL_MAX_BYTES,
+    Kind.OPENED: _OPENED.size + CHANNELS_MAX * _COUNT.size,
+    Kind.BLOCK: BLOCK_BYTES + _MESSAGE.size + MESSAGE_MAX_BYTES,
+    Kind.END: _TEXT_MAX,
+    Kind.REFUSED: _TEXT_MAX,
+    Kind.FAILED: _TEXT_MAX,
+}
+
+
+Take: TypeAlias = Callable[[int], bytes]  # returns so many of the next bytes
+
+
+class RefusedError(LocalError):
+    """The decoder says why the recording is none."""
+
+
+class FailedError(LocalError):
+    """The decoder says why it failed; empty: it lacks memory."""
+
+
+def frame_head(kind: Kind, size: int) -> bytes:
+    """Return the head of a frame with ``size`` bytes."""
+    return _HEAD.pack(kind, size)
+
+
+def message_head(message: Message) -> bytes:
+    """Return what stands before a message's bytes.
+
+    Raises:
+        LocalError: the message is too large, or its stamp has more than 64 bits.
+    """
+    size = len(message.raw)
+    if size > MESSAGE_MAX_BYTES:
+        raise LocalError(f"a message of {size} bytes; at most {MESSAGE_MAX_BYTES} are read")
+    try:
+        return _MESSAGE.pack(message.channel, message.stamp_ns, size)
+    except struct.error as error:
+        raise LocalError(f"a message with the stamp {message.stamp_ns}") from error
+
+
+def opened_to(count: int, counts: Sequence[int] | None) -> bytes:
+    """Return the bytes of OPENED.
+
+    Raises:
+        LocalError: there are too many channels, or numbers above 64 bits.
+    """
+    if counts is not None and len(counts) > CHANNELS_MAX:
+        raise LocalError(f"{len(counts)} topics; at most {CHANNELS_MAX} are read")
+    try:
+        return _OPENED.pack(count, counts is not None) + b"".join(map(_COUNT.pack, counts or ()))
+    except struct.error as error:
+        raise LocalError("a number of messages that cannot be") from error
+
+
+def text_to(text: str) -> bytes:
+    """Return a text's bytes, cut where it is too long."""
+    return text.encode("utf-8", "replace")[:_TEXT_MAX]
+
+
+class FrameReader:
+    """What a decoder says, in the order in which it must.
+
+    Attributes:
+        channels: of the recording; empty before ``open``.
+        is_giving: whether messages come, up to END.
+    """
+
+    def __init__(self) -> None:
+        self.channels: list[Channel] = []
+        self.is_giving = False
+
+    def open(self, take: Take) -> tuple[int, list[int] | None]:
+        """Take the channels; return the number of messages, and that of each channel where it is known.
+
+        Raises:
+            RefusedError, FailedError: the decoder says why it ends.
+            LocalError, RemoteError: it said something else.
+        """
+        left = CHANNELS_MAX_BYTES
+        while True:
+            kind, size = self._head(take)
+            left -= size
+            if kind == Kind.OPENED:
+                return self._counts(take(size))
+            if kind != Kind.CHANNEL or left < 0 or len(self.channels) == CHANNELS_MAX:
+                raise LocalError(f"{kind.name} before OPENED")
+            self.channels.append(Channel.from_wire(take(size)))
+
+    def skip(self, take: Take) -> None:
+        """Take what is left of the messages."""
+        while self.is_giving:
+            kind, size = self._head(take)
+            take(size)
+            self.is_giving = kind == Kind.BLOCK
+
+    def messages(self, take: Take) -> Generator[Message, None, str]:
+        """Yield messages up to END; return why some could not be read.
+
+        Raises:
+            RefusedError, FailedError: the decoder says why it ends.
+            LocalError: it said something else.
+        """
+        self.is_giving = True
+        while True:
+            kind, size = self._head(take)
+            if kind == Kind.END:
+                self.is_giving = False
+                return _text(take(size))
+            if kind != Kind.BLOCK:
+                raise LocalError(f"{kind.name} among messages")
+            if size > BLOCK_BYTES:
+                yield self._large(take, size - _MESSAGE.size)
+            else:
+                yield from self._small(take(size))
+
+    def _head(self, take: Take) -> tuple[Kind, int]:
+        number, size = _HEAD.unpack(take(_HEAD.size))
+        try:
+            kind = Kind(number)
+        except ValueError as error:
+            raise LocalError(f"a frame of kind {number}") from error
+        if size > _LONGEST[kind]:
+            raise LocalError(f"a frame of {size} bytes")
+        if kind == Kind.REFUSED:
+            raise RefusedError(_text(take(size)))
+        if kind == Kind.FAILED:
+            raise FailedError(_text(take(size)))
+        return kind, size
+
+    def _counts(self, data: bytes) -> tuple[int, list[int] | None]:
+        if len(data) < _OPENED.size:
+            raise LocalError("the numbers of messages are cut off")
+        count, has_counts = _OPENED.unpack_from(data)
+        rest = data[_OPENED.size :]
+        if len(rest) != (len(self.channels) * _COUNT.size if has_counts else 0):
+            raise LocalError("numbers of messages of other channels")
+        return count, [number for (number,) in _COUNT.iter_unpack(rest)] if has_counts else None
+
+    def _large(self, take: Take, size: int) -> Message:
+        channel, stamp_ns, said = _MESSAGE.unpack(take(_MESSAGE.size))
+        if channel >= len(self.channels) or said != size:
+            raise LocalError("a block that does not hold together")
+        return Message(channel, stamp_ns, take(size))
+
+    def _small(self, block: bytes) -> Iterator[Message]:
+        at = 0
+        while at < len(block):
+            if at + _MESSAGE.size > len(block):
+                raise LocalError("a block that ends in a head")
+            channel, stamp_ns, size = _MESSAGE.unpack_from(block, at)
+            at += _MESSAGE.size
+            if channel >= len(self.channels) or at + size > len(block):
+                raise LocalError("a block that does not hold together")
+            yield Message(channel, stamp_ns, block[at : at + size])
+            at += size
+
+
+def _text(data: bytes) -> str:
+    return data.decode("utf-8", "replace")
