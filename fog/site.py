@@ -5,6 +5,7 @@ Place: shell. ``fog.yaml`` states it; without one a site of its own is made in t
     state/  site.json                 its id: devices and runs carry it
             domain/ owner/            keys, as gdp lab makes them
             robot/                    what the robot's side boots: switch, RIB, proxy; keys of the supervisor's watch
+            enrolment/                tickets of machines that are to enrol, and the responder's key
             journal.sqlite3  supervisor.*  site.lock
 """
 
@@ -25,11 +26,13 @@ from typing import Annotated, Final, Literal, TypedDict
 from pydantic import AfterValidator, Field, model_validator
 
 from fog.enrolment.boots import RobotDevices, robot_boot
+from fog.enrolment.config import ENROLMENT_PORT, EnrolmentConfig, host_and_port
 from fog.enrolment.members import Authority
 from fog.host.bundle import install
 from fog.latency.config import LatencyConfig
 from fog.latency.known import Latencies
 from fog.providers.aws.config import AwsConfig
+from fog.providers.cloud_init import Vxlan
 from fog.providers.skypilot.config import SkyPilotConfig
 from fog.topology import AUTOMATIC, AUTOMATIC_REPLICA, Gateway, Topology
 from gdp.crypto.certificates import Role
@@ -93,6 +96,9 @@ class SiteConfig(Section):
         default=CLAIM_LEASE_S,
         description="Lease of the machines' claims, in seconds: `lease_s` of their proxy.yaml.",
     )
+    enrolment: EnrolmentConfig = Field(
+        default=EnrolmentConfig(), description="Where rented machines, with keys of their own, ask for memberships."
+    )
     idle_s: float | None = Field(default=None, gt=0, description="Default of a cluster's idle limit, in seconds.")
     budget_usd: float | None = Field(default=None, gt=0, description="Default of a cluster's budget.")
     latency_ms: Mapping[str, Annotated[float, Field(ge=0)]] = Field(
@@ -109,10 +115,23 @@ class SiteConfig(Section):
         return self.machine_iface or ("eth0" if self.provider == "local" else self._tunnel)
 
     @property
+    def enrolment_address(self) -> str:
+        """Return where a rented machine reaches the supervisor, ``HOST:PORT``; empty: machines are of this host."""
+        if self.provider == "local":
+            return ""
+        if self.enrolment.address is not None or self._vxlan is None:
+            return self.enrolment.address or ""
+        remote = self._vxlan.remote
+        return f"[{remote}]:{ENROLMENT_PORT}" if remote.version == 6 else f"{remote}:{ENROLMENT_PORT}"
+
+    @property
     def _tunnel(self) -> str:
+        return "" if self._vxlan is None else self._vxlan.device
+
+    @property
+    def _vxlan(self) -> Vxlan | None:
         setups = {"aws": self.aws.setup, "skypilot": self.skypilot.setup}
-        vxlan = setups[self.provider].vxlan if self.provider in setups else None
-        return "" if vxlan is None else vxlan.device
+        return setups[self.provider].vxlan if self.provider in setups else None
 
     @model_validator(mode="after")
     def _meets_the_overlay(self) -> SiteConfig:
@@ -126,6 +145,16 @@ class SiteConfig(Section):
             raise ValueError(
                 f"machine_iface is {self.device}, but the tunnel of {self.provider}.setup.vxlan is {self._tunnel}:"
                 " leave machine_iface out, or let both say the same"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _can_enrol(self) -> SiteConfig:
+        """A machine that finds nobody who admits it boots, costs, and never serves."""
+        if self.provider != "local" and not self.enrolment_address:
+            raise ValueError(
+                f"machines of {self.provider} do not know where to enrol: set enrolment.address to HOST:PORT at which"
+                " they reach this supervisor"
             )
         return self
 
@@ -172,6 +201,8 @@ class _Settings(TypedDict):
     budget_usd: float | None
     latency_ms: Mapping[str, float]
     latency: LatencyConfig
+    enrolment: EnrolmentConfig
+    enrolment_address: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,6 +238,30 @@ class Site:
     budget_usd: float | None = None
     latency_ms: Mapping[str, float] = field(default_factory=dict)
     latency: LatencyConfig = field(default_factory=LatencyConfig)
+    enrolment: EnrolmentConfig = field(default_factory=EnrolmentConfig)
+    enrolment_address: str = ""
+
+    @property
+    def enrolment_folder(self) -> Path:
+        """Return the folder of tickets, and of the socket for machines of this host."""
+        return self.state / "enrolment"
+
+    @property
+    def enrolment_url(self) -> str:
+        """Return where machines enrol, as their tickets say it."""
+        return f"tcp://{self.enrolment_address}" if self.enrolment_address else f"unix:{self.enrolment_socket}"
+
+    @property
+    def enrolment_socket(self) -> Path:
+        """Return the socket for machines of this host."""
+        return self.enrolment_folder / "socket"
+
+    @property
+    def enrolment_listens(self) -> tuple[str, int]:
+        """Return host and port on which the supervisor listens for rented machines; an empty host: every one."""
+        if self.enrolment.listen is not None:
+            return host_and_port(self.enrolment.listen)
+        return "", host_and_port(self.enrolment_address)[1]
 
     @property
     def latencies(self) -> Latencies:
@@ -402,4 +457,6 @@ def _settings(config: SiteConfig) -> _Settings:
         "budget_usd": config.budget_usd,
         "latency_ms": config.latency_ms,
         "latency": config.latency,
+        "enrolment": config.enrolment,
+        "enrolment_address": config.enrolment_address,
     }

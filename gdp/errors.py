@@ -80,6 +80,7 @@ class DropReason(IntEnum):
     RATE_LIMITED = 42  # more hellos than are verified
     COOKIE_REQUIRED = 43  # a stranger's hello under load, without proof that it receives at its address
     UNCONCERNED = 44  # a revocation by somebody of whom no certificate is held here
+    THROUGH_LEAF = 45  # the way leads through a leaf, or a leaf speaks for more than the nodes attached to it
 
     @property
     def label(self) -> str:

@@ -49,7 +49,7 @@ NACKS_PER_REPORT: Final = 24  # ranges: a report, sealed and alone in its frame,
 
 # Control plane
 CONTROL_MAX_BYTES: Final = 16 << 10  # one statement with its evidence
-CLAIM_MAX_BYTES: Final = 9 << 10  # with its evidence: a relay, an answer or a join around it must fit one statement
+CLAIM_MAX_BYTES: Final = 6_500  # with its evidence: a relay or an answer around one, a join around two fit a statement
 WITHDRAWAL_MAX_BYTES: Final = 1 << 10
 SEQUENCE_AHEAD_S: Final = 366 * 86_400.0  # sequence numbers are wall-clock milliseconds, at most so far ahead
 RECORD_OVERHEAD_BYTES: Final = 33  # what a channel puts around a statement: head and tag
@@ -94,12 +94,19 @@ READERS_MAX: Final = 16_384  # claims of the readers attached to a switch
 TREES_MAX: Final = 65_536  # branches of a switch's trees, some 4 KiB each
 JOINS_PER_S: Final = 2_000.0  # of one neighbouring switch; each is verified
 JOINS_BURST: Final = 16_384.0
+CLAIMS_PER_S: Final = 2_048.0  # claims and withdrawals of one neighbour; each is verified and relayed
+CLAIMS_BURST: Final = 2.0 * ATTACHED_MAX
+CLAIMS_WINDOW: Final = 1_024  # how far claims of one node may overtake each other
 QUESTIONS_PER_S: Final = 16.0  # new names that an attached node may have a RIB asked for
 QUESTIONS_BURST: Final = 256.0
 SWITCH_QUESTIONS_PER_S: Final = 256.0  # ... or a neighbouring switch
 SWITCH_QUESTIONS_BURST: Final = 2_048.0
 RIB_NAMES_PER_SENDER: Final = 200_000
 RIB_WATCHES_MAX: Final = 500_000
+ANSWER_BYTES_PER_S: Final = 4.0 * (1 << 20)  # that one asker's questions may draw from a RIB; some 2,000 answers
+ANSWER_BYTES_BURST: Final = 64.0 * (1 << 20)  # ... at once: all that a switch asks of a RIB that is new
+LINK_STATES_PER_S: Final = 10.0  # of one origin that are taken, and flooded
+LINK_STATES_BURST: Final = 100.0
 
 # Revocations
 REVOCATIONS_PER_ROOT: Final = 262_144  # of one trusted domain

@@ -184,13 +184,13 @@ def _insiders(arguments: Sequence[str]) -> int:
     slow = sorted(figures.slowest.items(), key=lambda each: each[1], reverse=True)[:6]
     for what, slow_s in slow:
         mean_ms = 1e3 * figures.spent[what] / figures.count[what]
-        print(f"processor time {1e3 * slow_s:6.1f} ms at most (mean {mean_ms:.2f}): {what}")
+        print(f"time {1e3 * slow_s:6.1f} ms at most (mean {mean_ms:.2f}): {what}")
     for place, found in search.found.items():
         print(f"\nFOUND {place}\n  at: {found.at}\n  {found.text.strip()}")
         if options.shrink:
             print(f"  {shrunk(found.plan, partial(_breaks, place), options.shrink)}")
         else:
-            print(f"  again: scripts/fuzz.py insiders --seed {found.plan.seed} --statements 3000 --shrink 600")
+            print(f"  again: scripts/fuzz.py insiders --seed {found.plan.seed} --statements 10000 --shrink 600")
     return 1 if search.found else 0
 
 

@@ -47,6 +47,7 @@ _STYLES: Final = {
     "failed": "red",
     "refused": "red",
     "trouble": "red",
+    "alarm": "red",
     "notice": "yellow",
     "draining": "yellow",
     "leaving": "yellow",

@@ -1,10 +1,11 @@
 """What a machine of a cluster, a gateway, and the robot's own side boot: their files and programs.
 
-Place: I/O, through ``members``. Every file names others relative to itself, so it does not matter where they will lie.
+Place: I/O, through ``members``. A machine's boot has no key, only the ticket with which it asks for what it is to be.
+Every file names others relative to itself, so it does not matter where they will lie.
 ::
 
-    machine   [node ...] -- ROS graph of its own -- [proxy] -- [switch] -- iface        towards the gateway
-                                                                  `-- uplink            while it is the gateway
+    machine   [node ...] -- ROS graph of its own -- [proxy] -- [leaf] -- iface          towards the gateway
+                                        of a replica gateway   [switch] -- uplink       while it is the gateway
     gateway   ifaces -- [switch] -- ifaces
     robot     ROS graph of the robot -- [proxy] -- [switch] -- uplink                   and [rib], and the watch
 """
@@ -19,13 +20,15 @@ import yaml
 
 from fog.cluster import Carried, CloudNode, ClusterPlan
 from fog.enrolment.members import Authority
-from fog.enrolment.papers import Papers
+from fog.enrolment.tickets import PlannedSeat
+from fog.host.bundle import TICKET_FILE
 from fog.machine import Boot, Program
-from gdp.crypto.certificates import Membership, Role
+from gdp.crypto.certificates import Role
 from gdp.limits import CLAIM_LEASE_S
+from gdp.trust.enrolment import Seat, Ticket
 
-__all__ = ["PROXY", "RobotDevices", "gateway_boot", "machine_boot", "node_names", "robot_boot", "robot_rule"]
-__all__ += ["SWITCH"]
+__all__ = ["PROXY", "SWITCH", "RobotDevices", "gateway_boot", "machine_boot", "machine_seats", "node_names"]
+__all__ += ["robot_boot", "robot_rule"]
 
 PROXY: Final = "proxy"
 SWITCH: Final = "switch"
@@ -59,41 +62,45 @@ class RobotDevices:
     watch: str
 
 
+def machine_seats(plan: ClusterPlan, name: str, *, is_gateway: bool = False) -> tuple[PlannedSeat, PlannedSeat]:
+    """Return what a machine of a cluster is to be: a leaf, and a proxy that gives what is carried.
+
+    Args:
+        is_gateway: it may become the gateway of its group. Then it is a switch, for it carries what is not its own.
+    """
+    title = f"{plan.name}-{name}"
+    switch = Seat(SWITCH, Role.SWITCH if is_gateway else Role.LEAF, title)
+    return PlannedSeat(switch), PlannedSeat(Seat(PROXY, Role.PROXY, title), plan.carried)
+
+
 def machine_boot(
     authority: Authority,
     plan: ClusterPlan,
     name: str,
     command: Callable[[CloudNode], Sequence[str]],
+    ticket: Ticket,
     *,
     iface: str,
-    days: float,
     shares_host: bool,
     lease_s: float = CLAIM_LEASE_S,
     uplink: str = "",
-) -> tuple[Boot, Papers]:
-    """Enrol a machine of a cluster; return what it boots, and the papers by which it is known.
+) -> Boot:
+    """Return what a machine of a cluster boots; nothing in it is secret but the token.
 
     Args:
         name: of the machine.
         command: how a node is started on it.
+        ticket: for its ``machine_seats``.
         iface: its device towards the overlay.
-        days: how long its papers hold.
         shares_host: whether other machines run on the same host.
         lease_s: of its claims.
         uplink: the device that it has while it is the gateway of its group; empty: it never is.
-
-    Raises:
-        LocalError: as ``Authority.enrol``.
     """
-    title = f"{plan.name}-{name}"
-    switch = authority.enrol(Role.SWITCH, title, days=days)
-    proxy = authority.enrol(Role.PROXY, title, plan.carried, days=days)
     domain = 1 + int(name[1:]) % _DOMAINS
     ports = [{"iface": iface}, *([{"iface": uplink, "optional": True}] if uplink else [])]
     rules = [{**_rule(each), **each.served, "owner": _OWNER} for each in plan.carried]
     files = {
-        **switch.below("switch"),
-        **proxy.below(PROXY),
+        TICKET_FILE: ticket.to_json(),
         _OWNER: authority.owner_key.read_bytes(),
         _PROFILE: _OFTEN,
         "switch.yaml": _yaml(
@@ -116,9 +123,7 @@ def machine_boot(
         Program(name, tuple(command(node)), environment={**environment, **node.environment}, is_users=True)
         for name, node in zip(node_names(plan), plan.nodes, strict=True)
     ]
-    programs = (*nodes, _switch(), _proxy(environment))
-    until_s = float(min(switch.member.not_after_unix_s, proxy.member.not_after_unix_s))
-    return Boot(files, programs), _papers(proxy.member, until_s, switch.member)
+    return Boot(files, (*nodes, _switch(), _proxy(environment)))
 
 
 def node_names(plan: ClusterPlan) -> list[str]:
@@ -179,10 +184,6 @@ def _rule(carried: Carried) -> dict[str, object]:
 
 def _who(folder: str) -> dict[str, object]:
     return {"identity": folder, "domain": {"root": f"{folder}/root.crt"}}
-
-
-def _papers(proxy: Membership, until_s: float, *others: Membership) -> Papers:
-    return Papers(proxy.name.to_text(), until_s, tuple(each.fingerprint.hex() for each in (proxy, *others)))
 
 
 def _switch() -> Program:

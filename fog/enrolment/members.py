@@ -1,6 +1,7 @@
-"""New members of the site's domain, with what the owner lets them do: keys and proofs as the files of a machine.
+"""New members of the site's domain, with what the owner lets them do.
 
-Place: I/O; draws keys, reads the domain's and the owner's private ones, and leaves nothing on disk.
+Place: I/O; reads the domain's and the owner's private keys. Members of this host get keys that are made here and leave
+nothing on disk; a machine's ask with keys of their own.
 """
 
 from __future__ import annotations
@@ -13,9 +14,12 @@ from typing import Final
 
 from fog.cluster import Carried
 from gdp.crypto.certificates import Membership, Role
+from gdp.crypto.kem import KemPublicKey
+from gdp.crypto.subject import Subject
 from gdp.metadata import Metadata
-from gdp.stores.issue import delegate, install_delegation, make_node
+from gdp.stores.issue import DAY_S, admit, delegate, make_node
 from gdp.stores.keyring import CARD, OWNER_PUBLIC, save_delegation
+from gdp.trust.enrolment import Application, Granted
 from gdp.trust.right import Right
 
 __all__ = ["Authority", "Enrolled", "metadata_of", "right_of"]
@@ -26,7 +30,7 @@ _CALLS: Final = (Right.SERVE, Right.CALL)
 
 @dataclass(frozen=True, slots=True)
 class Enrolled:
-    """A new member.
+    """A new member of this host's own: a gateway, or of the robot's side.
 
     Args:
         files: of its directory, to be kept private.
@@ -41,6 +45,14 @@ class Enrolled:
 
 
 @dataclass(frozen=True, slots=True)
+class _Node:
+    """Whom the owner delegates to; the same request proved both."""
+
+    subject: Subject
+    kem: KemPublicKey
+
+
+@dataclass(frozen=True, slots=True)
 class Authority:
     """Who admits and delegates: the directories of a domain and of an owner.
 
@@ -52,8 +64,8 @@ class Authority:
     owner: Path
     scratch: Path | None = None
 
-    def enrol(self, role: Role, label: str, carried: Iterable[Carried] = (), *, days: float) -> Enrolled:
-        """Return a new member that may give (serve, publish) what is carried.
+    def enrol(self, role: Role, label: str, *, days: float) -> Enrolled:
+        """Return a new member whose keys are made here.
 
         Raises:
             LocalError: no domain or no owner there, or its root has run out.
@@ -61,11 +73,30 @@ class Authority:
         with tempfile.TemporaryDirectory(prefix="gdp-fog-", dir=self.scratch) as scratch:
             node = Path(scratch) / "node"
             identity = make_node(node, role, label, self.domain, days=days)
-            for each in carried:
-                given = delegate(self.owner, node / CARD, metadata_of(each), [right_of(each, gives=True)], days=days)
-                install_delegation(node, given)
             files = {str(path.relative_to(node)): path.read_bytes() for path in node.rglob("*") if path.is_file()}
         return Enrolled(identity.member, files)
+
+    def grant(
+        self, application: Application, carried: Iterable[Carried], *, until_unix_s: float, unix_s: float
+    ) -> tuple[Membership, Granted]:
+        """Return the membership that a machine asks for, and what lets it give (serve, publish) what is carried.
+
+        Whoever calls has seen that role and label are those that were planned.
+
+        Raises:
+            StatementError: the application does not hold.
+            LocalError: as ``enrol``.
+        """
+        days = (until_unix_s - unix_s) / DAY_S
+        member = admit(self.domain, application.request, days=days, unix_s=unix_s)
+        node = _Node(member.subject, application.kem)
+        given = [
+            delegate(
+                self.owner, node, metadata_of(each), [right_of(each, gives=True)], days=days, unix_s=unix_s
+            ).to_wire()
+            for each in carried
+        ]
+        return member, Granted(member.wire, tuple(given))
 
     def let(self, node: Path, delegations: Path, carried: Iterable[Carried], *, days: float) -> None:
         """Let a node of the robot's side take (call, read) what is carried; what it had of these names is replaced.

@@ -12,10 +12,10 @@ __all__ = ["Papers"]
 
 @dataclass(frozen=True, slots=True)
 class Papers:
-    """What a machine was enrolled with.
+    """What a machine was enrolled with; until it is, only when all of it will run out.
 
     Args:
-        proxy: the name of its proxy in the overlay, 64 hex digits: who serves, if it does.
+        proxy: the name of its proxy in the overlay, 64 hex digits: who serves, if it does; empty: not enrolled yet.
         until_unix_s: when its certificates and delegations run out.
         fingerprints: of its memberships, in hex, to take them back by.
     """

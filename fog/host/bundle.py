@@ -15,9 +15,10 @@ from fog.machine import Boot, Program
 from gdp.errors import LocalError
 from gdp.stores.files import private, write_all
 
-__all__ = ["BOOT_FILE", "install", "pack", "read_programs", "unpack"]
+__all__ = ["BOOT_FILE", "TICKET_FILE", "install", "pack", "read_programs", "unpack"]
 
 BOOT_FILE: Final = "boot.json"
+TICKET_FILE: Final = "enrolment.json"  # until the machine has enrolled
 
 
 def pack(boot: Boot) -> dict[str, bytes]:

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from fog.host.bundle import TICKET_FILE
 from fog.host.host import Host
 from gdp.cli.node import Verbose, emit, failing_clearly, set_up_logging
 
@@ -31,7 +33,8 @@ AwaitGo = Annotated[bool, typer.Option("--await-go", hidden=True)]
 
 @app.command(epilog="Example: fog-machine --home /var/lib/fog/machine")
 def machine(home: Home, json: Json = False, verbose: Verbose = False, await_go: AwaitGo = False) -> None:
-    """Be a machine of a cluster: run the programs of its boot.json, until SIGTERM; SIGUSR1 drains it first.
+    """Be a machine of a cluster: enrol if there is a ticket, run the programs of boot.json until SIGTERM.
+    SIGUSR1 drains it first.
 
     Its folder's status.json tells how they are, logs/ what they say.
     """
@@ -41,6 +44,11 @@ def machine(home: Home, json: Json = False, verbose: Verbose = False, await_go: 
         if await_go and not sys.stdin.readline():
             log.warning("nobody says go, so nobody has a record of this machine")
             raise typer.Exit(1)
+        if (home / TICKET_FILE).exists():
+            from fog.host.enrolment import enrol  # what it imports no later start needs
+
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1, signal.SIGUSR2})  # for the host, soon
+            enrol(home.resolve())
         reason = asyncio.run(host.run())
         if json:
             emit("done", reason=reason)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import socket
 import threading
 import time
 from contextlib import closing
@@ -16,6 +17,9 @@ from functools import partial
 from types import FrameType
 from typing import Final
 
+from fog.enrolment.listener import Listener, bind_tcp, bind_unix
+from fog.enrolment.responder import Responder
+from fog.enrolment.tickets import Tickets
 from fog.site import Site, topology_now
 from fog.supervisor.background import held
 from fog.supervisor.decide import Patience
@@ -42,13 +46,25 @@ def supervise(site: Site, *, stays: bool = False, lock: int | None = None) -> No
         lock: descriptor of the lock, where it was taken already.
 
     Raises:
-        LocalError: another one lives, or the provider cannot be had.
+        LocalError: another one lives, the provider cannot be had, or machines have nowhere to enrol: a port is taken.
     """
-    with held(site, lock), closing(Journal(site.journal)) as journal:
-        _run(site, journal, stays=stays)
+    with (
+        held(site, lock),
+        closing(Journal(site.journal)) as journal,
+        closing(Tickets(site.enrolment_folder)) as tickets,
+        closing(Listener(_bound(site), Responder(tickets, site.authority))),
+    ):
+        _run(site, journal, tickets, stays=stays)
 
 
-def _run(site: Site, journal: Journal, *, stays: bool) -> None:
+def _bound(site: Site) -> socket.socket:
+    """Return the socket at which the site's machines enrol."""
+    if site.enrolment_address:
+        return bind_tcp(*site.enrolment_listens)
+    return bind_unix(site.enrolment_socket)
+
+
+def _run(site: Site, journal: Journal, tickets: Tickets, *, stays: bool) -> None:
     ended = threading.Event()
     watch = Watch(*site.watch) if site.watch is not None else None
     offered = _offered(site, journal)
@@ -56,6 +72,7 @@ def _run(site: Site, journal: Journal, *, stays: bool) -> None:
     supervisor = Supervisor(
         site,
         journal,
+        tickets,
         provider,
         partial(command_of, site),
         watch.heard if watch is not None else lambda: None,

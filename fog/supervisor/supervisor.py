@@ -6,6 +6,7 @@ Place: shell. What it must not forget is in the journal before it acts; what it 
 from __future__ import annotations
 
 import logging
+import secrets
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -14,10 +15,12 @@ from functools import partial
 from typing import Final, TypeAlias
 
 from fog.cluster import CloudNode, ClusterPlan, Wanted
-from fog.enrolment.boots import PROXY, machine_boot, node_names
+from fog.enrolment.boots import PROXY, machine_boot, machine_seats, node_names
 from fog.enrolment.members import metadata_of
+from fog.enrolment.papers import Papers
 from fog.enrolment.revoking import take_back
 from fog.enrolment.robot_side import forget_rules, introduce, reload
+from fog.enrolment.tickets import News, Report, Tickets
 from fog.machine import Machine, MachineSpec, MachineState
 from fog.offer import Offer
 from fog.providers.provider import GatewayProvider, Provider
@@ -33,7 +36,9 @@ from fog.supervisor.record import Ending, Record, cost_usd, learn
 from fog.supervisor.robot_calls import sent_by
 from fog.supervisor.story import changes
 from gdp.errors import GdpError, LocalError
-from gdp.stores.keyring import load_public_key
+from gdp.stores.issue import DAY_S
+from gdp.stores.keyring import load_domain, load_public_key
+from gdp.trust.enrolment import TOKEN_BYTES, Ticket
 
 __all__ = ["Heard", "Supervisor"]
 
@@ -56,6 +61,7 @@ class Supervisor:
     """Keeps the clusters of a site as they are wanted.
 
     Args:
+        tickets: with which machines enrol.
         command: how a node is started on a machine.
         heard: what the overlay says of who serves; None: it cannot be asked.
         on_names: called when the watch is to know more names.
@@ -65,6 +71,7 @@ class Supervisor:
         self,
         site: Site,
         journal: Journal,
+        tickets: Tickets,
         provider: Provider,
         command: Callable[[CloudNode], Sequence[str]],
         heard: Callable[[], Heard | None],
@@ -73,6 +80,7 @@ class Supervisor:
     ) -> None:
         self._site = site
         self._journal = journal
+        self._tickets = tickets
         self._provider = provider
         self._command = command
         self._heard = heard
@@ -123,6 +131,7 @@ class Supervisor:
             StoreError: the journal cannot be read or written.
         """
         self._harvest(time.time())
+        self._take_news(time.time())
         for cluster in self._journal.clusters():
             name = cluster.plan.name
             if cluster.is_up:
@@ -288,22 +297,77 @@ class Supervisor:
         self._troubles.pop(resting, None)
         offer = choice.offer
         spec = MachineSpec(plan.name, self._journal.next_machine(plan.name), offer)
-        boot, papers = machine_boot(
+        uplink = self._uplink_iface(offer.region)
+        ticket, until_unix_s = self._ticket(plan, spec.name, now_s, is_gateway=bool(uplink))
+        boot = machine_boot(
             self._site.authority,
             plan,
             spec.name,
             self._command,
+            ticket,
             iface=self._site.machine_iface,
-            days=self._site.papers_days,
             lease_s=self._site.lease_s,
             shares_host=self._provider.name == "local",
-            uplink=self._uplink_iface(offer.region),
+            uplink=uplink,
         )
-        record = Record(spec, wanted, papers, now_s)
+        record = Record(spec, wanted, Papers("", until_unix_s), now_s)
         records.append(record)
         detail = f"{offer.region} {offer.type_name}, {offer.usd_per_hour:.4f} USD an hour: {choice.why}"
         self._put(record, "asked", detail, now_s)
         self._acts.begin(plan.name, spec.name, "create", partial(self._provider.create, spec, boot))
+
+    def _ticket(self, plan: ClusterPlan, name: str, now_s: float, *, is_gateway: bool) -> tuple[Ticket, float]:
+        """Return a new machine's ticket, and until when what is issued for it will hold.
+
+        Args:
+            is_gateway: the machine may become the gateway of its group.
+
+        Raises:
+            LocalError: no domain there, or its root has run out.
+        """
+        root = load_domain(self._site.authority.domain).root
+        until_s = min(now_s + self._site.papers_days * DAY_S, float(root.validity.not_after_unix_s))
+        if until_s <= now_s:
+            raise LocalError("the root of the domain has run out")
+        ticket = self._tickets.issue(
+            plan.name,
+            name,
+            machine_seats(plan, name, is_gateway=is_gateway),
+            secrets.token_bytes(TOKEN_BYTES),
+            addresses=[self._site.enrolment_url],
+            unix_s=now_s,
+            expires_unix_s=now_s + self._patience.boot_s,
+            until_unix_s=until_s,
+        )
+        return ticket, until_s
+
+    def _take_news(self, now_s: float) -> None:
+        """Learn which machines enrolled, and let go of those whose token somebody else knows."""
+        for news in self._tickets.news():
+            record = next((each for each in self._journal.machines(news.cluster) if each.name == news.machine), None)
+            if record is not None:
+                if news.papers is not None:
+                    record = replace(record, papers=news.papers)
+                if news.report is Report.ENROLLED:
+                    self._put(record, "enrolled", news.detail, now_s)
+                    if record.is_gone or record.is_released:
+                        self._revoke(record, now_s)
+                else:
+                    self._let_go_misused(record, news, now_s)
+            self._tickets.taken(news)
+
+    def _let_go_misused(self, record: Record, news: News, now_s: float) -> None:
+        log.error("token misused cluster=%s machine=%s: %s", news.cluster, news.machine, news.detail)
+        if not self._site.enrolment.revoke_misused or record.is_gone:
+            self._put(record, "alarm", news.detail, now_s)
+            return
+        ending = Ending.FAILED if record.served_unix_s is None else Ending.TAKEN
+        known = replace(record, released_unix_s=now_s, ending=ending, reason="its enrolment token was misused")
+        self._put(known, "alarm", f"{news.detail}; it is revoked and replaced", now_s)
+        self._revoke(known, now_s)
+        if record.id and not self._acts.is_busy(news.cluster, news.machine):
+            plan = self._journal.cluster(news.cluster).plan
+            self._release(plan, news.machine, record.id, is_lost=True)
 
     def _uplink_iface(self, region: str) -> str:
         provider = self._provider
@@ -401,6 +465,7 @@ class Supervisor:
                 reload(path)
 
     def _revoke(self, record: Record, now_s: float) -> None:
+        self._tickets.take_back(record.spec.cluster, record.name)
         if self._site.revocations is None:
             return
         folder, switch = self._site.revocations

@@ -57,7 +57,11 @@ Request = Annotated[
 ]
 ExpectedRole = Annotated[
     Optional[Role],  # noqa: UP045
-    typer.Option("--role", help="what the node is to be; compared with its request. Asked for at a terminal"),
+    typer.Option(
+        "--role",
+        help="what the node is to be, a leaf for a switch that carries no transit; compared with its request. "
+        "Asked for at a terminal",
+    ),
 ]
 ExpectedLabel = Annotated[
     Optional[str],  # noqa: UP045
@@ -91,9 +95,13 @@ def issue(
 ) -> None:
     """Admit a node to a domain, as what you say that it is. The domain's ledger, issued.jsonl, keeps what was issued.
 
+    A switch may carry everybody's traffic. A leaf is a switch for its own nodes only: what a robot or a rented machine
+    brings along. The other switches send nothing through it, whatever it says.
+
     \b
     Examples:
       gdp cert issue --domain keys/school --node keys/robot --role proxy --label robot
+      gdp cert issue --domain keys/school --node keys/robot-switch --role leaf --label robot
       gdp cert issue --domain keys/school --request node.csr --role switch --label roof --out node.crt
     """
     if node is not None and request is None and out is None:

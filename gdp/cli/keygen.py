@@ -20,7 +20,9 @@ __all__ = ["app"]
 
 app = typer.Typer(no_args_is_help=True, help="Make keys for an owner of names, or for a node.")
 
-RoleOption = Annotated[Role, typer.Option("--role", help="what the node is")]
+RoleOption = Annotated[
+    Role, typer.Option("--role", help="what the node is; a leaf is a switch that carries no transit")
+]
 
 
 @app.command("owner")
@@ -54,11 +56,12 @@ def node(
     force: options.Force = False,
     as_json: options.Json = False,
 ) -> None:
-    """Make the keys of a switch, a RIB or a proxy, and its request to belong to a domain.
+    """Make the keys of a switch, a leaf, a RIB or a proxy, and its request to belong to a domain.
 
     \b
     Examples:
       gdp keygen node keys/robot --role proxy --label robot --meta site=roof
+      gdp keygen node keys/robot-switch --role leaf --label robot
       gdp keygen node keys/roof --role switch --label roof --key 'pkcs11:token=roof;object=node?module-path=...'
     """
     guard = asked_passphrase(protect)

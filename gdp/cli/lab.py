@@ -38,6 +38,9 @@ Hosts = Annotated[list[Path], typer.Argument(metavar="HOST...", help="a director
 DomainDir = Annotated[Path, typer.Option("--domain", metavar="DIR", help="the trust domain; made if it is not there")]
 OwnerDir = Annotated[Path, typer.Option("--owner", metavar="DIR", help="the owner of names; made if it is not there")]
 Iface = Annotated[str, typer.Option("--iface", help="what joins the machines")]
+IsLeaf = Annotated[
+    bool, typer.Option("--leaf", help="their switches are leaves: nothing passes through them between other switches")
+]
 
 
 def lab(
@@ -45,6 +48,7 @@ def lab(
     domain: DomainDir = Path("lab"),
     owner: OwnerDir = Path("owner"),
     iface: Iface = "eth0",
+    leaf: IsLeaf = False,
     as_json: options.Json = False,
 ) -> None:
     """Make a small lab: one trust domain, one owner, and for each machine a directory with a switch and a proxy.
@@ -52,8 +56,9 @@ def lab(
     A new domain's RIB is on the first machine. Where the domain is there already, machines are added to it.
 
     \b
-    Example:
+    Examples:
       gdp lab robot server --iface eth0
+      gdp lab arm --leaf
     """
     _refuse_what_is_there(hosts)
     is_new = not domain.exists()
@@ -66,7 +71,8 @@ def lab(
     else:
         make_owner(owner)
     for index, host in enumerate(hosts):
-        _make_host(host, domain, (owner / OWNER_PUBLIC).read_bytes(), iface, has_rib=is_new and index == 0)
+        has_rib = is_new and index == 0
+        _make_host(host, domain, (owner / OWNER_PUBLIC).read_bytes(), iface, has_rib=has_rib, is_leaf=leaf)
     result = {
         "domain": f"{domain} ({'made' if is_new else 'was there'})",
         "owner": str(owner),
@@ -83,10 +89,10 @@ def _refuse_what_is_there(hosts: Sequence[Path]) -> None:
             raise LocalError(f"{host} is there already")
 
 
-def _make_host(host: Path, domain: Path, owner_key: bytes, iface: str, *, has_rib: bool) -> None:
+def _make_host(host: Path, domain: Path, owner_key: bytes, iface: str, *, has_rib: bool, is_leaf: bool) -> None:
     roles = [Role.SWITCH, *([Role.RIB] if has_rib else []), Role.PROXY]
     for role in roles:
-        make_node(host / role.value, role, host.name, domain)
+        make_node(host / role.value, Role.LEAF if is_leaf and role is Role.SWITCH else role, host.name, domain)
     (host / Role.PROXY.value / DELEGATIONS).mkdir(mode=0o700)
     attach = ", ".join(f"{role.value}0" for role in roles[1:])
     files = {

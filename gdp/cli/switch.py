@@ -11,8 +11,8 @@ import typer
 
 from gdp.cli.node import Check, Config, Json, Verbose, emit, emit_wait, failing_clearly, set_up_logging
 from gdp.crypto.certificates import Role
+from gdp.crypto.identity import Identity
 from gdp.errors import LocalError
-from gdp.names import Name
 from gdp.nodes.config import DataPlane, SwitchConfig
 from gdp.nodes.membership import load_member
 from gdp.nodes.switch import run_switch
@@ -33,7 +33,10 @@ def switch(
     json: Json = False,
     verbose: Verbose = False,
 ) -> None:
-    """Switch frames by 256-bit names between layer-2 ports, until Ctrl-C."""
+    """Switch frames by 256-bit names between layer-2 ports, until Ctrl-C.
+
+    With the identity of a leaf it serves the nodes attached to it, and passes nothing on between its neighbours.
+    """
     set_up_logging(verbose=verbose)
     with failing_clearly():
         settings = SwitchConfig.load(config).with_ifaces(iface or [])
@@ -41,11 +44,11 @@ def switch(
             settings = settings.model_copy(update={"data_plane": _data_plane(data_plane)})
         if check:
             identity, _ = load_member(settings.identity, settings.domain, Role.SWITCH)
-            _report_check(identity.name, len(settings.ports), json=json)
+            _report_check(identity, len(settings.ports), json=json)
             return
         run_switch(
             settings,
-            lambda name, plane, reason: _report_ready(name, plane, reason, json=json),
+            lambda identity, plane, reason: _report_ready(identity, plane, reason, json=json),
             emit_wait if json else None,
         )
 
@@ -57,18 +60,18 @@ def _data_plane(text: str) -> DataPlane:
     return known[text]
 
 
-def _report_check(name: Name, ports: int, *, json: bool) -> None:
+def _report_check(identity: Identity, ports: int, *, json: bool) -> None:
     if json:
-        emit("checked", name=name.to_text(), ports=ports)
+        emit("checked", name=identity.name.to_text(), role=identity.role.value, ports=ports)
     else:
-        typer.echo(f"configuration good: switch {name.short}, {ports} ports")
+        typer.echo(f"configuration good: {identity.role.value} {identity.name.short}, {ports} ports")
 
 
-def _report_ready(name: Name, plane: str, reason: str, *, json: bool) -> None:
+def _report_ready(identity: Identity, plane: str, reason: str, *, json: bool) -> None:
     if json:
-        emit("ready", name=name.to_text(), data_plane=plane, reason=reason)
+        emit("ready", name=identity.name.to_text(), role=identity.role.value, data_plane=plane, reason=reason)
         return
-    typer.echo(f"switch {name.short} is up, data plane {plane}; Ctrl-C ends it")
+    typer.echo(f"{identity.role.value} {identity.name.short} is up, data plane {plane}; Ctrl-C ends it")
     if reason:
         typer.echo(f"not the kernel data plane: {reason}")
 

@@ -278,7 +278,7 @@ class Attachment:
 
     def _choose_switch(self, now_s: float) -> None:
         """Attach to the switch over the cheapest port; a new or restarted one hears every claim."""
-        switches = [each for each in self.greeter.all_up() if each.role is Role.SWITCH]
+        switches = [each for each in self.greeter.all_up() if each.role.is_switch]
         best = min(switches, key=lambda each: (self.greeter.ports[each.port].cost, each.port), default=None)
         is_same = best is not None and best is self._switch and best.nonce == self._switch_nonce
         if not is_same:

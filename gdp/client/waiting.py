@@ -18,7 +18,7 @@ def attachment_waits(attachment: Attachment, now_s: float) -> list[Wait]:
     """Return what keeps a node from being attached with all it advertises; empty when nothing does."""
     if attachment.switch is None:
         ports = attachment.greeter.ports.values()
-        of_ports = [wait for port in ports for wait in port_waits(port, (Role.SWITCH,))]
+        of_ports = [wait for port in ports for wait in port_waits(port, (Role.SWITCH, Role.LEAF))]
         strangers = list(stranger_waits(attachment.greeter, now_s))
         refusing = {wait.port for wait in strangers}
         return [*strangers, *(w for w in of_ports if w.port not in refusing or w.reason is WaitReason.LINK_DOWN)]

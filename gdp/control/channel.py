@@ -54,7 +54,7 @@ _OFFERS_PER_PEER: Final = 4  # accepted, and not in use yet
 _PEERS_MAX: Final = 8_192
 _OFFERS_PER_S: Final = 20.0  # accepted of one peer
 _HINTS_PER_S: Final = 100.0
-_PEER_ROLES: Final = (Role.SWITCH, Role.RIB)
+_PEER_ROLES: Final = (Role.SWITCH, Role.LEAF, Role.RIB)
 
 
 class Opened(NamedTuple):

@@ -43,6 +43,7 @@ from gdp.control.hello import (
     RTCERTS_MAX,
     Hello,
     Timing,
+    echo_of,
 )
 from gdp.control.join import Join
 from gdp.control.keepalive import KeepaliveSession, Slowness
@@ -94,6 +95,7 @@ Change = tuple[Neighbour, NeighbourState]
 class LinkPort:
     """A port as the control plane sees it."""
 
+    owner: Name  # the node whose port it is
     index: int
     mac: bytes
     own_mtu: int  # what our end takes, in bytes after the Ethernet header
@@ -116,6 +118,11 @@ class LinkPort:
     said_mtus: dict[Name, int] = field(default_factory=dict)  # what each neighbour's end takes
     addresses: dict[bytes, None] = field(default_factory=dict)  # of neighbours, former ones too; the last proven last
     strangers: Strangers = field(default_factory=Strangers)  # whose hellos were refused
+
+    @property
+    def echo(self) -> bytes:
+        """Return how others refer to our present session."""
+        return echo_of(self.nonce, self.owner)
 
     @property
     def mtu(self) -> int:
@@ -168,11 +175,11 @@ class LinkPort:
         return any(each.mac == mac and each.state is NeighbourState.UP for each in self.neighbours.values())
 
     def heard(self) -> tuple[bytes, ...]:
-        """Return the nonces that a hello echoes: those of neighbours first, then of candidates, the newest first."""
+        """Return what a hello echoes: neighbours first, then candidates, the newest first."""
         proven = [each for each in self.neighbours.values() if each.is_proven]
         others = sorted(self.candidates(), key=lambda each: each.heard_s, reverse=True)
-        restarts = [each.candidate for each in proven if each.candidate]
-        return *(each.nonce for each in proven), *(each.nonce for each in others), *restarts
+        restarts = [echo_of(each.candidate, each.name) for each in proven if each.candidate]
+        return *(each.echo for each in proven), *(each.echo for each in others), *restarts
 
     def end(self, neighbour: Neighbour) -> None:
         """Remember how far a session came that has proved itself; others cannot bring anybody up again."""
@@ -191,7 +198,7 @@ class LinkPort:
         Raises:
             StatementError: REPLAYED: it is of another session of either end, came before, or is too old to tell.
         """
-        if (join.session, join.sender_session) != (self.nonce, neighbour.nonce):
+        if (join.session, join.sender_session) != (self.echo, neighbour.nonce):
             raise StatementError(DropReason.REPLAYED, "a join of another session")
         window = self.joins.get(neighbour.nonce)
         if window is None:
@@ -311,7 +318,7 @@ class Greeter:
             lost = [] if port is None else self._lose(port, list(port.neighbours.values()), NeighbourEvent.LINK_LOST)
             nonce, key = self._session()
             self.ports[index] = LinkPort(
-                index, mac, own_mtu, cost, nonce, key, Admission(now_s), hello_at_s=now_s,
+                self._identity.name, index, mac, own_mtu, cost, nonce, key, Admission(now_s), hello_at_s=now_s,
                 addresses={} if port is None else port.addresses,
             )  # fmt: skip
             return lost
@@ -400,7 +407,7 @@ class Greeter:
         received_bytes = _received_bytes(arrival, statement)
         self._refuse_rival(port, hello, member.name, (arrival.mac, received_bytes), now.mono_s)
         self.rivals.take(member.name, hello.life)
-        is_two_way = port.nonce in hello.heard
+        is_two_way = port.echo in hello.heard
         known = port.neighbours.get(member.name)
         self._make_room(port, known, is_two_way=is_two_way)
         if known is None:
@@ -433,6 +440,7 @@ class Greeter:
         known.cookie = b"" if is_new_session else known.cookie
         known.sequence, known.digest, known.greeted_s = hello.sequence, hello.digest, now.mono_s
         known.member, known.checked_s, known.life = member, now.mono_s, hello.life
+        known.role = member.role  # a root may have made a leaf of a switch
         had_proof, known.proof = known.proof is not None, proof
         self._note_clash(port, known, hello, now.mono_s)
         self._alive(known, now.mono_s)
@@ -472,6 +480,10 @@ class Greeter:
         if member.name != statement.signer:
             raise StatementError(DropReason.BAD_CERTIFICATE, "a hello under another's certificate")
         statement.verify(member.key)
+        roles = member.role, self._identity.role
+        if Role.LEAF in roles and all(each.is_switch for each in roles) and member.domain != self._identity.root.domain:
+            port.strangers.note(hello.membership, DropReason.THROUGH_LEAF, now.mono_s)
+            raise StatementError(DropReason.THROUGH_LEAF, "a leaf joins switches of its own domain only")
         return hello, member
 
     def _admit(self, port: LinkPort, arrival: Arrival, signer: Name, hello: Hello, now_s: float) -> None:
@@ -555,7 +567,7 @@ class Greeter:
             return  # it was restarted there
         elsewhere = self._life_elsewhere(name)
         is_outlived_here = any(other.life < hello.life for other in others)
-        is_proven = port.nonce in hello.heard  # else it may be an old one played back
+        is_proven = port.echo in hello.heard  # else it may be an old one played back
         tell = self._tell_rival if is_proven else self.rivals.tell
         for other in others:
             if is_outlived_here:
@@ -618,8 +630,8 @@ class Greeter:
 
     def _note_clash(self, port: LinkPort, neighbour: Neighbour, hello: Hello, now_s: float) -> None:
         """Note what a neighbour's hello says of our identity."""
-        neighbour.refuses_us = port.nonce in hello.rivals and port.nonce not in hello.heard
-        if port.nonce in hello.rivals:
+        neighbour.refuses_us = port.echo in hello.rivals and port.echo not in hello.heard
+        if port.echo in hello.rivals:
             self.note_clash(neighbour.name, now_s)
 
     def receive_keepalive(self, arrival: Arrival, header: Header, now: Instant) -> Neighbour:
@@ -793,7 +805,7 @@ class Greeter:
         """Return a RIB's RtCerts for the switches that it hears on a port."""
         if self._rtcert_for is None:
             return ()
-        heard = [each for each in port.neighbours.values() if each.role is Role.SWITCH]
+        heard = [each for each in port.neighbours.values() if each.role.is_switch]
         switches = sorted((not each.is_proven, each.name) for each in heard)
         return tuple(self._rtcert_for(name) for _, name in switches[:RTCERTS_MAX])
 

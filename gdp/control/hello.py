@@ -5,6 +5,7 @@ Place: pure.
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -20,6 +21,7 @@ __all__ = [
     "COOKIES_MAX",
     "COOKIE_BYTES",
     "DIGEST_BYTES",
+    "ECHO_BYTES",
     "HEARD_MAX",
     "HELLO_MAX_BYTES",
     "INTERVAL_MAX_MS",
@@ -30,9 +32,11 @@ __all__ = [
     "RTCERTS_MAX",
     "Hello",
     "Timing",
+    "echo_of",
 ]
 
 NONCE_BYTES: Final = 8
+ECHO_BYTES: Final = 16
 DIGEST_BYTES: Final = 8
 LIFE_BYTES: Final = 16  # first sequence number (wall-clock milliseconds of the start), incarnation; big-endian
 COOKIE_BYTES: Final = 16
@@ -66,14 +70,22 @@ class Timing(NamedTuple):
 NO_KEEPALIVES: Final = Timing(0, 0, 1)
 
 
+def echo_of(nonce: bytes, name: Name) -> bytes:
+    """Return how another refers to a session of a port: by its nonce and by who was heard to say it.
+
+    A bare nonce would also be that of a member that says another's as its own (docs/model, H2 and J2).
+    """
+    return hashlib.sha256(b"gdp echo\0" + nonce + name).digest()[:ECHO_BYTES]
+
+
 @dataclass(frozen=True, slots=True)
 class Hello:
     """One greeting on one port.
 
     Args:
-        nonce: random for this session of the sender's port; to be echoed, which proves that the neighbour is there now.
+        nonce: random for this session of the sender's port; its echo proves that the neighbour is there now.
         sequence: rises within the session.
-        heard: the nonces of those that the sender hears on this port.
+        heard: the echo of each whom the sender hears on this port (``echo_of``).
         mtu: bytes after the Ethernet header that the sender's port takes.
         digest: of the link state that both ends should share; where it differs, they send each other all of it.
         membership: the sender's certificate, DER.
@@ -81,7 +93,7 @@ class Hello:
         exchange_key: X25519, for the key of keepalives; empty where the sender wants none.
         life: mark of the sender's life, ``LIFE_BYTES``.
         rtcerts: of a RIB, one for each switch that it hears here: which switch may speak of it.
-        rivals: nonces of those at this port whose identity another node has, too; refused are those not in ``heard``.
+        rivals: echoes of those at this port whose identity another node has, too; refused are those not in ``heard``.
         cookies: for each receiver that asked for one, the nonce of its port and what shows the cookie.
     """
 
@@ -126,14 +138,14 @@ class Hello:
         return cls(
             fields.bytes_("n", NONCE_BYTES),
             fields.uint("s"),
-            tuple(fields.byte_strings("h", HEARD_MAX, NONCE_BYTES)),
+            tuple(fields.byte_strings("h", HEARD_MAX, ECHO_BYTES)),
             fields.uint("m", FRAME_MAX_BYTES),
             fields.bytes_("d", DIGEST_BYTES),
             fields.bytes_("c"),
             _timing(fields),
             fields.bytes_("x", EXCHANGE_KEY_BYTES) if fields.get("x") != b"" else b"",
             fields.bytes_("b", LIFE_BYTES),
-            tuple(fields.byte_strings("u", RIVALS_MAX, NONCE_BYTES)),
+            tuple(fields.byte_strings("u", RIVALS_MAX, ECHO_BYTES)),
             tuple(fields.byte_strings("r", RTCERTS_MAX)),
             tuple(
                 (each[:NONCE_BYTES], each[NONCE_BYTES:])

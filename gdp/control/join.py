@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gdp.control.hello import NONCE_BYTES
+from gdp.control.hello import ECHO_BYTES, NONCE_BYTES
 from gdp.control.query import TRANSIT_MAX
 from gdp.crypto.fields import Fields
 from gdp.crypto.keys import SigningKey
@@ -30,12 +30,13 @@ class Join:
         mtu: smallest on the way down from here, in bytes after the Ethernet header.
         lease_s: how long the branch stands unless renewed; 0 takes it down (LEAVE).
         evidence: the signed claim of a reader further down; whoever passes a join on checks it.
-        session: nonce of the receiver's port, as its hellos say it.
+        session: echo of the receiver's port (``echo_of``), so that no other member can hand the join on to it.
         sequence: rises with every join and leave of the sender within its session.
-        version: sequence number of the publisher's claim that ``switch`` was read from; the newest decides.
+        version: sequence number of ``proof``; the newest decides.
         backup_for: the switch below that has the tree another way, and wants copies only while that way is broken;
             ``ZERO`` in an ordinary join. Source: the secondary join of RFC 7431.
         sender_session: nonce of the sender's port.
+        proof: the signed claim of the publisher, which says that it is at ``switch``; empty in a leave.
     """
 
     topic: Name
@@ -51,6 +52,7 @@ class Join:
     version: int = 0
     backup_for: Name = ZERO
     sender_session: bytes = bytes(NONCE_BYTES)
+    proof: bytes = b""
 
     def to_wire(self, signer: Name, key: SigningKey) -> bytes:
         """Return the signed statement."""
@@ -68,6 +70,7 @@ class Join:
             "v": self.version,
             "b": self.backup_for,
             "o": self.sender_session,
+            "c": self.proof,
         }
         return sign(StatementType.JOIN, body, signer, key)
 
@@ -87,9 +90,10 @@ class Join:
             fields.uint("m", FRAME_MAX_BYTES),
             fields.number("l", 0, LEASE_MAX_S),
             fields.bytes_("e"),
-            fields.bytes_("i", NONCE_BYTES),
+            fields.bytes_("i", ECHO_BYTES),
             fields.uint("s"),
             fields.uint("v"),
             fields.optional_name("b"),
             fields.bytes_("o", NONCE_BYTES),
+            fields.bytes_("c"),
         )

@@ -91,6 +91,7 @@ class LinkState:
     refused: tuple[Name, ...] = ()  # identities refused at this switch, for an older node has them
     is_partial: bool = False  # there are members that are not listed
     said_unix_s: int = 0  # when it was signed, by the origin's wall clock
+    is_leaf: bool = False  # from the origin's certificate: nothing leads through it
 
     def fitted(self, membership: bytes) -> LinkState:
         """Return as much of it as one statement carries beside the signer's certificate: RIBs and links first."""
@@ -131,8 +132,10 @@ class LinkState:
         return sign(StatementType.LINK_STATE, body, self.origin, key)
 
     @classmethod
-    def from_fields(cls, fields: Fields, origin: Name, domain: Name) -> LinkState:
-        """Read a parsed statement's body.
+    def from_fields(cls, fields: Fields, origin: Name, domain: Name, *, is_leaf: bool = False) -> LinkState:
+        """Read a parsed statement's body; what the origin is stands in its certificate.
+
+        Of a leaf, links that leave its domain are left out.
 
         Raises:
             StatementError: MALFORMED.
@@ -145,7 +148,7 @@ class LinkState:
             domain,
             Scope(scope),
             fields.uint("s"),
-            _adjacencies(fields, "l"),
+            tuple(each for each in _adjacencies(fields, "l") if not is_leaf or each.domain == domain),
             _adjacencies(fields, "i"),
             _ribs(fields),
             tuple(fields.names("m", MEMBERS_MAX)),
@@ -153,6 +156,7 @@ class LinkState:
             tuple(fields.names("u", RIBS_MAX)),
             fields.flag("z"),
             fields.uint("e"),
+            is_leaf,
         )
 
 

@@ -15,7 +15,7 @@ from enum import Enum
 from typing import Final
 
 from gdp.control.admission import TokenBucket
-from gdp.control.hello import LIFE_BYTES
+from gdp.control.hello import LIFE_BYTES, echo_of
 from gdp.control.keepalive import KeepaliveSession
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.keys import PublicKey
@@ -88,3 +88,8 @@ class Neighbour:
     is_proven: bool = False  # its present session has echoed our nonce: it is on this link now
     cookie: bytes = b""  # that it gave us: it verifies strangers' hellos with one only
     hellos: TokenBucket | None = None  # how many of its hellos are verified, once it is proven
+
+    @property
+    def echo(self) -> bytes:
+        """Return how we refer to its present session."""
+        return echo_of(self.nonce, self.name)

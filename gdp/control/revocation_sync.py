@@ -116,7 +116,7 @@ class RevocationSync:
             said = Revoked.from_fields(statement.fields)
         else:
             said = Lacking.from_fields(statement.expect(StatementType.LACKING))
-        session = self._greeter.ports[neighbour.port].nonce
+        session = self._greeter.ports[neighbour.port].echo
         key = session, neighbour.name
         if said.session != session or said.sequence <= self._received.get(key, -1):
             raise StatementError(DropReason.REPLAYED, "digests of revocations")
@@ -167,7 +167,7 @@ class RevocationSync:
         self._said_s[name] = now_s
         if len(self._said_s) > _NAMES_MAX:
             del self._said_s[next(iter(self._said_s))]
-        self._send(peer, Revoked(peer.neighbour.nonce, self._next(), tuple(self._revoked.summary())))
+        self._send(peer, Revoked(peer.neighbour.echo, self._next(), tuple(self._revoked.summary())))
 
     def _compare(self, peer: _Peer, said: Revoked, now: Instant) -> None:
         """Ask for what is lacking here, or say more exactly what is here."""
@@ -186,7 +186,7 @@ class RevocationSync:
             elif count:
                 hashes = self._revoked.hashes(domain)
                 assert hashes is not None
-                self._send(peer, Revoked(peer.neighbour.nonce, self._next(), (), domain, tuple(hashes)))
+                self._send(peer, Revoked(peer.neighbour.echo, self._next(), (), domain, tuple(hashes)))
 
     def _compare_buckets(self, peer: _Peer, said: Revoked, now_s: float) -> None:
         own = self._revoked.hashes(said.domain)
@@ -229,7 +229,7 @@ class RevocationSync:
         for _ in range(min(_ASKS_PER_TICK, len(peer.asks))):
             domain, buckets = peer.asks.popleft()
             ids = [each for bucket in buckets for each in self._revoked.ids(domain, bucket)]
-            self._send(peer, Lacking(peer.neighbour.nonce, self._next(), domain, buckets, tuple(ids[:IDS_MAX])))
+            self._send(peer, Lacking(peer.neighbour.echo, self._next(), domain, buckets, tuple(ids[:IDS_MAX])))
         for _ in range(min(_PER_TICK, len(peer.sends))):
             wire = self._revoked.wire(*peer.sends.popleft())
             if wire is not None and self._may_draw(peer.neighbour.name, now_s):

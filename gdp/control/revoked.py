@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from gdp.control.hello import NONCE_BYTES
+from gdp.control.hello import ECHO_BYTES
 from gdp.crypto.fields import Fields
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import StatementType, sign
@@ -27,7 +27,7 @@ class Revoked:
     """Digests of what the sender keeps.
 
     Args:
-        session: nonce of the receiver's port, from its hellos.
+        session: echo of the receiver's port (``echo_of``).
         sequence: rises with everything that the sender says of revocations.
         domains: trusted domain, how many it took back, digest of these.
         domain: of ``hashes``; ``ZERO``: there are none.
@@ -60,7 +60,7 @@ class Revoked:
         """
         domain = fields.name("d") if fields.bytes_("d") else ZERO
         joined = fields.bytes_("h", 0 if domain == ZERO else BUCKETS * ID_BYTES)
-        return cls(fields.bytes_("i", NONCE_BYTES), fields.uint("s"), _domains(fields), domain, _split(joined))
+        return cls(fields.bytes_("i", ECHO_BYTES), fields.uint("s"), _domains(fields), domain, _split(joined))
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +101,7 @@ class Lacking:
         buckets, ids = fields.bytes_("b"), fields.bytes_("k")
         if len(buckets) > BUCKETS or len(set(buckets)) < len(buckets) or len(ids) % ID_BYTES:
             raise StatementError(DropReason.MALFORMED, "what is lacking")
-        return cls(fields.bytes_("i", NONCE_BYTES), fields.uint("s"), fields.name("d"), tuple(buckets), _split(ids))
+        return cls(fields.bytes_("i", ECHO_BYTES), fields.uint("s"), fields.name("d"), tuple(buckets), _split(ids))
 
 
 def _split(joined: bytes) -> tuple[bytes, ...]:

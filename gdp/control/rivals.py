@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
+from gdp.control.hello import echo_of
 from gdp.names import Name
 
 __all__ = ["Rivals"]
@@ -68,11 +69,11 @@ class Rivals:
         return known is None or known.until_s <= now_s
 
     def on(self, port: int, now_s: float) -> tuple[bytes, ...]:
-        """Return the sessions at a port that have rivals."""
+        """Return the echoes of the sessions at a port that have rivals."""
         if not self._sessions:
             return ()
         self._sessions = {key: each for key, each in self._sessions.items() if each.until_s > now_s}
-        return tuple(nonce for its, nonce in self._sessions if its == port)
+        return tuple(echo_of(nonce, each.name) for (its, nonce), each in self._sessions.items() if its == port)
 
     def refused(self, now_s: float) -> list[Name]:
         """Return the identities of which a hello was refused lately."""

@@ -35,6 +35,7 @@ class WaitReason(Enum):
     NO_RIB = "no-rib"
     REFUSED = "claim-refused"
     IN_USE = "identity-in-use"
+    THROUGH_LEAF = "through-leaf"  # switches of the domain that only a leaf joins to this one
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +45,7 @@ class Wait:
     Args:
         port: index of the port that it is about, where it is about one.
         domain: label of a stranger's domain; unproven, maybe empty.
-        name: of the neighbour, or of the advertisement that was refused.
+        name: of the neighbour, of the advertisement that was refused, or of one switch that is cut off.
         refused: why a hello or an advertisement was refused.
     """
 
@@ -61,6 +62,8 @@ class Wait:
             return "stranger", self.port, self.domain
         if self.reason is WaitReason.REFUSED:
             return "claim", self.name
+        if self.reason is WaitReason.THROUGH_LEAF:
+            return "leaf", None
         return "port", self.port
 
 

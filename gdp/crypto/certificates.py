@@ -26,11 +26,21 @@ _PEM_END: Final = b"-----END CERTIFICATE-----\n"
 
 
 class Role(str, Enum):
-    """What a node is in its domain."""
+    """What a node is in its domain.
+
+    A leaf is a switch that carries the traffic of the nodes attached to it and no transit (RFC 6987, stub router).
+    Other switches hold it to that by its certificate.
+    """
 
     SWITCH = "switch"
     RIB = "rib"
     PROXY = "proxy"
+    LEAF = "leaf"
+
+    @property
+    def is_switch(self) -> bool:
+        """Return whether nodes attach to it and it speaks of links: a switch or a leaf."""
+        return self in (Role.SWITCH, Role.LEAF)
 
 
 @dataclass(frozen=True, slots=True)

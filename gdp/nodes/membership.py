@@ -32,12 +32,15 @@ log = logging.getLogger(__name__)
 def load_member(directory: Directory, domain: Domain, role: Role) -> tuple[Identity, Policy]:
     """Return a node's identity and its domain's policy.
 
+    Args:
+        role: what the node has to be; a leaf is a switch.
+
     Raises:
         LocalError: the files do not hold, or are of another role or domain.
     """
     identity = load_identity(directory, time.time())
     policy = load_policy(domain)
-    if identity.role is not role:
+    if identity.role is not role and not (role is Role.SWITCH and identity.role.is_switch):
         raise LocalError(f"{directory}: the identity of a {identity.role.value}, where a {role.value}'s was expected")
     if identity.member.domain != policy.own:
         raise LocalError(f"{directory}: the identity is of another domain than {domain.root}")

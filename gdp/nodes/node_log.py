@@ -137,6 +137,8 @@ class NodeLog:
             case WaitReason.REFUSED:
                 reason = "" if wait.refused is None else wait.refused.label
                 return f"advertisement of {'?' if wait.name is None else self._local_name(wait.name)} refused: {reason}"
+            case WaitReason.THROUGH_LEAF:
+                return f"switch {name}, maybe others, is joined by leaves only, which carry no transit"
             case WaitReason.IN_USE:
                 return "another node with this identity is attached elsewhere; this one starts when that one is gone"
 
@@ -149,6 +151,8 @@ def _refusal(ifname: str, wait: Wait) -> str:
     of = f"neighbour on {ifname} of domain {wait.domain or '?'}"
     if wait.refused is DropReason.WRONG_DOMAIN:
         return f"{of}, which is not trusted here (domain.trusts)"
+    if wait.refused is DropReason.THROUGH_LEAF:
+        return f"{of}: a leaf joins switches of its own domain only"
     if wait.refused is DropReason.EXPIRED:
         return f"{of}: its certificate is not valid now; has it expired, or is a clock wrong?"
     return f"{of} refused: {'' if wait.refused is None else wait.refused.label}"

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
+from gdp.crypto.identity import Identity
 from gdp.errors import LocalError, StatementError
-from gdp.names import Name
 from gdp.nodes.audit import keep_audit
 from gdp.nodes.config import SwitchConfig
 from gdp.nodes.counts import count_list
@@ -42,12 +42,12 @@ _MTU_FALLBACK = 1_500
 
 
 def run_switch(
-    config: SwitchConfig, ready: Callable[[Name, str, str], None], on_wait: OnWait | None = None
+    config: SwitchConfig, ready: Callable[[Identity, str, str], None], on_wait: OnWait | None = None
 ) -> None:
     """Run a switch until it is told to stop.
 
     Args:
-        ready: called once when it has begun, with the switch's name, its data plane, and why it is not a better one.
+        ready: called once when it has begun, with who it is, its data plane, and why that is not a better one.
         on_wait: called with reason and text when the switch reports what it waits for.
 
     Raises:
@@ -57,8 +57,7 @@ def run_switch(
     identity, policy = load_member(config.identity, config.domain, Role.SWITCH)
     if not config.ports and not config.attach:
         raise LocalError("a switch needs at least one port: --iface, or ports in the configuration")
-    ifaces = [port.iface for port in config.ports]
-    refuse_loopback(ifaces)
+    refuse_loopback(ifaces := [port.iface for port in config.ports])
     table = Table()
     settings = NodeSettings(
         incarnation(),
@@ -120,10 +119,11 @@ def run_switch(
             metrics = Metrics(_sources(switch, chosen, node_log))
             metrics.serve(config.metrics.port)
             stack.callback(metrics.close)
-        log.info("switch up name=%s plane=%s ports=%d", identity.name.short, chosen.name, len(plane.ports))
+        said = identity.name.short, identity.role.value, chosen.name, len(plane.ports)
+        log.info("switch up name=%s role=%s plane=%s ports=%d", *said)
         if chosen.reason:
             log.warning("not the best data plane plane=%s reason=%s", chosen.name, chosen.reason)
-        ready(identity.name, chosen.name, chosen.reason)
+        ready(identity, chosen.name, chosen.reason)
         runtime.run()
 
 

@@ -29,6 +29,8 @@ from gdp.effects import Instant
 from gdp.errors import DropReason, RemoteError, StatementError, StoreError
 from gdp.frame.kinds import Kind
 from gdp.limits import (
+    ANSWER_BYTES_BURST,
+    ANSWER_BYTES_PER_S,
     CLOCK_SKEW_S,
     LEASE_MAX_S,
     NEGATIVE_LEASE_S,
@@ -36,6 +38,7 @@ from gdp.limits import (
     RIB_WATCHES_MAX,
     WITHDRAWAL_MAX_BYTES,
 )
+from gdp.message.token_bucket import Paces
 from gdp.names import Name
 from gdp.rib.above import Above
 from gdp.rib.digest_tree import DigestTree
@@ -57,6 +60,8 @@ __all__ = ["Letter", "Rib", "RibSettings"]
 _ADVISED_S: Final = 30.0  # who was answered is told of a move for so long
 _UNTOLD_S: Final = 1.0  # ... where there are too many for that
 _NAMES_OF_ISSUER_MAX: Final = 256  # whose watchers are told of what somebody revoked who is not their owner
+_QUESTION_BYTES: Final = 1_024  # what a question costs, asked on above or denied
+_ANSWER_BYTES: Final = 1_024  # what an answer costs beside the claim in it
 _DOUBT_S: Final = 0.1  # a RIB above that said nothing for so long is asked for a sign of life beside a question
 _PEER_MESSAGES: Final[dict[StatementType, type[Message]]] = {
     StatementType.DIGEST: Digest,
@@ -110,6 +115,7 @@ class Rib:
         self._above = Above(is_top=not settings.upper)
         self._upstream = Upstream(settings.upper)
         self._replication = self._replication_over(store.digests)
+        self._answer_paces = Paces(ANSWER_BYTES_PER_S, ANSWER_BYTES_BURST)
         self._now_s = 0.0  # of the last call
         self._letters: list[Letter] = []
         self.boundary = ErrorBoundary()
@@ -248,7 +254,7 @@ class Rib:
     def _take_relay(self, statement: Statement, now: Instant) -> None:
         relay = Relay.from_fields(statement.fields)
         member = self._sender(relay.membership, statement, now)
-        if member.role not in (Role.SWITCH, Role.RIB):
+        if not (member.role.is_switch or member.role is Role.RIB):
             raise StatementError(DropReason.WRONG_DOMAIN, "relays are switches or RIBs")
         statement.verify(member.key)
         passed_on = parse(relay.statement)
@@ -260,7 +266,7 @@ class Rib:
             return
         try:
             claim = self._verifier.verify_statement(passed_on, now.unix_s)
-            if member.role is Role.SWITCH and claim.switch != member.name:
+            if member.role.is_switch and claim.switch != member.name:
                 raise StatementError(DropReason.NOT_DELEGATED, "the RtCert names another switch than the relay")
             if relay.domain is not None and not self._policy.trusts(relay.domain):
                 raise StatementError(DropReason.WRONG_DOMAIN, "a claim of a domain that is not trusted")
@@ -415,7 +421,7 @@ class Rib:
     def _take_query(self, statement: Statement, now: Instant) -> None:
         fields = statement.fields
         member = self._sender(fields.bytes_("c"), statement, now)
-        if member.role not in (Role.SWITCH, Role.RIB):
+        if not (member.role.is_switch or member.role is Role.RIB):
             raise StatementError(DropReason.NOT_DELEGATED, "only switches and RIBs ask")
         statement.verify(member.key)
         query = Query.from_fields(fields)
@@ -423,12 +429,15 @@ class Rib:
             self._deny(query.name, member.name)  # a probe for a sign of life
             return
         asker = _asker(member)
+        routes = [route for route in self._store.routes(query.name) if self._may_tell(route, asker)]
+        cost = _QUESTION_BYTES + sum(len(route.claim) + _ANSWER_BYTES for route in routes)
+        if not self._answer_paces.take(member.name, now.mono_s, cost):
+            raise StatementError(DropReason.QUOTA, "answers to one asker")
         if query.watch_s > 0:
             self._watch(query, asker, now.mono_s)
         if query.revoked is not None:
             lacked = self._revocations.lacked_by(member.name, query.name, query.revoked, now.mono_s)
             self._send_revocations(lacked, [member.name])
-        routes = [route for route in self._store.routes(query.name) if self._may_tell(route, asker)]
         for route in routes:
             self._answer(route, asker, now.mono_s)
         is_below = not self._upstream.has(member.name)
@@ -780,7 +789,7 @@ class Rib:
             self._tell_gone(route, now.mono_s, by=entry.sender)
 
     def _is_own_switch(self, member: Membership) -> bool:
-        return member.role is Role.SWITCH and member.domain == self._policy.own
+        return member.role.is_switch and member.domain == self._policy.own
 
     def _sender(self, membership: bytes, statement: Statement, now: Instant) -> Membership:
         member = self._policy.verify_membership(membership, now.unix_s)

@@ -47,7 +47,7 @@ from gdp.stores.keyring import (
 from gdp.stores.ledger import append_issued
 from gdp.stores.private_keys import Storage
 from gdp.trust.audit import Action
-from gdp.trust.card import Card
+from gdp.trust.card import Recipient
 from gdp.trust.delegation import Delegation
 from gdp.trust.grants import SECRET_BYTES
 from gdp.trust.owner import Owner
@@ -55,6 +55,7 @@ from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
 
 __all__ = [
+    "DAY_S",
     "admit",
     "admit_node",
     "delegate",
@@ -292,7 +293,7 @@ def install_membership(
 
 def delegate(
     owner: Path,
-    card: Path | Card,
+    recipient: Path | Recipient,
     metadata: Metadata,
     rights: Collection[Right],
     epochs: Iterable[int] = (0,),
@@ -303,10 +304,13 @@ def delegate(
 ) -> Delegation:
     """Let a node act on a name, and grant it the secrets of ``epochs``.
 
+    Args:
+        recipient: the node, or its card's file.
+
     Raises:
         LocalError: no owner there, no card, rights or epochs out of bounds.
     """
-    face = card if isinstance(card, Card) else load_card(card)
+    face = load_card(recipient) if isinstance(recipient, Path) else recipient
     validity = Validity.lasting(_now(unix_s), days * DAY_S)
     given = load_owner(owner).delegate(face, metadata, rights, epochs, validity, may_delegate=may_delegate)
     who, about = given.node.to_text(), given.name.to_text()

@@ -2,9 +2,15 @@
 
 Place: pure. The claim of whoever hears others on a name (``HEARS``) plants trees. A reader's is judged here; any other
 is kept, relayed, and judged by the RIB: those who hear it must find it.
+
+A node numbers its claims in one count, and says all of them again in each session with a switch. So a claim of another
+life of the node, one below the first that came in its present session, and one that came before, are recordings.
 """
 
 from __future__ import annotations
+
+from collections import OrderedDict
+from typing import Final
 
 from gdp.control.neighbour import Neighbour
 from gdp.control.verdict import Verdict
@@ -14,7 +20,8 @@ from gdp.crypto.statements import Statement, StatementType
 from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
-from gdp.limits import WITHDRAWAL_MAX_BYTES
+from gdp.limits import CLAIMS_WINDOW, WITHDRAWAL_MAX_BYTES
+from gdp.message.replay import ReplayWindow
 from gdp.names import ZERO, Name
 from gdp.switch.attached import Attached
 from gdp.switch.held import Held
@@ -25,11 +32,24 @@ from gdp.switch.planter import Planter
 from gdp.switch.relocation import Relocations
 from gdp.switch.unicast import Unicast
 from gdp.trust.audit import Action
-from gdp.trust.claim import ClaimBody
+from gdp.trust.claim import Claim, ClaimBody
 from gdp.trust.right import HEARS, Right
 from gdp.trust.verifier import ClaimVerifier
 
 __all__ = ["Claims"]
+
+_SESSIONS_MAX: Final = 4_096  # above the neighbours that a switch has
+_INCARNATION_BYTES: Final = 8  # at the end of a life
+
+
+class _Session:
+    """Which claims came in one session of a node."""
+
+    __slots__ = ("first", "window")
+
+    def __init__(self, first: int) -> None:
+        self.first = first
+        self.window = ReplayWindow(CLAIMS_WINDOW)
 
 
 class Claims:
@@ -59,6 +79,7 @@ class Claims:
         self._relocations = relocations
         self._held = held
         self._outbox = outbox
+        self._sessions: OrderedDict[bytes, _Session] = OrderedDict()  # by the nonce of the node
 
     def take(self, neighbour: Neighbour, statement: Statement, now: Instant) -> None:
         """Take a claim that an attached node brought; whether it is taken or refused, the node is told.
@@ -75,6 +96,7 @@ class Claims:
         except StatementError as error:
             self._refuse(neighbour, statement, error)
             raise
+        self._check_fresh(neighbour, claim)
         at = (neighbour.port, neighbour.mac)
         newest = self._sequence_of(claim.name, neighbour)
         if claim.sequence < newest:
@@ -109,6 +131,24 @@ class Claims:
             self._planter.publisher_attached(claim, now.mono_s)
         self._relocations.arrived(claim, now.mono_s)
         self._inquirer.ask(now.mono_s)
+
+    def _check_fresh(self, neighbour: Neighbour, claim: Claim) -> None:
+        """Note a verified claim of a neighbour.
+
+        Raises:
+            StatementError: REPLAYED, it is of another life or session of it, or came before.
+        """
+        if claim.incarnation.to_bytes(_INCARNATION_BYTES, "big") != neighbour.life[-_INCARNATION_BYTES:]:
+            raise StatementError(DropReason.REPLAYED, "a claim of another life of its maker")
+        session = self._sessions.get(neighbour.nonce)
+        if session is None:
+            session = self._sessions[neighbour.nonce] = _Session(claim.sequence)
+            if len(self._sessions) > _SESSIONS_MAX:
+                self._sessions.popitem(last=False)
+        if claim.sequence < session.first or session.window.is_finished(claim.sequence):
+            raise StatementError(DropReason.REPLAYED, "a claim")
+        session.window.finish(claim.sequence)
+        self._sessions.move_to_end(neighbour.nonce)
 
     def _sequence_of(self, name: Name, neighbour: Neighbour) -> int:
         """Return the highest sequence number of what an attached node claims on a name here, or -1."""

@@ -6,9 +6,9 @@ is verified here like anywhere else. Only the domain and its transit are the wor
 
 from __future__ import annotations
 
+from gdp.control.join import Join
 from gdp.control.query import Answer
 from gdp.control.relay import Relay
-from gdp.crypto.certificates import Role
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
@@ -16,6 +16,7 @@ from gdp.names import Name
 from gdp.switch.places import Place
 from gdp.trust.claim import Claim
 from gdp.trust.domain import Policy
+from gdp.trust.right import HEARS
 from gdp.trust.verifier import ClaimVerifier
 
 __all__ = ["Evidence"]
@@ -51,13 +52,28 @@ class Evidence:
         """
         relay = Relay.from_fields(statement.expect(StatementType.RELAY))
         member = self._policy.verify_membership(relay.membership, now.unix_s)
-        if member.name != statement.signer or member.role is not Role.SWITCH:
+        if member.name != statement.signer or not member.role.is_switch:
             raise StatementError(DropReason.BAD_CERTIFICATE, "a relay that is not from a switch")
         statement.verify(member.key)
         claim = self._verifier.verify_statement(parse(relay.statement), now.unix_s)
         if claim.switch != member.name:
             raise StatementError(DropReason.NOT_DELEGATED, "the RtCert names another switch")
         return _place(claim, member.domain, frozenset(relay.transit), claim.lease_s, now)
+
+    def of_join(self, join: Join, now: Instant) -> Claim:
+        """Return the reader's claim that a join with a lease shows; the publisher's proves where the join leads.
+
+        Raises:
+            StatementError: one of the two does not hold, or is about something else.
+        """
+        reader = self._verifier.verify(join.evidence, now.unix_s)
+        if reader.right not in HEARS or reader.name != join.topic:
+            raise StatementError(DropReason.NOT_DELEGATED, "a join without a reader's claim")
+        publisher = self._verifier.verify(join.proof, now.unix_s)
+        proven = publisher.name, publisher.node, publisher.right, publisher.switch, publisher.sequence
+        if proven != (join.topic, join.publisher, HEARS[reader.right], join.switch, join.version):
+            raise StatementError(DropReason.NOT_DELEGATED, "a join to where the publisher's claim is not")
+        return reader
 
     def still_holds(self, place: Place, now: Instant) -> bool:
         """Return whether the proofs of a place hold; one made without proofs does."""

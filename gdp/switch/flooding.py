@@ -3,7 +3,8 @@
 Place: pure; time comes in as ``now_s`` (monotonic seconds).
 Source: after RFC 2328, section 13. What differs: neighbours compare digests in every hello and send each other all they
 have where these differ, so that a lost flood heals without acknowledgements. A switch that has restarted asks not to be
-passed through until it has learnt the network again (RFC 6987, stub router on start-up).
+passed through until it has learnt the network again (RFC 6987, stub router on start-up). A leaf passes link states on
+like any other switch: that keeps views the same and draws no traffic. Its own links stay within its domain.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement
 from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
-from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_REFRESH_S
+from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_REFRESH_S, LINK_STATES_BURST, LINK_STATES_PER_S
+from gdp.message.token_bucket import Paces
 from gdp.names import Name
 from gdp.switch.damping import Damping
 from gdp.switch.link_states import LinkStates
@@ -81,10 +83,12 @@ class Flooding:
         self._stub_until_s: float | None = None
         self._was_stub = False
         self._domain = identity.member.domain
+        self._is_leaf = identity.role is Role.LEAF
         self.link_states = LinkStates(self._domain)
         self.paths = Paths(identity.name, self._domain, self.link_states)
         self.damping = Damping()
         self._rtcerts = RtCertCache(_RTCERTS_REMEMBERED)
+        self._paces = Paces(LINK_STATES_PER_S, LINK_STATES_BURST)
         self.drops: Counter[DropReason] = Counter()  # RIBs in link states that are not believed
         self._said: dict[Scope, tuple[object, ...]] = {}
         self._refresh_at_s: dict[Scope, float] = {}  # each by itself: news in one scope renew nothing of the other
@@ -97,7 +101,7 @@ class Flooding:
 
     def digest_for(self, port: LinkPort) -> bytes:
         """Return what to say in a hello on a port: nothing where its switches are of several domains."""
-        domains = {each.domain for each in port.neighbours.values() if each.role == Role.SWITCH}
+        domains = {each.domain for each in port.neighbours.values() if each.role.is_switch}
         return self.link_states.digest(domains.pop()) if len(domains) == 1 else bytes(DIGEST_BYTES)
 
     def receive(self, neighbour: Neighbour, statement: Statement, now: Instant) -> bool:
@@ -117,15 +121,20 @@ class Flooding:
                 raise StatementError(DropReason.STALE, "a link state of another time")
         check_sequence(fields.uint("s"), now.unix_s)
         member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
-        if member.name != statement.signer or member.role is not Role.SWITCH:
+        if member.name != statement.signer or not member.role.is_switch:
             raise StatementError(DropReason.BAD_CERTIFICATE, "a link state is signed by a switch")
-        state = LinkState.from_fields(fields, member.name, member.domain)
+        is_leaf = member.role is Role.LEAF
+        state = LinkState.from_fields(fields, member.name, member.domain, is_leaf=is_leaf)
+        if is_leaf and state.scope is Scope.BORDER:
+            raise StatementError(DropReason.THROUGH_LEAF, "a leaf that would be a border")
         if state.scope is Scope.DOMAIN and not self._domain == member.domain == neighbour.domain:
             raise StatementError(DropReason.WRONG_DOMAIN, "a link state that should not have left its domain")
         statement.verify(member.key)
         if state.origin == self._identity.name:
             self._outdo(state, now.mono_s)
             return False
+        if not self._paces.take(state.origin, now.mono_s):
+            raise StatementError(DropReason.QUOTA, "link states of one origin")  # digests bring the last one later
         proven = tuple(rib for rib in state.ribs if self._is_placed(rib, state, now.unix_s))
         if not self.link_states.put(replace(state, ribs=proven), statement.wire, now.mono_s):
             return False
@@ -135,7 +144,8 @@ class Flooding:
     def _is_placed(self, rib: AttachedRib, state: LinkState, unix_s: float) -> bool:
         """Return whether a RIB has proven that it is reached where a link state says so.
 
-        A border speaks of the RIBs of its own domain, and of those that are attached to itself.
+        A border speaks of the RIBs of its own domain, and of those that are attached to itself. A leaf speaks of those
+        that are both.
         """
         try:
             member = self._policy.verify_membership(rib.membership, unix_s)
@@ -145,7 +155,9 @@ class Flooding:
             self.drops[error.reason] += 1
             return False
         is_its = (member.role, member.name, member.domain) == (Role.RIB, rib.name, rib.domain)
-        is_here = rtcert.switch == state.origin or (state.scope is Scope.BORDER and member.domain == state.domain)
+        is_own = member.domain == state.domain
+        is_here = rtcert.switch == state.origin or (state.scope is Scope.BORDER and is_own)
+        is_here = is_here and (is_own or not state.is_leaf)
         if not (is_its and is_here):
             self.drops[DropReason.MISPLACED] += 1
         return is_its and is_here
@@ -207,12 +219,13 @@ class Flooding:
         if self.is_displaced:
             self._refresh_at_s = dict.fromkeys(self._refresh_at_s, now_s + LINK_STATE_REFRESH_S)
             return
-        switches = [each for each in self._greeter.all_up() if each.role == Role.SWITCH]
+        up = [each for each in self._greeter.all_up() if not self._is_leaf or each.domain == self._domain]
+        switches = [each for each in up if each.role.is_switch]
         links = tuple(sorted(Adjacency(n.name, n.domain, self._cost(n), n.mtu) for n in switches))
         self._rivals_seen = self._greeter.rivals.changes
         ribs = {
             AttachedRib(n.name, n.domain, n.nonce, n.life, *n.proof)
-            for n in self._greeter.all_up()
+            for n in up
             if n.role == Role.RIB and n.proof is not None
         }
         refused = tuple(self._greeter.rivals.refused(now_s))
@@ -248,7 +261,7 @@ class Flooding:
         self._sequence += 1
         state = LinkState(
             self._identity.name, self._domain, scope, self._sequence, links, inside, ribs, members, self._life, refused,
-            said_unix_s=max(int(now_s + self._unix_ahead_s), 0),
+            said_unix_s=max(int(now_s + self._unix_ahead_s), 0), is_leaf=self._is_leaf,
         ).fitted(self._identity.membership)
         wire = state.to_wire(self._identity.key, self._identity.membership)
         self.link_states.put(state, wire, now_s)
@@ -280,7 +293,7 @@ class Flooding:
         for neighbour in self._greeter.all_up():
             is_sender = but is not None and neighbour.port == but.port and neighbour.name == but.name
             is_in_scope = scope is Scope.BORDER or neighbour.domain == self._domain
-            if neighbour.role == Role.SWITCH and is_in_scope and not is_sender:
+            if neighbour.role.is_switch and is_in_scope and not is_sender:
                 self._send(neighbour, wire)
 
     def _cost(self, neighbour: Neighbour) -> int:

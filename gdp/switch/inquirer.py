@@ -200,7 +200,7 @@ class Inquirer:
             self._presence.ask(Presence.from_fields(fields), member.name, statement.wire, now.mono_s)
             return
         self._check_asked(statement, member, now.mono_s)
-        if member.role is Role.SWITCH:
+        if member.role.is_switch:
             self._take_context(statement, now)
             return
         if not is_fresh:
@@ -244,7 +244,7 @@ class Inquirer:
         """
         fields = statement.expect(StatementType.ANSWER)
         member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
-        if member.name != statement.signer or member.role not in (Role.RIB, Role.SWITCH):
+        if member.name != statement.signer or not (member.role.is_switch or member.role is Role.RIB):
             raise StatementError(DropReason.BAD_CERTIFICATE, "an answer from nobody who may give one")
         statement.verify(member.key)
         answer = Answer.from_fields(fields)
@@ -255,7 +255,7 @@ class Inquirer:
     def _was_asked(self, member: Membership, now_s: float) -> bool:
         if member.role is Role.RIB:
             return member.domain == self._policy.own or member.name in self._asked
-        return member.role is Role.SWITCH and self._relocations.is_former(member.name, now_s)
+        return member.role.is_switch and self._relocations.is_former(member.name, now_s)
 
     def _rib_answered(self, rib: Name, now_s: float) -> None:
         self._avoided.pop(rib, None)

@@ -153,4 +153,4 @@ class LinkStates:
 
 
 def _ways(state: LinkState) -> tuple[object, ...]:
-    return state.links, state.inside, state.ribs, state.members, state.life, state.refused
+    return state.links, state.inside, state.ribs, state.members, state.life, state.refused, state.is_leaf

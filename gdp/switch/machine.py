@@ -31,7 +31,7 @@ from gdp.effects import Arrival, Instant, Transmit
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
 from gdp.frame.codec import HEADER_BYTES, Header, decode, encode
 from gdp.frame.kinds import CONTROL_FROM, Kind
-from gdp.limits import HOPS_MAX, JOINS_BURST, JOINS_PER_S
+from gdp.limits import CLAIMS_BURST, CLAIMS_PER_S, HOPS_MAX, JOINS_BURST, JOINS_PER_S
 from gdp.message.token_bucket import Paces
 from gdp.names import Name
 from gdp.switch.attached import Attached
@@ -123,6 +123,7 @@ class Switch:
         self._told_rib: Name | None = None  # the RIB that what the operator revoked goes to
         self.boundary = ErrorBoundary()
         self._join_paces = Paces(JOINS_PER_S, JOINS_BURST)
+        self._claim_paces = Paces(CLAIMS_PER_S, CLAIMS_BURST)
         self._drops: Counter[DropReason] = Counter()
         self._rest_due_s: float | None = None  # when something other than the greeter is due; None: to be looked up
 
@@ -135,6 +136,11 @@ class Switch:
     def rib(self) -> Name | None:
         """Return the RIB that is asked, or None while none is known."""
         return self.inquirer.rib
+
+    @property
+    def severed(self) -> frozenset[Name]:
+        """Return the switches of the domain that leaves alone join to this one, so that no way leads to them."""
+        return self._paths.severed()
 
     @property
     def is_displaced(self) -> bool:
@@ -309,7 +315,7 @@ class Switch:
 
     def _take_keepalive(self, arrival: Arrival, header: Header, now: Instant) -> None:
         neighbour = self.greeter.receive_keepalive(arrival, header, now)
-        if neighbour.role is Role.SWITCH:
+        if neighbour.role.is_switch:
             self._flooding.compare(neighbour, now.mono_s)
 
     def _take(self, arrival: Arrival, header: Header, now: Instant) -> None:
@@ -345,18 +351,19 @@ class Switch:
             if change is not None:
                 self._neighbour_changed(change, now.mono_s)
             known = self.greeter.neighbour(arrival.port, statement.signer)
-            if known is not None and known.role is Role.SWITCH and not self._flooding.is_in_step(known):
+            if known is not None and known.role.is_switch and not self._flooding.is_in_step(known):
                 self._flooding.sync(known, now.mono_s)
             return
         neighbour = self._sender(arrival)
         if kind == Kind.LINK_STATE:
-            if neighbour.role is not Role.SWITCH:
+            if not neighbour.role.is_switch:
                 raise StatementError(DropReason.NOT_DELEGATED, "only switches speak of links")
             self._flooding.receive(neighbour, statement, now)
-        elif kind == Kind.ADVERTISE:
-            self._claims.take(neighbour, statement, now)
-        elif kind == Kind.WITHDRAW:
-            self._claims.withdraw(neighbour, statement, now)
+        elif kind in (Kind.ADVERTISE, Kind.WITHDRAW):
+            if not self._claim_paces.take(neighbour.name, now.mono_s):
+                raise StatementError(DropReason.QUOTA, "claims of one neighbour")  # it is told nothing: that costs, too
+            take = self._claims.take if kind == Kind.ADVERTISE else self._claims.withdraw
+            take(neighbour, statement, now)
         elif kind in (Kind.JOIN, Kind.LEAVE):
             self._take_join(neighbour, statement, now)
         elif kind == Kind.REVOKE:
@@ -430,11 +437,11 @@ class Switch:
             self._sync.neighbour_up(neighbour, now_s)
             self.planter.neighbour_up((neighbour.port, neighbour.mac), now_s)
             self._seen_version = -1  # it may have another address now: what leads to it is computed anew
-            if neighbour.role is Role.SWITCH:
+            if neighbour.role.is_switch:
                 self._flooding.sync(neighbour, now_s)
         elif before is NeighbourState.UP:
             self._sync.neighbour_lost(neighbour)
-            if neighbour.role is Role.SWITCH:
+            if neighbour.role.is_switch:
                 self._flooding.damping.went((neighbour.port, neighbour.name), now_s)
             self.planter.neighbour_lost((neighbour.port, neighbour.mac), now_s)
             for attachment in self.attached.of(neighbour.name):
@@ -512,7 +519,7 @@ class Switch:
     def _where(self, neighbour: Neighbour, statement: Statement, now: Instant) -> None:
         """Tell a neighbour, to whom our frames for a node go, where that node is."""
         query = Query.from_fields(statement.expect(StatementType.QUERY))
-        if neighbour.role is not Role.SWITCH or statement.signer != neighbour.name:
+        if not neighbour.role.is_switch or statement.signer != neighbour.name:
             raise StatementError(DropReason.UNKNOWN_SENDER, "a question that a neighbouring switch did not ask")
         statement.verify(neighbour.key)
         for known in self.inquirer.known_of(query.name, now.mono_s):
@@ -529,16 +536,16 @@ class Switch:
 
     def _take_join(self, neighbour: Neighbour, statement: Statement, now: Instant) -> None:
         join = Join.from_fields(statement.expect(StatementType.JOIN))
-        if neighbour.role is not Role.SWITCH or statement.signer != neighbour.name:
+        if not neighbour.role.is_switch or statement.signer != neighbour.name:
             raise StatementError(DropReason.UNKNOWN_SENDER, "a join is from a neighbouring switch")
         if not self._join_paces.take(neighbour.name, now.mono_s):
             raise StatementError(DropReason.QUOTA, "joins of one neighbour")
         statement.verify(neighbour.key)
         self.greeter.ports[neighbour.port].take_join(join, neighbour)
         if join.lease_s > 0:
-            claim = self._verifier.verify(join.evidence, now.unix_s)
-            if claim.right not in HEARS or claim.name != join.topic:
-                raise StatementError(DropReason.NOT_DELEGATED, "a join without a reader's claim")
+            claim = self._evidence.of_join(join, now)
+            if neighbour.role is Role.LEAF and claim.switch != neighbour.name:
+                raise StatementError(DropReason.THROUGH_LEAF, "a leaf that joins for a node of another switch")
             self._held.note_branch(join.topic, join.publisher, (neighbour.port, neighbour.mac), claim)
         if self.planter.join(join, neighbour, now.mono_s):
             self.relocations.redirect_join(join.topic, join.publisher, neighbour, now.mono_s)

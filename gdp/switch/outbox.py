@@ -52,9 +52,9 @@ class Outbox:
         return min(found, key=lambda n: (self._greeter.ports[n.port].cost, n.port), default=None)
 
     def sessions_with(self, port: int, name: Name) -> tuple[bytes, bytes] | None:
-        """Return the nonces of our port's and of a neighbour's present session; None when it is not up."""
+        """Return our port's nonce and a neighbour's echo, of their present sessions; None when it is not up."""
         neighbour = self._greeter.neighbour(port, name)
-        return None if neighbour is None else (self._greeter.ports[port].nonce, neighbour.nonce)
+        return None if neighbour is None else (self._greeter.ports[port].nonce, neighbour.echo)
 
     def hop(self, neighbour: Neighbour) -> Hop:
         """Return the table's hop to a neighbour."""

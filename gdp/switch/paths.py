@@ -4,6 +4,10 @@ Place: pure.
 Source: Dijkstra, by networkx. Edges are directed; a link counts when both ends name it. Of another domain a switch sees
 the borders only, so the way to a switch behind them is the way to the nearest border that lists it. A part of the own
 domain that a failure has cut off is seen in the same way: through its borders, over other domains.
+
+A leaf is an end and never on the way: no edge leads out of it, except for itself (RFC 6987; the overload bit of IS-IS,
+RFC 3277). That follows from the certificate in its link state, whatever costs it names. What only leaves join to this
+switch is ``severed``.
 """
 
 from __future__ import annotations
@@ -49,6 +53,9 @@ class Paths:
         self._version = -1
         self._graph: nx.DiGraph[Name] | None = None
         self._members: frozenset[Name] = frozenset()  # switches of our domain that are reachable within it
+        self._leaves: frozenset[Name] = frozenset()  # of our domain
+        self._severed: frozenset[Name] = frozenset()  # of our domain
+        self._is_border_severed = False
         self._domains: dict[Name, Name] = {}  # of every switch that is known by name
         # Of a switch that is not in the graph, and its domain: borders of that domain that list it.
         self._borders_of: dict[tuple[Name, Name], list[Name]] = {}
@@ -84,7 +91,8 @@ class Paths:
     def _alternate(self, way: Way, switch: Name, domain: Name, allowed: frozenset[Name]) -> Name | None:
         """Return the best neighbour whose own shortest path does not lead back here: RFC 5286, inequality 1.
 
-        Only one of our domain: how others choose their paths is theirs to know.
+        Only one of our domain: how others choose their paths is theirs to know. A leaf is none; for a leaf each
+        neighbour that knows a way is one, since no frame comes back through a leaf.
         """
         if self._graph is None or len(self._graph) > _ALTERNATES_SWITCHES_MAX:
             return None
@@ -92,15 +100,21 @@ class Paths:
         for neighbour, edge in self._graph.adj[self._me].items():
             if neighbour == way.first or self._domains.get(neighbour) != self._domain:
                 continue
+            if neighbour in self._leaves and neighbour != switch:
+                continue
             onwards = self._distance(neighbour, switch, domain, allowed)
             back = self._distance(neighbour, self._me, self._domain, allowed)
-            if onwards is not None and back is not None and onwards < back + way.distance:
+            if onwards is None or back is None:
+                continue
+            if self._me in self._leaves or onwards < back + way.distance:
                 found.append((edge["weight"] + onwards, neighbour))
         return min(found, default=(0, None))[1]
 
     def distance_from(self, start: Name, switch: Name, domain: Name, allowed: frozenset[Name]) -> int | None:
         """Return how far a switch is from another one than this; None where there is no way."""
         self._refresh()
+        if start in self._leaves and start != switch:
+            return None
         within = switch in self._members and start in self._members
         return self._distance(start, switch, domain, frozenset({self._domain}) if within else allowed)
 
@@ -183,6 +197,21 @@ class Paths:
         self._refresh()
         return self._members
 
+    def carries_transit(self, switch: Name) -> bool:
+        """Return whether ways may lead through a switch: it is no leaf."""
+        self._refresh()
+        return switch not in self._leaves
+
+    def severed(self) -> frozenset[Name]:
+        """Return the switches of our domain that leaves alone join to this one: no way leads to them."""
+        self._refresh()
+        return self._severed
+
+    def leads_through_leaf(self, switch: Name, domain: Name) -> bool:
+        """Return whether there might be a way to a switch, to which there is none, if leaves carried transit."""
+        self._refresh()
+        return switch in self._severed if domain == self._domain else self._is_border_severed
+
     def borders(self) -> dict[Name, int]:
         """Return the other switches of our domain that have links leaving it, with their distance within it."""
         ways = self._to_all(frozenset({self._domain}))
@@ -208,9 +237,10 @@ class Paths:
         from networkx import dijkstra_predecessor_and_distance
 
         open_ = {name for name, domain in self._domains.items() if domain in allowed or domain == self._domain}
+        ends = self._leaves - {start}
 
-        def cost(_from: Name, to: Name, edge: dict[str, int]) -> int | None:
-            return edge["weight"] if to in open_ else None  # None hides an edge
+        def cost(from_: Name, to: Name, edge: dict[str, int]) -> int | None:
+            return edge["weight"] if to in open_ and from_ not in ends else None  # None hides an edge
 
         before, distances = dijkstra_predecessor_and_distance(self._graph, start, weight=cost)
         ways: dict[Name, Way] = {}
@@ -227,7 +257,13 @@ class Paths:
         self._ways.clear()
         self._alternates.clear()
         home = self._link_states.states(Scope.DOMAIN)
-        self._members = _reachable(self._me, home, self._domain)
+        self._leaves = frozenset(state.origin for state in home if state.is_leaf)
+        self._members = _reachable(self._me, home, self._domain, self._leaves)
+        joined = _reachable(self._me, home, self._domain) if self._leaves else self._members
+        self._severed = joined - self._members
+        self._is_border_severed = any(
+            state.origin in self._severed and any(link.domain != self._domain for link in state.links) for state in home
+        )
         inside = [state for state in home if state.origin in self._members]
         beyond = [state for state in self._link_states.states(Scope.BORDER) if state.origin not in self._members]
         self._domains = {member: state.domain for state in beyond for member in state.members}
@@ -249,15 +285,17 @@ class Paths:
         self._graph = _graph([(s.origin, s.links) for s in inside] + [(s.origin, s.links + s.inside) for s in beyond])
 
 
-def _reachable(me: Name, states: Iterable[LinkState], domain: Name) -> frozenset[Name]:
-    """Return the switches that are joined to ``me`` by links within the domain."""
+def _reachable(
+    me: Name, states: Iterable[LinkState], domain: Name, leaves: frozenset[Name] = frozenset()
+) -> frozenset[Name]:
+    """Return the switches that are joined to ``me`` by links within the domain, and not through these leaves."""
     links = {state.origin: {link.name for link in state.links if link.domain == domain} for state in states}
     found, todo = {me}, [me]
     while todo:
         here = todo.pop()
         joined = {each for each in links.get(here, ()) if here in links.get(each, ())} - found
         found |= joined
-        todo += joined
+        todo += joined - leaves
     return frozenset(found)
 
 

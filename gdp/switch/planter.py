@@ -26,6 +26,7 @@ from typing import Final
 
 from gdp.control.join import Join
 from gdp.control.neighbour import Neighbour
+from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
@@ -77,6 +78,7 @@ class Planter:
     ) -> None:
         self._sequence = first_sequence
         self._identity = identity
+        self._is_leaf = identity.role is Role.LEAF
         self._policy = policy
         self._table = table
         self._paths = paths
@@ -135,7 +137,7 @@ class Planter:
             allowed = (self._policy.transit & place.transit) | {self._policy.own, place.domain}
             tree = self._tree(place.name, place.advertiser, allowed)
             if place.sequence >= tree.version:
-                self._place_at(tree, place.switch, place.domain, place.sequence)
+                self._place_at(tree, place.switch, place.domain, place.sequence, place.claim)
                 tree.allowed = allowed
             branch = Branch(reader.expires_s, self._outbox.mtu_of(at[0]), reader.claim.wire)
             if not self._put_branch(tree, at, branch):
@@ -149,14 +151,15 @@ class Planter:
         """Take in that a publisher claims its topic here: trees that pass here are asked of itself at once."""
         tree = self.trees.get(claim.name, claim.node)
         if tree is not None:
-            self._place_at(tree, self._identity.name, self._policy.own, max(claim.sequence, tree.version))
+            version = max(claim.sequence, tree.version)
+            self._place_at(tree, self._identity.name, self._policy.own, version, claim.wire)
             tree.renew_at_s = now_s
 
     def publisher_moved(self, place: Place, now_s: float) -> None:
         """Let the tree of a publisher follow it, if it passes here and its readers let it pass there."""
         tree = self.trees.get(place.name, place.advertiser)
         if tree is not None and place.sequence >= tree.version and place.domain in tree.allowed:
-            self._place_at(tree, place.switch, place.domain, place.sequence)
+            self._place_at(tree, place.switch, place.domain, place.sequence, place.claim)
             self._follow(tree, now_s)
 
     def below(self, topic: Name, publisher: Name) -> list[At]:
@@ -194,10 +197,14 @@ class Planter:
             if tree is not None and at in tree.branches and not _is_overtaken(join, tree.branches[at]):
                 self._cut(tree, at)
             return False
+        if self._is_leaf and join.switch != self._identity.name:
+            raise StatementError(DropReason.THROUGH_LEAF, "a tree that would pass a leaf")
         if self._policy.own not in join.allowed or neighbour.domain not in join.allowed:
             raise StatementError(DropReason.WRONG_DOMAIN, "a tree that must not pass here")
         if join.backup_for != ZERO and neighbour.domain != self._policy.own:
             raise StatementError(DropReason.WRONG_DOMAIN, "a backup for another domain")
+        if self._paths.domain_of(join.switch) not in (None, join.domain):
+            raise StatementError(DropReason.WRONG_DOMAIN, "the publisher's switch is of another domain")
         tree = self._tree(join.topic, join.publisher, join.allowed)
         before = tree.branches.get(at)
         if before is not None and _is_overtaken(join, before):
@@ -207,7 +214,7 @@ class Planter:
         is_behind = join.version < tree.version
         is_same_place = (tree.switch, tree.domain) == (join.switch, join.domain) or is_behind
         if join.version >= tree.version:
-            self._place_at(tree, join.switch, join.domain, join.version)
+            self._place_at(tree, join.switch, join.domain, join.version, join.proof)
             tree.allowed = join.allowed
         branch = Branch(
             now_s + min(join.lease_s, JOIN_LEASE_S), join.mtu, join.evidence, join.mtu, join.sequence,
@@ -379,6 +386,8 @@ class Planter:
                 if tree.backup is not None and tree.backup[0] == tree.above:
                     tree.backup = None  # an ordinary join takes its place
             self._plant(tree)
+        if above is None and self._paths.leads_through_leaf(tree.switch, tree.domain):
+            self.drops[DropReason.THROUGH_LEAF] += 1
         if above is None or not tree.is_wanted_below:
             return
         has_settled = tree.joins >= len(_JOIN_AGAIN_S)
@@ -409,10 +418,11 @@ class Planter:
             self._leave_backup(tree)
             tree.backup = other
             self._plant(tree)
-        if other is not None:
+        evidence = self._evidence(tree)
+        if other is not None and evidence:
             (port, _), _ = other
             mtu = min(tree.mtu, self._outbox.mtu_of(port))
-            self._say(tree, *other, mtu, JOIN_LEASE_S, tree.evidence, backup_for=self._identity.name)
+            self._say(tree, *other, mtu, JOIN_LEASE_S, evidence, backup_for=self._identity.name)
 
     def _leave_backup(self, tree: Tree) -> None:
         if tree.backup is not None:
@@ -423,23 +433,33 @@ class Planter:
 
     def _show(self, tree: Tree) -> None:
         """Join the one above, with the evidence of a reader below."""
-        evidence = tree.evidence
+        evidence = self._evidence(tree)
         tree.is_doubted = tree.is_doubted and evidence == tree.shown
         tree.shown = evidence
         tree.asked_backup_for = tree.backup_for
-        if tree.above is None or tree.above_name is None:
+        if tree.above is None or tree.above_name is None or not evidence:
             return
         backup_for = tree.backup_for or ZERO
         if backup_for != ZERO and self._paths.domain_of(tree.above_name) != self._policy.own:
             return  # what a domain does to survive is its own matter
         self._say(tree, tree.above, tree.above_name, tree.asked_mtu, JOIN_LEASE_S, evidence, backup_for=backup_for)
 
-    def _place_at(self, tree: Tree, switch: Name, domain: Name, version: int) -> None:
+    def _evidence(self, tree: Tree) -> bytes:
+        """Return the claim to show the one above; of a leaf that of a reader attached here, empty where none is.
+
+        A neighbour may still take a tree from a leaf that its publisher has just left. Nobody joins for that one.
+        """
+        if not self._is_leaf or tree.switch == self._identity.name:
+            return tree.evidence
+        own = self._readers.get(tree.topic, {}).keys() & tree.branches.keys()
+        return max((tree.branches[at] for at in own), key=lambda each: each.expires_s).evidence if own else b""
+
+    def _place_at(self, tree: Tree, switch: Name, domain: Name, version: int, proof: bytes) -> None:
         """Take in where a tree's publisher is; where that is news, the one above is left before another is asked."""
         if (tree.switch, tree.domain) != (switch, domain):
             self._leave_former(tree)
             tree.has_moved = True
-        tree.switch, tree.domain, tree.version = switch, domain, version
+        tree.switch, tree.domain, tree.version, tree.proof = switch, domain, version, proof
 
     def _part_from_above(self, tree: Tree, now_s: float, *, keep: bool) -> None:
         """Leave the one above: at once, or where the way to the same place has changed, after a while."""
@@ -454,10 +474,13 @@ class Planter:
     def _is_loop_free(self, tree: Tree) -> bool:
         """Return whether the one above, which is not the best any more, cannot take the messages from here itself.
 
-        Source: RFC 5286, inequality 3 (a downstream neighbour is nearer to the destination than we are).
+        Source: RFC 5286, inequality 3 (a downstream neighbour is nearer to the destination than we are). Nobody takes
+        messages of others from a leaf.
         """
         if tree.has_moved or tree.above_name is None:
             return False
+        if self._is_leaf:
+            return True
         own = self._paths.to_switch(tree.switch, tree.domain, tree.allowed)
         its = self._paths.distance_from(tree.above_name, tree.switch, tree.domain, tree.allowed)
         return own is not None and its is not None and its < own.distance
@@ -482,7 +505,7 @@ class Planter:
         sessions = self._outbox.sessions_with(above[0], name)
         if sessions is None:
             return  # it is gone, and with it what it knew of us
-        own_session, session = sessions
+        own_session, its_echo = sessions
         self._sequence += 1
         join = Join(
             tree.topic,
@@ -493,11 +516,12 @@ class Planter:
             mtu,
             lease_s,
             evidence,
-            session,
+            its_echo,
             self._sequence,
             tree.version,
             backup_for,
             own_session,
+            tree.proof if lease_s else b"",
         )
         kind = Kind.JOIN if lease_s else Kind.LEAVE
         self._outbox.say_at(*above, kind, join.to_wire(self._identity.name, self._identity.key))

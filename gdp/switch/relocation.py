@@ -25,7 +25,6 @@ from typing import Final
 from gdp.control.neighbour import Neighbour
 from gdp.control.query import Query
 from gdp.control.relay import relayed
-from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.frame.kinds import Kind
 from gdp.names import ZERO, Name
@@ -128,7 +127,7 @@ class Relocations:
         if self._moved_names.get(destination, 0.0) <= now_s:
             return
         self._unicast.forget(destination)
-        if neighbour.role is not Role.SWITCH:
+        if not neighbour.role.is_switch:
             return
         for (name, _), moved in self._moved.items():
             if name == destination and moved.until_s > now_s:
@@ -142,7 +141,7 @@ class Relocations:
 
     def ask_neighbour(self, name: Name, neighbour: Neighbour, now_s: float) -> None:
         """Ask the neighbour that sent a frame where its node is: no RIB answers, and it must have known."""
-        if neighbour.role is Role.SWITCH and self._may_say(name, neighbour, now_s):
+        if neighbour.role.is_switch and self._may_say(name, neighbour, now_s):
             identity = self._identity
             query = Query(name, 0.0).to_wire(identity.name, identity.key, identity.membership)
             self._outbox.say(neighbour, Kind.WHERE, query)

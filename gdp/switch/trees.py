@@ -62,7 +62,8 @@ class Tree:
     renew_at_s: float = 0.0
     asked_mtu: int = 0  # what the last join said
     shown: bytes = b""  # the evidence that it carried
-    version: int = 0  # sequence number of the publisher's claim that ``switch`` was read from
+    version: int = 0  # sequence number of ``proof``
+    proof: bytes = b""  # the publisher's claim that ``switch`` was read from
     joins: int = 0  # that the one above was sent since it was chosen
     has_moved: bool = False  # the publisher has, since the one above was chosen
     former: tuple[At, Name] | None = None  # whom this tree took its messages from before, until ``former_until_s``

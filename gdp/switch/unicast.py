@@ -88,7 +88,7 @@ class Unicast:
     def miss(self, header: Header, frame: bytes, neighbour: Neighbour, now_s: float) -> Name | None:
         """Take a neighbour's frame that has no entry in the table; return the name whose place it waits for, if any."""
         destination, source = Name(header.destination), Name(header.source)
-        kind = _FROM_SWITCH if neighbour.role is Role.SWITCH else _FROM_NODE
+        kind = _FROM_SWITCH if neighbour.role.is_switch else _FROM_NODE
         return self._find(destination, source, frame, kind + neighbour.name, now_s)
 
     def send(self, frames: list[bytes], destination: Name, source: Name, now_s: float) -> None:
@@ -96,7 +96,7 @@ class Unicast:
         if self._resolve(destination, source, b"", now_s) is None:
             hop = self._hop(destination, source)
             if hop is None:
-                self.drops[DropReason.NO_ROUTE] += len(frames)
+                self.drops[self._reason(destination, source)] += len(frames)
             else:
                 self._outbox.frames(hop[0], hop[1][:6], frames)
 
@@ -173,13 +173,17 @@ class Unicast:
     def _forward(self, destination: Name, source: Name, frame: bytes) -> None:
         hop = self._hop(destination, source)
         if hop is None:
-            why = self._installed.get(destination + source)
-            self.drops[DropReason.NO_ROUTE if why is None or why.nowhere is None else why.nowhere] += 1
+            self.drops[self._reason(destination, source)] += 1
         elif frame[HOPS_AT] <= 1:
             self.drops[DropReason.HOPS_EXPIRED] += 1
         else:
             on = frame[:HOPS_AT] + bytes([frame[HOPS_AT] - 1]) + frame[HOPS_AT + 1 :]
             self._outbox.frames(hop[0], hop[1][:6], [on])
+
+    def _reason(self, destination: Name, source: Name) -> DropReason:
+        """Return why an entry leads nowhere."""
+        why = self._installed.get(destination + source)
+        return DropReason.NO_ROUTE if why is None or why.nowhere is None else why.nowhere
 
     def _hop(self, destination: Name, source: Name) -> Hop | None:
         hops = self._table.entries.get(destination + source) or self._table.entries.get(destination)
@@ -202,7 +206,8 @@ class Unicast:
         if self._paths.is_switch(destination):
             domain = self._paths.domain_of(destination) or self._own_domain
             way = self._paths.to_switch(destination, domain, self._transit | {domain})
-            self._install_way(destination, b"", way, source, now_s + NODE_LEASE_S, now_s)
+            otherwise = self._why(destination, domain)
+            self._install_way(destination, b"", way, source, now_s + NODE_LEASE_S, now_s, otherwise)
             return None
         if self._paths.is_rib(destination):
             way, _ = self._paths.to_rib(destination, self._transit)
@@ -240,8 +245,13 @@ class Unicast:
             self._ask(source, owner, now_s)
             return source
         best = self._nearest(takers, transit & self._transit)
-        self._install_place(destination, source, best, source, now_s)
+        reasons = [self._why(place.switch, place.domain) for place in takers] if best is None else []
+        self._install_place(destination, source, best, source, now_s, max(reasons, default=DropReason.NO_ROUTE))
         return None
+
+    def _why(self, switch: Name, domain: Name) -> DropReason:
+        """Return the reason to give where there is no way to a switch."""
+        return DropReason.THROUGH_LEAF if self._paths.leads_through_leaf(switch, domain) else DropReason.NO_ROUTE
 
     def _ask(self, name: Name, owner: bytes, now_s: float) -> None:
         """Have a name asked for, within the pace of the neighbour at whose expense that is."""
@@ -273,10 +283,16 @@ class Unicast:
         return min(ways, key=lambda each: (each[1].distance, each[0].advertiser), default=None)
 
     def _install_place(
-        self, destination: Name, source_key: bytes, best: tuple[Place, Way] | None, source: Name, now_s: float
+        self,
+        destination: Name,
+        source_key: bytes,
+        best: tuple[Place, Way] | None,
+        source: Name,
+        now_s: float,
+        otherwise: DropReason = DropReason.NO_ROUTE,
     ) -> None:
         if best is None:
-            self._install_way(destination, source_key, None, source, now_s, now_s)
+            self._install_way(destination, source_key, None, source, now_s, now_s, otherwise)
         else:
             self._install_way(destination, source_key, best[1], source, self._until_s(best[0], now_s), now_s)
 
@@ -286,11 +302,19 @@ class Unicast:
         return max(place.expires_s, now_s + STALE_S)
 
     def _install_way(
-        self, destination: Name, source_key: bytes, way: Way | None, source: Name, expires_s: float, now_s: float
+        self,
+        destination: Name,
+        source_key: bytes,
+        way: Way | None,
+        source: Name,
+        expires_s: float,
+        now_s: float,
+        otherwise: DropReason = DropReason.NO_ROUTE,
     ) -> None:
+        """Install a way; where there is none, a negative entry with the reason ``otherwise``."""
         neighbour = None if way is None else self._outbox.neighbour(way.first)
         if neighbour is None:
-            self._install_nowhere(destination, source, DropReason.NO_ROUTE, now_s)
+            self._install_nowhere(destination, source, otherwise, now_s)
         else:
             hop = self._outbox.protected_hop(neighbour, None if way is None else way.alternate)
             self._install(destination, source_key, hop, source, expires_s)

@@ -1,4 +1,4 @@
-"""What a switch waits for before it can serve: neighbours on its ports, and a RIB.
+"""What a switch waits for before it can serve: neighbours on its ports, the rest of its domain, and a RIB.
 
 Sans-I/O.
 """
@@ -26,6 +26,8 @@ def switch_waits(switch: Switch, attachments: Collection[int], now_s: float) -> 
         if port.index not in attachments:
             found = port_waits(port, tuple(Role))
             waits += (each for each in found if port.index not in refusing or each.reason is WaitReason.LINK_DOWN)
+    if severed := switch.severed:
+        waits.append(Wait(WaitReason.THROUGH_LEAF, name=min(severed)))
     if switch.rib is None:
         waits.append(Wait(WaitReason.NO_RIB))
     return waits

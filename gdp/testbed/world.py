@@ -47,6 +47,7 @@ class World:
         lease_s: of claims and watches.
         lead_mtu: of the links to members and RIBs, in bytes after the Ethernet header.
         keepalive_ms: as in ``NodeSettings``; slower ones where no link fails save most of the time.
+        leaves: switches whose certificate says ``leaf``.
     """
 
     topology: Topology
@@ -59,6 +60,7 @@ class World:
     keepalive_ms: int | None = None
     trusts: dict[str, tuple[str, ...]] | None = None
     transits: Mapping[str, tuple[str, ...]] | None = None
+    leaves: Collection[str] = ()
     network: MemoryNetwork = field(init=False)
     authorities: dict[str, DomainAuthority] = field(default_factory=dict)
     identities: dict[str, Identity] = field(default_factory=dict)
@@ -171,7 +173,7 @@ class World:
         return settled
 
     def _add_switch(self, name: str, domain: str) -> None:
-        self.identity(Role.SWITCH, name, domain)
+        self.identity(Role.LEAF if name in self.leaves else Role.SWITCH, name, domain)
         self.network.add(name, *self._switch(name, domain))
 
     def _switch(self, name: str, domain: str) -> tuple[Switch, Table]:

@@ -44,10 +44,11 @@ class AuditLine:
         seq: 1, 2, ... without a gap.
         at_unix_s: when it was noted, to half a second.
         action: of ``Action``.
-        what: what it was: neighbour, name, membership, delegation, root, revocation, statements.
+        what: what it was: neighbour, name, membership, delegation, enrolment, root, revocation,
+            statements.
         who: the node or key that asked for it, 64 or 66 hex digits; empty: nobody who proved it.
-        about: the name that it is about, 64 hex digits, or a fingerprint; empty: none.
-        reason: why it was refused, as ``DropReason.label``; empty: it was not.
+        about: the name that it is about, 64 hex digits, a fingerprint, or ``cluster/machine``; empty: none.
+        reason: why it was refused, as ``DropReason.label``, or in a few words; empty: it was not.
         count: how many there were; above 1 ``who`` and ``about`` are those of the last.
         previous: SHA-256 of the line before, hex.
     """

@@ -7,6 +7,7 @@ is the node that the owner means; the name on it cannot be another's.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Protocol
 
 from gdp.crypto.certificates import Membership, Root, Unverified
 from gdp.crypto.identity import Identity
@@ -16,7 +17,17 @@ from gdp.crypto.subject import Subject
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
 
-__all__ = ["Card"]
+__all__ = ["Card", "Recipient"]
+
+
+class Recipient(Protocol):
+    """Whom an owner delegates to: a node's name, and the key that secrets for it are sealed to."""
+
+    @property
+    def subject(self) -> Subject: ...
+
+    @property
+    def kem(self) -> KemPublicKey: ...
 
 
 @dataclass(frozen=True, slots=True)

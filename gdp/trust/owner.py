@@ -20,7 +20,7 @@ from gdp.limits import CHAIN_MAX
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.trust.adcert import AdCert
-from gdp.trust.card import Card
+from gdp.trust.card import Recipient
 from gdp.trust.delegation import Delegation
 from gdp.trust.grants import SECRET_BYTES, make_grant
 from gdp.trust.revocation import Revocation
@@ -101,7 +101,7 @@ class Owner:
 
     def delegate(
         self,
-        card: Card,
+        recipient: Recipient,
         metadata: Metadata,
         rights: Collection[Right],
         epochs: Iterable[int],
@@ -112,7 +112,7 @@ class Owner:
         """Return what lets a node act on a name.
 
         Args:
-            card: of the node.
+            recipient: the node: its verified card, or what proved as much.
             metadata: of the name; goes into the file in plain, for the node's operator.
             rights: of publish, serve, call and read.
             epochs: whose secrets the node gets.
@@ -121,18 +121,19 @@ class Owner:
 
         Raises:
             LocalError: rights or epochs out of bounds, or a library without the KEM.
-            StatementError: MALFORMED, the card's key is none.
+            StatementError: MALFORMED, the recipient's key is none.
         """
         subject = self.subject(metadata)
         chain, issuer = self._links(subject)
         if len(chain) >= CHAIN_MAX:
             raise LocalError(f"a chain of more than {CHAIN_MAX} links")
-        link = AdCert.make(self.key, issuer, subject, card.subject, rights, validity, may_delegate=may_delegate)
+        to = recipient.subject
+        link = AdCert.make(self.key, issuer, subject, to, rights, validity, may_delegate=may_delegate)
         grants = {
-            epoch: make_grant(self.key, self.master, subject, epoch, card.name, card.kem)
+            epoch: make_grant(self.key, self.master, subject, epoch, to.name, recipient.kem)
             for epoch in sorted(set(epochs))
         }
-        return Delegation(subject, card.name, frozenset(rights), (*chain, link), MappingProxyType(grants), metadata)
+        return Delegation(subject, to.name, frozenset(rights), (*chain, link), MappingProxyType(grants), metadata)
 
     def revoke(self, subject: Subject, fingerprint: bytes, until_unix_s: int) -> bytes:
         """Return the statement that takes back an AdCert on one of this owner's names; a successor's: that it issued.

@@ -20,6 +20,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Final
 
+import security_amplification
+import security_insiders
+import security_replays
 import security_revocation
 from machine import machine_state
 from peers.process import FailedError
@@ -28,7 +31,12 @@ from report import progress
 from gdp.errors import GdpError
 
 OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks" / "security.json"
-COMMANDS: Final[Mapping[str, ModuleType]] = {"revocation": security_revocation}
+COMMANDS: Final[Mapping[str, ModuleType]] = {
+    "revocation": security_revocation,
+    "amplification": security_amplification,
+    "replays": security_replays,
+    "insiders": security_insiders,
+}
 
 
 def arguments() -> argparse.ArgumentParser:

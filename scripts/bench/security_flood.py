@@ -41,7 +41,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gdp.control.frames import ControlSplitter
-from gdp.control.hello import LIFE_BYTES, NONCE_BYTES, Hello
+from gdp.control.hello import ECHO_BYTES, LIFE_BYTES, NONCE_BYTES, Hello
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.issuing import DomainAuthority
@@ -132,7 +132,7 @@ def hellos(kind: str, overlay: Overlay) -> list[bytes]:
 
 def _hello(member: Identity, key: SigningKey | None) -> list[bytes]:
     hello = Hello(
-        secrets.token_bytes(NONCE_BYTES), 1, (secrets.token_bytes(NONCE_BYTES),), _MTU, bytes(8), member.membership,
+        secrets.token_bytes(NONCE_BYTES), 1, (secrets.token_bytes(ECHO_BYTES),), _MTU, bytes(8), member.membership,
         exchange_key=secrets.token_bytes(32), life=secrets.token_bytes(LIFE_BYTES),
     )  # fmt: skip
     wire = hello.to_wire(member.name, key or member.key)

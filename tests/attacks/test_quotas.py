@@ -7,12 +7,15 @@ from dataclasses import replace
 
 import pytest
 
+from gdp.control.frames import ControlSplitter
 from gdp.control.join import Join
+from gdp.control.link_state import LinkState, Scope
 from gdp.control.query import Query
 from gdp.control.relay import Relay
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.subject import Subject
+from gdp.crypto.validity import Validity
 from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
 from gdp.frame.codec import Header, encode
@@ -24,8 +27,9 @@ from gdp.rib.machine import Rib, RibSettings
 from gdp.rib.store import MemoryStore
 from gdp.switch.attached import Attached
 from gdp.testbed.world import World
-from gdp.trust.claim import Claim
+from gdp.trust.claim import Claim, make_claim
 from gdp.trust.domain import Policy
+from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
 from tests.gdp.trust.world import CLOUD, DAY, GATEWAY, NOW, ROBOT, SCHOOL, SWITCH, claim, verifier
 from tests.journeys.flows import ROBOT as ROBOT_AT
@@ -65,6 +69,50 @@ def test_a14_a_proxy_watches_nothing_at_a_rib() -> None:
     assert (at.watching, at.refusals) == (0, {DropReason.NOT_DELEGATED: 1})
 
 
+def test_a12_what_a_members_questions_draw_from_a_rib_is_paced_in_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gdp.rib.machine.ANSWER_BYTES_PER_S", 1_000.0)
+    monkeypatch.setattr("gdp.rib.machine.ANSWER_BYTES_BURST", 30_000.0)
+    at = rib()
+    for number in range(3):
+        tell(at, claim(subject=_subject(f"/own{number}"), chain=[]))
+    at.take()
+    name = _subject("/own1").name
+    for by in (SWITCH, CLOUD_SWITCH):
+        drawn = said = 0
+        for _ in range(100):
+            wire = Query(name, 0.0).to_wire(by.name, by.key, by.membership)
+            at.receive(wire, by.name, START)
+            said += len(wire)
+            drawn += sum(len(letter.statement) for letter in at.take())
+        assert 15_000 < drawn <= 30_000 < said
+    assert at.refusals[DropReason.QUOTA] >= 150
+
+
+def test_a07_link_states_of_one_origin_are_flooded_at_a_pace(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gdp.switch.flooding.LINK_STATES_PER_S", 10.0)
+    monkeypatch.setattr("gdp.switch.flooding.LINK_STATES_BURST", 20.0)
+    world = ring()
+    flow = flowing(world)
+    liar, sequence = world.identities["nuc2"], int(world.network.now.unix_s * 1_000) + 100_000
+    tap = Tap("nuc1", "nuc5")
+    world.network.taps.append(tap)
+    for number in range(200):
+        state = LinkState(
+            liar.name, liar.root.domain, Scope.BORDER, sequence + number, (), (), (),
+            said_unix_s=int(world.network.now.unix_s),
+        )  # fmt: skip
+        frames = ControlSplitter(liar.name, 1 << 40).split(
+            Kind.LINK_STATE, state.to_wire(liar.key, liar.membership), 1_400
+        )
+        for frame in frames:
+            world.network.inject("nuc1", _port_of(world, "nuc1", "nuc2"), frame, mac_of(world, "nuc1", 0))
+    assert 0 < tap.count(Kind.LINK_STATE) <= 21
+    assert world.switches["nuc1"].drops()[DropReason.QUOTA] >= 170
+    world.network.run(15)
+    still_flows(flow)
+    flow.outlive()
+
+
 def test_a15_a_nodes_claims_are_bounded_and_cost_the_same_however_many_there_are() -> None:
     attached = Attached()
     one = verifier().verify(claim(subject=_subject("/own"), chain=[], lease_s=3_600.0), NOW)
@@ -77,6 +125,40 @@ def test_a15_a_nodes_claims_are_bounded_and_cost_the_same_however_many_there_are
     attached.put(verifier().verify(others, NOW), 1, b"n", 0.0)
     assert len(attached.due(0.0)) == ATTACHED_MAX // 2 + 1
     assert attached.due(0.1) == []
+
+
+def test_a15_claims_and_withdrawals_beyond_a_neighbours_pace_draw_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gdp.switch.machine.CLAIMS_PER_S", 10.0)
+    monkeypatch.setattr("gdp.switch.machine.CLAIMS_BURST", 20.0)
+    world = ring()
+    other = world.add_member("nuc1/other", "nuc1")
+    assert world.network.run(5, lambda: other.attachment.is_attached)
+    nuc1, robot = world.switches["nuc1"], world.identities[ROBOT_AT]
+    incarnation = world.members[ROBOT_AT].attachment._incarnation
+    sequence = int(world.network.now.unix_s * 1_000) + 100_000
+    rtcert = RtCert.make(robot, nuc1.name, Validity.lasting(world.network.now.unix_s, 600))
+    port = _port_of(world, "nuc1", ROBOT_AT)
+    tap = Tap("nuc1", "nuc2")
+    world.network.taps.append(tap)
+
+    def say(numbers: range) -> int:
+        before = len(tap.frames)
+        for number in numbers:
+            wire = make_claim(
+                robot, Right.PUBLISH, _subject(f"/own{number}", robot), rtcert=rtcert, sequence=sequence + number,
+                incarnation=incarnation, lease_s=20.0, is_global=True,
+            )  # fmt: skip
+            for frame in ControlSplitter(robot.name, number).split(Kind.ADVERTISE, wire, 1_400):
+                world.network.inject("nuc1", port, frame, mac_of(world, "nuc1", port))
+        return len(tap.frames) - before
+
+    assert say(range(1, 30)) > 0
+    assert say(range(30, 200)) == 0
+    assert nuc1.drops()[DropReason.QUOTA] >= 170
+    late = advertise(world, "/late", "nuc1/other")
+    late.read_by(SERVER)
+    assert world.network.run(3, lambda: late.is_read_by(1))
+    late.outlive()
 
 
 def renamed(one: Claim, name: Name) -> Claim:

@@ -7,6 +7,8 @@ import pytest
 from gdp.client.feed import FeedState
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
+from gdp.names import Name
+from gdp.switch.machine import Switch
 from gdp.trust.right import Right
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 from tests.journeys.services import Party, outlive
@@ -98,3 +100,53 @@ def test_a09_an_old_gone_of_a_publisher_that_came_back_silences_no_topic() -> No
     assert world.switches["nuc5"].drops()[DropReason.REPLAYED] >= 50
     assert sum(world.members[SERVER].lost().values()) == 0
     flow.outlive()
+
+
+@pytest.mark.parametrize("right", [Right.PUBLISH, Right.READ])
+def test_a39_a_recorded_claim_of_what_was_withdrawn_is_not_taken_again(right: Right) -> None:
+    world = ring()
+    flow = flowing(world)
+    member = world.members[ROBOT]
+    topic = world.topic("/withdrawn", member, [right])
+    tap = Tap(ROBOT, "nuc1")
+    world.network.taps.append(tap)
+    if right is Right.PUBLISH:
+        member.advertise(topic, b"described", reliable=True)
+    else:
+        member.subscribe(topic)
+    world.network.touch(ROBOT)
+    world.network.run(1)
+    nuc1 = world.switches["nuc1"]
+    claims = [frame for header, frame in zip(tap.headers, tap.frames, strict=True) if header.kind == Kind.ADVERTISE]
+    assert _is_claimed(nuc1, topic.name, member.name)
+    if right is Right.PUBLISH:
+        member.withdraw(topic.name)
+    else:
+        member.unsubscribe(topic.name)
+    world.network.touch(ROBOT)
+    world.network.run(1)
+    assert not _is_claimed(nuc1, topic.name, member.name)
+    for frame in claims:
+        world.network.inject("nuc1", 2, frame, mac_of(world, "nuc1", 2))
+    assert not _is_claimed(nuc1, topic.name, member.name)
+    assert nuc1.drops()[DropReason.REPLAYED] > 0
+    still_flows(flow)
+
+
+def test_a39_a_recorded_claim_of_an_earlier_life_of_an_attached_node_is_not_taken() -> None:
+    world = ring()
+    tap = Tap(ROBOT, "nuc1")
+    world.network.taps.append(tap)
+    flow = flowing(world)
+    claims = [frame for header, frame in zip(tap.headers, tap.frames, strict=True) if header.kind == Kind.ADVERTISE]
+    nuc1 = world.restart_switch("nuc1")
+    member = world.restart_member(ROBOT)
+    assert world.network.run(10, lambda: member.attachment.is_attached)
+    for frame in claims:
+        world.network.inject("nuc1", 2, frame, mac_of(world, "nuc1", 2))
+    assert not _is_claimed(nuc1, flow.topic.name, member.name)
+    assert nuc1.drops()[DropReason.REPLAYED] > 0
+
+
+def _is_claimed(switch: Switch, name: Name, node: Name) -> bool:
+    return switch.attached.get(name, node) is not None or bool(switch.planter.readers(name))

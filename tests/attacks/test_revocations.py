@@ -235,7 +235,7 @@ def test_a06_fresh_hellos_draw_no_more_bytes_than_they_cost(echoes: bool) -> Non
     for _ in range(40):
         link = world.switches["nuc1"].greeter.ports[port]
         nonce = b"fresh" + next(numbers).to_bytes(3, "big")
-        hello = Hello(nonce, 1, (link.nonce,) if echoes else (), 1_500, bytes(8), identity.membership)
+        hello = Hello(nonce, 1, (link.echo,) if echoes else (), 1_500, bytes(8), identity.membership)
         for frame in world.members[label].attachment.splitter.split(
             Kind.HELLO, hello.to_wire(identity.name, identity.key), 1_500
         ):
@@ -257,7 +257,7 @@ def test_a06_a_proven_neighbour_draws_twice_all_there_is_at_most(monkeypatch: py
     world.network.run(5)
     identity, port = world.identities[THIEF], port_of(world, THIEF)
     answered = Bytes(world, "nuc1", THIEF)
-    session = world.switches["nuc1"].greeter.ports[port].nonce
+    session = world.switches["nuc1"].greeter.ports[port].echo
     for number in range(6):
         said = Lacking(session, int(2e15) + number, school_of(world), (), ())
         say(world, said.to_wire(identity.name, identity.key), THIEF, "nuc1", Kind.REVOKED)
@@ -270,11 +270,11 @@ def test_a_recorded_digest_draws_nothing() -> None:
     world, flow = with_thief()
     identity, port = world.identities[THIEF], port_of(world, THIEF)
     school = school_of(world)
-    session = world.switches["nuc1"].greeter.ports[port].nonce
+    session = world.switches["nuc1"].greeter.ports[port].echo
     said = Revoked(session, int(2e15), ((school, 5, b"another!"),)).to_wire(identity.name, identity.key)
     for _ in range(20):
         say(world, said, THIEF, "nuc1", Kind.REVOKED)
-    old = Revoked(b"an older", int(3e15), ((school, 5, b"another!"),)).to_wire(identity.name, identity.key)
+    old = Revoked(b"an older session", int(3e15), ((school, 5, b"another!"),)).to_wire(identity.name, identity.key)
     say(world, old, THIEF, "nuc1", Kind.REVOKED)
     assert world.switches["nuc1"].drops()[DropReason.REPLAYED] >= 20
     flow.outlive()

@@ -20,16 +20,13 @@ from pathlib import Path
 import pytest
 import yaml
 
-from fog.enrolment.boots import machine_boot
 from fog.host.bounded_log import BoundedLog
 from fog.host.bundle import pack, read_programs
 from fog.host.life import NODE_USER, Life
 from fog.machine import Boot, Program
 from fog.providers.cloud_init import HOME, Setup, cloud_config, placed
-from tests.fog.enrolment.test_enrolment import CLUSTER, authority
+from tests.fog.enrolment.desk import made_desk
 from tests.pages import ROOT
-
-__all__ = ["authority"]
 
 UNITS = sorted((ROOT / "scripts" / "systemd").glob("*.service"))
 EXPOSURE_MAX = {"gdp-switch": 27, "gdp-rib": 27, "gdp-proxy": 32, "fog-machine": 50}  # tenths; 96 without fences
@@ -100,16 +97,9 @@ def test_a53_the_unit_has_every_fence(unit: Path) -> None:
     assert "User=gdp" in lines or unit.stem == "fog-machine"
 
 
-def test_a53_nodes_of_a_machine_are_the_users_code(authority: object) -> None:
-    boot, _ = machine_boot(
-        authority,  # type: ignore[arg-type]
-        CLUSTER,
-        "m1",
-        lambda node: [node.executable],
-        iface="eth0",
-        days=1.0,
-        shares_host=False,
-    )
+def test_a53_nodes_of_a_machine_are_the_users_code(tmp_path: Path) -> None:
+    with made_desk(tmp_path) as desk:
+        boot = desk.boot("m1", shares_host=False)
     programs = read_programs(pack(boot)["boot.json"])
     assert {each.name: each.is_users for each in programs if each.name in ("switch", "proxy")} == {
         "switch": False,

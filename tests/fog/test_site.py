@@ -41,7 +41,36 @@ def test_machines_with_no_way_to_the_robot_are_refused(tmp_path: Path, provider:
 
 def test_a_tunnel_of_ones_own_is_named(tmp_path: Path) -> None:
     installs = f"skypilot: {{setup: {{requirements: ['{WHEEL}']}}}}"
-    assert site(tmp_path, "provider: skypilot", "machine_iface: tap0", installs).device == "tap0"
+    enrols = "enrolment: {address: 'launcher.example.org:4780'}"
+    assert site(tmp_path, "provider: skypilot", "machine_iface: tap0", installs, enrols).device == "tap0"
+
+
+def test_rented_machines_enrol_at_the_tunnels_end_unless_told_otherwise(tmp_path: Path) -> None:
+    assert site(tmp_path, "provider: aws", TUNNEL).enrolment_address == "198.51.100.7:4780"
+
+
+def test_machines_that_do_not_know_where_to_enrol_are_refused_before_anything_costs(tmp_path: Path) -> None:
+    installs = f"skypilot: {{setup: {{requirements: ['{WHEEL}']}}}}"
+    with pytest.raises(ConfigError, match=r"set enrolment\.address"):
+        site(tmp_path, "provider: skypilot", "machine_iface: tap0", installs)
+
+
+@pytest.mark.parametrize("address", ["launcher", "launcher:0", "launcher:70000", "fd00::1:4780", "'*:4780'", "':4780'"])
+def test_an_address_that_machines_cannot_reach_is_refused(tmp_path: Path, address: str) -> None:
+    with pytest.raises(ConfigError, match=r"enrolment\.address"):
+        site(tmp_path, f"enrolment: {{address: {address}}}")
+
+
+def test_the_supervisor_listens_where_it_is_told(tmp_path: Path) -> None:
+    for name in ("domain", "owner"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "fog.yaml").write_text(
+        f"domain: domain\nowner: owner\nstate: state\nprovider: aws\n{TUNNEL}"
+        "enrolment: {address: 'launcher.example.org:443', listen: '[fd00::1]:8443'}\n"
+    )
+    own = open_site(tmp_path / "fog.yaml")
+    assert own.enrolment_url == "tcp://launcher.example.org:443"
+    assert own.enrolment_listens == ("fd00::1", 8443)
 
 
 @pytest.mark.parametrize("topology", ["replica", "{gateway: edge, replica: true}"])

@@ -34,6 +34,7 @@ from gdp.trust.audit import BEGIN, AuditLine
 from gdp.trust.card import Card
 from gdp.trust.claim import ClaimBody
 from gdp.trust.delegation import Delegation
+from gdp.trust.enrolment import Answer, Application, Granted, Request, Seat, Ticket, request_head, seal_request
 from gdp.trust.revocation import Revocation
 from tests.fuzzing.decoder import Decoder
 from tests.gdp.control.test_bodies import BODIES
@@ -120,6 +121,9 @@ def _introduction() -> bytes:
 
 _REPORT: Final = Report(ReportFlag.NONE, 5, 1, (Missing(5, 1, 2),))
 _STATUS: Final = Status(1, 5, 0, {bytes(32): Start(1, 1, 1)}, b"description")
+_TICKET: Final = Ticket(("tcp://a:1",), _NODE.kem.public, _KEY, (Seat("switch", _NODE.role, "a"),))
+_APPLICATION: Final = Application(b"csr", _NODE.kem.public, bytes(64))
+_GRANTED: Final = Granted(b"certificate", (b"delegation",))
 
 DECODERS: Final = (
     Decoder("frame", codec.decode, tuple(_FRAMES[:2]), (FrameError,)),
@@ -166,6 +170,22 @@ DECODERS: Final = (
         lambda data: open_keepalive(_KEY, data),
         (seal_keepalive(_KEY, _HEADER, 0, 3, bytes(8)),),
         (FrameError,),
+    ),
+    Decoder("ticket", Ticket.from_json, (_TICKET.to_json(),), (LocalError,)),
+    Decoder("enrol-head", request_head, (seal_request(_TICKET, [_APPLICATION], _KEY),), (StatementError,)),
+    Decoder(
+        "enrol-request",
+        Request.from_wire,
+        (Request(_KEY, (_APPLICATION,)).to_wire(),),
+        (StatementError,),
+        is_cbor=True,
+    ),
+    Decoder(
+        "enrol-answer",
+        Answer.from_wire,
+        (Answer(b"root", (_GRANTED,)).to_wire(),),
+        (StatementError,),
+        is_cbor=True,
     ),
     Decoder("report", Report.from_wire, (_REPORT.to_wire(),), (FrameError,)),
     Decoder("status", Status.from_wire, (_STATUS.to_wire(),), (FrameError,)),

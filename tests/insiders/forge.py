@@ -38,17 +38,18 @@ from gdp.message.status import STARTS_MAX, Start, Status
 from gdp.names import ZERO, Name
 from gdp.switch.machine import Switch
 from gdp.trust.adcert import AdCert
-from gdp.trust.right import Right
+from gdp.trust.claim import Claim
+from gdp.trust.right import HEARS, Right
 from gdp.trust.rtcert import RtCert
 from tests.insiders.stage import PERSONAS, Persona, Place, Stage
 
-__all__ = ["Forge", "Utterance"]
+__all__ = ["KINDS_OF_WORDS", "Forge", "Utterance"]
 
 _U64: Final = (1 << 64) - 1
 _INTEGERS: Final = (0, 1, 2, 255, 256, 65_535, 65_536, (1 << 24), (1 << 31) - 1, 1 << 32, (1 << 63), _U64 - 1, _U64)
 _NUMBERS: Final = (0.0, -0.0, -1.0, 1e-9, 0.5, 1.0, 24.0, 3_599.5, 3_600.0, 3_600.5, 1e300, float("inf"), float("nan"))
 _TEXTS: Final = ("", "publish", "serve", "call", "read", "attach", "domain", "border", "x" * 300)
-_SIZES: Final = (900, 1_024, 1_025, 8_900, 9_216, 9_217, 12_000, 16_000, 16_300)
+_SIZES: Final = (900, 1_024, 1_025, 6_400, 6_500, 6_501, 12_000, 16_000, 16_300)
 _MAXIMA: Final = {
     "h": HEARD_MAX, "u": RIVALS_MAX, "y": COOKIES_MAX,
     "l": LINKS_MAX, "i": LINKS_MAX, "m": MEMBERS_MAX, "x": TRANSIT_MAX, "r": RIBS_MAX,
@@ -112,18 +113,31 @@ class Forge:
             mac = place.mac if rng.random() < 0.5 else b"\x02evil" + bytes([rng.randrange(4)])
             place = Place(place.node, rng.choice(list(ports)), mac)
         if rng.random() < 0.12:
-            what, make = rng.choice(_FRAMES)
-            frames = make(self, rng, persona, place)
-            return None if not frames else Utterance(persona, what, place, tuple(frames))
+            return self.say(rng, persona, rng.choice(_FRAMES)[0], place)
         type_ = rng.choice(_SPOKEN)
         kind, destination = self._delivery(rng, type_, place)
         wire = self._statement(rng, type_, persona, place)
-        if wire is None:
-            return None
+        return None if wire is None else self._sent(rng, persona, type_, place, kind, destination, wire)
+
+    def say(self, rng: random.Random, persona: Persona, what: str, place: Place) -> Utterance | None:
+        """Return something well formed: a statement of a type, or a frame of a kind, as in ``KINDS_OF_WORDS``."""
+        for each, make in _FRAMES:
+            if each == what:
+                frames = make(self, rng, persona, place)
+                return Utterance(persona, what, place, tuple(frames)) if frames else None
+        type_, identity = StatementType(what), self._stage.identity(persona)
+        kind, destination = self._delivery(rng, type_, place)
+        wire = self._signed(type_, _BODIES[type_](self, rng, identity, place), identity.name, identity.key)
+        return None if wire is None else self._sent(rng, persona, type_, place, kind, destination, wire)
+
+    def _sent(
+        self, rng: random.Random, persona: Persona, type_: StatementType, place: Place, kind: int, to: Name, wire: bytes
+    ) -> Utterance | None:
+        """Return a statement in frames, in a channel most of the time where it belongs in one."""
         if kind in (Kind.RIB_REQUEST, Kind.RIB_ANSWER) and rng.random() < 0.8:
-            return self._in_channel(persona, type_, place, destination, wire)
+            return self._in_channel(persona, type_, place, to, wire)
         try:
-            frames = self._splitters[persona.node].split(kind, wire, 1_500, destination)
+            frames = self._splitters[persona.node].split(kind, wire, 1_500, to)
         except LocalError:
             return None
         self._old.append(wire)
@@ -269,10 +283,19 @@ class Forge:
         switches = self._stage.world.switches.values()
         return [each.claim.wire for switch in switches for each in switch.attached.all()]
 
+    def _publishers(self) -> list[Claim]:
+        """Return the claims, of honest nodes too, that a join can show."""
+        switches = self._stage.world.switches.values()
+        claims = [each.claim for switch in switches for each in switch.attached.all()]
+        return [claim for claim in claims if claim.right in HEARS.values()]
+
     # -- honest bodies
 
     def _nonce(self, place: Place) -> bytes:
         return self._stage.nonce_at(place)
+
+    def _echo(self, place: Place) -> bytes:
+        return self._stage.echo_at(place)
 
     def _own_nonce(self, identity: Identity, place: Place) -> bytes:
         persona = next(each for each in PERSONAS if self._stage.identity(each).name == identity.name)
@@ -291,11 +314,11 @@ class Forge:
         switches = [each.name for each in self._stage.world.switches.values()]
         rtcerts = [RtCert.make(identity, rng.choice(switches), validity) for _ in range(rng.choice((0, 1, 2)))]
         return {
-            "n": nonce, "s": next(self._counters), "h": [self._nonce(place)] if rng.random() < 0.8 else [],
+            "n": nonce, "s": next(self._counters), "h": [self._echo(place)] if rng.random() < 0.8 else [],
             "m": 1_500, "d": rng.choice((bytes(8), rng.randbytes(8))), "c": identity.membership,
             "k": rng.choice(([1_000, 1_000, 3], [0, 0, 1], [1, 1, 1], [60_000, 60_000, 255])),
             "x": rng.choice((b"", bytes(32), b"\xff" * 32, rng.randbytes(32))), "b": self._own_life(identity, rng),
-            "u": [self._nonce(place)] if rng.random() < 0.1 else [], "r": rtcerts[:RTCERTS_MAX],
+            "u": [self._echo(place)] if rng.random() < 0.1 else [], "r": rtcerts[:RTCERTS_MAX],
             "y": [self._nonce(place) + rng.randbytes(COOKIE_BYTES)] if rng.random() < 0.2 else [],
         }  # fmt: skip
 
@@ -330,16 +353,25 @@ class Forge:
         world = self._stage.world
         switch = rng.choice([each for each in self._identities() if each.role.value == "switch"])
         claims = [each for each in self._old if b"read" in each or b"serve" in each or b"call" in each]
-        topic = rng.choice(self._topics)
+        shown = self._publishers()
+        if shown and rng.random() < 0.8:  # as an honest switch below says it
+            claim = rng.choice(shown)
+            topic, publisher, place_of = claim.name, claim.node, claim.switch
+            version, proof = claim.sequence, claim.wire
+        else:
+            topic, publisher, place_of = rng.choice(self._topics), rng.choice(self._nodes), switch.name
+            version = rng.choice((0, int(world.network.now.unix_s * 1_000), next(self._numbers)))
+            proof = rng.choice((b"", *(each.wire for each in shown)))
         right = rng.choice((Right.READ, Right.READ, Right.SERVE, Right.CALL))
         evidence = rng.choice(claims) if claims and rng.random() < 0.3 else self._claim_of(rng, identity, topic, right)
         return {
-            "n": topic, "p": rng.choice(self._nodes),
-            "w": switch.name, "d": switch.root.domain,
+            "n": topic, "p": publisher,
+            "w": place_of if rng.random() < 0.9 else switch.name, "d": switch.root.domain,
             "x": sorted({*self._domains, identity.root.domain}), "m": rng.choice((1_500, 576, 1, 9_000)),
-            "l": rng.choice((0.0, 1.0, 7.0, 3_600.0)), "e": evidence, "i": self._nonce(place),
-            "s": next(self._numbers), "v": rng.choice((0, int(world.network.now.unix_s * 1_000), next(self._numbers))),
+            "l": rng.choice((0.0, 1.0, 7.0, 3_600.0)), "e": evidence, "i": self._echo(place),
+            "s": next(self._numbers), "v": version if rng.random() < 0.9 else next(self._numbers),
             "b": rng.choice((ZERO, ZERO, rng.choice(self._nodes))), "o": self._own_nonce(identity, place),
+            "c": proof,
         }  # fmt: skip
 
     def _claim(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
@@ -369,7 +401,8 @@ class Forge:
                 ] if Right.ATTACH not in list(_RIGHTS)[:3] else []
         return {
             **subject.to_fields(), "name": subject.name, "right": right.value, "seq": next(self._numbers),
-            "inc": rng.choice((1, 7, next(self._counters))), "x": rng.choice((b"", bytes(32), rng.randbytes(32))),
+            "inc": int.from_bytes(self._own_life(identity, rng)[8:], "big"),
+            "x": rng.choice((b"", bytes(32), rng.randbytes(32))),
             "lease": rng.choice((1_000, 6_000, 24_000, 3_600_000)),
             "global": rng.random() < 0.5, "member": identity.membership, "chain": chain,
             "rt": RtCert.make(identity, switch, self._lasting()),
@@ -499,7 +532,7 @@ class Forge:
         domains = rng.sample(self._domains, rng.randrange(len(self._domains) + 1))
         hashes = rng.choice((b"", rng.randbytes(2_048)))
         return {
-            "i": self._nonce(place), "s": next(self._numbers),
+            "i": self._echo(place), "s": next(self._numbers),
             "p": [[each, rng.choice((0, 1, 100, _U64)), rng.choice((bytes(8), rng.randbytes(8)))] for each in domains],
             "d": rng.choice(self._domains) if hashes else b"", "h": hashes,
         }  # fmt: skip
@@ -507,7 +540,7 @@ class Forge:
     def _lacking(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         buckets = rng.sample(range(256), rng.choice((0, 1, 256)))
         return {
-            "i": self._nonce(place), "s": next(self._numbers), "d": rng.choice(self._domains), "b": bytes(buckets),
+            "i": self._echo(place), "s": next(self._numbers), "d": rng.choice(self._domains), "b": bytes(buckets),
             "k": rng.randbytes(8 * rng.choice((0, 1, 1_500))),
         }  # fmt: skip
 
@@ -706,3 +739,4 @@ _FRAMES: Final[tuple[tuple[str, Callable[[Forge, random.Random, Persona, Place],
     ("data", Forge._data),
 )
 assert set(_BODIES) == set(StatementType)
+KINDS_OF_WORDS: Final = (*(each.value for each in StatementType), *(what for what, _ in _FRAMES))

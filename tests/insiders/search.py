@@ -16,7 +16,7 @@ from tests.insiders.trial import BrokenError, Figures, Plan, Trial, prepared
 
 __all__ = ["Found", "Search", "plan_of", "run_plan", "searched"]
 
-WORDS: Final = 3_000  # of one trial
+WORDS: Final = 10_000  # of one trial
 _ACTS: Final = 6
 _PLACE_FRAMES: Final = 1
 

@@ -18,6 +18,7 @@ from typing import Final
 from gdp.client.member import Member, Topic
 from gdp.client.rib_host import RibHost
 from gdp.control.greeter import LinkPort
+from gdp.control.hello import ECHO_BYTES
 from gdp.crypto.identity import Identity
 from gdp.limits import RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX
 from gdp.rib.machine import RibSettings
@@ -133,6 +134,7 @@ class Stage:
     world: World = field(init=False)
     flow: Flow = field(init=False)
     topics: dict[str, Topic] = field(default_factory=dict)
+    _rib_nodes: dict[str, str] = field(init=False)
 
     def __post_init__(self) -> None:
         self.world = world = World(
@@ -144,6 +146,7 @@ class Stage:
             keepalive_ms=1_000,
             trusts=dict.fromkeys(_TRUSTED, _TRUSTED) | {"stranger": ("stranger", *_TRUSTED)},
         )
+        self._rib_nodes = {label: world.rib_node(label) for label in world.ribs}
         names, watches = self.rib_limits
         for host in world.ribs.values():
             settings = host.rib._settings
@@ -221,7 +224,7 @@ class Stage:
     def machines(self) -> dict[str, Switch | RibHost | Member]:
         """Return every machine that is alive, by node."""
         world = self.world
-        ribs = {world.rib_node(label): host for label, host in world.ribs.items()}
+        ribs = {self._rib_nodes[label]: host for label, host in world.ribs.items()}
         machines: dict[str, Switch | RibHost | Member] = {**world.switches, **ribs, **world.members}
         return {node: each for node, each in machines.items() if world.network._nodes[node].is_alive}
 
@@ -229,6 +232,11 @@ class Stage:
         """Return the nonce that a port says in its hellos."""
         port = self._port_at(place)
         return bytes(8) if port is None else port.nonce
+
+    def echo_at(self, place: Place) -> bytes:
+        """Return how others refer to a port's session."""
+        port = self._port_at(place)
+        return bytes(ECHO_BYTES) if port is None else port.echo
 
     def own_nonce(self, persona: Persona, place: Place) -> bytes:
         """Return the nonce of the persona's own port that leads to a place."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import random
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -29,9 +29,11 @@ from tests.journeys.networks import reproducible_keys
 __all__ = ["BrokenError", "Figures", "Plan", "Trial", "prepared", "shrunk"]
 
 STRANGERS_MAX: Final = 1.0  # bytes drawn for each byte of somebody unproven
-_LOOK_EVERY: Final = 500  # utterances between two looks at the tables
+_LOOK_EVERY: Final = 2_000  # utterances between two looks at the tables
 _GOOD_EVERY: Final = 100  # ... and between two messages of the good flow
-_PAUSES_S: Final = (*[0.0005] * 20, *[0.002] * 20, 0.02, 0.2)
+_PAUSES_S: Final = (*[0.0] * 80, *[0.0005] * 10, *[0.002] * 9, 0.05)  # after an utterance; in no time others follow
+_ECHO_S: Final = 0.01  # after which what an utterance drew has been counted
+_ACT_CHANCE: Final = 0.002  # of an act between two utterances of a stormy trial
 _HEALED_S: Final = 12.0  # leases, once all works again
 
 
@@ -64,8 +66,8 @@ class Figures:
         worst: highest ratio of the bytes that one machine sent to the bytes said, with both, by what was said and
             whether its sender was proven.
         said, drawn: bytes in all, by the same; what the busiest machine sent each time.
-        slowest: seconds of processor time of the slowest delivery, by what was said.
-        spent: seconds of processor time in all, by what was said; ``count`` so many.
+        slowest: seconds of the slowest delivery, by what was said.
+        spent: seconds in all, by what was said; ``count`` so many.
         tables: longest of each.
     """
 
@@ -92,6 +94,22 @@ class Figures:
             self.slowest[key] = max(slow_s, self.slowest.get(key, 0.0))
 
 
+@dataclass(frozen=True, slots=True)
+class _Said:
+    """An utterance and what it has drawn so far.
+
+    Args:
+        spent_s: time of its delivery.
+        at_s: when it was said.
+    """
+
+    utterance: Utterance
+    echo: Echo
+    spent_s: float
+    at_s: float
+    is_proven: bool
+
+
 @contextmanager
 def prepared(seed: int) -> Iterator[None]:
     """Let stages have keys by a seed, the signing oracle and a tracing network."""
@@ -114,7 +132,7 @@ class Trial:
         self._sent = 0
         self._got: list[bytes] = []
         self._open: list[tuple[float, bytes]] = []  # messages of the good flow under way, with their deadlines
-        self._cut: list[str] = []
+        self._echoes: deque[_Said] = deque()
 
     def run(self) -> Figures:
         """Let it happen.
@@ -127,7 +145,7 @@ class Trial:
             self._act(random.Random(number))
         for number, word in enumerate(self.plan.words):
             rng = random.Random(word)
-            if self.plan.is_stormy and rng.random() < 0.01:
+            if self.plan.is_stormy and rng.random() < _ACT_CHANCE:
                 self._act(rng)
             self._speak(rng)
             if number % _LOOK_EVERY == _LOOK_EVERY - 1:
@@ -135,6 +153,7 @@ class Trial:
             if not self.plan.is_stormy and number % _GOOD_EVERY == _GOOD_EVERY - 1:
                 self._send_good()
         self._check_tables()
+        self._note_echoes(float("inf"))
         if self.plan.is_stormy:
             self._heal()
         else:
@@ -156,27 +175,34 @@ class Trial:
         echo, network, place = Echo(), stage.world.network, utterance.place
         assert isinstance(network, TracingNetwork)
         is_proven = stage.believes(utterance.persona, place)
-        begun_s = time.process_time()
+        begun_s = time.perf_counter()  # a clock that costs little: the other ones are system calls
         network.echo = echo
         for frame in utterance.frames:
             network.inject(place.node, place.port, frame, place.mac)
         network.echo = None
-        spent_s = time.process_time() - begun_s
-        network.run(rng.choice(_PAUSES_S))
-        self._note(utterance, echo, spent_s, is_proven=is_proven)
+        spent_s = time.perf_counter() - begun_s
+        self._echoes.append(_Said(utterance, echo, spent_s, network.now.mono_s, is_proven=is_proven))
+        if pause_s := rng.choice(_PAUSES_S):
+            network.run(pause_s)
+            self._note_echoes(network.now.mono_s - _ECHO_S)
 
-    def _note(self, utterance: Utterance, echo: Echo, spent_s: float, *, is_proven: bool) -> None:
+    def _note_echoes(self, until_s: float) -> None:
+        """Count what was said until then."""
+        while self._echoes and self._echoes[0].at_s <= until_s:
+            self._note(self._echoes.popleft())
+
+    def _note(self, said: _Said) -> None:
         figures = self.figures
-        what, size, drawn = utterance.what, utterance.size, echo.most
-        key = what if is_proven else f"{what}, unproven"
+        what, size, drawn = said.utterance.what, said.utterance.size, said.echo.most
+        key = what if said.is_proven else f"{what}, unproven"
         figures.count[what] += 1
         figures.said[key] += size
         figures.drawn[key] += drawn
         figures.worst[key] = max((drawn / size, drawn, size), figures.worst.get(key, (0.0, 0, 0)))
-        figures.spent[what] += spent_s  # type: ignore[assignment]
-        figures.slowest[what] = max(spent_s, figures.slowest.get(what, 0.0))
-        if not is_proven and drawn > STRANGERS_MAX * size:
-            raise BrokenError(f"{size} bytes of somebody unproven draw {drawn}: {utterance.what}")
+        figures.spent[what] += said.spent_s  # type: ignore[assignment]
+        figures.slowest[what] = max(said.spent_s, figures.slowest.get(what, 0.0))
+        if not said.is_proven and drawn > STRANGERS_MAX * size:
+            raise BrokenError(f"{size} bytes of somebody unproven draw {drawn}: {what}")
 
     # -- what must hold
 

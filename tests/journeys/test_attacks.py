@@ -305,7 +305,7 @@ def test_a_join_without_evidence_plants_nothing() -> None:
     flow = flowing(world)
     nuc2, nuc1 = world.identities["nuc2"], world.switches["nuc1"]
     secret = Name(b"t" * 32)
-    session = nuc1.greeter.ports[0].nonce
+    session = nuc1.greeter.ports[0].echo
     domains = frozenset(nuc1._policy.transit)
     join = Join(
         secret, world.members[ROBOT].name, nuc1.name, nuc1._policy.own, domains, 1_500, 5.0, b"", session, 1 << 60,
@@ -323,7 +323,7 @@ def test_a_join_with_evidence_of_another_topic_plants_nothing() -> None:
     flow = flowing(world)
     nuc2, nuc1 = world.identities["nuc2"], world.switches["nuc1"]
     evidence = nuc1.planter.trees.of_topic(flow.topic.name)[0].evidence
-    secret, session = Name(b"t" * 32), nuc1.greeter.ports[0].nonce
+    secret, session = Name(b"t" * 32), nuc1.greeter.ports[0].echo
     domains = frozenset(nuc1._policy.transit)
     join = Join(
         secret, world.members[ROBOT].name, nuc1.name, nuc1._policy.own, domains, 1_500, 5.0, evidence, session, 1 << 60,

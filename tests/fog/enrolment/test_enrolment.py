@@ -3,79 +3,123 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
-from fog.cluster import Carried, CloudNode, ClusterPlan, Wanted
-from fog.enrolment.boots import gateway_boot, machine_boot
+from fog.cluster import Carried
+from fog.enrolment.boots import gateway_boot
+from fog.enrolment.listener import bind_tcp
 from fog.enrolment.members import Authority, metadata_of
 from fog.enrolment.revoking import take_back
 from fog.enrolment.robot_side import forget_rules, introduce, processes_of
-from fog.hardware import Hardware
 from fog.host.bundle import install
+from fog.host.enrolment import enrol
 from fog.site import open_site
+from gdp.crypto.certificates import Role
 from gdp.crypto.statements import parse
 from gdp.errors import LocalError
 from gdp.nodes.config import RibConfig, SwitchConfig
-from gdp.stores.issue import make_domain, make_owner
+from gdp.nodes.membership import load_member
 from gdp.stores.keyring import load_identity, load_owner
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 from proxy.config import ProxyConfig
 from proxy.held import Held
-
-PLAN = Carried("service", "/plan", "nav_msgs/srv/GetPlan", {"timeout_s": 9.0}, {"encoding": "cbor"})
-MAP = Carried("topic", "/map", "nav_msgs/msg/OccupancyGrid")
-CLUSTER = ClusterPlan("c", (CloudNode("p", "e", environment={"X": "1"}),), (Wanted(Hardware(cpus=1)),), (PLAN, MAP))
+from tests.fog.enrolment.desk import CLUSTER, MAP, PLAN, Desk, made_desk
 
 
 @pytest.fixture
-def authority(tmp_path: Path) -> Authority:
-    make_domain(tmp_path / "domain", "site")
-    make_owner(tmp_path / "owner")
-    return Authority(tmp_path / "domain", tmp_path / "owner")
+def desk(tmp_path: Path) -> Iterator[Desk]:
+    with made_desk(tmp_path) as made:
+        yield made
 
 
-def machine(authority: Authority, home: Path) -> ProxyConfig:
-    boot, _ = machine_boot(
-        authority, CLUSTER, "m7", lambda node: ("run", node.package), iface="eth0", days=1.0, shares_host=True
-    )
-    install(home, boot)
-    return ProxyConfig.load(home / "proxy.yaml")
+@pytest.fixture
+def authority(desk: Desk) -> Authority:
+    return desk.authority
 
 
-def test_a_machine_boots_with_files_that_the_nodes_take(authority: Authority, tmp_path: Path) -> None:
-    config = machine(authority, tmp_path / "home")
+def test_a_machine_boots_with_files_that_the_nodes_take(desk: Desk, tmp_path: Path) -> None:
+    desk.enrol(tmp_path / "home")
+    config = ProxyConfig.load(tmp_path / "home" / "proxy.yaml")
     switch = SwitchConfig.load(tmp_path / "home" / "switch.yaml")
     assert (switch.attach, [port.iface for port in switch.ports]) == (("proxy0",), ["eth0"])
     assert [(rule.name, rule.encoding) for rule in config.expose] == [("/plan", "cbor"), ("/map", "json")]
 
 
-def test_a_machine_may_give_what_is_carried_and_nothing_else(authority: Authority, tmp_path: Path) -> None:
-    config = machine(authority, tmp_path / "home")
+def test_a_machine_is_a_leaf_unless_it_may_become_the_gateway(desk: Desk, tmp_path: Path) -> None:
+    for name, is_gateway, role in (("m1", False, Role.LEAF), ("m2", True, Role.SWITCH)):
+        desk.enrol(tmp_path / name, name, is_gateway=is_gateway)
+        config = SwitchConfig.load(tmp_path / name / "switch.yaml")
+        assert load_member(config.identity, config.domain, Role.SWITCH)[0].role is role
+
+
+def test_a_machine_may_give_what_is_carried_and_nothing_else(desk: Desk, tmp_path: Path) -> None:
+    desk.enrol(tmp_path / "home")
+    config = ProxyConfig.load(tmp_path / "home" / "proxy.yaml")
     held = Held(config.delegations, load_identity(config.identity, time.time()))
-    key = load_owner(authority.owner).key.public.compressed
+    key = load_owner(desk.authority.owner).key.public.compressed
     assert {(topic.name, topic.delegation.rights) for topic in held} == {
         (metadata_of(PLAN).name(key), frozenset({Right.SERVE})),
         (metadata_of(MAP).name(key), frozenset({Right.PUBLISH})),
     }
 
 
-def test_no_two_machines_share_a_key(authority: Authority) -> None:
-    papers = [
-        machine_boot(authority, CLUSTER, name, lambda _: ("run",), iface="eth0", days=1.0, shares_host=False)[1]
-        for name in ("m1", "m2")
-    ]
+def test_no_two_machines_share_a_key(desk: Desk, tmp_path: Path) -> None:
+    for name in ("m1", "m2"):
+        desk.enrol(tmp_path / name, name)
+    papers = [each.papers for each in desk.tickets.news()]
+    assert papers[0] is not None
+    assert papers[1] is not None
     assert papers[0].proxy != papers[1].proxy
     assert not {*papers[0].fingerprints} & {*papers[1].fingerprints}
     assert papers[0].until_unix_s == pytest.approx(time.time() + 86_400, abs=120)
 
 
-def test_nodes_start_first_and_know_their_machine(authority: Authority) -> None:
-    boot, _ = machine_boot(authority, CLUSTER, "m7", lambda _: ("run",), iface="eth0", days=1.0, shares_host=True)
+def test_a_machine_that_has_enrolled_does_not_ask_again(desk: Desk, tmp_path: Path) -> None:
+    desk.enrol(tmp_path / "home")
+    assert not enrol(tmp_path / "home")
+    assert load_identity(tmp_path / "home" / "switch", time.time()).label == "c-m7"
+
+
+def test_a_machine_asks_until_its_launcher_is_there(desk: Desk, tmp_path: Path) -> None:
+    install(tmp_path / "home", desk.boot())
+    with ThreadPoolExecutor() as pool:
+        asking = pool.submit(enrol, tmp_path / "home", patience_s=30.0)
+        key = tmp_path / "home" / "proxy" / "node.csr"
+        while not key.exists() and not asking.done():
+            time.sleep(0.01)
+        with desk.listening():
+            assert asking.result()
+
+
+def test_a_machine_gives_up_where_nobody_answers(desk: Desk, tmp_path: Path) -> None:
+    install(tmp_path / "home", desk.boot())
+    with pytest.raises(LocalError, match=r"nobody let this machine enrol.*socket"):
+        enrol(tmp_path / "home", patience_s=0.1)
+
+
+def test_a_machine_enrols_over_tcp(desk: Desk, tmp_path: Path) -> None:
+    bound = bind_tcp("127.0.0.1", 0)
+    ticket = desk.ticket(address=f"tcp://127.0.0.1:{bound.getsockname()[1]}")
+    install(tmp_path / "home", desk.boot(ticket=ticket))
+    with desk.listening(bound):
+        assert enrol(tmp_path / "home")
+
+
+def test_a_socket_below_a_long_path_is_reached(tmp_path: Path) -> None:
+    folder = tmp_path / ("long" * 40)
+    folder.mkdir()
+    with made_desk(folder) as desk:
+        desk.enrol(tmp_path / "home")
+
+
+def test_nodes_start_first_and_know_their_machine(desk: Desk) -> None:
+    boot = desk.boot()
     assert [program.name for program in boot.programs] == ["node", "switch", "proxy"]
     assert boot.programs[0].environment["FOG_MACHINE"] == "m7"
     assert boot.programs[0].environment["X"] == "1"

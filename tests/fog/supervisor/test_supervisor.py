@@ -12,6 +12,7 @@ import yaml
 
 from fog.cluster import Carried, CloudNode, ClusterPlan
 from fog.enrolment.boots import PROXY
+from fog.enrolment.tickets import Tickets
 from fog.hardware import Hardware
 from fog.machine import Boot, Machine, MachineSpec, MachineState
 from fog.offer import Offer
@@ -117,7 +118,7 @@ def journal(site: Site) -> Iterator[Journal]:
 
 
 def supervisor(site: Site, journal: Journal, provider: Memory) -> Supervisor:
-    return Supervisor(site, journal, provider, lambda _: ("run",), lambda: None)
+    return Supervisor(site, journal, Tickets(site.enrolment_folder), provider, lambda _: ("run",), lambda: None)
 
 
 def work(each: Supervisor, is_met: Callable[[], object]) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from gdp.cli.gdp import main
+from gdp.cli.switch import app as switch
 from gdp.crypto.certificates import Role
 from gdp.nodes.config import RibConfig, SwitchConfig
 from gdp.nodes.membership import load_member
@@ -63,3 +64,17 @@ def test_a_directory_that_is_no_domain_is_refused() -> None:
     Path("lab").mkdir()
     assert _lab("robot") == 2
     assert not Path("robot").exists()
+
+
+def test_a_machine_with_a_leaf_gets_files_of_a_switch_that_carries_no_transit(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert _lab("desk") == 0
+    assert _lab("robot --leaf") == 0
+    switches = [_switch(host) for host in ("desk", "robot")]
+    identities = [load_member(each.identity, each.domain, Role.SWITCH)[0] for each in switches]
+    assert [each.role for each in identities] == [Role.SWITCH, Role.LEAF]
+    capsys.readouterr()
+    with pytest.raises(SystemExit):
+        switch(["--config", "robot/switch.yaml", "--check"])
+    assert capsys.readouterr().out.startswith(f"configuration good: leaf {identities[1].name.short}, 1 ports")

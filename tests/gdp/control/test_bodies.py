@@ -22,14 +22,14 @@ from tests.gdp.control.members import node
 
 NODE = node("n")
 A, B, C = Name(b"a" * 32), Name(b"b" * 32), Name(b"c" * 32)
-HELLO = Hello(b"n" * 8, 7, (b"h" * 8,), 1_500, b"d" * 8, b"cert")
-JOIN = Join(A, B, C, A, frozenset({A, B}), 1_400, 7.0, b"evidence", b"s" * 8, 99)
+HELLO = Hello(b"n" * 8, 7, (b"h" * 16,), 1_500, b"d" * 8, b"cert")
+JOIN = Join(A, B, C, A, frozenset({A, B}), 1_400, 7.0, b"evidence", b"s" * 16, 99)
 LINKS, INSIDE, RIBS = (Adjacency(B, A, 10, 1_500),), (Adjacency(C, A, 3, 1),), (AttachedRib(C, A, bytes(8)),)
 STATE = LinkState(NODE.name, A, Scope.BORDER, 5, LINKS, INSIDE, RIBS, (A, B))
 ANSWER = Answer(A, B, b"claim", C, (A, B), 30.0)
-REVOKED = Revoked(b"s" * 8, 7, ((A, 3, b"d" * 8), (B, 0, bytes(8))))
-BUCKETS = Revoked(b"s" * 8, 8, (), A, tuple(bytes([at]) * 8 for at in range(256)))
-LACKING = Lacking(b"s" * 8, 9, A, (1, 200), (b"i" * 8, b"j" * 8))
+REVOKED = Revoked(b"s" * 16, 7, ((A, 3, b"d" * 8), (B, 0, bytes(8))))
+BUCKETS = Revoked(b"s" * 16, 8, (), A, tuple(bytes([at]) * 8 for at in range(256)))
+LACKING = Lacking(b"s" * 16, 9, A, (1, 200), (b"i" * 8, b"j" * 8))
 
 Read = Callable[[Fields], object]
 BODIES: dict[str, tuple[bytes, object, Read]] = {

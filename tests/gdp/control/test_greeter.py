@@ -7,7 +7,7 @@ from itertools import product
 import pytest
 
 from gdp.control.greeter import NEIGHBOURS_MAX, PADDED_BYTES, Change, Greeter, LinkPort
-from gdp.control.hello import NONCE_BYTES, Hello
+from gdp.control.hello import ECHO_BYTES, Hello
 from gdp.control.join import Join
 from gdp.control.neighbour import TRANSITIONS, Neighbour, NeighbourEvent, NeighbourState
 from gdp.crypto.certificates import Role
@@ -181,7 +181,7 @@ def test_an_expired_certificate_is_refused() -> None:
 def test_a_neighbour_whose_certificate_runs_out_falls_silent() -> None:
     one = greeter(A, 1)
     short = node("short", validity=Validity(YEAR.not_before_unix_s, UNIX_S + 10))
-    hear(one, forged(short, heard=(one.ports[0].nonce,)), 0.0)
+    hear(one, forged(short, heard=(one.ports[0].echo,)), 0.0)
     assert len(one.all_up()) == 1
     late = forged(short, sequence=2)
     with pytest.raises(StatementError) as caught:
@@ -207,7 +207,7 @@ def test_ones_own_hello_come_back_is_not_for_us() -> None:
 
 def test_a_port_has_so_many_neighbours_and_no_more() -> None:
     one = greeter(A, 1)
-    heard = (one.ports[0].nonce,)
+    heard = (one.ports[0].echo,)
     for number in range(NEIGHBOURS_MAX):
         hear(one, forged(node(f"n{number}", Role.PROXY), heard=heard), 0.0, b"\x02far\x00" + bytes([number]))
     with pytest.raises(StatementError) as caught:
@@ -268,7 +268,7 @@ def test_hellos_fit_the_narrowest_end_that_was_heard() -> None:
 
 def test_a_neighbour_that_claims_to_take_nothing_is_taken_for_the_narrowest_there_may_be() -> None:
     one = greeter(A, 1)
-    hello = Hello(b"n" * 8, 1, (one.ports[0].nonce,), 0, bytes(8), B.membership)
+    hello = Hello(b"n" * 8, 1, (one.ports[0].echo,), 0, bytes(8), B.membership)
     hear(one, hello.to_wire(B.name, B.key), 0.0)
     assert one.ports[0].mtu == 576
 
@@ -337,23 +337,23 @@ def is_taken(
 
 def test_a_join_counts_once() -> None:
     port = greeter(A, 1).ports[0]
-    taken = [is_taken(port, port.nonce, neighbour_of(b"b"), sequence) for sequence in (5, 4, 5, 6, 4)]
+    taken = [is_taken(port, port.echo, neighbour_of(b"b"), sequence) for sequence in (5, 4, 5, 6, 4)]
     assert taken == [True, True, False, True, False]
 
 
 def test_a_join_of_another_session_is_refused() -> None:
     port = greeter(A, 1).ports[0]
-    assert not is_taken(port, bytes(NONCE_BYTES), neighbour_of(b"b"), 1)
+    assert not is_taken(port, bytes(ECHO_BYTES), neighbour_of(b"b"), 1)
 
 
 def test_joins_of_two_neighbours_do_not_hinder_each_other() -> None:
     port = greeter(A, 1).ports[0]
     both = neighbour_of(b"a", b"a" * 8), neighbour_of(b"b", b"b" * 8)
-    assert [is_taken(port, port.nonce, each, 1, each.nonce) for each in both] == [True, True]
+    assert [is_taken(port, port.echo, each, 1, each.nonce) for each in both] == [True, True]
 
 
 def test_a_join_counts_from_anew_in_a_new_session_of_its_sender_and_one_of_the_last_session_not_at_all() -> None:
     port, before, after = greeter(A, 1).ports[0], neighbour_of(b"b"), neighbour_of(b"b", b"o" * 8)
-    assert is_taken(port, port.nonce, before, 1_000)
-    assert is_taken(port, port.nonce, after, 1, b"o" * 8)
-    assert not is_taken(port, port.nonce, after, 1_001)
+    assert is_taken(port, port.echo, before, 1_000)
+    assert is_taken(port, port.echo, after, 1, b"o" * 8)
+    assert not is_taken(port, port.echo, after, 1_001)

@@ -50,6 +50,14 @@ def test_a_membership_says_who_the_node_is() -> None:
     assert (MEMBER.digest, MEMBER.key, MEMBER.validity) == (DIGEST, KEY.public, MONTH)
 
 
+def test_a_leaf_is_a_switch_by_another_role_and_name() -> None:
+    request = {role: request_membership(KEY, role, "robot", node_metadata(role, "robot").digest()) for role in Role}
+    leaf, switch = (SCHOOL.admit(request[role], MONTH) for role in (Role.LEAF, Role.SWITCH))
+    assert (leaf.role, switch.role) == (Role.LEAF, Role.SWITCH)
+    assert [role for role in Role if role.is_switch] == [Role.SWITCH, Role.LEAF]
+    assert leaf.name != switch.name
+
+
 def test_its_name_comes_from_its_metadata_and_key() -> None:
     assert MEMBER.name == Metadata({"kind": "proxy", "name": "robot"}).name(KEY.public.compressed)
 

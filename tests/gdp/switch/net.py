@@ -30,11 +30,12 @@ def state(
     inside: tuple[Adjacency, ...] = (),
     ribs: tuple[str, ...] = (),
     members: tuple[str, ...] = (),
+    is_leaf: bool = False,
 ) -> LinkState:
     """Return a link state."""
     attached = tuple(AttachedRib(name(rib), domain, bytes(8)) for rib in ribs)
     listed = tuple(name(member) for member in members)
-    return LinkState(name(origin), domain, scope, sequence, links, inside, attached, listed)
+    return LinkState(name(origin), domain, scope, sequence, links, inside, attached, listed, is_leaf=is_leaf)
 
 
 def known(*states: LinkState) -> LinkStates:

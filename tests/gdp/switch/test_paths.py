@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gdp.control.link_state import Scope
 from gdp.switch.paths import Paths, Way
-from tests.gdp.switch.net import AWAY, HOME, THIRD, link, name, paths, state
+from tests.gdp.switch.net import AWAY, HOME, THIRD, known, link, name, paths, state
 
 ALL = frozenset({HOME, AWAY, THIRD})
 
@@ -189,3 +189,64 @@ def test_a_neighbour_of_another_domain_is_no_alternate() -> None:
     found = three_domains()
     found.has_alternates = True
     assert found.to_switch(name("x"), AWAY, ALL) == Way(name("t"), 10, None)
+
+
+def beside_a_leaf(me: str, bd: int = 100, dear: int = 1) -> Paths:
+    """Return the paths of ``me``, with alternates: a and d are joined by b, and by the leaf (``dear`` from a)."""
+    found = paths(
+        me,
+        state("a", link("b"), link("leaf", dear)),
+        state("b", link("a"), link("d", bd)),
+        state("leaf", link("a", dear), link("d", 1), is_leaf=True),
+        state("d", link("b", bd), link("leaf", 1), ribs=("rib",)),
+    )
+    found.has_alternates = True
+    return found
+
+
+def test_a_way_leads_to_a_leaf_and_never_through_one() -> None:
+    found = beside_a_leaf("a")
+    assert found.to_switch(name("d"), HOME, ALL) == Way(name("b"), 110)
+    assert found.to_switch(name("leaf"), HOME, ALL) == Way(name("leaf"), 1)
+    assert found.to_rib(name("rib"), ALL) == (Way(name("b"), 110), name("d"))
+    assert not found.carries_transit(name("leaf"))
+
+
+def test_a_leaf_is_an_alternate_to_itself_only() -> None:
+    found = beside_a_leaf("a", 10, dear=500)
+    assert found.to_switch(name("leaf"), HOME, ALL) == Way(name("b"), 21, name("leaf"))
+    assert found.to_switch(name("d"), HOME, ALL) == Way(name("b"), 20, None)
+
+
+def test_a_leaf_itself_takes_either_neighbour_for_nothing_comes_back_through_it() -> None:
+    found = beside_a_leaf("leaf")
+    assert found.to_switch(name("b"), HOME, ALL) == Way(name("a"), 11, name("d"))
+    assert found.to_switch(name("d"), HOME, ALL) == Way(name("d"), 1, name("a"))
+    assert found.distance_from(name("leaf"), name("d"), HOME, ALL) is None
+
+
+def test_what_only_leaves_join_is_severed_and_no_member() -> None:
+    found = paths(
+        "a",
+        state("a", link("leaf")),
+        state("leaf", link("a"), link("d"), link("far"), is_leaf=True),
+        state("far", link("leaf"), is_leaf=True),
+        state("d", link("leaf"), link("e", 5, AWAY)),
+    )
+    assert found.to_switch(name("d"), HOME, ALL) is None
+    assert found.severed() == {name("d"), name("far")}
+    assert found.members() == {name("a"), name("leaf")}
+    assert found.leads_through_leaf(name("d"), HOME)
+    assert found.leads_through_leaf(name("e"), AWAY)
+    assert not found.leads_through_leaf(name("nobody"), HOME)
+    assert found.borders() == {}
+
+
+def test_a_switch_whose_root_made_it_a_leaf_is_passed_through_no_more() -> None:
+    states = known(
+        state("a", link("b")), state("b", link("a"), link("c")), state("c", link("b")),
+    )  # fmt: skip
+    found = Paths(name("a"), HOME, states)
+    assert first(found.to_switch(name("c"), HOME, ALL)) == "b"
+    states.put(state("b", link("a"), link("c"), sequence=2, is_leaf=True), b"wire", 0.0)
+    assert found.to_switch(name("c"), HOME, ALL) is None

@@ -1,0 +1,199 @@
+"""Who answers a machine's request for its memberships: verifies, issues, remembers.
+
+Place: I/O, through ``tickets`` and ``members``; no socket, and times come in as arguments.
+A request without a valid tag costs a look-up and a few hashes. One with it costs a decapsulation and four
+verifications, at most ``OPENED_MAX`` times a ticket; the same bytes again cost the tag alone.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections import OrderedDict
+from typing import Final, TypeVar
+
+from fog.enrolment.members import Authority
+from fog.enrolment.papers import Papers
+from fog.enrolment.tickets import Kept, Tickets
+from gdp.crypto.certificates import Membership, Role
+from gdp.crypto.identity import node_metadata
+from gdp.crypto.x509_form import Holder, read_request
+from gdp.errors import DropReason, StatementError
+from gdp.stores.audit_log import AuditLog
+from gdp.stores.keyring import ROOT_CERTIFICATE, load_root
+from gdp.trust.audit import Action, AuditTrail
+from gdp.trust.enrolment import (
+    REFUSED,
+    Answer,
+    Application,
+    Request,
+    has_tag,
+    open_request,
+    request_head,
+    seal_answer,
+)
+
+__all__ = ["OPENED_MAX", "Responder"]
+
+OPENED_MAX: Final = 64  # requests of one ticket that are opened; a machine needs one, or a few where answers are lost
+_REMEMBERED: Final = 1_024  # tickets
+_WHAT: Final = "enrolment"
+_KNOWN: Final = "somebody has read its user data"
+
+_T = TypeVar("_T")
+
+
+class Responder:
+    """Answers requests, one after the other, from one thread; the domain's audit log has each that is refused.
+
+    Raises:
+        LocalError: the domain's folder is not this user's alone.
+    """
+
+    def __init__(self, tickets: Tickets, authority: Authority) -> None:
+        self._tickets = tickets
+        self._authority = authority
+        self._trail = AuditTrail()
+        self._trail.begin()
+        self._audit = AuditLog(authority.domain)
+        self._opened: OrderedDict[bytes, int] = OrderedDict()
+        self._answered: OrderedDict[bytes, tuple[bytes, bytes]] = OrderedDict()  # SHA-256 of the request, answer
+
+    def is_expected(self, identifier: bytes) -> bool:
+        """Return whether there is a ticket of this id; what else its request says may then be read.
+
+        Raises:
+            StoreError: the tickets cannot be read now.
+        """
+        if self._tickets.find(identifier) is not None:
+            return True
+        self._refuse("no such ticket")
+        return False
+
+    def answer(self, request: bytes, unix_s: float) -> bytes:
+        """Return what a whole request gets; empty: nothing.
+
+        Raises:
+            StoreError, LocalError: tickets or keys cannot be read or written now; the machine asks again.
+        """
+        try:
+            head = request_head(request)
+        except StatementError:
+            head = None
+        if head is None or head[1] != len(request):
+            self._refuse("not a request")
+            return b""
+        identifier = head[0]
+        kept = self._tickets.find(identifier)
+        if kept is None or not has_tag(kept.token, request):
+            self._refuse("wrong token" if kept is not None else "no such ticket")
+            return b""
+        digest = hashlib.sha256(request).digest()
+        if self._answered.get(identifier, (b"", b""))[0] == digest and not kept.is_reported:
+            return self._answered[identifier][1]
+        about = f"{kept.cluster}/{kept.machine}"
+        if kept.is_reported or not self._may_open(identifier):
+            self._refuse("a token that was misused" if kept.is_reported else "too many requests", about)
+            return REFUSED
+        try:
+            sent = self._granted(identifier, kept, request, unix_s)
+        except StatementError as error:
+            self._misused(identifier, f"{_KNOWN}, and asked for what was not planned: {error}", about)
+            return REFUSED
+        if sent == REFUSED:
+            return sent
+        _remember(self._answered, identifier, (digest, sent))
+        return sent
+
+    def flush(self) -> None:
+        """Write what is due of the audit log.
+
+        Raises:
+            LocalError: it cannot be written; what was to be written is lost.
+        """
+        self._audit.write(self._trail, time.monotonic(), time.time())
+
+    def _granted(self, identifier: bytes, kept: Kept, request: bytes, unix_s: float) -> bytes:
+        asked = open_request(self._tickets.responder, request)
+        holders = _verified(identifier, kept, asked)
+        keys = _keys_digest(asked, holders)
+        about = f"{kept.cluster}/{kept.machine}"
+        if kept.keys is not None and kept.keys != keys:
+            enrolled = f"; enrolled first is {kept.papers.proxy[:16]}" if kept.papers is not None else ""
+            self._misused(identifier, f"{_KNOWN}: the token was used again with another key{enrolled}", about)
+            return REFUSED
+        if unix_s >= kept.expires_unix_s:
+            self._refuse("a token that has run out", about)
+            return REFUSED
+        if kept.answer is not None:
+            return seal_answer(kept.token, request, asked.answer_secret, kept.answer)
+        if not self._tickets.use(identifier, keys):
+            self._refuse("a ticket that was taken back", about)
+            return REFUSED
+        answer, papers = self._issue(kept, asked.applications, unix_s)
+        sealed = seal_answer(kept.token, request, asked.answer_secret, answer)
+        if not self._tickets.complete(identifier, answer, papers, f"as {papers.proxy[:16]}"):
+            self._refuse("a ticket that was taken back", about)
+            return REFUSED
+        self._trail.note(Action.ACCEPTED, _WHAT, who=papers.proxy, about=about)
+        return sealed
+
+    def _issue(self, kept: Kept, applications: tuple[Application, ...], unix_s: float) -> tuple[bytes, Papers]:
+        granted, members = [], list[Membership]()
+        for planned, application in zip(kept.seats, applications, strict=True):
+            member, given = self._authority.grant(
+                application, planned.carried, until_unix_s=kept.until_unix_s, unix_s=unix_s
+            )
+            granted.append(given)
+            members.append(member)
+        root = load_root(self._authority.domain / ROOT_CERTIFICATE)
+        serves = next((each for each in members if each.role is Role.PROXY), members[0])
+        until_s = float(min(each.not_after_unix_s for each in members))
+        papers = Papers(serves.name.to_text(), until_s, tuple(each.fingerprint.hex() for each in members))
+        return Answer(root.to_pem(), tuple(granted)).to_wire(), papers
+
+    def _may_open(self, identifier: bytes) -> bool:
+        opened = self._opened.get(identifier, 0)
+        _remember(self._opened, identifier, opened + 1)
+        return opened < OPENED_MAX
+
+    def _misused(self, identifier: bytes, detail: str, about: str) -> None:
+        self._tickets.misused(identifier, detail)
+        self._answered.pop(identifier, None)
+        self._refuse("a token that somebody else knows", about)
+
+    def _refuse(self, reason: str, about: str = "") -> None:
+        self._trail.note(Action.REFUSED, _WHAT, about=about, reason=reason)
+
+
+def _verified(identifier: bytes, kept: Kept, asked: Request) -> list[Holder]:
+    """Return whom the applications are about: exactly what was planned, each with its key's proof.
+
+    Raises:
+        StatementError: they are about something else, or a proof does not hold.
+    """
+    if len(asked.applications) != len(kept.seats):
+        raise StatementError(DropReason.WRONG_NAME, "another number of members")
+    holders = []
+    for planned, application in zip(kept.seats, asked.applications, strict=True):
+        seat, holder = planned.seat, read_request(application.request)
+        digest = node_metadata(seat.role, seat.label).digest()
+        if (holder.unit, holder.label, holder.subject.digest) != (seat.role.value, seat.label, digest):
+            raise StatementError(DropReason.WRONG_NAME, f"{holder.unit[:16]!r} {holder.label!r}, not {seat.label!r}")
+        application.verify(holder.key, identifier)
+        holders.append(holder)
+    return holders
+
+
+def _keys_digest(asked: Request, holders: list[Holder]) -> bytes:
+    told = hashlib.sha256()
+    for application, holder in zip(asked.applications, holders, strict=True):
+        told.update(holder.key.compressed + application.kem.wire)
+    return told.digest()
+
+
+def _remember(kept: OrderedDict[bytes, _T], identifier: bytes, value: _T) -> None:
+    kept[identifier] = value
+    kept.move_to_end(identifier)
+    if len(kept) > _REMEMBERED:
+        kept.popitem(last=False)

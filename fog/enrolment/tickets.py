@@ -1,0 +1,270 @@
+"""Tickets of machines that are to enrol: what each may become, whether it has, and what the supervisor is to know.
+
+Place: I/O, one folder of the site's state, private::
+
+    responder.key       what requests are sealed to
+    tickets.sqlite3     a row a ticket, and news
+
+A ticket is written before its machine is asked for. It is marked as used, on disk, before anything is issued for it:
+whatever is killed in between, no second key gets anything. The responder's thread and the supervisor's use one object.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Final
+
+from fog.cluster import Carried
+from fog.enrolment.papers import Papers
+from gdp.crypto.certificates import Role
+from gdp.crypto.kem import KemPrivateKey
+from gdp.errors import StoreError
+from gdp.stores.files import private, read_private, write_all
+from gdp.trust.enrolment import Seat, Ticket, token_id
+
+__all__ = ["Kept", "News", "PlannedSeat", "Report", "Tickets"]
+
+_KEY: Final = "responder.key"
+_FILE: Final = "tickets.sqlite3"
+_PATIENCE_S: Final = 10.0
+_TABLES: Final = """
+CREATE TABLE IF NOT EXISTS tickets (
+  id BLOB PRIMARY KEY, token BLOB NOT NULL, cluster TEXT NOT NULL, machine TEXT NOT NULL, seats TEXT NOT NULL,
+  expires_unix_s REAL NOT NULL, until_unix_s REAL NOT NULL,
+  keys BLOB, answer BLOB, papers TEXT, is_reported INTEGER NOT NULL DEFAULT 0
+) STRICT;
+CREATE TABLE IF NOT EXISTS news (
+  id INTEGER PRIMARY KEY AUTOINCREMENT, cluster TEXT NOT NULL, machine TEXT NOT NULL,
+  report TEXT NOT NULL, detail TEXT NOT NULL, papers TEXT
+) STRICT;
+"""
+
+
+class Report(Enum):
+    """What happened to a ticket."""
+
+    ENROLLED = "enrolled"
+    MISUSED = "misused"  # whoever asked knows the token, and is not the machine, or not the first one
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedSeat:
+    """A seat, and what its member may give (serve, publish)."""
+
+    seat: Seat
+    carried: tuple[Carried, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """A ticket as the launcher keeps it.
+
+    Args:
+        expires_unix_s: until when it can be used.
+        until_unix_s: when all that is issued for it ends.
+        keys: SHA-256 of the keys that used it; None: nobody did.
+        answer: what these were given; None: not complete yet.
+        papers: of who used it.
+        is_reported: a misuse was reported; nothing more is answered.
+    """
+
+    token: bytes = field(repr=False)
+    cluster: str
+    machine: str
+    seats: tuple[PlannedSeat, ...]
+    expires_unix_s: float
+    until_unix_s: float
+    keys: bytes | None
+    answer: bytes | None = field(repr=False)
+    papers: Papers | None
+    is_reported: bool
+
+
+@dataclass(frozen=True, slots=True)
+class News:
+    """Something that the supervisor is to act on, told again until it is ``taken``."""
+
+    id: int
+    cluster: str
+    machine: str
+    report: Report
+    detail: str
+    papers: Papers | None
+
+
+class Tickets:
+    """The folder, opened.
+
+    Raises:
+        LocalError: the folder is not this user's alone.
+        StoreError: it cannot be read or written now; from every method, too.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / _FILE
+        if not (folder / _KEY).exists():
+            write_all(folder, {_KEY: private(KemPrivateKey.generate().wire)})
+        self.responder = KemPrivateKey.from_wire(read_private(folder / _KEY))
+        self._lock = threading.Lock()
+        with self._translated():
+            os.close(os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+            self._file = sqlite3.connect(
+                self._path, timeout=_PATIENCE_S, isolation_level=None, check_same_thread=False
+            )
+            self._file.execute("PRAGMA journal_mode=WAL")
+            self._file.execute("PRAGMA synchronous=FULL")  # a token that was used stays used
+            self._file.executescript(_TABLES)
+
+    def close(self) -> None:
+        """Close the files."""
+        with self._lock:
+            self._file.close()
+
+    def issue(
+        self,
+        cluster: str,
+        machine: str,
+        seats: Sequence[PlannedSeat],
+        token: bytes,
+        *,
+        addresses: Sequence[str],
+        unix_s: float,
+        expires_unix_s: float,
+        until_unix_s: float,
+    ) -> Ticket:
+        """Keep and return a machine's ticket; those whose time is over are forgotten.
+
+        Args:
+            token: 32 bytes drawn for it.
+        """
+        with self._writing() as file:
+            file.execute(
+                "DELETE FROM tickets WHERE until_unix_s < ? OR (keys IS NULL AND expires_unix_s < ?)", (unix_s, unix_s)
+            )
+            file.execute(
+                "INSERT INTO tickets (id, token, cluster, machine, seats, expires_unix_s, until_unix_s)"
+                " VALUES (?, ?, ?, ?, ?, ?, ?)",
+                (token_id(token), token, cluster, machine, _seats_text(seats), expires_unix_s, until_unix_s),
+            )
+        return Ticket(tuple(addresses), self.responder.public, token, tuple(each.seat for each in seats))
+
+    def find(self, identifier: bytes) -> Kept | None:
+        """Return the ticket of this id."""
+        query = (
+            "SELECT token, cluster, machine, seats, expires_unix_s, until_unix_s, keys, answer, papers, is_reported"
+            " FROM tickets WHERE id = ?"
+        )
+        with self._translated(), self._lock:
+            row = self._file.execute(query, (identifier,)).fetchone()
+        if row is None:
+            return None
+        token, cluster, machine, seats, expires_unix_s, until_unix_s, keys, answer, papers, is_reported = row
+        return Kept(
+            token, cluster, machine, _seats(seats), expires_unix_s, until_unix_s, keys, answer, _papers(papers),
+            bool(is_reported),
+        )
+
+    def use(self, identifier: bytes, keys: bytes) -> bool:
+        """Mark a ticket as used by these keys; return whether it was not used, or by the same ones."""
+        with self._writing() as file:
+            return bool(
+                file.execute(
+                    "UPDATE tickets SET keys = ? WHERE id = ? AND is_reported = 0 AND (keys IS NULL OR keys = ?)",
+                    (keys, identifier, keys),
+                ).rowcount
+            )
+
+    def complete(self, identifier: bytes, answer: bytes, papers: Papers, detail: str) -> bool:
+        """Keep what the keys of a ticket are given, and tell the supervisor; False: the ticket was taken back."""
+        text = json.dumps(asdict(papers))
+        with self._writing() as file:
+            if not file.execute(
+                "UPDATE tickets SET answer = ?, papers = ? WHERE id = ?", (answer, text, identifier)
+            ).rowcount:
+                return False
+            _tell(file, identifier, Report.ENROLLED, detail, text)
+        return True
+
+    def misused(self, identifier: bytes, detail: str) -> None:
+        """Let a ticket be good for nothing any more, and tell the supervisor, once."""
+        with self._writing() as file:
+            if file.execute(
+                "UPDATE tickets SET is_reported = 1 WHERE id = ? AND is_reported = 0", (identifier,)
+            ).rowcount:
+                _tell(file, identifier, Report.MISUSED, detail, None)
+
+    def take_back(self, cluster: str, machine: str) -> None:
+        """Forget the ticket of a machine that is no more; fine if there is none."""
+        with self._writing() as file:
+            file.execute("DELETE FROM tickets WHERE cluster = ? AND machine = ?", (cluster, machine))
+
+    def news(self) -> list[News]:
+        """Return what was not ``taken`` yet, the oldest first."""
+        with self._translated(), self._lock:
+            rows = self._file.execute(
+                "SELECT id, cluster, machine, report, detail, papers FROM news ORDER BY id"
+            ).fetchall()
+        return [
+            News(number, cluster, machine, Report(report), detail, _papers(papers))
+            for number, cluster, machine, report, detail, papers in rows
+        ]
+
+    def taken(self, news: News) -> None:
+        """Forget news that were acted on."""
+        with self._writing() as file:
+            file.execute("DELETE FROM news WHERE id = ?", (news.id,))
+
+    @contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        with self._translated(), self._lock:
+            self._file.execute("BEGIN IMMEDIATE")
+            with self._file:  # commits, or rolls back
+                yield self._file
+
+    @contextmanager
+    def _translated(self) -> Iterator[None]:
+        try:
+            yield
+        except (sqlite3.Error, OSError) as error:
+            raise StoreError(f"{self._path}: {error}") from error
+
+
+def _tell(file: sqlite3.Connection, identifier: bytes, report: Report, detail: str, papers: str | None) -> None:
+    file.execute(
+        "INSERT INTO news (cluster, machine, report, detail, papers)"
+        " SELECT cluster, machine, ?, ?, coalesce(?, papers) FROM tickets WHERE id = ?",
+        (report.value, detail, papers, identifier),
+    )
+
+
+def _seats_text(seats: Sequence[PlannedSeat]) -> str:
+    return json.dumps(
+        [
+            {**asdict(each.seat), "role": each.seat.role.value, "carried": [asdict(one) for one in each.carried]}
+            for each in seats
+        ]
+    )
+
+
+def _seats(text: str) -> tuple[PlannedSeat, ...]:
+    return tuple(
+        PlannedSeat(
+            Seat(each["folder"], Role(each["role"]), each["label"]), tuple(Carried(**one) for one in each["carried"])
+        )
+        for each in json.loads(text)
+    )
+
+
+def _papers(text: str | None) -> Papers | None:
+    if text is None:
+        return None
+    told = json.loads(text)
+    return Papers(told["proxy"], told["until_unix_s"], tuple(told["fingerprints"]))

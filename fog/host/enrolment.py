@@ -1,0 +1,153 @@
+"""A machine's first start: it makes its own keys, and asks for what it is to be with the token of its ticket.
+
+Place: I/O. Keys are on disk before they are shown, so that a machine that starts again asks with the same ones. When
+all is there the ticket is removed: no file, no enrolment.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import secrets
+import socket
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Final
+
+from fog.host.bundle import TICKET_FILE
+from gdp.crypto.certificates import Root
+from gdp.errors import LocalError, StatementError
+from gdp.stores.files import read_private, read_public
+from gdp.stores.issue import install_delegation, install_membership, make_node_keys
+from gdp.stores.keyring import REQUEST, load_node_keys
+from gdp.trust.delegation import Delegation
+from gdp.trust.enrolment import (
+    ANSWER_HEAD_BYTES,
+    ANSWER_SECRET_BYTES,
+    REFUSED,
+    Answer,
+    Application,
+    Ticket,
+    answer_bytes,
+    apply,
+    open_answer,
+    seal_request,
+)
+
+__all__ = ["enrol"]
+
+log = logging.getLogger(__name__)
+
+_PATIENCE_S: Final = 900.0  # whoever launched gives up then, too
+_TRY_S: Final = 10.0
+_PAUSE_MIN_S: Final = 0.2
+_PAUSE_MAX_S: Final = 5.0
+
+
+def enrol(home: Path, *, patience_s: float = _PATIENCE_S) -> bool:
+    """Enrol the machine if its folder has a ticket; return whether it had one.
+
+    Raises:
+        LocalError: the ticket is none; the responder refuses it; nobody answers within ``patience_s``; or what was
+            answered does not fit the machine's keys.
+    """
+    path = home / TICKET_FILE
+    if not path.exists():
+        return False
+    ticket = Ticket.from_json(read_private(path))
+    applications = [_application(home, ticket, index) for index in range(len(ticket.seats))]
+    answer = _ask(ticket, applications, patience_s)
+    if len(answer.granted) != len(ticket.seats):
+        raise LocalError(f"{path}: answered for {len(answer.granted)} members of {len(ticket.seats)}")
+    try:
+        root = Root.from_wire(answer.root)
+        for seat, granted in zip(ticket.seats, answer.granted, strict=True):
+            install_membership(home / seat.folder, granted.member, root, force=True)
+            for each in granted.delegations:
+                install_delegation(home / seat.folder, Delegation.from_wire(each), force=True)
+    except StatementError as error:
+        raise LocalError(f"{path}: the answer does not hold: {error}") from error
+    path.unlink()
+    log.info("machine enrolled members=%d", len(ticket.seats))
+    return True
+
+
+def _application(home: Path, ticket: Ticket, index: int) -> Application:
+    """Make a member's keys, or find those of an earlier start, and apply with them."""
+    seat = ticket.seats[index]
+    folder = home / seat.folder
+    if not (folder / REQUEST).exists():  # the last file to be written
+        make_node_keys(folder, seat.role, seat.label, force=True)
+    keys = load_node_keys(folder)
+    return apply(ticket.token, keys.key, read_public(folder / REQUEST), keys.kem.public)
+
+
+def _ask(ticket: Ticket, applications: list[Application], patience_s: float) -> Answer:
+    """Ask until somebody answers."""
+    end_s, pause_s, reason = time.monotonic() + patience_s, _PAUSE_MIN_S, ""
+    secret = secrets.token_bytes(ANSWER_SECRET_BYTES)
+    request = seal_request(ticket, applications, secret)  # the same each time
+    while True:
+        for address in ticket.addresses:
+            try:
+                return open_answer(ticket.token, request, secret, _exchange(address, request))
+            except (OSError, StatementError) as error:
+                said = f"{address}: {error}"
+                if said != reason:
+                    log.warning("not enrolled yet reason=%s", said)
+                reason = said
+        if time.monotonic() + pause_s >= end_s:
+            raise LocalError(f"nobody let this machine enrol within {patience_s:.0f} s: {reason}")
+        time.sleep(pause_s)  # nothing tells a machine when its launcher is back
+        pause_s = min(2 * pause_s, _PAUSE_MAX_S)
+
+
+def _exchange(address: str, request: bytes) -> bytes:
+    """Return what followed the head of the answer.
+
+    Raises:
+        OSError: nobody is there, or the connection ends early.
+        StatementError: no answer.
+        LocalError: a refusal.
+    """
+    with closing(_connected(address)) as peer:
+        peer.settimeout(_TRY_S)
+        peer.sendall(request)
+        head = _received(peer, 1)
+        if head == REFUSED:
+            raise LocalError(f"{address} refuses this machine's ticket")
+        return _received(peer, answer_bytes(head + _received(peer, ANSWER_HEAD_BYTES - 1)))
+
+
+def _connected(address: str) -> socket.socket:
+    if address.startswith("unix:"):
+        path = Path(address.removeprefix("unix:"))
+        peer = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            try:
+                peer.settimeout(_TRY_S)
+                peer.connect(f"/proc/self/fd/{folder}/{path.name}")  # a socket's path has at most 107 bytes
+            finally:
+                os.close(folder)
+        except OSError:
+            peer.close()
+            raise
+        return peer
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    if not port.isdecimal():
+        raise LocalError(f"{address!r} is no address of a launcher: expected tcp://HOST:PORT or unix:PATH")
+    return socket.create_connection((host.strip("[]"), int(port)), _TRY_S)
+
+
+def _received(peer: socket.socket, size: int) -> bytes:
+    end_s = time.monotonic() + _TRY_S
+    found = bytearray()
+    while len(found) < size:
+        peer.settimeout(max(end_s - time.monotonic(), 0.001))
+        data = peer.recv(size - len(found))
+        if not data:
+            raise ConnectionResetError("the connection was closed")
+        found += data
+    return bytes(found)

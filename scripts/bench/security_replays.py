@@ -1,0 +1,638 @@
+"""How many recorded frames are accepted after a restart, of so many that are played back? None should be.
+
+One process: two domains with a RIB each, a publisher and its reader, a client and a server, a node that has moved, one
+that has withdrawn its topic, and one that is revoked, on the in-memory network, its clock virtual. Every frame on every
+link is recorded: while all come up, at work, while a link is cut, a RIB restarts, a node moves, withdraws or is
+revoked. Then nothing, one process or all of them restart, after seconds or, all being off, after hours or days, with
+their clocks right, or nearly an hour behind or ahead. RIBs begin with their snapshot and switches with the revocations
+that they kept. Right from the start of each, recordings are played back: single frames, all parts of a statement, and
+stretches of a link in their order, at the port where they came in or at any other one, under the address of the
+neighbour there, their own, or a stranger's.
+
+*Accepted* is what the oracle (``Domain.found``) sees after that and ``QUIET_S`` more:
+
+- a message or request that an application was given and nobody sent in this batch, or was given twice or out of order;
+- one that was sent when all had settled, and was not delivered or answered within ``PROMISE_S``: a flow was cut;
+- a neighbour, an attached claim, a place, a route of a RIB, or a branch of a tree, that is not of who is there, or that
+  is gone although it is: of the moved node the former place, of the withdrawn topic and the revoked node anything;
+- a link state that its origin did not say last.
+
+What a frame warrants by itself is none of these: a keepalive of now keeps a neighbour up that is there.
+
+``--control`` takes one check of freshness away and must find something; it shows that the oracle can.
+
+    .venv/bin/python scripts/bench/security.py replays
+    .venv/bin/python scripts/bench/security.py replays --tries 2000 --control window --no-save
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import random
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+from unittest import mock
+
+from report import progress
+from rich.console import Console
+from rich.table import Table
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from gdp.client.feed import Feed
+from gdp.client.rib_host import RibHost
+from gdp.control.boundary import ErrorBoundary
+from gdp.control.neighbour import NeighbourState
+from gdp.control.replica import Entry
+from gdp.effects import Arrival, Instant, Machine, Transmit
+from gdp.frame.codec import ETHER_BYTES, decode
+from gdp.frame.kinds import Kind
+from gdp.message.replay import ReplayWindow
+from gdp.message.status import Status
+from gdp.rib.route import Route
+from gdp.switch.claims import Claims
+from gdp.switch.table import Table as ForwardingTable
+from gdp.testbed.memory import EPOCH_UNIX_S, MemoryNetwork
+from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
+from gdp.testbed.world import World
+from gdp.trust.revocation import Revocation
+from gdp.trust.right import Right
+from tests.insiders.oracle import signing_oracle
+from tests.journeys.flows import Flow, advertise
+from tests.journeys.networks import reproducible_keys
+from tests.journeys.services import Party
+
+__all__ = ["add_arguments", "run"]
+
+QUIET_S: Final = 4.0
+PROMISE_S: Final = 5.0
+SETTLE_S: Final = 20.0
+ROBOT, READER, CLIENT, SERVER = "a/robot", "c/reader", "a/client", "c/server"
+ROAMER, GHOST, OUTCAST = "a/roamer", "a/ghost", "b/outcast"
+GAPS_S: Final = (0.0, 0.0, 60.0, 3_000.0, 7_000.0, 15_000.0, 86_400.0, 5 * 86_400.0)
+CLOCKS_S: Final = (0.0, 0.0, 0.0, -3_000.0, 3_000.0)
+RESTARTS: Final = ("nothing", ROBOT, READER, CLIENT, SERVER, ROAMER, "switch a", "switch b", "switch c", "rib home",
+                   "rib away", "all", "all", "all")  # fmt: skip
+BATCH: Final = 500
+_BATCHES: Final = 6  # of one network
+_LEASE_S: Final = 6.0
+_TOPOLOGY: Final = Topology(
+    links=(Link("a", "b"), Link("b", "c")),
+    domains=(DomainPlan("home", ("a", "b"), upper="away"), DomainPlan("away", ("c",))),
+    attachments=(
+        Attachment("b", "rib", "rib"),
+        Attachment("c", "rib", "rib"),
+        *(
+            Attachment(label.split("/")[0], "proxy", label.split("/")[1])
+            for label in (ROBOT, READER, CLIENT, SERVER, ROAMER, GHOST, OUTCAST)
+        ),
+    ),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """A frame, from its header on, as it came in somewhere."""
+
+    node: str
+    port: int
+    mac: bytes
+    frame: bytes
+    kind: int
+    statement: tuple[int, bytes, int]  # that it is a part of
+
+
+class _Stepped:
+    """A machine whose wall clock is off."""
+
+    def __init__(self, machine: Machine, ahead_s: float) -> None:
+        self._machine = machine
+        self._ahead_s = ahead_s
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._machine, name)
+
+    def _at(self, now: Instant) -> Instant:
+        return Instant(now.mono_s, now.unix_s + self._ahead_s)
+
+    def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Instant) -> None:
+        self._machine.add_port(index, mac, mtu, cost, self._at(now))
+
+    def port_changed(self, port: int, up: bool, now: Instant) -> None:
+        self._machine.port_changed(port, up, self._at(now))
+
+    def receive(self, arrivals: Sequence[Arrival], now: Instant) -> None:
+        self._machine.receive(arrivals, self._at(now))
+
+    def timeout(self, now: Instant) -> None:
+        self._machine.timeout(self._at(now))
+
+    def next_timeout(self) -> float | None:
+        return self._machine.next_timeout()
+
+    def take(self) -> list[Transmit]:
+        return self._machine.take()
+
+
+class RecordingNetwork(MemoryNetwork):
+    """Records what comes in where, and lets clocks jump and be off.
+
+    Attributes:
+        records: None: nothing is recorded.
+        ahead_s: of the clock of what starts now.
+    """
+
+    records: list[Recorded] | None = None
+    ahead_s = 0.0
+
+    @property
+    def now(self) -> Instant:
+        return Instant(self._now_s, EPOCH_UNIX_S + self._now_s + self.ahead_s)
+
+    def jump(self, gap_s: float) -> None:
+        """Let time go by in which nobody is alive."""
+        self._now_s += gap_s
+
+    def replace(self, name: str, machine: Machine, table: ForwardingTable | None = None) -> None:
+        stepped = _Stepped(machine, self.ahead_s) if self.ahead_s else machine
+        ahead_s, self.ahead_s = self.ahead_s, 0.0
+        super().replace(name, stepped, table)  # type: ignore[arg-type]
+        self.ahead_s = ahead_s
+
+    def _send(self, wired: Any, frame: bytes) -> None:
+        if self.records is not None:
+            _, own, far = wired
+            header = decode(frame, ETHER_BYTES)
+            group = (header.kind, bytes(header.source), header.number)
+            self.records.append(Recorded(far.node, far.port, own.mac, frame[ETHER_BYTES:], header.kind, group))
+        super()._send(wired, frame)
+
+
+@dataclass(slots=True)
+class Domain:
+    """The network of one episode, and what must be true of it."""
+
+    seed: int
+    rng: random.Random = field(init=False)
+    world: World = field(init=False)
+    network: RecordingNetwork = field(init=False)
+    flow: Flow = field(init=False)
+    moved: Flow = field(init=False)
+    client: Party = field(init=False)
+    server: Party = field(init=False)
+    records: list[Recorded] = field(default_factory=list)
+    groups: dict[tuple[int, bytes, int], list[Recorded]] = field(default_factory=dict)
+    kinds: dict[int, list[int]] = field(default_factory=dict)
+    sent: int = 0
+    expected: list[bytes] = field(default_factory=list)  # messages since all had settled
+    asked: list[bytes] = field(default_factory=list)
+    revocation: bytes = b""
+    before: dict[str, set[Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.rng = random.Random(self.seed)
+        self.world = world = World(
+            _TOPOLOGY, self.seed, hello_s=1.0, dead_s=3.6, lease_s=_LEASE_S, keepalive_ms=500
+        )
+        assert isinstance(world.network, RecordingNetwork)
+        self.network = world.network
+        self.network.records = self.records
+        assert world.settle(SETTLE_S)
+        self._begin_flows()
+        self._live_through()
+        self.network.records = None
+        for number, each in enumerate(self.records):
+            self.groups.setdefault(each.statement, []).append(each)
+            self.kinds.setdefault(each.kind, []).append(number)
+
+    # -- what is recorded
+
+    def _begin_flows(self) -> None:
+        self.flow = advertise(self.world, "/chatter", ROBOT)
+        self.flow.read_by(READER)
+        self.moved = advertise(self.world, "/moved", ROAMER)
+        self.moved.read_by(READER)
+        self.client, self.server = Party(self.world, CLIENT, Right.CALL), Party(self.world, SERVER, Right.SERVE)
+        assert self._is_settled(SETTLE_S)
+
+    def _live_through(self) -> None:
+        """Let happen what is recorded."""
+        world, network = self.world, self.network
+        ghost = advertise(world, "/ghost", GHOST)
+        ghost.read_by(READER)
+        for _ in range(10):
+            self.say()
+            ghost.publish(b"ghost")
+            network.run(0.1)
+        world.members[GHOST].withdraw(ghost.topic.name)
+        world.members[READER].unsubscribe(ghost.topic.name)
+        network.touch(GHOST)
+        network.touch(READER)
+        member, authority = world.identities[OUTCAST].member, world.authorities["home"]
+        self.revocation = Revocation.make(
+            authority.key, authority.root.subject, member.fingerprint, member.validity.not_after_unix_s
+        )
+        world.switches["a"].revoke(self.revocation, network.now)
+        network.touch("a")
+        network.run(2.0)
+        network.set_link(world.cables[frozenset("ab")], up=False)
+        network.run(5.0)
+        network.set_link(world.cables[frozenset("ab")], up=True)
+        network.run(3.0)
+        world.roam(ROAMER, "b")
+        network.run(3.0)
+        self.restart("rib home")
+        self.restart(SERVER)
+        self.restart(ROBOT)
+        assert self._is_settled(SETTLE_S)
+        for _ in range(10):
+            self.say()
+            network.run(0.2)
+        network.run(2.0)
+        self.forget()
+
+    # -- what happens
+
+    def say(self) -> None:
+        """Publish a message and ask a question."""
+        self.sent += 1
+        message = b"message %d" % self.sent
+        self.expected.append(message)
+        self.asked.append(message)
+        self.flow.publish(message)
+        self.client.publish(message)
+
+    def restart(self, what: str, ahead_s: float = 0.0) -> None:
+        """Start a process again, with what it had on disk, and have it do what it did."""
+        world, network = self.world, self.network
+        network.ahead_s = ahead_s
+        if what.startswith("switch "):
+            name = what.split()[1]
+            world.restart_switch(name)
+            world.switches[name].revoke(self.revocation, network.now)
+        elif what.startswith("rib "):
+            label = what.split()[1]
+            entries = self._snapshot(world.ribs[label])
+            world.restart_rib(label)
+            world.ribs[label].rib.load(entries, network.now)
+        elif what != "nothing":
+            world.restart_member(what)
+        network.ahead_s = 0.0
+        self._take_part(what)
+
+    def _take_part(self, what: str) -> None:
+        world = self.world
+        if what == ROBOT:
+            name = self.flow.topic
+            self.flow.publisher = world.members[ROBOT].advertise(name, b"described", reliable=True)
+        elif what == ROAMER:
+            self.moved.publisher = world.members[ROAMER].advertise(self.moved.topic, b"described", reliable=True)
+        elif what == READER:
+            self.flow.read_by(READER)
+            self.moved.read_by(READER)
+        elif what == CLIENT:
+            self.client.begin()
+        elif what == SERVER:
+            self.server.begin()
+        if what in world.members:
+            self.network.touch(what)
+
+    def _snapshot(self, host: RibHost) -> list[Entry]:
+        """Return what a RIB has on disk."""
+        now_s = self.network.now.mono_s
+        store = host.rib._store
+        return [entry for key in store.known() if (entry := host.rib.entry_of(key, now_s))]  # type: ignore[attr-defined]
+
+    def restart_all(self, gap_s: float, aheads: Callable[[], float]) -> None:
+        """End every process, let time go by, and start them all."""
+        world, network = self.world, self.network
+        names = [*(f"switch {each}" for each in world.switches), *(f"rib {each}" for each in world.ribs)]
+        nodes = [*world.switches, *map(world.rib_node, world.ribs), *world.members]
+        entries = {label: self._snapshot(host) for label, host in world.ribs.items()}
+        for node in nodes:
+            network.stop(node)
+        network.run(1.0)
+        network.jump(gap_s)
+        for what in names:
+            network.ahead_s = aheads()
+            if what.startswith("switch "):
+                world.restart_switch(what.split()[1])
+                world.switches[what.split()[1]].revoke(self.revocation, network.now)
+            else:
+                world.restart_rib(what.split()[1])
+                left = [replace(each, lease_s=each.lease_s - gap_s) for each in entries[what.split()[1]]]
+                kept = [each for each in left if each.lease_s > 0 or each.membership]
+                world.ribs[what.split()[1]].rib.load(
+                    [replace(each, lease_s=max(each.lease_s, 0.0)) for each in kept], network.now
+                )
+        for label in world.members:
+            network.ahead_s = aheads()
+            world.restart_member(label)
+        network.ahead_s = 0.0
+        for label in (ROBOT, ROAMER, READER, CLIENT, SERVER):
+            self._take_part(label)
+
+    def play(self, tries: int, counts: Counter[str], *, is_live: bool) -> Iterator[None]:
+        """Play back so many frames; yield now and then."""
+        done = 0
+        while done < tries:
+            first = self.rng.choice(self.kinds[self.rng.choice(list(self.kinds))])
+            chance = self.rng.random()
+            if chance < 0.5:
+                chosen = self.records[first : first + 1]
+            elif chance < 0.8:
+                chosen = self.groups[self.records[first].statement][:64]
+            else:
+                at = self.records[first].node
+                chosen = [each for each in self.records[first : first + 200] if each.node == at][:30]
+            elsewhere = None if self.rng.random() < 0.7 else self._anywhere()
+            address = self.rng.random()
+            for each in chosen[: tries - done]:
+                node, port = elsewhere or (each.node, each.port)
+                ports = self.network._nodes[node].ports
+                mac = ports[port][2].mac if address < 0.8 else each.mac if address < 0.9 else b"\x02evil\x00"
+                self.network.inject(node, port, each.frame, mac)
+                counts[Kind(each.kind).name.lower()] += 1
+                done += 1
+                self.network.run(self.rng.choice((0.0, 0.0, 0.0002, 0.001)))
+            if self.rng.random() < 0.02:
+                self.network.run(self.rng.choice((0.1, 0.5)))
+            if is_live and self.rng.random() < 0.03:
+                self.say()
+            yield
+
+    def _anywhere(self) -> tuple[str, int]:
+        node = self.rng.choice(list(self.network._nodes))
+        return node, self.rng.choice(list(self.network._nodes[node].ports))
+
+    # -- what must be true
+
+    def _is_settled(self, within_s: float) -> bool:
+        """Wait until all flows are there; return whether that came true."""
+        def are_there() -> bool:
+            server, client = self.server.member, self.client.member
+            return (
+                self.flow.is_read_by(1) and self.moved.is_read_by(1)
+                and len(server.peers(self.server.service)) == 1 and len(client.peers(self.client.service)) == 1
+            )  # fmt: skip
+
+        return self.network.run(within_s, are_there)
+
+    def forget(self) -> None:
+        """Take everything that was delivered, and begin anew to count."""
+        self.collect()
+        self.network.run(0.5)  # for answers to what the server has just taken
+        self.collect()
+        self.flow.got[READER].clear()
+        self.server.got.clear()
+        self.client.got.clear()
+        self.expected.clear()
+        self.asked.clear()
+
+    def collect(self) -> None:
+        """Take what was delivered."""
+        self.flow.got[READER] += [each.delivered for each in self.world.members[READER].take_messages()]
+        self.server.collect()
+        self.client.collect()
+
+    def settle(self) -> list[str]:
+        """Wait until all that restarted work again; return what was delivered meanwhile, or what does not work."""
+        found = [] if self._is_settled(SETTLE_S) else ["a flow does not come back"]
+        self.network.run(QUIET_S)
+        return [*found, *self.delivered()]
+
+    def delivered(self) -> list[str]:
+        """Return what applications were given that they should not have been, or were not given in time."""
+        self.network.run(PROMISE_S, self._has_all)
+        tail = b" by " + SERVER.encode()
+        found = []
+        for what, got, due in (
+            ("message", [each.message for each in self.flow.got[READER]], self.expected),
+            ("request", [each.delivered.message for each in self.server.got], self.asked),
+            ("answer", [each.delivered.message for each in self.client.got], [each + tail for each in self.asked]),
+        ):
+            if got != due:
+                extra = [each for each in got if each not in due]
+                twice = len(got) - len(set(got))
+                found.append(f"{what}s: {len(extra)} of before, {twice} twice, {len(set(due) - set(got))} lost")
+        self.forget()
+        return found
+
+    def _has_all(self) -> bool:
+        self.collect()
+        return (
+            len(self.flow.got[READER]) >= len(self.expected)
+            and len(self.server.got) >= len(self.asked) and len(self.client.got) >= len(self.asked)
+        )  # fmt: skip
+
+    def found(self) -> list[str]:
+        """Return what was accepted, by ``before`` and by what is true now."""
+        found = self.delivered()
+        state, true = self.state(), self._truth()
+        for what, values in state.items():
+            if wrong := values - true.get(what, values):
+                found.append(f"{what}: {len(wrong)} that are not")
+            if what != "link states" and (extra := values - self.before.get(what, values) - true.get(what, set())):
+                found.append(f"{what}: {len(extra)} new")
+            if what in ("neighbours", "attached", "routes", "trees") and (gone := self.before[what] - values):
+                found.append(f"{what}: {len(gone)} gone")
+        return found
+
+    def _truth(self) -> dict[str, set[Any]]:
+        """Return where everybody is, whoever says what."""
+        world = self.world
+        at = {label: label.split("/")[0] for label in world.members} | {ROAMER: "b"}
+        claims = {
+            (claim.subject.name, member.name, world.identities[at[label]].name)
+            for label, member in world.members.items() if label != OUTCAST
+            for claim in member.attachment.claims if claim.right is not Right.READ
+        }  # fmt: skip
+        last = {
+            (switch.name, entry.state.scope, entry.state.sequence)
+            for switch in world.switches.values()
+            for (origin, _), entry in switch._flooding.link_states._entries.items() if origin == switch.name
+        }  # fmt: skip
+        return {"attached": claims, "places": claims, "routes": claims, "link states": last}
+
+    def state(self) -> dict[str, set[Any]]:
+        """Return what nodes believe."""
+        world = self.world
+        hosts = {world.rib_node(label): host.attachment.greeter for label, host in world.ribs.items()}
+        members = {label: member.attachment.greeter for label, member in world.members.items() if label != OUTCAST}
+        greeters = {label: switch.greeter for label, switch in world.switches.items()} | hosts | members
+        switches = world.switches
+        return {
+            "neighbours": {
+                (node, port.index, each.name, each.mac)
+                for node, greeter in greeters.items() for port in greeter.ports.values()
+                for each in port.neighbours.values() if each.state is NeighbourState.UP
+            },
+            "attached": {
+                (each.claim.name, each.claim.node, switch.name)
+                for switch in switches.values() for each in switch.attached.all()
+            },
+            "places": {
+                (each.name, each.advertiser, each.switch)
+                for switch in switches.values() for each in switch.places.all()
+            },
+            "routes": {
+                (*key, route.switch)
+                for host in world.ribs.values() for key in host.rib._store.known()  # type: ignore[attr-defined]
+                if isinstance(route := host.rib._store.get(*key), Route)
+            },
+            "trees": {
+                (node, tree.topic, tree.publisher, at)
+                for node, switch in switches.items() for tree in switch.planter.trees.all() for at in tree.branches
+            },
+            "link states": {
+                (origin, scope, entry.state.sequence)
+                for switch in switches.values()
+                for (origin, scope), entry in switch._flooding.link_states._entries.items()
+            },
+        }  # fmt: skip
+
+
+# -- checks taken away
+
+def _always(value: Any) -> Callable[..., Any]:
+    return lambda *_: value
+
+
+def _any_start(self: Feed, joined: Any, epoch: int, now_s: float) -> None:
+    """Take a start that is of another life of this reader."""
+    status = Status.from_wire(joined.message)
+    start = status.starts.get(self._reader.name)
+    if start is not None:
+        wire = status._replace(
+            starts={self._reader.name: start._replace(incarnation=self._reader.incarnation)}
+        ).to_wire()
+        joined = replace(joined, message=wire)
+    _TAKE_STATUS(self, joined, epoch, now_s)
+
+
+_TAKE_STATUS: Final = Feed._take_status
+
+
+CONTROLS: Final[dict[str, tuple[tuple[object, str, Any], ...]]] = {
+    "window": ((ReplayWindow, "is_finished", _always(False)),),
+    "start": ((Feed, "_take_status", _any_start),),
+    "claims": ((Claims, "_check_fresh", _always(None)),),
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what this subcommand takes."""
+    parser.add_argument("--tries", type=int, default=100_000, help="frames played back (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="end after so long in any case")
+    parser.add_argument("--seed", type=int, default=1, help="of the first network")
+    parser.add_argument("--add", action="store_true", help="to the figures in the file; begins at the next network")
+    parser.add_argument("--control", choices=list(CONTROLS), help="take this check away; something must be found")
+
+
+def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
+    """Play back so many frames."""
+    logging.disable(logging.CRITICAL)
+    ErrorBoundary.reraises = True
+    counts: Counter[str] = Counter()
+    restarts: Counter[str] = Counter()
+    found: list[str] = []
+    held = _held(options.json) if options.add else {}
+    begun_s, first = time.monotonic(), held["seeds"][1] + 1 if held else options.seed
+    seed = first
+    with ExitStack() as stack:
+        stack.enter_context(mock.patch("gdp.testbed.world.MemoryNetwork", RecordingNetwork))
+        stack.enter_context(signing_oracle())
+        while counts.total() < options.tries and time.monotonic() - begun_s < options.seconds:
+            with reproducible_keys(seed), _without(options.control):
+                found += _episode(Domain(seed), options.tries - counts.total(), counts, restarts)
+            progress(f"network {seed}: {counts.total()} tries, {len(found)} accepted")
+            seed += 1
+    seconds = round(time.monotonic() - begun_s, 1)
+    if options.control is not None:
+        _show(counts, restarts, found)
+        controls = _held(options.json).get("controls", {})
+        controls[options.control] = {"tries": counts.total(), "accepted": len(found)}
+        return {"controls": controls}, bool(found)
+    counts.update(held.get("by_kind", {}))
+    restarts.update(held.get("by_restart", {}))
+    _show(counts, restarts, found)
+    found = [*held.get("found", []), *found]
+    figures = {
+        "tries": counts.total(), "accepted": held.get("accepted", 0) + len(found) - len(held.get("found", [])),
+        "target_accepted": 0, "by_kind": dict(counts.most_common()), "by_restart": dict(restarts.most_common()),
+        "found": found[:50], "seeds": [held["seeds"][0] if held else first, seed - 1],
+        "seconds": seconds + held.get("seconds", 0.0),
+    }  # fmt: skip
+    return figures, not figures["accepted"]
+
+
+def _held(path: Path) -> dict[str, Any]:
+    """Return the figures of earlier runs."""
+    saved = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    return dict(saved.get("replays", {}))
+
+
+@contextmanager
+def _without(control: str | None) -> Iterator[None]:
+    with ExitStack() as stack:
+        for owner, name, value in CONTROLS[control] if control else ():
+            stack.enter_context(mock.patch.object(owner, name, value))
+        yield
+
+
+def _episode(domain: Domain, tries: int, counts: Counter[str], restarts: Counter[str]) -> list[str]:
+    """Restart and play back a few times in one network; return what was accepted."""
+    rng, found = domain.rng, []
+    for number in range(_BATCHES):
+        size = min(BATCH, tries - number * BATCH)
+        if size <= 0:
+            break
+        what = rng.choice(RESTARTS)
+        gap_s, ahead_s = rng.choice(GAPS_S) if what == "all" else 0.0, rng.choice(CLOCKS_S)
+        text = f"network {domain.seed}, batch {number}: {what}, {gap_s:g} s later, clock {ahead_s:+g} s"
+        if broken := domain.settle():
+            found += [f"{text}, before it: {each}" for each in broken]
+            break
+        domain.before = domain.state()
+        at_once = rng.randrange(size) if rng.random() < 0.7 else 0
+        if what == "all":
+            aheads = [0.0, ahead_s]
+            domain.restart_all(gap_s, lambda aheads=aheads: rng.choice(aheads))  # type: ignore[misc]
+        else:
+            domain.restart(what, ahead_s)
+        for _ in domain.play(at_once, counts, is_live=False):
+            pass
+        seen = domain.settle()
+        for _ in domain.play(size - at_once, counts, is_live=True):
+            pass
+        domain.network.run(QUIET_S)
+        seen += domain.found()
+        restarts[what] += size
+        found += [f"{text}: {each}" for each in seen]
+        if seen:
+            break
+    return found
+
+
+def _show(counts: Counter[str], restarts: Counter[str], found: list[str]) -> None:
+    table = Table(title=f"{counts.total():,} recorded frames played back, {len(found)} accepted", title_justify="left")
+    table.add_column("kind")
+    table.add_column("tries", justify="right")
+    table.add_column("restarted")
+    table.add_column("tries", justify="right")
+    left, right = counts.most_common(), restarts.most_common()
+    for at in range(max(len(left), len(right))):
+        a, b = (each[at] if at < len(each) else ("", "") for each in (left, right))
+        table.add_row(str(a[0]), str(a[1]), str(b[0]), str(b[1]))
+    console = Console(width=120)
+    console.print(table)
+    for each in found[:20]:
+        console.print(each, highlight=False)
