@@ -107,9 +107,9 @@ def _mutator(decoder: Decoder) -> Callable[[bytes, int, int], bytes]:
     corpus: Sequence[bytes] = corpus_of(decoder)
 
     def mutate(data: bytes, maximum: int, seed: int) -> bytes:
-        rng = random.Random(seed)
-        if rng.random() < 0.5:
+        if seed & 1:
             return bytes(atheris.Mutate(data, maximum))
+        rng = random.Random(seed)
         return mutated(decoder, [bytes(data), *rng.choices(corpus, k=_OTHERS)], rng)[:maximum]
 
     return mutate
