@@ -33,7 +33,7 @@ _PURPOSE: Final = b"gdp-cookie-1"
 
 NEIGHBOUR_HELLOS: Final = (25.0, 50.0)  # a second, and at once; a neighbour in a hurry says four a second
 ADDRESS_HELLOS: Final = (10.0, 20.0)
-STRANGER_HELLOS: Final = (100.0, 200.0)  # of all strangers on a port: 2 % of a core where each shows a new certificate
+STRANGER_HELLOS: Final = (100.0, 64.0)  # of all strangers on a port; 64 take 30 ms, a seventh of the time to detect
 PROVEN_HELLOS: Final = (50.0, 50.0)  # of strangers with a cookie, beside the former
 COOKIES: Final = (100.0, 100.0)
 REFUSALS: Final = (100.0, 200.0)  # more of them are a flood, too

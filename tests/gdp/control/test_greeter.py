@@ -209,9 +209,9 @@ def test_a_port_has_so_many_neighbours_and_no_more() -> None:
     one = greeter(A, 1)
     heard = (one.ports[0].echo,)
     for number in range(NEIGHBOURS_MAX):
-        hear(one, forged(node(f"n{number}", Role.PROXY), heard=heard), 0.0, b"\x02far\x00" + bytes([number]))
+        hear(one, forged(node(f"n{number}", Role.PROXY), heard=heard), number / 100, b"\x02far\x00" + bytes([number]))
     with pytest.raises(StatementError) as caught:
-        hear(one, forged(heard=heard), 0.0, b"\x02other")
+        hear(one, forged(heard=heard), 1.0, b"\x02other")
     assert caught.value.reason is DropReason.QUOTA
 
 
