@@ -22,7 +22,7 @@ __all__ = ["ITEMS_MAX", "Value", "decode", "encode"]
 
 Value: TypeAlias = "bool | int | float | bytes | str | list[Value] | dict[str, Value] | None"
 
-ITEMS_MAX: Final = 4_096  # bounds the work of one decode to about 2 ms
+ITEMS_MAX: Final = 2_048  # bounds one decode to about 1 ms and 250 KiB; a link state has 1,100 at most
 _SIMPLE: Final[dict[int, bool | None]] = {0xF4: False, 0xF5: True, 0xF6: None}
 _FLOATS: Final = {0xF9: struct.Struct("!e"), 0xFA: struct.Struct("!f"), 0xFB: struct.Struct("!d")}
 _NAN: Final = b"\xf9\x7e\x00"

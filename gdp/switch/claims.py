@@ -40,15 +40,17 @@ __all__ = ["Claims"]
 
 _SESSIONS_MAX: Final = 4_096  # above the neighbours that a switch has
 _INCARNATION_BYTES: Final = 8  # at the end of a life
+_TOLD_S: Final = 1.0
 
 
 class _Session:
     """Which claims came in one session of a node."""
 
-    __slots__ = ("first", "window")
+    __slots__ = ("first", "told_s", "window")
 
     def __init__(self, first: int) -> None:
         self.first = first
+        self.told_s = float("-inf")  # when its node was last told that it is behind
         self.window = ReplayWindow(CLAIMS_WINDOW)
 
 
@@ -96,7 +98,7 @@ class Claims:
         except StatementError as error:
             self._refuse(neighbour, statement, error)
             raise
-        self._check_fresh(neighbour, claim)
+        self._check_fresh(neighbour, claim, now.mono_s)
         at = (neighbour.port, neighbour.mac)
         newest = self._sequence_of(claim.name, neighbour)
         if claim.sequence < newest:
@@ -132,8 +134,8 @@ class Claims:
         self._relocations.arrived(claim, now.mono_s)
         self._inquirer.ask(now.mono_s)
 
-    def _check_fresh(self, neighbour: Neighbour, claim: Claim) -> None:
-        """Note a verified claim of a neighbour.
+    def _check_fresh(self, neighbour: Neighbour, claim: Claim, now_s: float) -> None:
+        """Note a verified claim of a neighbour; one that is far behind is told by how much, now and then.
 
         Raises:
             StatementError: REPLAYED, it is of another life or session of it, or came before.
@@ -146,6 +148,9 @@ class Claims:
             if len(self._sessions) > _SESSIONS_MAX:
                 self._sessions.popitem(last=False)
         if claim.sequence < session.first or session.window.is_finished(claim.sequence):
+            if claim.sequence <= session.window.top - CLAIMS_WINDOW and now_s >= session.told_s + _TOLD_S:
+                session.told_s = now_s  # it may be the node's own, which says nothing newer unless it is told
+                self._judge(neighbour, claim.name, DropReason.STALE, session.window.top)
             raise StatementError(DropReason.REPLAYED, "a claim")
         session.window.finish(claim.sequence)
         self._sessions.move_to_end(neighbour.nonce)

@@ -84,7 +84,7 @@ ANSWER_HEAD_BYTES: Final = 1 + _LENGTH_BYTES
 _TAG_BYTES: Final = 32
 _SIGNATURE_BYTES: Final = 64
 _NONCE: Final = bytes(12)
-_DELEGATIONS_MAX: Final = 512
+_DELEGATIONS_MAX: Final = 480  # of each of the members: all fit the items of one decode
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,10 +2,11 @@
 
 One process for each row: the stage of the insiders (``tests/insiders/stage.py``) on the in-memory network, its clock
 virtual, honest-looking statements and frames of every kind, signed by real keys. A row is spoken not at all, at the
-rate that the speaker's grants pay, and at ten times that rate. *In* are the bytes said; *out* are the bytes that all
-other machines send more than they do without it, answers, copies on the way and later repetitions included (not
+rate that the speaker's grants pay, at five and ten times that rate. *In* are the bytes said; *out* are the bytes that
+all other machines send more than they do without it, answers, copies on the way and later repetitions included (not
 counted: frames that a data plane forwards by its table). *Plain* is out by in at the first rate; *beyond* is the
-difference of out by that of in between both rates: what is drawn by what no grant pays. Of a stranger everything
+difference of out by that of in between the last two: what is drawn by what no grant pays. (Many words are refused for
+what they say, so the grants are not used up at the first rate; at five times it they are.) Of a stranger everything
 counts, and *towards* are the bytes sent into its link.
 
 Rates and bursts of the grants are made smaller for this (``GRANTS``), so that the first rate is as much for every kind;
@@ -78,7 +79,7 @@ _GRANTS: Final[tuple[tuple[str, float], ...]] = (
     ("gdp.trust.revocations._ISSUER_PER_S", _PER_S),
     ("gdp.trust.revocations._ISSUER_BURST", _PER_S),
 )
-_TIMES: Final = 10
+_RATES: Final = 1, 5, 10  # of what a grant pays
 _TAIL_S: Final = 3.0
 _RECORDED: Final = "recorded"
 
@@ -178,7 +179,7 @@ def _measured(options: argparse.Namespace) -> Iterator[Row]:
         (speaker, kind, times)
         for speaker in options.speakers
         for kind in ((_RECORDED,) if speaker == "stranger, recorded" else options.kinds)
-        for times in (1, _TIMES)
+        for times in _RATES
     ]
     jobs += [(speaker, "", 0) for speaker in options.speakers]
     with prepared(options.seed), _smaller_grants():
@@ -192,18 +193,18 @@ def _measured(options: argparse.Namespace) -> Iterator[Row]:
             for speaker, kind, times in list(under_way):
                 if times == 1:
                     progress(f"{speaker}: {kind}")
-                    once, often = (under_way[speaker, kind, each].get() for each in (1, _TIMES))
-                    yield _row(speaker, kind, silent[speaker].get(), once, often)
+                    meters = (under_way[speaker, kind, each].get() for each in _RATES)
+                    yield _row(speaker, kind, silent[speaker].get(), *meters)
 
 
-def _row(speaker: str, kind: str, silent: Meter, once: Meter, often: Meter) -> Row:
+def _row(speaker: str, kind: str, silent: Meter, once: Meter, paid: Meter, often: Meter) -> Row:
     def ratio(drawn: int, said: int) -> float | None:
         return drawn / said if said > 0 else None
 
     return Row(
         speaker, kind, often.said,
         ratio(once.sent - silent.sent, once.said),
-        ratio(often.sent - once.sent, often.said - once.said),
+        ratio(often.sent - paid.sent, often.said - paid.said),
         ratio(often.towards - silent.towards, often.said),
     )  # fmt: skip
 
