@@ -10,6 +10,7 @@ import pytest
 
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
+from gdp.limits import MTU_HOLD_S, MTU_NARROWINGS
 from gdp.testbed.topology import Topology, chain, ring5
 from gdp.testbed.world import World
 from tests.journeys.flows import LEASE_S, ROBOT, SERVER, Flow, Tap, advertise, flowing, ring
@@ -198,6 +199,7 @@ def test_of_news_that_overtake_each_other_the_newest_counts(where: str) -> None:
     world.cables[MIDDLE].jitter_s = 0.02 if where == "links" else 0.0
     seen = []
     for last in (JUMBO, 1_280, JUMBO, 800):
+        network.run(MTU_HOLD_S * MTU_NARROWINGS)  # so often it may narrow again
         for mtu in (1_000, USUAL, SMALL, JUMBO, 700, last):
             network.set_mtu(cable, mtu)
             network.run(0.0015)
