@@ -5,6 +5,10 @@ Place: pure; time comes in as ``now_s`` (monotonic seconds).
 A question is asked again until it is answered. A name that readers here want, or that frames are sent to, is watched:
 it is asked again before its watch ends, so that a RIB which restarted learns of the watch again. While no RIB answers,
 what is known is served beyond its lease, until the proofs of the claim end themselves (RFC 8767 in spirit).
+
+Questions for new names have a window: so many wait for answers at a time, and those who have them asked take turns. A
+RIB is thus asked at the pace at which it answers. Without it, what is asked again because its answer waits in a queue
+makes that queue longer, and nothing is answered in time.
 """
 
 from __future__ import annotations
@@ -12,16 +16,21 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final
 
-from gdp.limits import CLAIM_LEASE_S, NEGATIVE_LEASE_S
+from gdp.limits import CLAIM_LEASE_S, NEGATIVE_LEASE_S, PARKED_S
+from gdp.message.fair_queue import FairQueue
 from gdp.names import Name
 from gdp.trust.claim import Claim
 from gdp.trust.right import Right
 
-__all__ = ["Place", "Places"]
+__all__ = ["AT_ONCE", "WINDOW", "Place", "Places"]
 
 RETRY_S: Final = 0.25
 TRIES_MAX: Final = 8
 QUESTIONS_MAX: Final = 4_096  # open at once; each costs a signature at every try
+WINDOW: Final = 128  # new names whose answers are awaited at a time; a tenth of a second's work of a RIB
+AT_ONCE: Final = 64  # questions in one go, some 10 ms: a switch has other things to do
+_LOOK_S: Final = 0.01  # between two looks at what is to be asked again
+_WAITS: Final = float("inf")
 USES_MAX: Final = 8_192  # names watched because frames are sent to them
 
 
@@ -48,7 +57,8 @@ class Place:
 
 @dataclass(slots=True)
 class _Question:
-    ask_at_s: float
+    ask_at_s: float  # ``_WAITS``: when it has its turn
+    since_s: float
     tries: int = 0
     is_watch: bool = False  # a reader here wants to know of all who advertise the name
     used_until_s: float = 0.0  # frames are sent to it
@@ -75,6 +85,8 @@ class Places:
         self._names_of: dict[Name, set[Name]] = {}  # what each advertiser advertises, of ``_places``
         self._nobody: dict[Name, float] = {}
         self._questions: dict[Name, _Question] = {}
+        self._waiting = FairQueue[Name]()
+        self._awaited: set[Name] = set()  # of new names, whose answers are awaited
         self._watches = 0
         self._ask_at_s = float("inf")  # no question is due before
         self._expire_at_s = float("inf")  # no lease ends before
@@ -106,17 +118,21 @@ class Places:
         """Return whether the RIB said a moment ago that nobody advertises the name."""
         return self._nobody.get(name, 0.0) > now_s
 
-    def want(self, name: Name, now_s: float, *, watch: bool) -> None:
+    def want(self, name: Name, now_s: float, *, watch: bool, owner: bytes = b"") -> None:
         """Have the RIB asked for a name, unless it is being asked already, or too much is.
 
         Watches are for readers who proved themselves, and are always taken on.
+
+        Args:
+            owner: at whose expense.
         """
         question = self._questions.get(name)
         if question is None:
             if not watch and len(self._questions) - self._watches >= QUESTIONS_MAX:
                 return
-            question = self._questions[name] = _Question(now_s)
-            self._ask_at_s = min(self._ask_at_s, now_s)
+            question = self._questions[name] = _Question(_WAITS, now_s)
+            if not watch:
+                self._waiting.put(owner, name)
         if watch and not question.is_watch:
             question.is_watch = True
             question.ask_at_s = now_s
@@ -129,13 +145,13 @@ class Places:
         if question is None:
             if len(self._questions) - self._watches >= USES_MAX:
                 return  # moved nodes are then learnt of by redirects alone
-            question = self._questions[name] = _Question(now_s)
+            question = self._questions[name] = _Question(now_s, now_s)
             self._ask_at_s = min(self._ask_at_s, now_s)
         question.used_until_s = now_s + self._use_watch_s
 
-    def ask_now(self, name: Name, now_s: float) -> None:
-        """Have a name asked for at once, what is known of it being wrong."""
-        self.want(name, now_s, watch=False)
+    def ask_now(self, name: Name, now_s: float, owner: bytes = b"") -> None:
+        """Have a name asked for at once, what is known of it being wrong; ``owner`` as in ``want``."""
+        self.want(name, now_s, watch=False, owner=owner)
         question = self._questions.get(name)
         if question is not None and question.is_answered:
             question.is_answered, question.tries, question.ask_at_s = False, 0, now_s
@@ -154,41 +170,81 @@ class Places:
             question.is_watch = False
             self._watches -= 1
         if question.used_until_s == 0.0:
-            del self._questions[name]
+            self._forget(name)
 
     def ask_again(self, now_s: float) -> None:
         """Have every open question and every watch asked at once: there is a new RIB."""
         for question in self._questions.values():
-            question.ask_at_s, question.tries = now_s, 0
+            question.tries = 0
+            if question.ask_at_s != _WAITS:
+                question.ask_at_s = now_s
         self._ask_at_s = min(self._ask_at_s, now_s)
 
     def due(self, now_s: float) -> tuple[list[tuple[Name, float]], list[Name]]:
-        """Return the questions to send now, as (name, seconds to watch it), and the names that were given up."""
+        """Return the questions to send now, as (name, seconds to watch it), and the names that were given up.
+
+        At most ``AT_ONCE`` questions; more are due at once.
+        """
         ask: list[tuple[Name, float]] = []
         given_up: list[Name] = []
-        if now_s < self._ask_at_s:
-            return ask, given_up
-        for name, question in list(self._questions.items()):
-            if question.ask_at_s > now_s:
+        if now_s >= self._ask_at_s:
+            self._due_again(now_s, ask, given_up)
+        while len(ask) < AT_ONCE and self._has_turn():
+            name = self._waiting.pop()
+            question = self._questions.get(name)
+            if question is None or question.ask_at_s != _WAITS:
                 continue
-            is_used = question.used_until_s > now_s
-            if not question.is_watch and not is_used and (question.is_answered or question.tries >= TRIES_MAX):
-                del self._questions[name]
-                if not question.is_answered:
-                    given_up.append(name)
+            if now_s >= question.since_s + PARKED_S:  # what asked for it waits no more
+                self._forget(name)
+                given_up.append(name)
                 continue
-            question.tries += 1
-            if question.is_answered:
-                question.ask_at_s = now_s + (self._watch_again_s if question.is_watch else self._use_again_s)
-            else:
-                question.ask_at_s = now_s + RETRY_S * min(2 ** (question.tries // TRIES_MAX), 8)
-            ask.append((name, self.watch_s if question.is_watch else self._use_watch_s if is_used else 0.0))
-        self._ask_at_s = min((question.ask_at_s for question in self._questions.values()), default=float("inf"))
+            self._awaited.add(name)
+            ask.append((name, self._asked(question, now_s)))
+            self._ask_at_s = min(self._ask_at_s, question.ask_at_s)
         return ask, given_up
+
+    def _due_again(self, now_s: float, ask: list[tuple[Name, float]], given_up: list[Name]) -> None:
+        """Add what was asked before, or is watched, and is due; as ``due``."""
+        next_s = _WAITS
+        for name, question in list(self._questions.items()):
+            if question.ask_at_s <= now_s:
+                is_used = question.used_until_s > now_s
+                if not question.is_watch and not is_used and (question.is_answered or question.tries >= TRIES_MAX):
+                    self._forget(name)
+                    if not question.is_answered:
+                        given_up.append(name)
+                    continue
+                if len(ask) >= AT_ONCE:
+                    self._ask_at_s = now_s
+                    return
+                ask.append((name, self._asked(question, now_s)))
+            next_s = min(next_s, question.ask_at_s)
+        self._ask_at_s = max(next_s, now_s + _LOOK_S)
+
+    def _asked(self, question: _Question, now_s: float) -> float:
+        """Note that a question is asked now; return for how long to watch its name."""
+        question.tries += 1
+        if question.is_answered:
+            question.ask_at_s = now_s + (self._watch_again_s if question.is_watch else self._use_again_s)
+        else:
+            question.ask_at_s = now_s + RETRY_S * min(2 ** (question.tries // TRIES_MAX), 8)
+        return self.watch_s if question.is_watch else self._use_watch_s if question.used_until_s > now_s else 0.0
+
+    def _has_turn(self) -> bool:
+        return len(self._waiting) > 0 and len(self._awaited) < WINDOW
+
+    def _forget(self, name: Name) -> None:
+        """Ask for a name no more."""
+        del self._questions[name]
+        self._awaited.discard(name)
 
     def next_due(self) -> float | None:
         """Return a monotonic second that is no later than the next question, or None."""
-        return self._ask_at_s if self._questions else None
+        if not self._questions:
+            return None
+        if self._has_turn():
+            return float("-inf")
+        return None if self._ask_at_s == _WAITS else self._ask_at_s
 
     def put(self, place: Place, now_s: float, *, is_ours: bool = False, has_left: bool = False) -> Place | None:
         """Note a place; return what was known of this advertiser before.
@@ -276,8 +332,9 @@ class Places:
         if question is None:
             return
         if not question.is_watch and question.used_until_s <= now_s:
-            del self._questions[name]
+            self._forget(name)
             return
+        self._awaited.discard(name)
         if not question.is_answered:  # what is pushed later renews no watch
             question.is_answered = True
             question.ask_at_s = now_s + (self._watch_again_s if question.is_watch else self._use_again_s)

@@ -257,7 +257,7 @@ class Unicast:
         """Have a name asked for, within the pace of the neighbour at whose expense that is."""
         pace = self._paces.get(owner[:1])
         if pace is None or self._places.is_asked(name) or pace.take(owner, now_s):
-            self._places.ask_now(name, now_s)
+            self._places.ask_now(name, now_s, owner)
 
     def _is_of_own_domain(self, source: Name, now_s: float) -> bool:
         if self._attached.at(source) is not None or self._paths.domain_of(source) == self._own_domain:

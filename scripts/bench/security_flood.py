@@ -1,15 +1,23 @@
-"""Does a flood of hellos by a stranger on a link disturb real switches? Neighbours lost, memory, goodput, cores.
+"""Does a flood by a stranger on a link, or by a member, disturb real nodes? Neighbours lost, memory, goodput, cores.
 
 Three switches in a row, each a process in a namespace of its own; a topic goes from a member at the first to a member
 at the last one. A stranger on the link between the first and the middle one plays hellos to the middle one, from
 10,000 invented addresses: with certificates of its own (``fresh``), recorded ones of members (``recorded``), and with a
 member's certificate and a wrong signature (``wrong``). Broadcast data, which no switch reads, is the control
-(``noise``): what it disturbs is the machine, on which the flood takes a core. The rate is ten times what this machine
-verifies in a second.
-A calm phase before each flood is what it is compared with. At the end of each phase the first switch is killed and
-started again: how long until the middle one has it for a neighbour?
+(``noise``): what it disturbs is the machine, on which the flood takes a core.
 
-    sudo .venv/bin/python scripts/bench/security.py flood
+A fourth switch at the middle one is hostile (``faults.hostile``): it sends frames to ``names`` that nobody has,
+``joins`` that hold, ``revocations`` of its own. A proxy at the middle one, which reads the topic and publishes another,
+is so in its turn: it sends ``reports`` that everything lacks, and first ``parts`` of large messages, one after the
+other.
+
+The rate is ten times what this machine verifies in a second; that of parts, which are a member's right to send, ten
+times that of the good topic's frames.
+A calm phase before each flood is what it is compared with. At the end of each phase the first switch is killed and
+started again: how long until the middle one has it for a neighbour? Memory is that of the node which the flood aims at:
+the middle switch, the publisher (``reports``), the reader (``parts``).
+
+    sudo .venv/bin/python scripts/bench/security.py flood                        # an hour
     sudo .venv/bin/python scripts/bench/security.py flood --planes kernel --kinds fresh --seconds 5 --rounds 1 --no-save
 """
 
@@ -18,12 +26,14 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import secrets
+import signal
 import statistics
 import struct
 import time
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -49,22 +59,30 @@ from gdp.frame.kinds import Kind
 from gdp.ports.link import LinkWatch
 from gdp.stores.keyring import load_identity
 from gdp.testbed import netns_files
-from gdp.testbed.runs import Runs
+from gdp.testbed.runs import Run, Runs
 
 __all__ = ["add_arguments", "run"]
 
 GOAL_MEMORY_MIB: Final = 16.0
 GOAL_GOODPUT: Final = 0.9
 TIMES: Final = 10  # what a core verifies
-KINDS: Final = ("fresh", "recorded", "wrong", "noise")
+STRANGE: Final = ("fresh", "recorded", "wrong", "noise")
+OF_SWITCH: Final = ("names", "joins", "revocations")
+OF_PROXY: Final = ("reports", "parts")
+KINDS: Final = (*STRANGE, *OF_SWITCH, *OF_PROXY)
 SETTLE_S: Final = 6.0
-FLOW: Final = Flow("/flood/good", "p", ("r",), reliable=False, hz=200.0, size=1_000)
+FLOW: Final = Flow("/flood/good", "p", ("r", "g", "m"), reliable=False, hz=200.0, size=1_000)
+OWN: Final = Flow("/flood/own", "g", ("v",), hz=1.0)
 _FRAMES: Final = 2_000
+_LOST: Final = re.compile(r"neighbour lost port=(?![hg]\b)")
 _RESTART_S: Final = 12.0
+_HOSTILE_READY_S: Final = 60.0
 _MTU: Final = 1_500
 _TICK_S: Final = 1 / os.sysconf("SC_CLK_TCK")
 _VICTIM: Final = "s0"
 _NEAR: Final = "s1"
+_HOSTILE: Final = dict.fromkeys(OF_SWITCH, "switch h") | dict.fromkeys(OF_PROXY, "member g")
+_AIMED_AT: Final = {"reports": ("member p", _NEAR), "parts": ("member v", "s2")}  # and by which link
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,9 +94,10 @@ class Phase:
         core: share of a core that the switch in the middle took.
         restart_s: from the kill of a neighbour until it is a neighbour again.
         lost: neighbours that any switch lost.
-        memory_mib: resident memory of the switch in the middle at the end.
+        memory_mib: resident memory, at the end, of the node that the flood aims at.
         backlog_drops: frames of any link that this machine lost before any switch saw them: all namespaces share the
             queue of their processor (``net.core.netdev_max_backlog``). Where there are some, losses prove nothing.
+        reached: frames a second that came into that node by the link on which the flood comes.
         waited: seconds for which switches were ready to run and had no core, of each second, summed over all. Nothing
             that a switch does about a flood makes that less; the control shows how much of it is the machine's.
     """
@@ -90,15 +109,16 @@ class Phase:
     memory_mib: float
     backlog_drops: int
     waited: float
+    reached: float
 
 
 def plan() -> Plan:
-    """Return three switches in a row with a member at each end."""
+    """Return three switches in a row with a member at each end, and a switch and a proxy at the middle one."""
     topology, members = make_topology(
-        {"home": (_VICTIM, _NEAR, "s2")}, {}, [f"{_NEAR}-{_VICTIM}", f"{_VICTIM}-s2"], (_VICTIM,),
-        {"p": _NEAR, "r": "s2"},
+        {"home": (_VICTIM, _NEAR, "s2", "h")}, {}, [f"{_NEAR}-{_VICTIM}", f"{_VICTIM}-s2", f"h-{_VICTIM}"], (_VICTIM,),
+        {"p": _NEAR, "r": "s2", "v": "s2", "m": "h", "g": _VICTIM},
     )  # fmt: skip
-    return Plan(topology, members, flows=(FLOW,))
+    return Plan(topology, members, flows=(FLOW, OWN))
 
 
 def verifications_hz() -> float:
@@ -150,8 +170,8 @@ def processor_s(pid: int) -> float:
 
 
 def waited_s(overlay: Overlay) -> float:
-    """Return how long all switches have waited for a core so far (schedstat, proc(5))."""
-    pids = [overlay.pid(f"switch {node}") for node in overlay.plan.switches]
+    """Return how long the good switches have waited for a core so far (schedstat, proc(5))."""
+    pids = [overlay.pid(f"switch {node}") for node in (_VICTIM, _NEAR, "s2")]
     return sum(int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) for pid in pids) / 1e9
 
 
@@ -162,15 +182,15 @@ def backlog_drops() -> int:
 
 
 def lost(overlay: Overlay) -> int:
-    """Return how often any switch has lost a neighbour so far."""
-    texts = [text for node in overlay.plan.switches for _, text in overlay.logs(f"switch {node}")]
-    return sum(text.count("neighbour lost") for text in texts)
+    """Return how often any switch has lost a neighbour so far, those that may be hostile apart."""
+    texts = [text for node in overlay.plan.switches if node != "h" for _, text in overlay.logs(f"switch {node}")]
+    return sum(len(_LOST.findall(text)) for text in texts)
 
 
 def counted(overlay: Overlay) -> tuple[int, int]:
     """Return how many messages were published and delivered since the last call."""
     seen = dict.fromkeys((Happened.PUBLISHED, Happened.DELIVERED), 0)
-    for member in overlay.plan.members:
+    for member in ("p", "r"):
         for _, records in overlay.read(member):
             for record in records:
                 if record.kind in seen:
@@ -196,29 +216,33 @@ def restart_s(overlay: Overlay) -> float:
     return took_s
 
 
-def phase(overlay: Overlay, seconds: float) -> Phase:
+def phase(overlay: Overlay, kind: str, seconds: float) -> Phase:
     """Let time go on, with a flood or without."""
     pid = overlay.pid(f"switch {_VICTIM}")
+    aimed_at, link = _AIMED_AT.get(kind, (f"switch {_VICTIM}", "h" if kind in OF_SWITCH else _NEAR))
+    node = aimed_at.split()[1]
+    before_reached = overlay.received(node, [link])[link]
     counted(overlay)
     before_s, before_lost, begun_s = processor_s(pid), lost(overlay), time.monotonic()
     before_drops, before_waited_s = backlog_drops(), waited_s(overlay)
     time.sleep(seconds)
     took_s = time.monotonic() - begun_s
     core, waited = (processor_s(pid) - before_s) / took_s, (waited_s(overlay) - before_waited_s) / took_s
-    memory = memory_mib(pid)
+    memory = memory_mib(overlay.pid(aimed_at))
+    reached = (overlay.received(node, [link])[link] - before_reached) / took_s
     published, delivered = counted(overlay)
     time.sleep(1.0)  # a switch logs what it lost each half second
     losses = lost(overlay) - before_lost
     for node in overlay.plan.switches if losses else ():
         progress(f"{node}:\n{overlay.log_tail(f'switch {node}', 6)}")
     drops = backlog_drops() - before_drops
-    return Phase(delivered / max(published, 1), core, restart_s(overlay), losses, memory, drops, waited)
+    return Phase(delivered / max(published, 1), core, restart_s(overlay), losses, memory, drops, waited, reached)
 
 
 def measure(
     runs: Runs, plane: str, kinds: Sequence[str], seconds: float, rate: float, rounds: int, *, spoof: bool
 ) -> dict[str, list[dict[str, Phase]]]:
-    """Return for each kind of hello what each round showed, calm and flooded."""
+    """Return for each kind of flood what each round showed, calm and flooded."""
     run = runs.start()
     try:
         with Overlay(run, plan(), plane=plane) as overlay:
@@ -228,26 +252,54 @@ def measure(
             for number in range(rounds):
                 for kind in kinds:
                     progress(f"{plane}, {kind}, round {number + 1}")
-                    path = run.directory / f"{kind}.frames"
-                    frames = hellos(kind, overlay)
-                    path.write_bytes(b"".join(struct.pack("!I", len(frame)) + frame for frame in frames))
-                    calm = phase(overlay, seconds)
+                    calm = phase(overlay, kind, seconds)
                     time.sleep(SETTLE_S)
-                    told = {
-                        "iface": _VICTIM, "frames": str(path), "rate": rate, "seconds": seconds + 1 + _RESTART_S,
-                        "source": _address_of(overlay) if spoof else "",
-                    }  # fmt: skip
-                    argv = ["-m", "faults.hello_flood", json.dumps(told)]
-                    with Started(run, f"flood {kind} {number}", partial(overlay.spaces.command, _NEAR), argv) as flood:
-                        flood.read(30)
-                        flooded = phase(overlay, seconds)
+                    of_kind = TIMES * FLOW.hz if kind == "parts" else rate
+                    with _flooding(run, overlay, kind, of_kind, seconds + 1 + _RESTART_S, spoof=spoof) as flood:
+                        flooded = phase(overlay, kind, seconds)
                         said = flood.read(_RESTART_S + 30)
-                        progress(f"{float(str(said['sent'])) / float(str(said['seconds'])):,.0f} hellos a second")
+                        progress(f"{float(str(said['sent'])) / float(str(said['seconds'])):,.0f} frames a second")
                         found[kind].append({"calm": calm, "flooded": flooded})
                     time.sleep(SETTLE_S)
             return found
     finally:
         run.end()
+
+
+@contextmanager
+def _flooding(
+    run: Run, overlay: Overlay, kind: str, rate: float, seconds: float, *, spoof: bool
+) -> Iterator[Started]:
+    """Let a flood begin; a hostile member takes the place of the honest one of its name, which comes back."""
+    if kind not in _HOSTILE:
+        path = run.directory / f"{kind}.frames"
+        path.write_bytes(b"".join(struct.pack("!I", len(frame)) + frame for frame in hellos(kind, overlay)))
+        told: dict[str, object] = {
+            "iface": _VICTIM, "frames": str(path), "rate": rate, "seconds": seconds,
+            "source": _address_of(overlay) if spoof else "",
+        }  # fmt: skip
+        argv = ["-m", "faults.hello_flood", json.dumps(told)]
+        with Started(run, f"flood {kind}", partial(overlay.spaces.command, _NEAR), argv) as flood:
+            flood.read(30)
+            yield flood
+        return
+    who = _HOSTILE[kind]
+    role, _, node = who.partition(" ")
+    told = {"what": kind, "frames": _FRAMES, "rate": rate, "seconds": seconds}
+    if role == "switch":
+        told["config"] = str(overlay.directory / f"switch-{node}.yaml")
+    else:
+        told |= {"config": str(overlay.directory / f"end-{node}.yaml"), "reads": FLOW.topic, "publishes": OWN.topic}
+    overlay.kill(who)
+    try:
+        argv = ["-m", "faults.hostile", json.dumps(told)]
+        with Started(run, f"flood {kind}", partial(overlay.spaces.command, node), argv) as flood:
+            flood.read(_HOSTILE_READY_S)
+            os.kill(flood.pid, signal.SIGUSR1)
+            yield flood
+    finally:
+        overlay.restart(who)
+        overlay.await_ready(who)
 
 
 def _address_of(overlay: Overlay) -> str:
@@ -268,18 +320,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--seconds", type=float, default=10.0, help="of each phase (default: %(default)s)")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--rate", type=float, help="hellos a second (default: ten times what a core verifies)")
+    parser.add_argument("--rate", type=float, help="frames a second (default: ten times what a core verifies)")
     parser.add_argument("--spoof", action="store_true", help="under the address of the neighbour on that link")
 
 
 def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
-    """Measure every plane with every kind of hello; return the figures, and whether the targets were met."""
+    """Measure every plane with every kind of flood; return the figures, and whether the targets were met."""
     runs = Runs()
     runs.sweep()
     verified = verifications_hz()
     rate = options.rate or TIMES * verified
-    heads = ("goodput, ratio", "lost", "memory, MiB", "core", "restart, s", "backlog drops", "waited")
-    table = Table("plane", "hellos", *heads, title=f"{rate:,.0f} hellos a second")
+    heads = ("goodput, ratio", "lost", "memory, MiB", "core", "restart, s", "backlog drops", "waited", "reached")
+    table = Table("plane", "flood", *heads, title=f"{rate:,.0f} frames a second")
     saved: dict[str, object] = {"verified_hz": verified, "rate_hz": rate}
     has_met = True
     for plane in options.planes:
@@ -322,5 +374,6 @@ def _row(rounds: Sequence[dict[str, Phase]]) -> list[str]:
         f"{restarts[0]:.1f} -> {restarts[1]:.1f}",
         " ".join(str(each["flooded"].backlog_drops) for each in rounds),
         f"{waits[0]:.2f} -> {waits[1]:.2f}",
+        " -> ".join(f"{statistics.median(each[name].reached for each in rounds):,.0f}" for name in ("calm", "flooded")),
     ]
 

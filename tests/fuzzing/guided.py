@@ -22,7 +22,7 @@ from typing import Final
 
 from tests.fuzzing.decoder import Decoder
 from tests.fuzzing.mutation import mutated
-from tests.fuzzing.runner import Finding, Outcome, corpus_of, execute
+from tests.fuzzing.runner import Finding, Outcome, Watchdog, corpus_of, execute
 
 __all__ = ["guided", "instrumented_decoders"]
 
@@ -86,9 +86,10 @@ def _fuzz(decoder: Decoder, seconds: float, seed: int, folder: Path, shared: mma
         "-timeout=60", "-rss_limit_mb=2048", f"-artifact_prefix={folder}/", "-verbosity=0", *_words(decoder, folder),
         str(folder / "new"), str(folder / "seeds"),
     ]  # fmt: skip
-    tried = _Tried(decoder, folder / "findings", shared)
-    atheris.Setup(arguments, tried, custom_mutator=_mutator(decoder))
-    atheris.Fuzz()
+    with Watchdog() as watchdog:
+        tried = _Tried(decoder, folder / "findings", shared, watchdog)
+        atheris.Setup(arguments, tried, custom_mutator=_mutator(decoder))
+        atheris.Fuzz()
 
 
 def _words(decoder: Decoder, folder: Path) -> list[str]:
@@ -118,13 +119,15 @@ def _mutator(decoder: Decoder) -> Callable[[bytes, int, int], bytes]:
 class _Tried:
     """What libFuzzer calls with each input; it never raises, so that the run goes on after a finding."""
 
-    def __init__(self, decoder: Decoder, folder: Path, shared: mmap.mmap) -> None:
+    def __init__(self, decoder: Decoder, folder: Path, shared: mmap.mmap, watchdog: Watchdog) -> None:
         self._outcome = Outcome(decoder)
         self._folder = folder
         self._shared = shared
+        self._watchdog = watchdog
 
     def __call__(self, data: bytes) -> None:
         outcome, decoder = self._outcome, self._outcome.decoder
+        self._watchdog.look(time.monotonic())
         if outcome.executions % _MEMORY_EVERY == 1:
             self._measure(data)
         else:

@@ -1,7 +1,7 @@
 """The loop that gives a decoder mutated inputs, and what came of it.
 
-An input that runs steps from line to line that none before it ran joins the corpus. They are traced in one execution
-of ``_TRACE_EVERY``, since tracing slows a decoder down by a factor of ten or more; ``guided.py`` does without that.
+An input that runs steps from line to line that none before it ran joins the corpus. Tracing slows a decoder down by a
+factor of ten or more, so it gets a tenth of the time; ``guided.py`` does without that.
 """
 
 from __future__ import annotations
@@ -21,25 +21,49 @@ from typing import Any, Final
 from tests.fuzzing.decoder import Decoder
 from tests.fuzzing.mutation import mutated
 
-__all__ = ["CORPUS", "Finding", "HangError", "Outcome", "corpus_of", "execute", "fuzz", "keep", "minimise"]
+__all__ = ["CORPUS", "Finding", "HangError", "Outcome", "Watchdog", "corpus_of", "execute", "fuzz", "keep", "minimise"]
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 CORPUS: Final = ROOT / "tests" / "corpus"
 _ROOMS: Final = tuple(str(ROOT / room) for room in ("gdp", "proxy", "fog"))
-_TRACE_EVERY: Final = 8
+_TRACED_SHARE: Final = 0.1  # of the time
 _MEMORY_EVERY: Final = 16
 _MEMORY_LEAST_BYTES: Final = 4 << 10  # a shorter input counts as one of this length
 _CORPUS_MAX: Final = 512
 _KEPT_MAX_BYTES: Final = 4 << 10  # of a file that is added to the corpus
 _KEPT_BYTES: Final = 24 << 10  # of all of one decoder; findings are kept beside
 _COVER: Final = "cover-"  # how names of files begin that are kept for what they run, not because they once broke
-_HANG_S: Final = 10.0
+_HANG_S: Final = 10.0  # processor time
+_REARM_S: Final = 1.0
 
 _Step = tuple[str, int, int]  # file, line, the line that ran next in that frame
 
 
 class HangError(BaseException):
     """A decoder took too much processor time."""
+
+
+class Watchdog:
+    """Raises ``HangError`` in an execution that takes some 9 to 10 s of processor time, while it is entered.
+
+    To set a signal's handler and a timer for each execution would cost more than most executions do.
+    """
+
+    def __enter__(self) -> Watchdog:
+        self._before = signal.signal(signal.SIGPROF, _hang)
+        self._armed_s = 0.0
+        self.look(time.monotonic())
+        return self
+
+    def look(self, now_s: float) -> None:
+        """Begin anew with the time that is left, once a second; called between executions."""
+        if now_s >= self._armed_s + _REARM_S:
+            signal.setitimer(signal.ITIMER_PROF, _HANG_S)
+            self._armed_s = now_s
+
+    def __exit__(self, *_: object) -> None:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, self._before)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,21 +115,28 @@ def fuzz(decoder: Decoder, seconds: float, seed: int, executions_max: int | None
     outcome = Outcome(decoder)
     corpus = corpus_of(decoder)
     seen: set[_Step] = set()
-    for data in corpus:
-        _traced(outcome, data, seen)
-    deadline_s = time.monotonic() + seconds
-    while time.monotonic() < deadline_s and (executions_max is None or outcome.executions < executions_max):
-        data = mutated(decoder, corpus, rng)
-        if outcome.executions % _TRACE_EVERY == 0:
-            if _traced(outcome, data, seen) and len(corpus) < _CORPUS_MAX:
-                corpus.append(data)
-                outcome.found.append(data)
-        elif outcome.executions % _MEMORY_EVERY == 1:
-            _measured(outcome, data)
-        else:
-            begun_s = time.thread_time()
-            execute(outcome, data)
-            outcome.slowest_ms = max(outcome.slowest_ms, 1e3 * (time.thread_time() - begun_s))
+    with Watchdog() as watchdog:
+        for data in corpus:
+            watchdog.look(time.monotonic())
+            _traced(outcome, data, seen)
+        begun_s = now_s = time.monotonic()
+        traced_s = 0.0
+        while now_s < begun_s + seconds and (executions_max is None or outcome.executions < executions_max):
+            watchdog.look(now_s)
+            data = mutated(decoder, corpus, rng)
+            if traced_s <= _TRACED_SHARE * (now_s - begun_s):
+                if _traced(outcome, data, seen) and len(corpus) < _CORPUS_MAX:
+                    corpus.append(data)
+                    outcome.found.append(data)
+                traced_s += time.monotonic() - now_s
+            elif outcome.executions % _MEMORY_EVERY == 1:
+                _measured(outcome, data)
+            else:
+                spent_s = -time.thread_time()
+                execute(outcome, data)
+                spent_s += time.thread_time()
+                outcome.slowest_ms = max(outcome.slowest_ms, 1e3 * spent_s)
+            now_s = time.monotonic()
     return outcome
 
 
@@ -163,8 +194,6 @@ def _adding(decoder: Decoder, corpus: Sequence[bytes], inputs: Sequence[bytes]) 
 def execute(outcome: Outcome, data: bytes) -> None:
     """Give the decoder one input, and count what came of it."""
     outcome.executions += 1
-    before = signal.signal(signal.SIGPROF, _hang)
-    signal.setitimer(signal.ITIMER_PROF, _HANG_S)
     try:
         outcome.decoder.run(data)
     except outcome.decoder.allowed:
@@ -174,9 +203,6 @@ def execute(outcome: Outcome, data: bytes) -> None:
     except BaseException as error:
         outcome.foreign += 1
         outcome.findings.setdefault(_place(error), Finding(data, f"{type(error).__name__}: {error}"[:200]))
-    finally:
-        signal.setitimer(signal.ITIMER_PROF, 0)
-        signal.signal(signal.SIGPROF, before)
 
 
 def _traced(outcome: Outcome, data: bytes, seen: set[_Step]) -> bool:

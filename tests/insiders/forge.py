@@ -81,10 +81,15 @@ class Utterance:
 
 
 class Forge:
-    """Makes utterances for a stage; the same randomness in the same state makes the same one."""
+    """Makes utterances for a stage; the same randomness in the same state makes the same one.
 
-    def __init__(self, stage: Stage) -> None:
+    Args:
+        may_break: also those of personas whose office lets them hurt the good flow.
+    """
+
+    def __init__(self, stage: Stage, *, may_break: bool = True) -> None:
         self._stage = stage
+        self._personas = [each for each in PERSONAS if may_break or not each.may_break]
         world = stage.world
         self._unknown = tuple(Name(bytes([number]) * 32) for number in range(1, 9))
         self._nodes = tuple(identity.name for identity in world.identities.values())
@@ -103,7 +108,7 @@ class Forge:
 
     def utter(self, rng: random.Random) -> Utterance | None:
         """Return what some persona says next, or None where it is cut off."""
-        persona = rng.choice(PERSONAS)
+        persona = rng.choice(self._personas)
         places = self._stage.places(persona.node)
         if not places:
             return None

@@ -2,7 +2,7 @@
 
 ::
 
-    school:    nuc1 ---- nuc2        evil (hostile switch) at nuc1 and nuc2; hostile RIB at evil
+    school:    nuc1 ---- nuc2        at both: evil (hostile switch, with a hostile RIB), hired (hostile leaf)
     backbone:          nuc3          upper RIB
     cloud:             nuc4          far (hostile switch) at nuc3 and nuc4; hostile RIB at far
     stranger:          x1 at nuc2    no domain of the others trusts it
@@ -42,6 +42,7 @@ _PARTS: Final = {
     "nuc2/reader": ((_TOPIC, Right.READ),),
     "nuc4/alien": ((_TOPIC, Right.READ), (_SERVICE, Right.CALL)),
     "evil/guest": ((_TOPIC, Right.READ), (_SERVICE, Right.SERVE)),
+    "hired/tenant": ((_TOPIC, Right.READ), (_SERVICE, Right.SERVE)),
 }
 
 _TOPOLOGY: Final = Topology(
@@ -51,12 +52,14 @@ _TOPOLOGY: Final = Topology(
         Link("nuc3", "nuc4"),
         Link("evil", "nuc1"),
         Link("evil", "nuc2"),
+        Link("hired", "nuc1"),
+        Link("hired", "nuc2"),
         Link("far", "nuc3"),
         Link("far", "nuc4"),
         Link("x1", "nuc2"),
     ),
     domains=(
-        DomainPlan("school", ("nuc1", "nuc2", "evil"), upper="backbone"),
+        DomainPlan("school", ("nuc1", "nuc2", "evil", "hired"), upper="backbone"),
         DomainPlan("backbone", ("nuc3",)),
         DomainPlan("cloud", ("nuc4", "far"), upper="backbone"),
         DomainPlan("stranger", ("x1",)),
@@ -75,6 +78,7 @@ _TOPOLOGY: Final = Topology(
         Attachment("nuc4", "proxy", "alien"),
         Attachment("nuc2", "proxy", "reader"),
         Attachment("evil", "proxy", "guest"),
+        Attachment("hired", "proxy", "tenant"),
         Attachment("x1", "proxy", "mallory"),
     ),
 )
@@ -103,6 +107,8 @@ PERSONAS: Final = (
     Persona("x1/mallory", "x1/mallory"),
     Persona("evil", "evil"),
     Persona("far", "far"),
+    Persona("hired", "hired"),  # a leaf, as on a rented machine
+    Persona("hired/tenant", "hired/tenant"),  # and a proxy behind it
     Persona("x1", "x1"),
     Persona("evil/rib2", "rib:school#2", may_break=True),
     Persona("far/rib2", "rib:cloud#2", may_break=True),
@@ -144,6 +150,7 @@ class Stage:
             dead_s=3.6,
             lease_s=_LEASE_S,
             keepalive_ms=1_000,
+            leaves=("hired",),
             trusts=dict.fromkeys(_TRUSTED, _TRUSTED) | {"stranger": ("stranger", *_TRUSTED)},
         )
         self._rib_nodes = {label: world.rib_node(label) for label in world.ribs}

@@ -126,7 +126,7 @@ class Trial:
     def __init__(self, plan: Plan, stage: Stage | None = None) -> None:
         self.plan = plan
         self.stage = stage or Stage(plan.seed)
-        self.forge = Forge(self.stage)
+        self.forge = Forge(self.stage, may_break=plan.is_stormy)
         self.figures = Figures()
         self.at: Utterance | str | None = None  # what happens now
         self._sent = 0
@@ -168,8 +168,6 @@ class Trial:
         stage = self.stage
         utterance = self.forge.utter(rng)
         if utterance is None:
-            return
-        if not self.plan.is_stormy and utterance.persona.may_break:
             return
         self.at = utterance
         echo, network, place = Echo(), stage.world.network, utterance.place
@@ -260,7 +258,7 @@ class Trial:
         self.stage.world.network.run(rng.choice((0.0, 0.001, 0.1, 0.5, 2.0)))
 
     def _hostile_member(self, rng: random.Random) -> str:
-        return rng.choice(("nuc1/insider", "nuc2/reader", "nuc4/alien", "evil/guest", "x1/mallory"))
+        return rng.choice(("nuc1/insider", "nuc2/reader", "nuc4/alien", "evil/guest", "hired/tenant", "x1/mallory"))
 
     def _cut_cable(self, rng: random.Random) -> None:
         world = self.stage.world
@@ -283,7 +281,7 @@ class Trial:
         self.stage.world.restart_member(self._hostile_member(rng))
 
     def _restart_hostile_switch(self, rng: random.Random) -> None:
-        self.stage.world.restart_switch(rng.choice(("evil", "far", "x1")))
+        self.stage.world.restart_switch(rng.choice(("evil", "far", "hired", "x1")))
 
     def _restart_hostile_rib(self, rng: random.Random) -> None:
         self.stage.world.restart_rib(rng.choice(("school#2", "cloud#2")))
@@ -305,7 +303,7 @@ class Trial:
 
     def _join_in(self, rng: random.Random) -> None:
         """Take part anew, where it does not any more."""
-        for label in ("nuc1/insider", "nuc2/reader", "nuc4/alien", "evil/guest"):
+        for label in ("nuc1/insider", "nuc2/reader", "nuc4/alien", "evil/guest", "hired/tenant"):
             self.stage.take_part_again(label)
 
     def _roam(self, rng: random.Random) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from gdp.limits import CLAIM_LEASE_S, NEGATIVE_LEASE_S
+from gdp.limits import CLAIM_LEASE_S, NEGATIVE_LEASE_S, PARKED_S
 from gdp.names import Name
-from gdp.switch.places import QUESTIONS_MAX, RETRY_S, TRIES_MAX, Place, Places
+from gdp.switch.places import AT_ONCE, QUESTIONS_MAX, RETRY_S, TRIES_MAX, WINDOW, Place, Places
 from gdp.trust.right import Right
 from tests.gdp.switch.net import HOME, name
 
@@ -115,8 +115,41 @@ def test_open_questions_are_bounded_and_watches_stand_apart() -> None:
     for number in range(QUESTIONS_MAX + 10):
         places.want(name(str(number)), 0.0, watch=False)
     places.want(TOPIC, 0.0, watch=True)
-    assert len(asked(places, 0.0)) == QUESTIONS_MAX + 1
+    assert places.is_asked(TOPIC)
+    assert places.is_asked(name(str(QUESTIONS_MAX - 1)))
     assert not places.is_asked(name(str(QUESTIONS_MAX + 9)))
+
+
+def test_a_window_of_new_names_awaits_answers_and_each_answer_lets_another_go() -> None:
+    places = Places()
+    for number in range(2 * WINDOW):
+        places.want(name(str(number)), 0.0, watch=False)
+    first = [each for _ in range(10) for each, _ in asked(places, 0.0)]
+    assert len(first) == WINDOW
+    assert max(len(asked(places, RETRY_S)), len(asked(places, RETRY_S))) == AT_ONCE  # the same ones again
+    places.nobody(first[0], RETRY_S)
+    assert [each for each, _ in asked(places, RETRY_S)] == [name(str(WINDOW))]
+
+
+def test_who_has_many_names_asked_for_holds_up_nobody_else() -> None:
+    places = Places()
+    for number in range(2 * WINDOW):
+        places.want(name(str(number)), 0.0, watch=False, owner=b"greedy")
+    places.want(TOPIC, 0.0, watch=False, owner=b"modest")
+    assert (TOPIC, 0.0) in asked(places, 0.0)
+
+
+def test_a_name_whose_turn_comes_too_late_is_given_up_unasked() -> None:
+    places = Places()
+    for number in range(WINDOW + 1):
+        places.want(name(str(number)), 0.0, watch=False)
+    first = [each for _ in range(10) for each, _ in asked(places, 0.0)]
+    late = name(str(WINDOW))
+    assert late not in first
+    places.nobody(first[0], PARKED_S)
+    given_up = [each for _ in range(10) for each in places.due(PARKED_S)[1]]
+    assert given_up == [late]
+    assert not places.is_asked(late)
 
 
 def test_the_echo_of_a_claim_that_was_brought_from_here_answers_no_question_until_it_is_told_again() -> None:
