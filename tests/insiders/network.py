@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gdp.effects import Transmit
-from gdp.frame.codec import ETHER_BYTES
+from gdp.frame.codec import ETHER_BYTES, HOPS_AT
 from gdp.testbed.memory import MemoryNetwork
 
 __all__ = ["Echo", "TracingNetwork"]
@@ -18,13 +18,30 @@ __all__ = ["Echo", "TracingNetwork"]
 class Echo:
     """What one utterance drew, from all nodes, as far as frames drew it; timers are nobody's.
 
+    Args:
+        said: its frames. A machine that sends one of them on, once, carries it as a data plane would.
+
     Attributes:
         sent: bytes after the Ethernet header that machines sent, by node.
-        forwarded: bytes that data planes forwarded, copies of multicast included.
+        forwarded: bytes that were carried, copies of multicast included.
     """
 
+    said: tuple[bytes, ...] = ()
     sent: Counter[str] = field(default_factory=Counter)
     forwarded: Counter[str] = field(default_factory=Counter)
+    _carried: set[tuple[str, bytes]] = field(default_factory=set)
+    _keys: frozenset[bytes] = frozenset()
+
+    def __post_init__(self) -> None:
+        self._keys = frozenset(map(_but_hops, self.said))
+
+    def note(self, node: str, frame: bytes, *, is_machine: bool) -> None:
+        """Count a frame (from its header on) that a node sends."""
+        key = node, _but_hops(frame)
+        is_carried = not is_machine or (key[1] in self._keys and key not in self._carried)
+        if is_machine and is_carried:
+            self._carried.add(key)
+        (self.forwarded if is_carried else self.sent)[node] += len(frame)
 
     @property
     def most(self) -> int:
@@ -65,6 +82,10 @@ class TracingNetwork(MemoryNetwork):
 
     def _send(self, wired: Any, frame: bytes) -> None:
         if self.echo is not None:
-            counts = self.echo.sent if self._is_machine else self.echo.forwarded
-            counts[wired[1].node] += len(frame) - ETHER_BYTES
+            self.echo.note(wired[1].node, frame[ETHER_BYTES:], is_machine=self._is_machine)
         super()._send(wired, frame)
+
+
+def _but_hops(frame: bytes) -> bytes:
+    """Return a frame without the field that changes on its way."""
+    return frame[:HOPS_AT] + frame[HOPS_AT + 1 :]

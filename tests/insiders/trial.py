@@ -170,7 +170,7 @@ class Trial:
         if utterance is None:
             return
         self.at = utterance
-        echo, network, place = Echo(), stage.world.network, utterance.place
+        echo, network, place = Echo(utterance.frames), stage.world.network, utterance.place
         assert isinstance(network, TracingNetwork)
         is_proven = stage.believes(utterance.persona, place)
         begun_s = time.perf_counter()  # a clock that costs little: the other ones are system calls
