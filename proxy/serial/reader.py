@@ -28,7 +28,7 @@ _Values: TypeAlias = "tuple[object, ...] | list[object]"
 _Shape: TypeAlias = "Callable[[_Values, Tree], None]"
 
 ITEMS_MAX: Final = 1 << 19  # records, lists and texts of one message: some 150 MB
-_ITEMS_FREE: Final = 4_096  # ... of which a message may have so many whatever its length
+_ITEMS_FREE: Final = 256  # ... of which a message may have so many whatever its length
 _ITEMS_PER_BYTE: Final = 4  # ... and so many for each of its bytes
 
 

@@ -5,7 +5,7 @@
     sudo .venv/bin/python scripts/bench/security.py revocation --part closed --rounds 3 --no-save
     .venv/bin/python scripts/bench/security.py rotation                   # messages lost while epochs change; no root
     sudo .venv/bin/python scripts/bench/security.py cost                  # beside the commit before; minutes
-    sudo .venv/bin/python scripts/bench/security.py flood                 # hellos of a stranger; half an hour
+    sudo .venv/bin/python scripts/bench/security.py flood                 # by strangers and by members; an hour
 
 Each subcommand is a module beside this one that has ``add_arguments(parser)`` and ``run(options)``; ``run`` returns its
 figures, which go under the subcommand's name into the file, and whether every target was met.
