@@ -1,34 +1,36 @@
-"""A queue in which each of those who fill it has its turn, however much one of them puts in.
+"""A queue that serves its owners in turn (round robin), however much one of them puts in.
 
 Sans-I/O. Source: J. Nagle, On Packet Switches With Infinite Storage, RFC 970.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
+from collections import OrderedDict
+from collections.abc import Hashable
 from typing import Generic, TypeVar
 
 __all__ = ["FairQueue"]
 
-_T = TypeVar("_T")
+_T = TypeVar("_T", bound=Hashable)
 
 
 class FairQueue(Generic[_T]):
-    """Items by their owners; one of each owner in turn, the oldest first. It has no bound of its own."""
+    """Items by owner: one of each owner in turn, each owner's oldest first. It has no bound of its own."""
 
-    __slots__ = ("_length", "_of")
+    __slots__ = ("_of",)
 
     def __init__(self) -> None:
-        self._of: OrderedDict[bytes, deque[_T]] = OrderedDict()
-        self._length = 0
+        self._of: OrderedDict[bytes, OrderedDict[_T, None]] = OrderedDict()
 
     def __len__(self) -> int:
-        return self._length
+        return sum(map(len, self._of.values()))
+
+    def __bool__(self) -> bool:
+        return bool(self._of)
 
     def put(self, owner: bytes, item: _T) -> None:
-        """Put an item behind the others of its owner."""
-        self._of.setdefault(owner, deque()).append(item)
-        self._length += 1
+        """Put an item behind the others of its owner, unless it is there already."""
+        self._of.setdefault(owner, OrderedDict())[item] = None
 
     def pop(self) -> _T:
         """Return the next item.
@@ -37,8 +39,19 @@ class FairQueue(Generic[_T]):
             KeyError: there is none.
         """
         owner, items = self._of.popitem(last=False)
-        item = items.popleft()
-        self._length -= 1
+        item, _ = items.popitem(last=False)
         if items:
             self._of[owner] = items
         return item
+
+    def discard(self, owner: bytes, item: _T) -> None:
+        """Take an item out; nothing happens if it is not there."""
+        items = self._of.get(owner)
+        if items is not None:
+            items.pop(item, None)
+            if not items:
+                del self._of[owner]
+
+    def clear(self) -> None:
+        """Take everything out."""
+        self._of.clear()

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Final, Generic, NamedTuple, TypeVar
 
 from gdp.errors import LocalError
+from gdp.message.fair_queue import FairQueue
 from gdp.names import Name
 from gdp.service.calls import Calls
 
@@ -84,7 +85,7 @@ class Serving(Generic[R]):
     ) -> None:
         self._calls: Calls[_Served[R]] = Calls(limit, start)
         self._numbers: dict[Asked, int] = {}
-        self._waiting: OrderedDict[Name, OrderedDict[int, None]] = OrderedDict()  # by client, whose turn is next first
+        self._waiting = FairQueue[int]()  # owned by clients
         self._held_back: dict[Asked, dict[int, None]] = {}  # call -> those that wait for its end
         self._ended: dict[Name, OrderedDict[Asked, bytes]] = {}  # by client
         self._ended_count = 0
@@ -128,7 +129,7 @@ class Serving(Generic[R]):
         self._shares[client] += 1
         self._waiting_bytes[client] += size
         if after is None:
-            self._wait(number, client)
+            self._waiting.put(client, number)
         else:
             self._held_back.setdefault(after, {})[number] = None
         return number
@@ -137,15 +138,11 @@ class Serving(Generic[R]):
         """Return, once, the requests whose turn it is."""
         turns: list[Turn[R]] = []
         while self._waiting and (self._at_once is None or self._given < self._at_once):
-            client, numbers = next(iter(self._waiting.items()))
-            number = next(iter(numbers))
-            self._wait_no_more(number, client)
-            if numbers:
-                self._waiting.move_to_end(client)
+            number = self._waiting.pop()
             served = self._calls.get(number)
             if served is not None and served.request is not None:
                 turns.append(Turn(number, served.asked, served.request))
-                _take_off(self._waiting_bytes, client, served.size_bytes)
+                _take_off(self._waiting_bytes, served.asked.client, served.size_bytes)
                 served.request = None
                 self._given += 1
         return turns
@@ -244,23 +241,13 @@ class Serving(Generic[R]):
             self._given -= 1
         else:
             _take_off(self._waiting_bytes, client, served.size_bytes)
-            self._wait_no_more(number, client)
+            self._waiting.discard(client, number)
             if served.after is not None:
                 self._held_back.get(served.after, {}).pop(number, None)
         for each in self._held_back.pop(served.asked, ()):
             other = self._calls.get(each)
             if other is not None:
-                self._wait(each, other.asked.client)
-
-    def _wait(self, number: int, client: Name) -> None:
-        self._waiting.setdefault(client, OrderedDict())[number] = None
-
-    def _wait_no_more(self, number: int, client: Name) -> None:
-        numbers = self._waiting.get(client)
-        if numbers is not None:
-            numbers.pop(number, None)
-            if not numbers:
-                del self._waiting[client]
+                self._waiting.put(other.asked.client, each)
 
 
 def _take_off(counts: Counter[Name], client: Name, count: int) -> None:

@@ -59,6 +59,7 @@ class Place:
 class _Question:
     ask_at_s: float  # ``_WAITS``: when it has its turn
     since_s: float
+    owner: bytes = b""  # at whose expense
     tries: int = 0
     is_watch: bool = False  # a reader here wants to know of all who advertise the name
     used_until_s: float = 0.0  # frames are sent to it
@@ -130,10 +131,11 @@ class Places:
         if question is None:
             if not watch and len(self._questions) - self._watches >= QUESTIONS_MAX:
                 return
-            question = self._questions[name] = _Question(_WAITS, now_s)
+            question = self._questions[name] = _Question(_WAITS, now_s, owner)
             if not watch:
                 self._waiting.put(owner, name)
         if watch and not question.is_watch:
+            self._waiting.discard(question.owner, name)
             question.is_watch = True
             question.ask_at_s = now_s
             self._ask_at_s = min(self._ask_at_s, now_s)
@@ -191,9 +193,7 @@ class Places:
             self._due_again(now_s, ask, given_up)
         while len(ask) < AT_ONCE and self._has_turn():
             name = self._waiting.pop()
-            question = self._questions.get(name)
-            if question is None or question.ask_at_s != _WAITS:
-                continue
+            question = self._questions[name]
             if now_s >= question.since_s + PARKED_S:  # what asked for it waits no more
                 self._forget(name)
                 given_up.append(name)
@@ -231,20 +231,18 @@ class Places:
         return self.watch_s if question.is_watch else self._use_watch_s if question.used_until_s > now_s else 0.0
 
     def _has_turn(self) -> bool:
-        return len(self._waiting) > 0 and len(self._awaited) < WINDOW
+        return bool(self._waiting) and len(self._awaited) < WINDOW
 
     def _forget(self, name: Name) -> None:
         """Ask for a name no more."""
-        del self._questions[name]
+        self._waiting.discard(self._questions.pop(name).owner, name)
         self._awaited.discard(name)
 
     def next_due(self) -> float | None:
-        """Return a monotonic second that is no later than the next question, or None."""
-        if not self._questions:
-            return None
+        """Return the monotonic second at which ``due`` has something to do, or an earlier one; None: not yet known."""
         if self._has_turn():
             return float("-inf")
-        return None if self._ask_at_s == _WAITS else self._ask_at_s
+        return self._ask_at_s if self._questions and self._ask_at_s != _WAITS else None
 
     def put(self, place: Place, now_s: float, *, is_ours: bool = False, has_left: bool = False) -> Place | None:
         """Note a place; return what was known of this advertiser before.

@@ -14,15 +14,13 @@ import random
 import struct
 import sys
 import tempfile
-import time
-import tracemalloc
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
 from tests.fuzzing.decoder import Decoder
 from tests.fuzzing.mutation import mutated
-from tests.fuzzing.runner import Finding, Outcome, Watchdog, corpus_of, execute
+from tests.fuzzing.runner import Finding, Outcome, corpus_of, measured_bytes, timed_ms, watched
 
 __all__ = ["guided", "instrumented_decoders"]
 
@@ -86,8 +84,8 @@ def _fuzz(decoder: Decoder, seconds: float, seed: int, folder: Path, shared: mma
         "-timeout=60", "-rss_limit_mb=2048", f"-artifact_prefix={folder}/", "-verbosity=0", *_words(decoder, folder),
         str(folder / "new"), str(folder / "seeds"),
     ]  # fmt: skip
-    with Watchdog() as watchdog:
-        tried = _Tried(decoder, folder / "findings", shared, watchdog)
+    with watched():
+        tried = _Tried(decoder, folder / "findings", shared)
         atheris.Setup(arguments, tried, custom_mutator=_mutator(decoder))
         atheris.Fuzz()
 
@@ -119,21 +117,19 @@ def _mutator(decoder: Decoder) -> Callable[[bytes, int, int], bytes]:
 class _Tried:
     """What libFuzzer calls with each input; it never raises, so that the run goes on after a finding."""
 
-    def __init__(self, decoder: Decoder, folder: Path, shared: mmap.mmap, watchdog: Watchdog) -> None:
+    def __init__(self, decoder: Decoder, folder: Path, shared: mmap.mmap) -> None:
         self._outcome = Outcome(decoder)
         self._folder = folder
         self._shared = shared
-        self._watchdog = watchdog
 
     def __call__(self, data: bytes) -> None:
         outcome, decoder = self._outcome, self._outcome.decoder
-        self._watchdog.look(time.monotonic())
         if outcome.executions % _MEMORY_EVERY == 1:
             self._measure(data)
         else:
-            spent_ms = self._timed(data)
+            spent_ms = timed_ms(outcome, data)
             if spent_ms > decoder.time_max_ms:
-                spent_ms = min(spent_ms, *(self._timed(data) for _ in range(_REPEATS)))
+                spent_ms = min(spent_ms, *(timed_ms(outcome, data) for _ in range(_REPEATS)))
                 if spent_ms > decoder.time_max_ms:
                     self._find("time", Finding(data, f"{spent_ms:.0f} ms", True))
             outcome.slowest_ms = max(outcome.slowest_ms, spent_ms)
@@ -142,22 +138,11 @@ class _Tried:
         numbers = outcome.executions, outcome.refused, outcome.foreign, outcome.slowest_ms, outcome.memory_ratio
         _NUMBERS.pack_into(self._shared, 0, *numbers)
 
-    def _timed(self, data: bytes) -> float:
-        begun_s = time.thread_time()
-        execute(self._outcome, data)
-        return 1e3 * (time.thread_time() - begun_s)
-
     def _measure(self, data: bytes) -> None:
-        tracemalloc.start()
-        try:
-            execute(self._outcome, data)
-            peak = tracemalloc.get_traced_memory()[1]
-        finally:
-            tracemalloc.stop()
-        ratio = peak / max(len(data), _MEMORY_LEAST_BYTES)
+        size = max(len(data), _MEMORY_LEAST_BYTES)
+        ratio = measured_bytes(self._outcome, data) / size
         self._outcome.memory_ratio = max(self._outcome.memory_ratio, ratio)
         if ratio > self._outcome.decoder.memory_max:
-            size = max(len(data), _MEMORY_LEAST_BYTES)
             self._find("memory", Finding(data, f"{ratio:.1f} times {size} bytes", True))
 
     def _find(self, place: str, finding: Finding) -> None:

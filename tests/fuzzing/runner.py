@@ -1,7 +1,7 @@
 """The loop that gives a decoder mutated inputs, and what came of it.
 
-An input that runs steps from line to line that none before it ran joins the corpus. Tracing slows a decoder down by a
-factor of ten or more, so it gets a tenth of the time; ``guided.py`` does without that.
+An input that runs steps from line to line that none before it ran joins the corpus. They are traced in one execution
+of ``_TRACE_EVERY``, since tracing slows a decoder down by a factor of ten or more; ``guided.py`` does without that.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import signal
 import sys
 import time
 import tracemalloc
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -21,12 +22,25 @@ from typing import Any, Final
 from tests.fuzzing.decoder import Decoder
 from tests.fuzzing.mutation import mutated
 
-__all__ = ["CORPUS", "Finding", "HangError", "Outcome", "Watchdog", "corpus_of", "execute", "fuzz", "keep", "minimise"]
+__all__ = [
+    "CORPUS",
+    "Finding",
+    "HangError",
+    "Outcome",
+    "corpus_of",
+    "execute",
+    "fuzz",
+    "keep",
+    "measured_bytes",
+    "minimise",
+    "timed_ms",
+    "watched",
+]
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 CORPUS: Final = ROOT / "tests" / "corpus"
 _ROOMS: Final = tuple(str(ROOT / room) for room in ("gdp", "proxy", "fog"))
-_TRACED_SHARE: Final = 0.1  # of the time
+_TRACE_EVERY: Final = 8
 _MEMORY_EVERY: Final = 16
 _MEMORY_LEAST_BYTES: Final = 4 << 10  # a shorter input counts as one of this length
 _CORPUS_MAX: Final = 512
@@ -34,7 +48,6 @@ _KEPT_MAX_BYTES: Final = 4 << 10  # of a file that is added to the corpus
 _KEPT_BYTES: Final = 24 << 10  # of all of one decoder; findings are kept beside
 _COVER: Final = "cover-"  # how names of files begin that are kept for what they run, not because they once broke
 _HANG_S: Final = 10.0  # processor time
-_REARM_S: Final = 1.0
 
 _Step = tuple[str, int, int]  # file, line, the line that ran next in that frame
 
@@ -43,27 +56,14 @@ class HangError(BaseException):
     """A decoder took too much processor time."""
 
 
-class Watchdog:
-    """Raises ``HangError`` in an execution that takes some 9 to 10 s of processor time, while it is entered.
-
-    To set a signal's handler and a timer for each execution would cost more than most executions do.
-    """
-
-    def __enter__(self) -> Watchdog:
-        self._before = signal.signal(signal.SIGPROF, _hang)
-        self._armed_s = 0.0
-        self.look(time.monotonic())
-        return self
-
-    def look(self, now_s: float) -> None:
-        """Begin anew with the time that is left, once a second; called between executions."""
-        if now_s >= self._armed_s + _REARM_S:
-            signal.setitimer(signal.ITIMER_PROF, _HANG_S)
-            self._armed_s = now_s
-
-    def __exit__(self, *_: object) -> None:
-        signal.setitimer(signal.ITIMER_PROF, 0)
-        signal.signal(signal.SIGPROF, self._before)
+@contextmanager
+def watched() -> Iterator[None]:
+    """Make an ``execute`` that takes too long raise ``HangError``; its handler is set once, which costs 12 us."""
+    before = signal.signal(signal.SIGPROF, _hang)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGPROF, before)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,28 +115,21 @@ def fuzz(decoder: Decoder, seconds: float, seed: int, executions_max: int | None
     outcome = Outcome(decoder)
     corpus = corpus_of(decoder)
     seen: set[_Step] = set()
-    with Watchdog() as watchdog:
+    with watched():
         for data in corpus:
-            watchdog.look(time.monotonic())
             _traced(outcome, data, seen)
-        begun_s = now_s = time.monotonic()
-        traced_s = 0.0
-        while now_s < begun_s + seconds and (executions_max is None or outcome.executions < executions_max):
-            watchdog.look(now_s)
+        deadline_s = time.monotonic() + seconds
+        while time.monotonic() < deadline_s and (executions_max is None or outcome.executions < executions_max):
             data = mutated(decoder, corpus, rng)
-            if traced_s <= _TRACED_SHARE * (now_s - begun_s):
+            if outcome.executions % _TRACE_EVERY == 0:
                 if _traced(outcome, data, seen) and len(corpus) < _CORPUS_MAX:
                     corpus.append(data)
                     outcome.found.append(data)
-                traced_s += time.monotonic() - now_s
             elif outcome.executions % _MEMORY_EVERY == 1:
-                _measured(outcome, data)
+                ratio = measured_bytes(outcome, data) / max(len(data), _MEMORY_LEAST_BYTES)
+                outcome.memory_ratio = max(outcome.memory_ratio, ratio)
             else:
-                spent_s = -time.thread_time()
-                execute(outcome, data)
-                spent_s += time.thread_time()
-                outcome.slowest_ms = max(outcome.slowest_ms, 1e3 * spent_s)
-            now_s = time.monotonic()
+                outcome.slowest_ms = max(outcome.slowest_ms, timed_ms(outcome, data))
     return outcome
 
 
@@ -185,15 +178,17 @@ def _adding(decoder: Decoder, corpus: Sequence[bytes], inputs: Sequence[bytes]) 
     """Return those short inputs, shortest first, that run what neither the corpus nor a shorter one runs."""
     seen: set[_Step] = set()
     outcome = Outcome(decoder)
-    for data in corpus:
-        _traced(outcome, data, seen)
     short = sorted((data for data in inputs if len(data) <= _KEPT_MAX_BYTES), key=lambda data: (len(data), data))
-    return [data for data in short if _traced(outcome, data, seen)]
+    with watched():
+        for data in corpus:
+            _traced(outcome, data, seen)
+        return [data for data in short if _traced(outcome, data, seen)]
 
 
 def execute(outcome: Outcome, data: bytes) -> None:
-    """Give the decoder one input, and count what came of it."""
+    """Give the decoder one input, and count what came of it; only while ``watched``."""
     outcome.executions += 1
+    signal.setitimer(signal.ITIMER_PROF, _HANG_S)
     try:
         outcome.decoder.run(data)
     except outcome.decoder.allowed:
@@ -203,6 +198,8 @@ def execute(outcome: Outcome, data: bytes) -> None:
     except BaseException as error:
         outcome.foreign += 1
         outcome.findings.setdefault(_place(error), Finding(data, f"{type(error).__name__}: {error}"[:200]))
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
 
 
 def _traced(outcome: Outcome, data: bytes, seen: set[_Step]) -> bool:
@@ -233,14 +230,21 @@ def _traced(outcome: Outcome, data: bytes, seen: set[_Step]) -> bool:
     return len(seen) > count
 
 
-def _measured(outcome: Outcome, data: bytes) -> None:
+def timed_ms(outcome: Outcome, data: bytes) -> float:
+    """Execute; return the processor time that it took."""
+    begun_s = time.thread_time()
+    execute(outcome, data)
+    return 1e3 * (time.thread_time() - begun_s)
+
+
+def measured_bytes(outcome: Outcome, data: bytes) -> int:
+    """Execute; return the most memory that was held at a time."""
     tracemalloc.start()
     try:
         execute(outcome, data)
-        peak = tracemalloc.get_traced_memory()[1]
+        return tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    outcome.memory_ratio = max(outcome.memory_ratio, peak / max(len(data), _MEMORY_LEAST_BYTES))
 
 
 def _hang(number: int, frame: FrameType | None) -> None:

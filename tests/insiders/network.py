@@ -29,18 +29,14 @@ class Echo:
     said: tuple[bytes, ...] = ()
     sent: Counter[str] = field(default_factory=Counter)
     forwarded: Counter[str] = field(default_factory=Counter)
-    _carried: set[tuple[str, bytes]] = field(default_factory=set)
-    _keys: frozenset[bytes] = frozenset()
-
-    def __post_init__(self) -> None:
-        self._keys = frozenset(map(_but_hops, self.said))
+    _carried: set[tuple[str, bytes]] = field(default_factory=set)  # by machines
 
     def note(self, node: str, frame: bytes, *, is_machine: bool) -> None:
         """Count a frame (from its header on) that a node sends."""
-        key = node, _but_hops(frame)
-        is_carried = not is_machine or (key[1] in self._keys and key not in self._carried)
-        if is_machine and is_carried:
-            self._carried.add(key)
+        is_carried = not is_machine
+        if is_machine and (body := _but_hops(frame)) in map(_but_hops, self.said):
+            is_carried = (node, body) not in self._carried
+            self._carried.add((node, body))
         (self.forwarded if is_carried else self.sent)[node] += len(frame)
 
     @property

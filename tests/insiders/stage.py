@@ -30,14 +30,14 @@ from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 from tests.journeys.flows import Flow
 
-__all__ = ["GOOD", "PERSONAS", "PROMISE_S", "Persona", "Place", "Stage"]
+__all__ = ["GOOD", "PARTS", "PERSONAS", "PROMISE_S", "Persona", "Place", "Stage"]
 
 PROMISE_S: Final = 3.0  # within which a message of an established flow arrives
 GOOD: Final = ("nuc1/robot", "nuc4/server")
 _TRUSTED: Final = ("school", "backbone", "cloud")
 _LEASE_S: Final = 6.0
 _TOPIC, _SERVICE = "/noise", "/work"
-_PARTS: Final = {
+PARTS: Final = {
     "nuc1/insider": ((_TOPIC, Right.PUBLISH), (_SERVICE, Right.SERVE)),
     "nuc2/reader": ((_TOPIC, Right.READ),),
     "nuc4/alien": ((_TOPIC, Right.READ), (_SERVICE, Right.CALL)),
@@ -175,14 +175,14 @@ class Stage:
 
     def join_in(self) -> None:
         """Let the insiders' members publish, read, serve and call."""
-        for label in _PARTS:
+        for label in PARTS:
             self.take_part_again(label)
 
     def take_part_again(self, label: str) -> None:
         """Let a member do what it is here for, as far as it does not."""
         member = self.world.members[label]
         claimed = {each.right for each in member.attachment.claims}
-        for name, right in _PARTS.get(label, ()):
+        for name, right in PARTS.get(label, ()):
             if right in claimed:
                 continue
             topic = self.topics.get(f"{label} {right.value}") or self.world.topic(name, member, [right])

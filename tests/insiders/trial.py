@@ -22,7 +22,7 @@ from gdp.errors import LocalError
 from tests.insiders.forge import Forge, Utterance
 from tests.insiders.network import Echo, TracingNetwork
 from tests.insiders.oracle import signing_oracle
-from tests.insiders.stage import GOOD, PERSONAS, PROMISE_S, Stage
+from tests.insiders.stage import GOOD, PARTS, PERSONAS, PROMISE_S, Stage
 from tests.insiders.tables import GENERAL_MAX, LIMITS, sizes
 from tests.journeys.networks import reproducible_keys
 
@@ -258,7 +258,7 @@ class Trial:
         self.stage.world.network.run(rng.choice((0.0, 0.001, 0.1, 0.5, 2.0)))
 
     def _hostile_member(self, rng: random.Random) -> str:
-        return rng.choice(("nuc1/insider", "nuc2/reader", "nuc4/alien", "evil/guest", "hired/tenant", "x1/mallory"))
+        return rng.choice((*PARTS, "x1/mallory"))
 
     def _cut_cable(self, rng: random.Random) -> None:
         world = self.stage.world
@@ -303,8 +303,7 @@ class Trial:
 
     def _join_in(self, rng: random.Random) -> None:
         """Take part anew, where it does not any more."""
-        for label in ("nuc1/insider", "nuc2/reader", "nuc4/alien", "evil/guest", "hired/tenant"):
-            self.stage.take_part_again(label)
+        self.stage.join_in()
 
     def _roam(self, rng: random.Random) -> None:
         self.stage.world.roam(rng.choice(("nuc1/insider", "nuc2/reader", "nuc4/alien")), rng.choice(("nuc2", "nuc3")))

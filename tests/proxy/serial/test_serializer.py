@@ -15,6 +15,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from gdp.errors import DropReason, RemoteError
 from proxy.serial.channel import Channel, DefinitionFormat, RosVersion
 from proxy.serial.serializer import Encoding, Serializer, canonical
+from tests.proxy.bridge import known
 
 LITTLE = b"\x00\x01\x00\x00"
 READABLE: tuple[Encoding, ...] = ("json", "cbor")
@@ -398,3 +399,10 @@ def test_a_typed_array_of_another_kind_or_length_is_refused() -> None:
     about = channel("float32[] a\n")
     for tag, raw in ((86, bytes(8)), (85, bytes(7)), (64, bytes(4))):
         assert refusal(about, cbor2.dumps({"a": cbor2.CBORTag(tag, raw)}), "cbor") is DropReason.MALFORMED
+
+
+def test_a_few_bytes_that_claim_many_records_without_fields_are_not_read() -> None:
+    channel = known.custom("a/msg/Nothings", f"a/Nothing[] nothings\n{RULE}MSG: a/Nothing\n", 1)
+    serializer = Serializer(channel, "json")
+    assert json.loads(serializer.encode(struct.pack("<I", 200))) == {"nothings": [{}] * 200}
+    assert "$raw" in json.loads(serializer.encode(struct.pack("<I", 1_000)))
