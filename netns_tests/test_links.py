@@ -61,9 +61,7 @@ def test_nothing_new_is_an_empty_list(watch: LinkWatch) -> None:
     ],
     ids=["carrier lost", "switched off", "mtu", "address", "deleted"],
 )
-def test_a_change_is_news(
-    words: tuple[str, ...], seen: Callable[[Link], bool], watch: LinkWatch, space: Space
-) -> None:
+def test_a_change_is_news(words: tuple[str, ...], seen: Callable[[Link], bool], watch: LinkWatch, space: Space) -> None:
     space.veth("one", "two", MAC, PEER_MAC)
     watch.news()
     space.ip(*words)

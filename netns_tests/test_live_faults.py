@@ -103,9 +103,7 @@ def test_a_type_that_the_far_machine_has_not(pair: Pair, a: Peer, b: Peer) -> No
     a.tell("!diagnosis = talk(DiagnosticArray, '/diagnosis')")
     b.tell("read(DiagnosticArray, '/diagnosis')")
     a.waits_for("diagnosis.get_subscription_count()", 1)
-    until(
-        lambda: a.tell("diagnosis.publish(DiagnosticArray())") or pair.proxy("b").warnings("/diagnosis"), "a warning"
-    )
+    until(lambda: a.tell("diagnosis.publish(DiagnosticArray())") or pair.proxy("b").warnings("/diagnosis"), "a warning")
     assert "install the package diagnostic_msgs" in tells(pair.proxy("b"), "/diagnosis", "unknown-type")
     assert pair.proxy("a").warnings("/diagnosis") == []
     flows(a, b)

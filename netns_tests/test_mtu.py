@@ -85,9 +85,7 @@ class Lab:
         self._add_switch("first", "r1", "a0")
         self._add_switch("second", "a1", "e1", "b1")
         rib = self._identity(Role.RIB, "rib")
-        self._run(
-            RibHost(rib, self._policy, Rib(rib, self._policy, MemoryStore(), RibSettings()), settings()), "b0"
-        )
+        self._run(RibHost(rib, self._policy, Rib(rib, self._policy, MemoryStore(), RibSettings()), settings()), "b0")
         self._robot, robot = self._add_member("robot", "r0")
         self._server, server = self._add_member("server", "e0")
         self.publisher = self._robot.advertise(self._topic(robot, Right.PUBLISH), b"described", reliable=True)

@@ -26,6 +26,7 @@ from proxy.rules.rule import Rule
 
 __all__ = ["check_proxy"]
 
+
 def check_proxy(settings: ProxyConfig, *, json: bool) -> None:
     """Say what each rule means.
 
@@ -47,9 +48,7 @@ def check_proxy(settings: ProxyConfig, *, json: bool) -> None:
         Console().print(f"configuration good: proxy {identity.name.short}", highlight=False)
 
 
-def _findings(
-    settings: ProxyConfig, at: int, graph: Graph, delegations: Mapping[Name, Delegation]
-) -> list[Finding]:
+def _findings(settings: ProxyConfig, at: int, graph: Graph, delegations: Mapping[Name, Delegation]) -> list[Finding]:
     def of(rules: Sequence[Rule]) -> list[Rule]:
         return [rule for rule in rules if settings.endpoint_of(rule) == at]
 

@@ -206,9 +206,7 @@ def _of_kind(graph: Iterable[End], kind: Kind) -> Iterator[End]:
             if is_topic == (kind == "topic"):
                 yield end
         elif not is_topic and end.name.endswith(_GOAL):
-            yield End(
-                end.role, end.name.removesuffix(_GOAL), end.type_name.removesuffix(_GOAL_TYPE), end.node, end.key
-            )
+            yield End(end.role, end.name.removesuffix(_GOAL), end.type_name.removesuffix(_GOAL_TYPE), end.node, end.key)
 
 
 def _qos_in_words(qos: Qos) -> str:

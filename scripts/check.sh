@@ -4,5 +4,6 @@ set -euo pipefail
 
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 .venv/bin/ruff check .
+.venv/bin/ruff format --check --quiet --exclude "*.md" .
 .venv/bin/mypy
 .venv/bin/lint-imports

@@ -36,8 +36,7 @@ if TYPE_CHECKING:
     from tests.insiders.trial import Plan
 
 _COLUMNS = (
-    f"{'decoder':<15} {'executions':>10} {'refused':>8} {'foreign':>8}"
-    f" {'slowest ms':>11} {'memory x':>9} {'new':>5}"
+    f"{'decoder':<15} {'executions':>10} {'refused':>8} {'foreign':>8} {'slowest ms':>11} {'memory x':>9} {'new':>5}"
 )
 _Fuzz = Callable[[Decoder, float, int], Outcome]
 

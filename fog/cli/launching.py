@@ -44,7 +44,6 @@ class GatewayKind(Enum):
     REPLICA = "replica"
 
 
-
 File = Annotated[Path, typer.Argument(metavar="FILE", help="a launch file (.py), or a plan (.json)")]
 Words = Annotated[Optional[list[str]], typer.Argument(metavar="[NAME:=VALUE]...")]  # noqa: UP045
 DryRun = Annotated[bool, typer.Option("--dry-run", help="show machines and price, start nothing")]

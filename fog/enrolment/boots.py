@@ -103,9 +103,7 @@ def machine_boot(
         TICKET_FILE: ticket.to_json(),
         _OWNER: authority.owner_key.read_bytes(),
         _PROFILE: _OFTEN,
-        "switch.yaml": _yaml(
-            {**_who("switch"), "ports": ports, "attach": ["proxy0"], "table_max": _TABLE_MAX}
-        ),
+        "switch.yaml": _yaml({**_who("switch"), "ports": ports, "attach": ["proxy0"], "table_max": _TABLE_MAX}),
         "proxy.yaml": _yaml(
             {
                 **_who(PROXY),

@@ -116,9 +116,7 @@ class Tickets:
         self._lock = threading.Lock()
         with self._translated():
             os.close(os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
-            self._file = sqlite3.connect(
-                self._path, timeout=_PATIENCE_S, isolation_level=None, check_same_thread=False
-            )
+            self._file = sqlite3.connect(self._path, timeout=_PATIENCE_S, isolation_level=None, check_same_thread=False)
             self._file.execute("PRAGMA journal_mode=WAL")
             self._file.execute("PRAGMA synchronous=FULL")  # a token that was used stays used
             self._file.executescript(_TABLES)
@@ -173,7 +171,15 @@ class Tickets:
             return None
         token, cluster, machine, seats, expires_unix_s, until_unix_s, keys, answer, papers, is_reported = row
         return Kept(
-            token, cluster, machine, _seats(seats), expires_unix_s, until_unix_s, keys, answer, _papers(papers),
+            token,
+            cluster,
+            machine,
+            _seats(seats),
+            expires_unix_s,
+            until_unix_s,
+            keys,
+            answer,
+            _papers(papers),
             bool(is_reported),
         )
 

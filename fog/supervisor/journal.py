@@ -129,9 +129,7 @@ class Journal:
         with _translated(self._path):
             query = "SELECT name, plan, is_up, why, begun_unix_s FROM clusters ORDER BY name"
             rows = self._file.execute(query).fetchall()
-        return [
-            Cluster(self._plan(name, plan), bool(is_up), why, begun) for name, plan, is_up, why, begun in rows
-        ]
+        return [Cluster(self._plan(name, plan), bool(is_up), why, begun) for name, plan, is_up, why, begun in rows]
 
     def cluster(self, name: str) -> Cluster:
         """Return a cluster.

@@ -42,9 +42,7 @@ def begin(
       gdp cert rollover begin --domain keys/school --overlap-days 30
     """
     guard = asked_passphrase(protect)
-    made = begin_rollover(
-        domain, days=days, overlap_days=overlap_days, key=token_key(key), passphrase=guard
-    )
+    made = begin_rollover(domain, days=days, overlap_days=overlap_days, key=token_key(key), passphrase=guard)
     show({**described_root(made.root), "root": str(domain / NEXT / ROOT_CERTIFICATE)}, as_json=as_json)
 
 

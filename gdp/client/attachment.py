@@ -102,9 +102,7 @@ class Attachment:
         self._former = ZERO  # the one before
         self._moved_s = float("-inf")
         self._rtcerts: dict[Name, tuple[bytes, float]] = {}  # by switch, with the monotonic second of the next one
-        self._sync = RevocationSync(
-            identity, policy.revoked, self.greeter, self._say_revoked, settings.first_sequence
-        )
+        self._sync = RevocationSync(identity, policy.revoked, self.greeter, self._say_revoked, settings.first_sequence)
         self._now = Instant(0.0, 0.0)
         self._out: list[Transmit] = []
         self._in_use_s = 0.0  # since when another node with this identity keeps its place

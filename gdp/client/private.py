@@ -164,9 +164,7 @@ class PrivateFeed(Feed):
         ended: Ended,
     ) -> None:
         writer, incarnation = public.publisher, private_incarnation(name)
-        super().__init__(
-            name, reader, writer, incarnation, verifier, public.exchange, secrets, budget, now_s, ended
-        )
+        super().__init__(name, reader, writer, incarnation, verifier, public.exchange, secrets, budget, now_s, ended)
         self.state = FeedState.LIVE
         self._public = public
         self._early_bytes = 0

@@ -543,9 +543,7 @@ class Greeter:
                 return hello.membership, wire
         return None
 
-    def _refuse_rival(
-        self, port: LinkPort, hello: Hello, name: Name, arrived: tuple[bytes, int], now_s: float
-    ) -> None:
+    def _refuse_rival(self, port: LinkPort, hello: Hello, name: Name, arrived: tuple[bytes, int], now_s: float) -> None:
         """Take a hello's word only if no older node with its identity is alive; a younger one is let go.
 
         Args:

@@ -112,5 +112,3 @@ def authenticated(header: bytes) -> bytes:
 def ethernet(destination_mac: bytes, source_mac: bytes) -> bytes:
     """Return the 14-byte Ethernet II header (two 6-byte addresses and our EtherType)."""
     return destination_mac + source_mac + _ETHERTYPE
-
-

@@ -206,9 +206,7 @@ class Joiner:
             message = self._start(header, salt, opener, now_s)
         return self._keep(message, header, plain, sealed, signature, now_s)
 
-    def _take_whole(
-        self, header: Header, salt: bytes, plain: bytes, sealed: bytes, signature: bytes
-    ) -> Joined | None:
+    def _take_whole(self, header: Header, salt: bytes, plain: bytes, sealed: bytes, signature: bytes) -> Joined | None:
         number = header.number
         running = digest_of(header, salt)
         running.update(sealed)

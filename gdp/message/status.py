@@ -91,9 +91,7 @@ class Status(NamedTuple):
             raise FrameError(DropReason.MALFORMED, "status")
         started = {reader: Start(*start) for reader, *start in _START.iter_unpack(wire[_HEAD.size : moves_at])}
         lost = tuple(_range(*each) for each in _GONE.iter_unpack(wire[gone_at:end]))
-        return cls(
-            oldest, sent_number, sent_part, started, wire[end:], moved, oldest_sequence, sent_sequence, lost
-        )
+        return cls(oldest, sent_number, sent_part, started, wire[end:], moved, oldest_sequence, sent_sequence, lost)
 
 
 def _range(first: int, last: int, reason: int) -> LostRange:

@@ -42,6 +42,7 @@ from gdp.stores.files import read_private
 
 __all__ = ["DataPlane", "LeaseSeconds", "PortConfig", "Quotas", "RibConfig", "SwitchConfig"]
 
+
 def _server(text: str) -> str:
     host, colon, port = text.rpartition(":")
     if not (host and colon and port.isdecimal() and 0 < int(port) < 65_536):

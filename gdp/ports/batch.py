@@ -218,9 +218,7 @@ class PlainBatch:
         slots = [self._slots[at][ETHER_BYTES : ETHER_BYTES + self._sizes[at]] for at in range(first, first + count)]
         return self._submit(sink, slots, macs, drops)
 
-    def _submit(
-        self, sink: socket.socket, frames: Sequence[bytes | memoryview], macs: bytes, drops: list[int]
-    ) -> int:
+    def _submit(self, sink: socket.socket, frames: Sequence[bytes | memoryview], macs: bytes, drops: list[int]) -> int:
         self._head[: len(macs)] = macs
         left = 0
         for at, frame in enumerate(frames):

@@ -67,9 +67,7 @@ class RawPlane(LinkedPlane):
         LocalError: as ``add_port``.
     """
 
-    def __init__(
-        self, ifnames: Sequence[str] = (), table: Table | None = None, *, bypass_qdisc: bool = False
-    ) -> None:
+    def __init__(self, ifnames: Sequence[str] = (), table: Table | None = None, *, bypass_qdisc: bool = False) -> None:
         self._bypass_qdisc = bypass_qdisc
         self._lanes: dict[Lane, dict[int, socket.socket]] = {lane: {} for lane in _LANES}  # by port
         self._batch: Batch = make_batch(OVERHEAD_BYTES)

@@ -225,9 +225,7 @@ def admit_node(
     return identity
 
 
-def renew(
-    domain: Path, certificate: bytes, *, days: float = MEMBER_DAYS, unix_s: float | None = None
-) -> Membership:
+def renew(domain: Path, certificate: bytes, *, days: float = MEMBER_DAYS, unix_s: float | None = None) -> Membership:
     """Return a membership anew, for the same key, role and label; the one that it replaces may have run out.
 
     Raises:
@@ -243,7 +241,11 @@ def renew(
 
 
 def renew_node(
-    domain: Path, node: Path, *, days: float = MEMBER_DAYS, before_days: float | None = None,
+    domain: Path,
+    node: Path,
+    *,
+    days: float = MEMBER_DAYS,
+    before_days: float | None = None,
     unix_s: float | None = None,
 ) -> Membership | None:
     """Renew the membership of a node whose directory is at hand; a running node takes it up.

@@ -260,8 +260,18 @@ class Flooding:
         self._said[scope] = said
         self._sequence += 1
         state = LinkState(
-            self._identity.name, self._domain, scope, self._sequence, links, inside, ribs, members, self._life, refused,
-            said_unix_s=max(int(now_s + self._unix_ahead_s), 0), is_leaf=self._is_leaf,
+            self._identity.name,
+            self._domain,
+            scope,
+            self._sequence,
+            links,
+            inside,
+            ribs,
+            members,
+            self._life,
+            refused,
+            said_unix_s=max(int(now_s + self._unix_ahead_s), 0),
+            is_leaf=self._is_leaf,
         ).fitted(self._identity.membership)
         wire = state.to_wire(self._identity.key, self._identity.membership)
         self.link_states.put(state, wire, now_s)

@@ -249,8 +249,7 @@ class Revocations:
     def summary(self) -> list[tuple[Name, int, bytes]]:
         """Return for each root, by the hash of its key, how many it took back, and a digest."""
         return [
-            (root.root, root.count, reduce(xor, root.hashes).to_bytes(ID_BYTES, "big"))
-            for root in self._roots.values()
+            (root.root, root.count, reduce(xor, root.hashes).to_bytes(ID_BYTES, "big")) for root in self._roots.values()
         ]
 
     def hashes(self, of: Name) -> list[bytes] | None:

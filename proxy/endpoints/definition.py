@@ -108,9 +108,7 @@ def interface_of(type_name: str, lookup: Callable[[str], type]) -> Interface:
 def definition_of(interface: Interface) -> str:
     """Return the ``msg`` text: the fields of the type, then each used type after a rule of 80 ``=``."""
     first, *used = interface
-    return _body(interface[first]) + "".join(
-        f"{_RULE}\nMSG: {_short(name)}\n{_body(interface[name])}" for name in used
-    )
+    return _body(interface[first]) + "".join(f"{_RULE}\nMSG: {_short(name)}\n{_body(interface[name])}" for name in used)
 
 
 def type_hash_of(interface: Interface) -> str:

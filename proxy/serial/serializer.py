@@ -181,7 +181,6 @@ class Codec:
         self._writer(body, tree)
         return bytes(body) if self._ros == 1 else b"".join((_PREFIX, body))
 
-
     def _first_fit(self, order: bytes, body: memoryview, pad_max: int) -> object | None:
         for layout in self._layouts:
             try:

@@ -315,9 +315,7 @@ def run_seed(runs: Runs, seed: int, options: argparse.Namespace) -> list[str]:
     plan = random_network(seed, options.switches, rate=options.rate, one_rib=options.one_rib)
     kinds = [SHORT[name] for name in options.only] if options.only else None
     in_store = _in_store(plan, seed, is_wanted=options.cluster)
-    faults = make_schedule(
-        plan, seed, options.seconds, pace_s=options.pace_s, kinds=kinds, has_store=bool(in_store)
-    )
+    faults = make_schedule(plan, seed, options.seconds, pace_s=options.pace_s, kinds=kinds, has_store=bool(in_store))
     begun_s = time.monotonic()
     with ExitStack() as undo:
         run = runs.start()

@@ -186,9 +186,7 @@ def _measured(options: argparse.Namespace) -> Iterator[Row]:
         _stage = Stage(options.seed)
         _record = _recorded(_stage)
         with multiprocessing.get_context("fork").Pool(options.processes, maxtasksperchild=1) as pool:
-            under_way = {
-                job: pool.apply_async(_spoken, (*job, options.seconds)) for job in jobs
-            }
+            under_way = {job: pool.apply_async(_spoken, (*job, options.seconds)) for job in jobs}
             silent = {speaker: under_way.pop((speaker, "", 0)) for speaker in options.speakers}
             for speaker, kind, times in list(under_way):
                 if times == 1:

@@ -267,9 +267,7 @@ def measure(
 
 
 @contextmanager
-def _flooding(
-    run: Run, overlay: Overlay, kind: str, rate: float, seconds: float, *, spoof: bool
-) -> Iterator[Started]:
+def _flooding(run: Run, overlay: Overlay, kind: str, rate: float, seconds: float, *, spoof: bool) -> Iterator[Started]:
     """Let a flood begin; a hostile member takes the place of the honest one of its name, which comes back."""
     if kind not in _HOSTILE:
         path = run.directory / f"{kind}.frames"
@@ -376,4 +374,3 @@ def _row(rounds: Sequence[dict[str, Phase]]) -> list[str]:
         f"{waits[0]:.2f} -> {waits[1]:.2f}",
         " -> ".join(f"{statistics.median(each[name].reached for each in rounds):,.0f}" for name in ("calm", "flooded")),
     ]
-

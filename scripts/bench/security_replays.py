@@ -201,9 +201,7 @@ class Domain:
 
     def __post_init__(self) -> None:
         self.rng = random.Random(self.seed)
-        self.world = world = World(
-            _TOPOLOGY, self.seed, hello_s=1.0, dead_s=3.6, lease_s=_LEASE_S, keepalive_ms=500
-        )
+        self.world = world = World(_TOPOLOGY, self.seed, hello_s=1.0, dead_s=3.6, lease_s=_LEASE_S, keepalive_ms=500)
         assert isinstance(world.network, RecordingNetwork)
         self.network = world.network
         self.network.records = self.records
@@ -399,6 +397,7 @@ class Domain:
 
     def _is_settled(self, within_s: float) -> bool:
         """Wait until all flows are there; return whether that came true."""
+
         def are_there() -> bool:
             server, client = self.server.member, self.client.member
             return (
@@ -523,6 +522,7 @@ class Domain:
 
 
 # -- checks taken away
+
 
 def _always(value: Any) -> Callable[..., Any]:
     return lambda *_: value

@@ -113,9 +113,7 @@ def buried(world: World, label: str) -> list[bytes]:
     """Let a switch die and be forgotten; return its last link states."""
     origin = world.identities[label].name
     wires = [
-        entry.wire
-        for (its, _), entry in world.switches["nuc1"]._flooding.link_states._entries.items()
-        if its == origin
+        entry.wire for (its, _), entry in world.switches["nuc1"]._flooding.link_states._entries.items() if its == origin
     ]
     assert wires
     world.network.stop(label)

@@ -187,9 +187,7 @@ def test_a41_a_cookie_counts_for_one_address_one_session_and_one_hello() -> None
 
 @pytest.mark.parametrize(("count", "pause_s"), [(80, 0.015), (16, 1.0)])
 @pytest.mark.parametrize("pad", [0, 1_400])
-def test_a20_what_goes_to_who_has_not_proved_itself_is_no_more_than_came(
-    pad: int, count: int, pause_s: float
-) -> None:
+def test_a20_what_goes_to_who_has_not_proved_itself_is_no_more_than_came(pad: int, count: int, pause_s: float) -> None:
     calm, link = pair(FAST), pair(FAST)
     for each in (calm, link):
         each.run(4.0)

@@ -105,9 +105,7 @@ def _changed(lines: list[bytes]) -> list[bytes]:
     ],
     ids=["changed", "first gone", "removed", "twice", "other", "rewritten"],
 )
-def test_a73_a_changed_ledger_is_noticed(
-    tmp_path: Path, forge: Callable[[list[bytes]], list[bytes]], at: int
-) -> None:
+def test_a73_a_changed_ledger_is_noticed(tmp_path: Path, forge: Callable[[list[bytes]], list[bytes]], at: int) -> None:
     make_domain(tmp_path / "lab", "lab")
     for index in range(3):
         make_node(tmp_path / str(index), Role.PROXY, "p", tmp_path / "lab")

@@ -114,9 +114,7 @@ def test_l02_a_leaf_that_lists_links_to_everybody_attracts_nobody() -> None:
     flow = flowing(world, source=TALKER, readers=(LISTENER,))
     leaf = world.identities["leaf"]
     before = {(at, to): first_to(world, at, to) for at in ("left", "middle", "right") for to in ("left", "right")}
-    everybody = tuple(
-        sorted(Adjacency(each.name, leaf.root.domain, 1, 9_000) for each in world.switches.values())
-    )
+    everybody = tuple(sorted(Adjacency(each.name, leaf.root.domain, 1, 9_000) for each in world.switches.values()))
     tap = Tap("left", "leaf")
     for scope in Scope:
         said = replace(state_of(world, "leaf"), scope=scope, links=everybody, inside=())

@@ -184,9 +184,7 @@ def test_a33_no_note_is_accepted_that_is_forged_or_recorded_whatever_restarts() 
         before = snapshot(pipe)
         for other in present.keys() - {label}:
             for life in (incarnation, incarnation + 1):
-                forger = Notes(
-                    reader_of(other, life), pipe.publisher._source, TOPIC, secrets, as_name=names[label]
-                )
+                forger = Notes(reader_of(other, life), pipe.publisher._source, TOPIC, secrets, as_name=names[label])
                 pipe.tell(*forger.hello(epoch), *(forger.report(report, epoch) for report in LIES))
         pipe.tell(*recorded)
         assert snapshot(pipe) == before, f"turn {turn}"

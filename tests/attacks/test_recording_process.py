@@ -263,9 +263,7 @@ def test_b04_a_pipe_in_place_of_a_recording_is_refused(tmp_path: Path) -> None:
         (signal.SIGXCPU, "takes more than"),
     ],
 )
-def test_b05_the_end_of_a_decoder_is_one_error_that_names_the_recording(
-    tmp_path: Path, number: int, says: str
-) -> None:
+def test_b05_the_end_of_a_decoder_is_one_error_that_names_the_recording(tmp_path: Path, number: int, says: str) -> None:
     path = recording(tmp_path / "a.mcap", 3, 4 << 20)
     with BagReader(path) as bag:
         messages = bag.messages()

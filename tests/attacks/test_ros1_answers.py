@@ -34,7 +34,9 @@ ANSWERS = [
     XML.format("<array></array>"),
     XML.format("<array><data>" + "<value><array><data>" * 2_000),
     XML.format("<array><data><value>" + STATE.format("<int>1</int>") + "</value></data></array>"),
-    XML.format(f"<array><data><value><array><data><value>{STATE.format('')}</value></data></array></value></data></array>"),
+    XML.format(
+        f"<array><data><value><array><data><value>{STATE.format('')}</value></data></array></value></data></array>"
+    ),
     "<!DOCTYPE a [<!ENTITY b 'bbbbbbbb'><!ENTITY c '&b;&b;&b;&b;'>]>" + XML.format("&c;"),
 ]
 

@@ -49,9 +49,7 @@ def test_a01_a02_a40_no_claim_or_withdrawal_of_any_size_ends_a_switch_or_a_rib(k
     world = ring()
     flow = flowing(world)
     robot = world.identities[ROBOT]
-    wire = sign(
-        StatementType.WITHDRAW, {"n": robot.name, "right": "read", "s": 1 << 40}, robot.name, robot.key
-    )
+    wire = sign(StatementType.WITHDRAW, {"n": robot.name, "right": "read", "s": 1 << 40}, robot.name, robot.key)
     if kind is Kind.ADVERTISE:
         now_s = world.network.now.unix_s
         rtcert = RtCert.make(robot, world.identities["nuc1"].name, Validity.lasting(now_s, 600))
@@ -100,6 +98,7 @@ def test_a23_a71_a_verdict_of_a_giant_number_ends_no_proxy(sequence: int) -> Non
 def test_a64_a_link_state_of_more_than_fits_is_cut_and_ends_no_switch() -> None:
     world = ring()
     nuc1 = world.identities["nuc1"]
+
     def names(count: int) -> list[Name]:
         return [Name(bytes([1 + each % 255, each // 255]) * 16) for each in range(count)]
 

@@ -150,9 +150,7 @@ def looked(tmp_path: Path, *, is_users: bool) -> dict[str, object]:
 
 
 @needs_root
-def test_a53_the_users_code_runs_as_another_user_without_rights(
-    home: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a53_the_users_code_runs_as_another_user_without_rights(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(NODE_USER, "daemon")
     daemon = pwd.getpwnam("daemon")
     said = looked(home, is_users=True)

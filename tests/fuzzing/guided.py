@@ -151,4 +151,3 @@ class _Tried:
         if not path.exists():
             told = {"data": finding.data.hex(), "error": finding.error, "excess": finding.is_excess}
             path.write_text(json.dumps({"place": place, **told}))
-

@@ -101,9 +101,7 @@ class Forge:
         self._old: deque[bytes] = deque(self._recorded(), maxlen=_REMEMBERED)
         self._numbers = count(int(world.network.now.unix_s * 1_000) + 100_000)
         self._counters = count(1 << 40)
-        self._splitters = {
-            persona.node: ControlSplitter(stage.identity(persona).name, 77) for persona in PERSONAS
-        }
+        self._splitters = {persona.node: ControlSplitter(stage.identity(persona).name, 77) for persona in PERSONAS}
         self._sealers: dict[tuple[str, str, int], Any] = {}
 
     def utter(self, rng: random.Random) -> Utterance | None:
@@ -383,9 +381,7 @@ class Forge:
         right = rng.choice(_RIGHTS)
         return self._claim_body(rng, identity, rng.choice(self._topics), right, self._switch_at(rng, place))
 
-    def _claim_body(
-        self, rng: random.Random, identity: Identity, topic: Name, right: Right, switch: Name
-    ) -> _Body:
+    def _claim_body(self, rng: random.Random, identity: Identity, topic: Name, right: Right, switch: Name) -> _Body:
         """Return a claim on the node's own name, on a topic by its delegation, or on a name of its own making."""
         now = self._stage.world.network.now.unix_s
         subject, chain = identity.subject, []
@@ -401,9 +397,11 @@ class Forge:
             subject = own
             if chance < 0.75:
                 validity = Validity(int(now) - 10, int(now) + 1_000)
-                chain = [
-                    AdCert.make(identity.key, own.name, own, identity.subject, list(_RIGHTS)[:3], validity)
-                ] if Right.ATTACH not in list(_RIGHTS)[:3] else []
+                chain = (
+                    [AdCert.make(identity.key, own.name, own, identity.subject, list(_RIGHTS)[:3], validity)]
+                    if Right.ATTACH not in list(_RIGHTS)[:3]
+                    else []
+                )
         return {
             **subject.to_fields(), "name": subject.name, "right": right.value, "seq": next(self._numbers),
             "inc": int.from_bytes(self._own_life(identity, rng)[8:], "big"),
@@ -530,7 +528,9 @@ class Forge:
         member = rng.choice(self._identities()).member
         until = rng.choice((unix_s, unix_s + 100, _U64, 0, member.validity.not_after_unix_s))
         return {
-            **identity.subject.to_fields(), "cert": rng.choice((rng.randbytes(32), member.fingerprint)), "until": until
+            **identity.subject.to_fields(),
+            "cert": rng.choice((rng.randbytes(32), member.fingerprint)),
+            "until": until,
         }
 
     def _revoked(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
@@ -556,7 +556,11 @@ class Forge:
     def _accept(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         to = rng.choice(self._nodes)
         return {
-            "o": rng.randbytes(32), "i": rng.randbytes(8), "k": rng.randbytes(32), "w": to, "c": identity.membership
+            "o": rng.randbytes(32),
+            "i": rng.randbytes(8),
+            "k": rng.randbytes(32),
+            "w": to,
+            "c": identity.membership,
         }
 
     def _adcert(self, rng: random.Random, identity: Identity, place: Place) -> _Body:

@@ -325,7 +325,11 @@ _CALM_ACTS: Final[tuple[_Act, ...]] = (
     Trial._leave, Trial._join_in, Trial._join_in, Trial._roam, Trial._wait, Trial._publish, Trial._resize,
 )  # fmt: skip
 _ACTS: Final[tuple[_Act, ...]] = (
-    *_CALM_ACTS, Trial._cut_cable, Trial._mend_cable, Trial._mend_cable, Trial._restart_any
+    *_CALM_ACTS,
+    Trial._cut_cable,
+    Trial._mend_cable,
+    Trial._mend_cable,
+    Trial._restart_any,
 )
 
 

@@ -121,9 +121,7 @@ class Tap:
         return sum(1 for each in self.headers if each.kind == kind and destination in (None, each.destination))
 
 
-def ring(
-    seed: int = 1, transits: Mapping[str, tuple[str, ...]] | None = None, *, lease_s: float = LEASE_S
-) -> World:
+def ring(seed: int = 1, transits: Mapping[str, tuple[str, ...]] | None = None, *, lease_s: float = LEASE_S) -> World:
     """Return the ring of five, every member attached."""
     world = World(ring5(), seed, transits=transits, lease_s=lease_s)
     assert world.settle()

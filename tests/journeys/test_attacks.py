@@ -133,9 +133,7 @@ def test_cbor_nested_a_thousand_deep_is_malformed(container: bytes) -> None:
 def test_a_flood_of_beginnings_is_bounded_and_given_back() -> None:
     flow = flowing(ring())
     world = flow.world
-    frames = (
-        control(Kind.HELLO, bytes(1_000), number=n, parts=3, source=n.to_bytes(32, "big")) for n in range(3_000)
-    )
+    frames = (control(Kind.HELLO, bytes(1_000), number=n, parts=3, source=n.to_bytes(32, "big")) for n in range(3_000))
     attack(flow, frames, ("nuc1",))
     assert 0 < world.switches["nuc1"].greeter.held_bytes <= CONTROL_JOIN_BYTES
     world.network.run(CONTROL_PATIENCE_S + 1)

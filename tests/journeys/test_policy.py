@@ -78,9 +78,7 @@ def test_a_border_of_an_untrusted_domain_is_no_neighbour() -> None:
     world = World(ring5(), trusts=WITHOUT_BACKBONE)
     world.network.run(3)
     border = world.switches["nuc2"]
-    assert {n.name for n in border.greeter.all_up()} == {
-        world.identities[label].name for label in ("nuc1", "nuc2/rib")
-    }
+    assert {n.name for n in border.greeter.all_up()} == {world.identities[label].name for label in ("nuc1", "nuc2/rib")}
     assert border.drops()[DropReason.WRONG_DOMAIN] > 0
 
 

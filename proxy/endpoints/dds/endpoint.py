@@ -115,9 +115,7 @@ class DdsEndpoint:
     def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
         """Hear a topic from now on, whatever its type."""
         handle = next(self._numbers)
-        return self._keep(
-            handle, Subscription(self._node, self._survey, handle, self._tell, topic, type_name, qos)
-        )
+        return self._keep(handle, Subscription(self._node, self._survey, handle, self._tell, topic, type_name, qos))
 
     def advertise(self, channel: Channel) -> int:
         """Be a publisher of a topic.

@@ -90,7 +90,6 @@ class _Transport(xmlrpc.client.Transport):
         connection.timeout = _PATIENCE_S
         return connection
 
-
     def parse_response(self, response: http.client.HTTPResponse) -> tuple[Any, ...]:
         """Read an answer as it is, unpacked and at most ``_ANSWER_MAX_BYTES`` long."""
         if response.getheader("Content-Encoding", ""):

@@ -53,9 +53,7 @@ class Desk:
     def socket(self) -> Path:
         return self.folder / "enrolment" / "socket"
 
-    def ticket(
-        self, name: str = "m7", *, address: str = "", minutes: float = 10.0, is_gateway: bool = False
-    ) -> Ticket:
+    def ticket(self, name: str = "m7", *, address: str = "", minutes: float = 10.0, is_gateway: bool = False) -> Ticket:
         now_s = time.time()
         return self.tickets.issue(
             CLUSTER.name,

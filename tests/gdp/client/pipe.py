@@ -81,9 +81,7 @@ class Pipe:
     def attach(self, reader: Reader, *, loss: float = 0.0, secrets: Secrets = SECRETS) -> End:
         budget = Budget()
         publisher, exchange = Name(b"p" * 32), self.publisher._source.notes.public
-        feed = Feed(
-            TOPIC, reader, publisher, self.incarnation, WRITER.public, exchange, secrets, budget, self.now_s
-        )
+        feed = Feed(TOPIC, reader, publisher, self.incarnation, WRITER.public, exchange, secrets, budget, self.now_s)
         end = self.ends[reader.name] = End(reader, feed, budget, loss)
         return end
 

@@ -325,9 +325,7 @@ def neighbour_of(label: bytes, nonce: bytes = b"n" * 8) -> Neighbour:
 def is_taken(
     port: LinkPort, session: bytes, neighbour: Neighbour, sequence: int, sender_session: bytes = b"n" * 8
 ) -> bool:
-    join = Join(
-        ZERO, ZERO, ZERO, ZERO, frozenset(), 1_500, 1.0, b"", session, sequence, sender_session=sender_session
-    )
+    join = Join(ZERO, ZERO, ZERO, ZERO, frozenset(), 1_500, 1.0, b"", session, sequence, sender_session=sender_session)
     try:
         port.take_join(join, neighbour)
     except StatementError as error:

@@ -67,9 +67,7 @@ def test_a_node_whose_link_is_down_and_then_up_says_so() -> None:
     assert reasons(alone) == [WaitReason.LINK_DOWN]
 
 
-@pytest.mark.parametrize(
-    ("role", "reason"), [(Role.SWITCH, WaitReason.ONE_WAY), (Role.PROXY, WaitReason.NO_SWITCH)]
-)
+@pytest.mark.parametrize(("role", "reason"), [(Role.SWITCH, WaitReason.ONE_WAY), (Role.PROXY, WaitReason.NO_SWITCH)])
 def test_a_neighbour_that_does_not_answer_is_told_from_one_that_is_no_switch(role: Role, reason: WaitReason) -> None:
     alone, other = attachment(), greeter(node("other", role), 2)
     alone.greeter.add_port(0, bytes(6), 1_500, 10, 0.0)

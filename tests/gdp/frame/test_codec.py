@@ -44,7 +44,7 @@ def test_hops_left_stands_where_the_codec_says() -> None:
 
 
 def test_the_ethernet_header_carries_the_ethertype() -> None:
-    assert ethernet(b"\x01" * 6, b"\x02" * 6).hex() == "010101010101" "020202020202" "88b5"
+    assert ethernet(b"\x01" * 6, b"\x02" * 6).hex() == "01010101010102020202020288b5"
 
 
 @pytest.mark.parametrize("vector", VECTORS, ids=lambda vector: vector["what"])

@@ -85,9 +85,7 @@ def test_only_a_successor_is_trusted(domain: Path, tmp_path: Path) -> None:
         finish_rollover(domain)
 
 
-def test_an_owner_is_succeeded_by_commands(
-    domain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_owner_is_succeeded_by_commands(domain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     owner, heir, given = tmp_path / "owner", tmp_path / "heir", tmp_path / "a.delegation"
     topic = ["--kind", "topic", "--name", "/a", "--type", "std_msgs/msg/Empty", "--card", tmp_path / "node/node.card"]
     gdp(capsys, "keygen", "owner", owner)

@@ -269,9 +269,7 @@ def test_what_could_not_be_written_is_written_when_the_disk_has_space_again(
     assert caplog.text.count("snapshot not written") == 1
 
 
-def test_what_waits_for_a_full_disk_is_bounded_by_what_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_waits_for_a_full_disk_is_bounded_by_what_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gdp.stores.snapshot.RETRY_S", 0.001)
     monkeypatch.setattr("gdp.nodes.rib_upkeep.CHANGES_MAX", 4)
     site, folder = Site(), tmp_path / "disk"

@@ -73,9 +73,7 @@ def flow(sites: Sites, caller: Client, period_s: float, count: int) -> None:
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("seed", [1, 2])
-def test_any_two_of_three_die_while_requests_flow_and_each_is_answered_once(
-    sites: Sites, mode: str, seed: int
-) -> None:
+def test_any_two_of_three_die_while_requests_flow_and_each_is_answered_once(sites: Sites, mode: str, seed: int) -> None:
     dice = random.Random(seed)
     machines, locals_, _, caller = replicas(sites, mode=mode, timeout_s=5)
     for local in locals_:

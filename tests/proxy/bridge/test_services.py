@@ -108,9 +108,7 @@ def test_two_far_servers_are_both_asked_and_the_first_answer_wins(sites: Sites) 
 @pytest.mark.parametrize("there", [1, 2])
 @pytest.mark.parametrize("here", [1, 2])
 @pytest.mark.parametrize("encoding", ["json", "cbor", "cdr"])
-def test_a_client_and_a_server_of_either_ros(
-    sites: Sites, there: RosVersion, here: RosVersion, encoding: str
-) -> None:
+def test_a_client_and_a_server_of_either_ros(sites: Sites, there: RosVersion, here: RosVersion, encoding: str) -> None:
     rule = f"{SWITCH}, encoding: {encoding}"
     server, client = sites.add(SERVER, expose=[rule], ros=there), sites.add(ROBOT, imports=[rule], ros=here)
     requests: list[bytes] = []

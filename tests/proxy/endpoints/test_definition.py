@@ -34,9 +34,7 @@ def hashes_of(package: str) -> dict[str, str]:
 @pytest.mark.parametrize("package", PACKAGES)
 def test_every_type_has_the_hash_that_rosidl_gave_it(package: str) -> None:
     wrong = [
-        name
-        for name, digest in hashes_of(package).items()
-        if type_hash_of(interface_of(name, class_of)) != digest
+        name for name, digest in hashes_of(package).items() if type_hash_of(interface_of(name, class_of)) != digest
     ]
     assert wrong == []
 

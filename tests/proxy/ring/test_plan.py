@@ -44,9 +44,7 @@ def test_every_switch_gets_a_port_a_link_and_a_device_for_each_attachment(materi
 def test_the_ribs_of_the_edge_domains_know_the_one_above(materials: Materials, tmp_path: Path) -> None:
     uppers = {at.switch: RibConfig.load(materials.rib(at)).upper for at in RING.attached("rib")}
     assert uppers["nuc3"] == ()
-    assert uppers["nuc2"] == uppers["nuc4"] == (
-        load_identity(tmp_path / "nodes" / "rib-nuc3", time.time()).name,
-    )
+    assert uppers["nuc2"] == uppers["nuc4"] == (load_identity(tmp_path / "nodes" / "rib-nuc3", time.time()).name,)
 
 
 def test_both_ends_know_a_topic_by_one_name_and_each_may_do_its_part(materials: Materials, tmp_path: Path) -> None:

@@ -39,4 +39,3 @@ def add_subparsers_on_demand(parser, cli_name, dest, group_name, hide_extensions
             parsers[each]._root_parser = root
             extension.add_arguments(parsers[each], f"{cli_name} {each}")
             del parsers[each]._root_parser
-
