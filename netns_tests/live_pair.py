@@ -30,13 +30,13 @@ from typing import Final
 import yaml
 
 from gdp.crypto.certificates import Role
+from gdp.host import netns_files
+from gdp.host.run_registry import Run, Runs
 from gdp.metadata import Metadata
+from gdp.simulation.namespaces import Namespaces
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE, load_identity
-from gdp.testbed import netns_files
-from gdp.testbed.namespaces import Namespaces
-from gdp.testbed.runs import Run, Runs
-from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
 from gdp.trust.right import Right
 from netns_tests.lifetimes import LEASE_S, LEASES, Lifetime, noted
 from proxy.endpoints.endpoint import proxy_node_name

@@ -11,8 +11,8 @@ from faults.disk import Disk
 from faults.plan import make_topology
 from faults.store import StoreCluster
 
-from gdp.testbed.namespaces import Namespaces
-from gdp.testbed.runs import Runs
+from gdp.host.run_registry import Runs
+from gdp.simulation.namespaces import Namespaces
 
 __all__: list[str] = []
 

@@ -17,9 +17,9 @@ from faults.plan import Flow, Plan, make_topology
 from faults.records import Kind
 from faults.store import has_server
 
-from gdp.testbed.netns_files import processes_inside
-from gdp.testbed.processes import Process
-from gdp.testbed.runs import Runs
+from gdp.host.netns_files import processes_inside
+from gdp.host.processes import Process
+from gdp.host.run_registry import Runs
 from netns_tests.live_pair import until
 from tests.pages import ROOT
 

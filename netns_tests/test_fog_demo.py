@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from fog.demo.stage import STATE, standing_runs, sweep
-from gdp.testbed.runs import Runs
+from gdp.host.run_registry import Runs
 from netns_tests.local_site import leftovers
 from tests.pages import ROOT
 

@@ -16,6 +16,7 @@ import pytest
 from pyroute2 import IPRoute
 
 from gdp.errors import LocalError
+from gdp.host.netns_files import inside
 from gdp.ports.kernel.assembler import Assembler
 from gdp.ports.kernel.device import has_free_peer
 from gdp.ports.kernel.netlink import Questions
@@ -23,7 +24,6 @@ from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.kernel.program import UP
 from gdp.ports.kernel.shapes import PortAt, PortFlag
 from gdp.ports.kernel.syscall import Command, address, bpf, create_link, load_program
-from gdp.testbed.netns_files import inside
 from netns_tests.conftest import MakeKernel
 from netns_tests.spaces import Space
 from netns_tests.test_kernel_plane import LOOK_S, PATIENCE_S, filled

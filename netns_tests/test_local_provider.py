@@ -24,7 +24,7 @@ from fog.providers.local.standing import find
 from fog.providers.local.wire import exists
 from fog.topology import Gateway
 from gdp.errors import LocalError, StoreError
-from gdp.testbed import netns_files
+from gdp.host import netns_files
 from netns_tests.local_site import (
     PATIENCE_S,
     Domain,
@@ -132,7 +132,7 @@ def test_a_frozen_machine_is_taken_at_the_moment_of_its_notice_too(provider: Loc
 def either(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a test run as it does where cgroups may not be written to, too."""
     if request.param == "without":
-        monkeypatch.setattr("gdp.testbed.cgroups._roots", lambda: (None, {}))
+        monkeypatch.setattr("gdp.host.cgroups._roots", lambda: (None, {}))
 
 
 @pytest.mark.usefixtures("either")
@@ -171,7 +171,7 @@ def test_a_slow_machine_has_to_wait_for_its_processor(provider: LocalProvider) -
 
 
 def test_a_machine_without_bounds_cannot_be_slowed(provider: LocalProvider, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gdp.testbed.cgroups._roots", lambda: (None, {}))
+    monkeypatch.setattr("gdp.host.cgroups._roots", lambda: (None, {}))
     machine = booted(provider)
     assert not find(provider.runs, machine).file.is_bounded
     with pytest.raises(LocalError, match="no bound on processor time"):

@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import LocalError
-from gdp.testbed import netns_files
-from gdp.testbed.namespaces import Namespaces
-from gdp.testbed.processes import Process
-from gdp.testbed.runs import Run, Runs, in_first_user_namespace
-from gdp.testbed.topology import chain, ring5
+from gdp.host import netns_files
+from gdp.host.processes import Process
+from gdp.host.run_registry import Run, Runs, in_first_user_namespace
+from gdp.simulation.namespaces import Namespaces
+from gdp.simulation.topology import chain, ring5
 
 pytestmark = pytest.mark.netns
 
@@ -128,10 +128,10 @@ def test_where_root_is_real_ip_netns_finds_the_namespaces(run: Run) -> None:
 ORPHAN = """
 import subprocess, sys, tempfile, signal
 from pathlib import Path
-from gdp.testbed.namespaces import Namespaces
-from gdp.testbed.processes import Process
-from gdp.testbed.runs import Runs
-from gdp.testbed.topology import chain
+from gdp.simulation.namespaces import Namespaces
+from gdp.host.processes import Process
+from gdp.host.run_registry import Runs
+from gdp.simulation.topology import chain
 tempfile.tempdir = sys.argv[1]
 run = Runs(Path(sys.argv[1]) / "runs").start()
 namespaces = Namespaces(chain(2), run)

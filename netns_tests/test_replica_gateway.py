@@ -30,9 +30,9 @@ from fog.supervisor.ground import local_provider
 from fog.supervisor.journal import Journal
 from fog.topology import AUTOMATIC_REPLICA, Gateway
 from gdp.errors import LocalError
+from gdp.host import netns_files
 from gdp.limits import CALL_QUIET_S
 from gdp.metadata import Metadata
-from gdp.testbed import netns_files
 from netns_tests.local_site import PATIENCE_S, Domain, leftovers, machine_of, plain_gateway, spec, ticking, until
 from netns_tests.spaces import Space
 from netns_tests.test_fog import Fog, left_of

@@ -14,7 +14,7 @@ from typing import Final
 
 import pytest
 
-from gdp.testbed.runs import Runs
+from gdp.host.run_registry import Runs
 from netns_tests.lifetimes import LEASE_S, Lifetime, noted
 from proxy.endpoints.bag import BagReader
 

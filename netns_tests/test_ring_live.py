@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import LocalError
-from gdp.testbed.runs import Runs
+from gdp.host.run_registry import Runs
 from netns_tests.lifetimes import LEASE_S
 from netns_tests.test_ring import PROJECT, WHERE, command, crossed, left_of, ring, topics
 from proxy.endpoints.ros1.install import rospy_folder

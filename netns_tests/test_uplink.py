@@ -19,13 +19,13 @@ import yaml
 from pyroute2 import IPRoute
 
 from gdp.crypto.certificates import Role
+from gdp.host import netns_files
+from gdp.host.run_registry import Run, Runs
 from gdp.metadata import Metadata
+from gdp.simulation.namespaces import Namespaces
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, ROOT_CERTIFICATE
-from gdp.testbed import netns_files
-from gdp.testbed.namespaces import Namespaces
-from gdp.testbed.runs import Run, Runs
-from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
 from gdp.trust.right import Right
 from proxy.ring.plan import Credentials, rib_yaml, switch_yaml
 from tests.pages import ROOT

@@ -20,8 +20,8 @@ from fog.demo.play import Outcome, Pace, play
 from fog.demo.stage import Stage, end_all_of, standing_runs, sweep
 from fog.demo.view import View
 from gdp.errors import GdpError
-from gdp.testbed.interruption import Interrupted, interruptible, let_nothing_interrupt
-from gdp.testbed.runs import Run
+from gdp.host.interruption import Interrupted, interruptible, let_nothing_interrupt
+from gdp.host.run_registry import Run
 from proxy.ring.child import ChildError
 
 __all__ = ["main"]

@@ -22,10 +22,10 @@ from typing import Final
 import yaml
 
 from gdp.errors import LocalError
+from gdp.host.run_registry import Run, Runs, outer_uid
+from gdp.simulation.namespaces import Namespaces
+from gdp.simulation.topology import Attachment, DomainPlan, Topology, ring5
 from gdp.stores.keyring import CARD, DELEGATIONS, ROOT_CERTIFICATE
-from gdp.testbed.namespaces import Namespaces
-from gdp.testbed.runs import Run, Runs, outer_uid
-from gdp.testbed.topology import Attachment, DomainPlan, Topology, ring5
 from proxy.ring.child import Child
 from proxy.ring.children import Children
 from proxy.ring.materials import Materials

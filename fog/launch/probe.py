@@ -19,7 +19,7 @@ from fog.child_environment import child_environment
 from fog.cluster import CloudNode
 from fog.launch.resolve import PYTHON, command_line, file_of
 from gdp.errors import LocalError
-from gdp.testbed.runs import Runs
+from gdp.host.run_registry import Runs
 
 __all__ = ["cache_file", "free_domain", "kept", "offered"]
 

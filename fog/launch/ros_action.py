@@ -30,7 +30,7 @@ from fog.launch.hold import Gate
 from fog.launch.probe import offered
 from fog.launch.unreturned import watch_ros_launch
 from gdp.errors import GdpError, LocalError
-from gdp.testbed.runs import Run, Runs
+from gdp.host.run_registry import Run, Runs
 
 __all__ = ["FogCluster"]
 

@@ -25,7 +25,7 @@ from fog.providers.local.wire import delete
 from fog.providers.provider import Provider
 from fog.site import SCRATCH, Site
 from gdp.errors import LocalError
-from gdp.testbed.runs import Runs
+from gdp.host.run_registry import Runs
 
 if TYPE_CHECKING:
     from fog.providers.local.provider import LocalProvider

@@ -29,7 +29,7 @@ from fog.supervisor.supervisor import Supervisor
 from fog.supervisor.watch import Watch
 from fog.topology import Gateway
 from gdp.errors import StoreError
-from gdp.testbed.processes import Process
+from gdp.host.processes import Process
 
 __all__ = ["supervise"]
 

@@ -10,8 +10,8 @@ import sys
 from collections.abc import Coroutine, Iterable, Mapping, Sequence
 from typing import Final, TypeVar
 
-from gdp.testbed.namespaces import Namespaces
-from gdp.testbed.runs import Run
+from gdp.host.run_registry import Run
+from gdp.simulation.namespaces import Namespaces
 from proxy.ring.child import Child
 from proxy.ring.events import Event
 

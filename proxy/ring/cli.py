@@ -19,10 +19,10 @@ from rich.console import Console
 from rich.markup import escape
 
 from gdp.errors import GdpError, LocalError
+from gdp.host.interruption import Interrupted, interruptible, let_nothing_interrupt
+from gdp.host.run_registry import Run, Runs
 from gdp.limits import CLAIM_LEASE_S
-from gdp.testbed.interruption import Interrupted, interruptible, let_nothing_interrupt
-from gdp.testbed.runs import Run, Runs
-from gdp.testbed.topology import MTU_BYTES
+from gdp.simulation.topology import MTU_BYTES
 from proxy.config import Encoding
 from proxy.ring.child import ChildError
 from proxy.ring.faults import Cut, Kill, Roam

@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from gdp.testbed.namespaces import Namespaces
-from gdp.testbed.runs import Run
+from gdp.host.run_registry import Run
+from gdp.simulation.namespaces import Namespaces
 from proxy.ring.child import Child
 from proxy.ring.children import READY_S, Children
 from proxy.ring.faults import Cut, Kill, Roam, roamers

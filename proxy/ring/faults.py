@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias, cast, get_args
 
 from gdp.errors import LocalError
-from gdp.testbed.topology import Attachment, Topology
+from gdp.simulation.topology import Attachment, Topology
 
 __all__ = ["Cut", "Fault", "Kill", "KillRole", "Roam", "check_faults", "roamers"]
 

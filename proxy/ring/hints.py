@@ -9,7 +9,7 @@ import shlex
 import sys
 from pathlib import Path
 
-from gdp.testbed.runs import in_first_user_namespace
+from gdp.host.run_registry import in_first_user_namespace
 from proxy.ring.fabric import Fabric
 from proxy.ring.live_run import LiveRing
 from proxy.ring.plan import METRICS_PORTS

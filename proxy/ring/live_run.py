@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
-from gdp.testbed.runs import Run
-from gdp.testbed.topology import Attachment
+from gdp.host.run_registry import Run
+from gdp.simulation.topology import Attachment
 from proxy.endpoints.ros1.install import rospy_folder
 from proxy.ring.child import Child
 from proxy.ring.events import Event

@@ -20,9 +20,9 @@ from gdp.crypto.certificates import Role
 from gdp.limits import CLAIM_LEASE_S
 from gdp.metadata import Metadata
 from gdp.names import Name
+from gdp.simulation.topology import Attachment, Topology
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
-from gdp.testbed.topology import Attachment, Topology
 from gdp.trust.right import Right
 from proxy.config import Encoding
 from proxy.ring.live_plan import Carried, Side

@@ -12,7 +12,7 @@ from typing import Final, Literal
 
 from gdp.errors import LocalError
 from gdp.limits import CLAIM_LEASE_S, LEASE_MAX_S, LEASE_MIN_S
-from gdp.testbed.topology import MTU_BYTES, Topology, ring5
+from gdp.simulation.topology import MTU_BYTES, Topology, ring5
 from proxy.config import Encoding
 from proxy.ring.faults import Cut, Fault, Kill, Roam, check_faults
 

@@ -12,7 +12,7 @@ from typing import Final, TypeAlias
 
 from gdp.limits import CLAIM_LEASE_S
 from gdp.names import Name
-from gdp.testbed.topology import Attachment, DomainPlan, Topology
+from gdp.simulation.topology import Attachment, DomainPlan, Topology
 from proxy.config import Encoding
 from proxy.serial.channel import Channel
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import ConfigError
-from gdp.testbed.runs import Run
+from gdp.host.run_registry import Run
 from proxy.compare import compare
 from proxy.endpoints.bag import BagReader
 from proxy.ring.child import Child

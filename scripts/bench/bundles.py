@@ -28,8 +28,8 @@ from plot import panel_of, require_plot, save_bars
 from report import Goal, Rounds, Settings, progress, show, write_json
 
 from gdp.errors import LocalError
+from gdp.host.run_registry import Runs
 from gdp.nodes.spin import SPIN_US
-from gdp.testbed.runs import Runs
 
 BUNDLES: Final = "bundles"
 SINGLE: Final = "one seal a message"

@@ -13,10 +13,10 @@ from bundles_end import topics
 from peers.chain import LEFT, MIDDLE, RIGHT, Chain
 from peers.process import FailedError, Started
 
+from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
 from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, ROOT_CERTIFICATE
-from gdp.testbed.runs import Run
 from gdp.trust.right import Right
 from proxy.ring.materials import Materials
 

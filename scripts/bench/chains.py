@@ -1,6 +1,6 @@
 """A chain of namespaces for the forwarding and scale benches: a source, some switches, a sink, each in its own.
 
-Place: I/O; ``gdp.testbed`` makes and removes the namespaces. What the switches are is ``contenders.py``'s.
+Place: I/O; ``gdp.simulation`` makes and removes the namespaces. What the switches are is ``contenders.py``'s.
 ::
 
     s1 (source) -- s2 -- ... -- s(n+1) -- s(n+2) (sink)        devices are called like the neighbour they lead to
@@ -19,10 +19,10 @@ from pyroute2 import IPRoute
 from search import Try
 from worker import Worker, floats, integer, number
 
-from gdp.testbed import netns_files
-from gdp.testbed.namespaces import Namespaces
-from gdp.testbed.runs import Runs
-from gdp.testbed.topology import chain
+from gdp.host import netns_files
+from gdp.host.run_registry import Runs
+from gdp.simulation.namespaces import Namespaces
+from gdp.simulation.topology import chain
 
 __all__ = ["Chain"]
 

@@ -48,7 +48,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gdp.errors import GdpError
-from gdp.testbed.runs import Runs
+from gdp.host.run_registry import Runs
 
 SECONDS: Final = 60.0
 AFTER_S: Final = 8.0  # that everything is watched after the last fault

@@ -40,7 +40,7 @@ from report import Goal, Rounds, percentile, progress, show, write_json
 from search import LOSS_MAX, highest
 
 from gdp.errors import LocalError
-from gdp.testbed.runs import Runs
+from gdp.host.run_registry import Runs
 
 SIZES: Final = {1_500: (128, 1_400), 9_000: (8_900,)}
 LENGTHS: Final = (1, 3)

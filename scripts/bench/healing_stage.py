@@ -25,8 +25,8 @@ from fog.supervisor.background import pid_of
 from fog.supervisor.ground import local_provider
 from fog.supervisor.journal import Journal
 from fog.supervisor.record import Record
-from gdp.testbed.namespaces import Namespaces
-from gdp.testbed.topology import DomainPlan, Topology
+from gdp.simulation.namespaces import Namespaces
+from gdp.simulation.topology import DomainPlan, Topology
 
 __all__ = ["Cluster"]
 

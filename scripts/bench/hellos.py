@@ -29,7 +29,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gdp.errors import GdpError
-from gdp.testbed.runs import Runs
+from gdp.host.run_registry import Runs
 
 OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks" / "hellos.json"
 GOAL: Final = 1.0  # percent of a core

@@ -2,7 +2,7 @@
 
 Place: I/O; reads /proc and asks devices, by the old one-word ethtool requests, because the ``ethtool`` command and its
 netlink family are often absent. Whatever is about devices speaks of the namespace that the calling thread is in
-(``gdp.testbed.netns_files.inside`` enters another).
+(``gdp.host.netns_files.inside`` enters another).
 Source: ``linux/ethtool.h``, ``linux/sockios.h``, netdevice(7).
 
     state = machine_state()                            call it first: it also takes the load before the bench

@@ -40,8 +40,8 @@ from plot import Panel, panel_of, require_plot, save_bars
 from report import Rounds, Settings, show, write_json
 
 from gdp.errors import LocalError
+from gdp.host.run_registry import Runs
 from gdp.nodes.spin import SPIN_US
-from gdp.testbed.runs import Runs
 
 SIZES: Final = (100, 10_000, 921_600)
 MTUS: Final = (1_500, 9_000)

@@ -36,8 +36,8 @@ from priority_row import MTU, SHAPED_BITS_S, Row
 from report import Goal, Rounds, Settings, percentile, progress, show, write_json
 
 from gdp.errors import LocalError
+from gdp.host.run_registry import Run, Runs
 from gdp.nodes.spin import SPIN_US
-from gdp.testbed.runs import Run, Runs
 
 PLANES: Final = ("kernel", "raw")
 LINKS: Final = {"free": "free links", "shaped": f"{SHAPED_BITS_S // 1_000_000} Mbit/s"}

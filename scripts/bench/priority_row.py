@@ -1,6 +1,6 @@
 """The row of the bench of priorities: A and a second sender C at the first of three switches, B behind the last.
 
-Place: shell; makes namespaces, keys and processes through ``gdp.testbed`` and the commands that robots run.
+Place: shell; makes namespaces, keys and processes through ``gdp.simulation`` and the commands that robots run.
 ::
 
     a --.
@@ -21,13 +21,13 @@ from peers.process import FailedError, Started
 from priority_end import CONTROL, IMAGES
 from pyroute2 import IPRoute
 
+from gdp.host import netns_files
+from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
+from gdp.simulation.namespaces import Namespaces
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, ROOT_CERTIFICATE
-from gdp.testbed import netns_files
-from gdp.testbed.namespaces import Namespaces
-from gdp.testbed.runs import Run
-from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
 from gdp.trust.right import Right
 from proxy.ring.materials import Materials
 

@@ -38,7 +38,7 @@ from plot import Panel, panel_of, require_plot, save_bars  # noqa: E402
 from report import Goal, Rounds, Settings, percentile, progress, show, write_json  # noqa: E402
 
 from gdp.errors import LocalError  # noqa: E402
-from gdp.testbed.runs import Runs  # noqa: E402
+from gdp.host.run_registry import Runs  # noqa: E402
 
 KILLED, ADDED, HEDGED = "killed", "added", "hedged"
 CASES: Final = {

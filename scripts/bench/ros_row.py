@@ -34,13 +34,13 @@ import yaml
 from peers.process import FailedError, Started
 from pyroute2 import IPRoute
 
+from gdp.host import netns_files
+from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
+from gdp.simulation.namespaces import Namespaces
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
-from gdp.testbed import netns_files
-from gdp.testbed.namespaces import Namespaces
-from gdp.testbed.runs import Run
-from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
 from gdp.trust.right import Right
 from proxy.config import Encoding
 from proxy.ring.materials import Materials

@@ -24,7 +24,7 @@ from report import Goal, Rounds, Settings, progress, show, write_json
 from ros_row import BUFFER_BYTES, Carried, Row
 
 from gdp.errors import LocalError
-from gdp.testbed.runs import Runs
+from gdp.host.run_registry import Runs
 
 __all__ = ["DIRECT", "Bench", "Options", "Turn", "parse", "perform"]
 

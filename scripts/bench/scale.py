@@ -40,7 +40,7 @@ from search import LOSS_MAX, Try, highest
 from worker import Worker, number
 
 from gdp.errors import LocalError
-from gdp.testbed.runs import Runs
+from gdp.host.run_registry import Runs
 
 PLANES: Final = ("kernel", "raw")
 SIZES: Final = (1_000, 100_000, 1_000_000)

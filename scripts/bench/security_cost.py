@@ -36,7 +36,7 @@ from peers.figures import MEDIAN
 from peers.process import FailedError
 from report import Goal, Rounds, progress, show
 
-from gdp.testbed.runs import Runs
+from gdp.host.run_registry import Runs
 
 __all__ = ["add_arguments", "run"]
 

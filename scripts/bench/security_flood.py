@@ -56,10 +56,10 @@ from gdp.crypto.keys import SigningKey
 from gdp.crypto.validity import Validity
 from gdp.frame.codec import KIND_AT
 from gdp.frame.kinds import Kind
+from gdp.host import netns_files
+from gdp.host.run_registry import Run, Runs
 from gdp.ports.link import LinkWatch
 from gdp.stores.keyring import load_identity
-from gdp.testbed import netns_files
-from gdp.testbed.runs import Run, Runs
 
 __all__ = ["add_arguments", "run"]
 

@@ -59,11 +59,11 @@ from gdp.frame.kinds import Kind
 from gdp.message.replay import ReplayWindow
 from gdp.message.status import Status
 from gdp.rib.route import Route
+from gdp.simulation.memory import EPOCH_UNIX_S, MemoryNetwork
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from gdp.simulation.world import World
 from gdp.switch.claims import Claims
 from gdp.switch.table import Table as ForwardingTable
-from gdp.testbed.memory import EPOCH_UNIX_S, MemoryNetwork
-from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
-from gdp.testbed.world import World
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 from tests.insiders.oracle import signing_oracle
@@ -570,7 +570,7 @@ def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
     begun_s, first = time.monotonic(), held["seeds"][1] + 1 if held else options.seed
     seed = first
     with ExitStack() as stack:
-        stack.enter_context(mock.patch("gdp.testbed.world.MemoryNetwork", RecordingNetwork))
+        stack.enter_context(mock.patch("gdp.simulation.world.MemoryNetwork", RecordingNetwork))
         stack.enter_context(signing_oracle())
         while counts.total() < options.tries and time.monotonic() - begun_s < options.seconds:
             with reproducible_keys(seed), _without(options.control):

@@ -42,13 +42,13 @@ from gdp.effects import Instant
 from gdp.errors import StatementError
 from gdp.frame.codec import ETHER_BYTES, decode
 from gdp.frame.kinds import Kind as FrameKind
+from gdp.host.run_registry import Runs
 from gdp.metadata import Metadata
 from gdp.nodes.revocation_upkeep import RevocationUpkeep
+from gdp.simulation.topology import DomainPlan, Link, Topology
+from gdp.simulation.world import World
 from gdp.stores.files import read_public
 from gdp.stores.keyring import NODE_CERTIFICATE, load_owner
-from gdp.testbed.runs import Runs
-from gdp.testbed.topology import DomainPlan, Link, Topology
-from gdp.testbed.world import World
 from gdp.trust.revocation import Revocation
 from gdp.trust.revocations import Revocations
 

@@ -24,8 +24,8 @@ from rich.table import Table
 from gdp.client.member import Topic
 from gdp.client.publisher import Publisher
 from gdp.metadata import Metadata
-from gdp.testbed.topology import ring5
-from gdp.testbed.world import World
+from gdp.simulation.topology import ring5
+from gdp.simulation.world import World
 from gdp.trust.card import Card
 from gdp.trust.right import Right
 

@@ -38,9 +38,9 @@ from rich.console import Console
 from rich.table import Table
 
 from gdp.errors import GdpError
-from gdp.testbed.runs import Runs
-from gdp.testbed.topology import chain
-from gdp.testbed.world import World
+from gdp.host.run_registry import Runs
+from gdp.simulation.topology import chain
+from gdp.simulation.world import World
 from gdp.trust.right import Right
 from gdp.trust.verifier import ADCERTS_REMEMBERED
 

@@ -37,7 +37,7 @@ from rich.table import Table
 from survive_rows import NEW_TOPICS, ROWS, Row
 
 from gdp.errors import GdpError
-from gdp.testbed.runs import Run, Runs
+from gdp.host.run_registry import Run, Runs
 
 OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks" / "survive.json"
 ROUNDS: Final = 30

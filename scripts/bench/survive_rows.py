@@ -22,7 +22,7 @@ from faults.link_faults import FrameFaults
 from faults.overlay import Overlay
 from faults.plan import Flow, Plan, make_topology
 
-from gdp.testbed.topology import Link
+from gdp.simulation.topology import Link
 
 __all__ = ["NEW_TOPICS", "ROWS", "Row"]
 

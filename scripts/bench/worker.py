@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
-from gdp.testbed.namespaces import Namespaces
+from gdp.simulation.namespaces import Namespaces
 
 __all__ = ["Answer", "Worker", "answer", "command", "command_waits", "floats", "integer", "number"]
 

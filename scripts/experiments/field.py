@@ -26,12 +26,12 @@ import yaml
 from bench_path import ROOT
 from peers.process import Started
 
+from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
+from gdp.simulation.namespaces import Namespaces
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
-from gdp.testbed.namespaces import Namespaces
-from gdp.testbed.runs import Run
-from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
 from gdp.trust.right import Right
 from proxy.ring.materials import Materials
 

@@ -30,8 +30,8 @@ from ros_row import DIRECT_DOMAIN, LEFT, READY_S, RIGHT, Carried, Row
 from study import JsonOption, OutOption, QuickOption, place_of
 
 from gdp.errors import LocalError
-from gdp.testbed.cgroups import Cgroup
-from gdp.testbed.runs import Run, Runs
+from gdp.host.cgroups import Cgroup
+from gdp.host.run_registry import Run, Runs
 
 __all__: list[str] = []
 

@@ -26,7 +26,7 @@ from samples import Sample, Summary
 from series import Series
 
 from gdp.errors import LocalError
-from gdp.testbed.runs import Runs
+from gdp.host.run_registry import Runs
 
 __all__ = [
     "Asking",

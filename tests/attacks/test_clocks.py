@@ -16,10 +16,10 @@ from gdp.frame.kinds import Kind
 from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_LEASE_S, LINK_STATE_REFRESH_S
 from gdp.rib.machine import Rib, RibSettings
 from gdp.rib.store import MemoryStore
+from gdp.simulation.world import World
 from gdp.switch.link_states import PAST_S
 from gdp.switch.machine import Switch
 from gdp.switch.table import Table
-from gdp.testbed.world import World
 from tests.gdp.switch.net import known, link, state
 from tests.journeys.flows import SERVER, Flow, flowing, ring
 from tests.journeys.test_attacks import mac_of

@@ -10,9 +10,9 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
+from gdp.simulation.world import World
 from gdp.switch.machine import Switch
 from gdp.switch.trees import Tree
-from gdp.testbed.world import World
 from tests.journeys.flows import SERVER, Flow, flowing, ring
 from tests.journeys.test_attacks import counted, still_flows
 

@@ -15,10 +15,10 @@ from gdp.crypto.validity import Validity
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
 from gdp.names import Name
+from gdp.simulation.memory import Cable
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from gdp.simulation.world import World
 from gdp.switch.waiting import switch_waits
-from gdp.testbed.memory import Cable
-from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
-from gdp.testbed.world import World
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
 from tests.journeys.flows import Flow, Tap, flowing

@@ -12,7 +12,7 @@ from gdp.crypto.validity import Validity
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
 from gdp.names import Name
-from gdp.testbed.world import World
+from gdp.simulation.world import World
 from gdp.trust.rtcert import RtCert
 from tests.journeys.flows import ROBOT, flowing, ring
 from tests.journeys.test_attacks import mac_of, still_flows

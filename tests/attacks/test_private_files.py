@@ -9,11 +9,11 @@ import pytest
 
 from fog.site import open_site
 from gdp.errors import LocalError
+from gdp.host.run_registry import Runs
 from gdp.nodes.config import ClusterConfig
 from gdp.stores.files import private, read_private, write_all
 from gdp.stores.issue import make_domain
 from gdp.stores.keyring import load_domain
-from gdp.testbed.runs import Runs
 from tests.attacks.owners import NOBODY, give_away
 
 

@@ -25,8 +25,8 @@ from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.rib.machine import Rib, RibSettings
 from gdp.rib.store import MemoryStore
+from gdp.simulation.world import World
 from gdp.switch.attached import Attached
-from gdp.testbed.world import World
 from gdp.trust.claim import Claim, make_claim
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right

@@ -20,7 +20,7 @@ from gdp.frame.kinds import Kind
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.nodes.revocation_upkeep import RevocationUpkeep
-from gdp.testbed.world import World
+from gdp.simulation.world import World
 from gdp.trust.revocation import Revocation
 from gdp.trust.revocations import hash_of
 from gdp.trust.right import Right

@@ -16,7 +16,7 @@ from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import CLAIM_MAX_BYTES, CONTROL_MAX_BYTES, HOPS_MAX, WITHDRAWAL_MAX_BYTES
 from gdp.names import ZERO, Name
-from gdp.testbed.world import World
+from gdp.simulation.world import World
 from gdp.trust.claim import make_claim
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert

@@ -9,7 +9,7 @@ from typing import Any
 
 from gdp.effects import Transmit
 from gdp.frame.codec import ETHER_BYTES, HOPS_AT
-from gdp.testbed.memory import MemoryNetwork
+from gdp.simulation.memory import MemoryNetwork
 
 __all__ = ["Echo", "TracingNetwork"]
 

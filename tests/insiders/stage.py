@@ -22,9 +22,9 @@ from gdp.control.hello import ECHO_BYTES
 from gdp.crypto.identity import Identity
 from gdp.limits import RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX
 from gdp.rib.machine import RibSettings
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from gdp.simulation.world import World
 from gdp.switch.machine import Switch
-from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
-from gdp.testbed.world import World
 from gdp.trust.domain import Policy
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right

@@ -10,7 +10,7 @@ from collections.abc import Generator
 
 import pytest
 
-from gdp.testbed.world import World
+from gdp.simulation.world import World
 
 LEASES = 3
 _WORLDS = pytest.StashKey[list[World]]()

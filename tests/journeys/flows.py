@@ -12,8 +12,8 @@ from gdp.client.member import Member, Topic
 from gdp.client.publisher import Publisher
 from gdp.frame.codec import ETHER_BYTES, Header, decode
 from gdp.names import Name
-from gdp.testbed.topology import ring5
-from gdp.testbed.world import World
+from gdp.simulation.topology import ring5
+from gdp.simulation.world import World
 from gdp.trust.right import Right
 
 ROBOT, SERVER = "nuc1/robot", "nuc5/server"

@@ -20,8 +20,8 @@ from hypothesis import strategies as st
 
 from gdp.crypto.keys import SigningKey, SoftwareKey
 from gdp.limits import DEAD_S, HELLO_S, JOIN_LEASE_S
-from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
-from gdp.testbed.world import World
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from gdp.simulation.world import World
 from tests.journeys.flows import Flow, advertise
 
 SWITCHES_MAX: Final = 40

@@ -9,7 +9,7 @@ from math import ceil
 from gdp.client.member import Member, Message
 from gdp.client.publisher import Publisher
 from gdp.names import Name
-from gdp.testbed.world import World
+from gdp.simulation.world import World
 from gdp.trust.right import Right
 from tests.journeys.flows import STEP_S
 

@@ -17,12 +17,12 @@ from gdp.errors import DropReason
 from gdp.frame.codec import ETHER_BYTES, HOPS_AT, KIND_AT
 from gdp.frame.kinds import Kind
 from gdp.names import Name
+from gdp.simulation import world as worlds
+from gdp.simulation.memory import Cable, MemoryNetwork
+from gdp.simulation.topology import chain
+from gdp.simulation.world import World
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.unicast import Unicast
-from gdp.testbed import world as worlds
-from gdp.testbed.memory import Cable, MemoryNetwork
-from gdp.testbed.topology import chain
-from gdp.testbed.world import World
 from tests.journeys.flows import Tap, advertise, flowing
 
 pytestmark = pytest.mark.momentary("the books close once the last frame has come to rest, before any lease ends")

@@ -21,9 +21,9 @@ from gdp.frame.codec import HEADER_BYTES, Header, decode, encode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import CONTROL_JOIN_BYTES, CONTROL_PATIENCE_S, HOPS_MAX
 from gdp.names import ZERO, Name
+from gdp.simulation.world import World
 from gdp.switch.machine import Switch
 from gdp.switch.places import QUESTIONS_MAX
-from gdp.testbed.world import World
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 
 Injector = Callable[[bytes], None]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from gdp.frame.kinds import Kind
-from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
-from gdp.testbed.world import World
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from gdp.simulation.world import World
 from tests.journeys.flows import LEASE_S, Flow, Tap, flowing
 
 P, R, NEAR, HERE = "s1/robot", "s4/reader", "s2/near", "s1/here"

@@ -10,11 +10,11 @@ from gdp.client.waiting import attachment_waits
 from gdp.control.waiting import WaitReason
 from gdp.errors import DropReason
 from gdp.limits import CLAIM_LEASE_S, DEAD_S
+from gdp.simulation.memory import Cable
+from gdp.simulation.world import World
 from gdp.switch.machine import Switch
 from gdp.switch.table import Table
 from gdp.switch.waiting import switch_waits
-from gdp.testbed.memory import Cable
-from gdp.testbed.world import World
 from gdp.trust.right import Right
 from tests.journeys.flows import ROBOT, SERVER, advertise, flowing, ring
 

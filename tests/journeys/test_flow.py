@@ -6,8 +6,8 @@ import pytest
 
 from gdp.frame.kinds import Kind
 from gdp.limits import DEAD_S, JOIN_LEASE_S
-from gdp.testbed.topology import ring5
-from gdp.testbed.world import World
+from gdp.simulation.topology import ring5
+from gdp.simulation.world import World
 from gdp.trust.right import Right
 from tests.journeys.flows import LEASE_S, ROBOT, SERVER, Tap, advertise, flowing, ring
 

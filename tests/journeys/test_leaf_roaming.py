@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from gdp.frame.kinds import Kind
-from gdp.testbed.memory import Cable
-from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
-from gdp.testbed.world import World
+from gdp.simulation.memory import Cable
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from gdp.simulation.world import World
 from tests.journeys.flows import Flow, Tap, flowing
 
 LEASE_S = 2.5

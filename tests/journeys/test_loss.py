@@ -6,8 +6,8 @@ import pytest
 
 from gdp.limits import CLAIM_LEASE_S, READER_GRACE_S, READER_LEASE_S
 from gdp.message.loss import LossReason
-from gdp.testbed.topology import chain
-from gdp.testbed.world import World
+from gdp.simulation.topology import chain
+from gdp.simulation.world import World
 from tests.journeys.flows import Flow, advertise, flowing
 
 SOURCE, READER = "s1/left", "s2/right"

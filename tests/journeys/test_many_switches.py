@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import random
 
-from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
-from gdp.testbed.world import World
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from gdp.simulation.world import World
 from tests.journeys.flows import flowing
 
 DOMAINS, SWITCHES = 8, 25

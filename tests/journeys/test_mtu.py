@@ -11,8 +11,8 @@ import pytest
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
 from gdp.limits import MTU_HOLD_S, MTU_NARROWINGS
-from gdp.testbed.topology import Topology, chain, ring5
-from gdp.testbed.world import World
+from gdp.simulation.topology import Topology, chain, ring5
+from gdp.simulation.world import World
 from tests.journeys.flows import LEASE_S, ROBOT, SERVER, Flow, Tap, advertise, flowing, ring
 
 MIDDLE = frozenset(("nuc2", "nuc3"))

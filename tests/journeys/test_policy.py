@@ -6,8 +6,8 @@ import pytest
 
 from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import Kind
-from gdp.testbed.topology import ring5
-from gdp.testbed.world import World
+from gdp.simulation.topology import ring5
+from gdp.simulation.world import World
 from gdp.trust.right import Right
 from tests.journeys.flows import SERVER, Tap, advertise, flowing, ring
 

@@ -9,9 +9,9 @@ import pytest
 
 from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Kind
-from gdp.testbed.memory import Cable
-from gdp.testbed.topology import DomainPlan, Link, Topology
-from gdp.testbed.world import World
+from gdp.simulation.memory import Cable
+from gdp.simulation.topology import DomainPlan, Link, Topology
+from gdp.simulation.world import World
 from tests.journeys.flows import LEASE_S
 
 SQUARE = Topology(

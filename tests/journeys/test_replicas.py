@@ -12,8 +12,8 @@ from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import Kind
 from gdp.limits import CALL_LAG_S, CALL_QUIET_S, CLAIM_LEASE_S, FLIGHT_START_BYTES
 from gdp.names import Name
-from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology, chain
-from gdp.testbed.world import World
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology, chain
+from gdp.simulation.world import World
 from gdp.trust.right import Right
 from tests.journeys.flows import LEASE_S, Tap
 from tests.journeys.services import Party, meet, outlive, work

@@ -7,8 +7,8 @@ import pytest
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
-from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
-from gdp.testbed.world import World
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from gdp.simulation.world import World
 from gdp.trust.delegation import Delegation
 from gdp.trust.revocation import Revocation
 from tests.journeys.flows import LEASE_S, ROBOT, SERVER, Tap, flowing, ring

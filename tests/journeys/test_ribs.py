@@ -7,8 +7,8 @@ from functools import partial
 
 from gdp.control.query import Query
 from gdp.limits import CLAIM_LEASE_S
-from gdp.testbed.topology import Attachment, ring5
-from gdp.testbed.world import World
+from gdp.simulation.topology import Attachment, ring5
+from gdp.simulation.world import World
 from tests.journeys.flows import ROBOT, SERVER, advertise, flowing
 
 LEASES_S = 3 * CLAIM_LEASE_S

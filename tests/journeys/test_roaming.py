@@ -10,7 +10,7 @@ from gdp.crypto.statements import parse
 from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.rib.route import Route
-from gdp.testbed.world import World
+from gdp.simulation.world import World
 from gdp.trust.claim import ClaimBody
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 

@@ -10,7 +10,7 @@ from gdp.client.member import Topic
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.validity import Validity
 from gdp.limits import CLOCK_SKEW_S
-from gdp.testbed.world import World
+from gdp.simulation.world import World
 from gdp.trust.card import Card
 from gdp.trust.domain import Policy
 from gdp.trust.owner import Owner

@@ -12,7 +12,7 @@ from gdp.effects import Arrival
 from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import Kind
 from gdp.limits import CLAIM_LEASE_S, READER_LEASE_S
-from gdp.testbed.world import World
+from gdp.simulation.world import World
 from gdp.trust.adcert import AdCert
 from gdp.trust.right import Right
 from tests.journeys.flows import ROBOT, SERVER, Tap, ring

@@ -14,8 +14,8 @@ from gdp.errors import DropReason
 from gdp.frame.codec import decode
 from gdp.frame.kinds import CONTROL_FROM
 from gdp.limits import READER_LEASE_S, WINDOW_BYTES
-from gdp.testbed.topology import chain
-from gdp.testbed.world import World
+from gdp.simulation.topology import chain
+from gdp.simulation.world import World
 from tests.journeys.flows import LEASE_S, Flow, flowing
 
 SOURCE, NEAR, FAR, SLOW = "s1/left", "s1/near", "s3/right", "s2/slow"

@@ -8,8 +8,8 @@ import pytest
 
 from gdp.frame.kinds import Kind
 from gdp.limits import CLAIM_LEASE_S
-from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
-from gdp.testbed.world import World
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from gdp.simulation.world import World
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 
 LONG_S = 3 * CLAIM_LEASE_S + 8

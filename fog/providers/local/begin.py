@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
-from gdp.testbed.runs import Run
+from gdp.host.run_registry import Run
 
 __all__ = ["begin"]
 

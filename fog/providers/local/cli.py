@@ -13,7 +13,7 @@ import typer
 
 from fog.providers.local import trouble
 from gdp.cli.node import failing_clearly
-from gdp.testbed.runs import Runs
+from gdp.host.run_registry import Runs
 
 __all__ = ["local_app"]
 

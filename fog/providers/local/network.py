@@ -33,8 +33,8 @@ from fog.providers.local.wire import (
 )
 from fog.topology import Gateway
 from gdp.errors import LocalError, StoreError
-from gdp.testbed.processes import Process
-from gdp.testbed.runs import Record, Run, Runs
+from gdp.host.processes import Process
+from gdp.host.run_registry import Record, Run, Runs
 
 __all__ = ["GatewayBoot", "Network"]
 

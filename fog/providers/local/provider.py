@@ -1,6 +1,6 @@
 """Machines on this one: each a network namespace with an address, a process group, bounds and programs of its own.
 
-Place: shell; needs root of the machine or of a user namespace. A machine is a kept run (``gdp/testbed/runs.py``) with
+Place: shell; needs root of the machine or of a user namespace. A machine is a kept run (``gdp.host.run_registry``) with
 ``machine.json`` in its folder: all that is known lies there, so that whoever comes later, or after a crash, finds it.
 They live on when their creator is killed, as machines elsewhere do.
 """
@@ -33,8 +33,8 @@ from fog.providers.local.trouble import hold, kill
 from fog.providers.local.wire import MACHINE_DEVICE, UP, UPLINK_BRIDGE, delete, exists, join, make_space, plug
 from fog.topology import AUTOMATIC, Gateway
 from gdp.errors import LocalError, StoreError
-from gdp.testbed.processes import end_all
-from gdp.testbed.runs import Run, Runs
+from gdp.host.processes import end_all
+from gdp.host.run_registry import Run, Runs
 
 __all__ = ["UPLINK", "LocalProvider"]
 

@@ -14,9 +14,9 @@ from fog.machine import Machine, MachineState
 from fog.providers.local.machine_file import MachineFile
 from fog.providers.local.wire import space_path
 from gdp.errors import LocalError
-from gdp.testbed.cgroups import Cgroup
-from gdp.testbed.processes import Process
-from gdp.testbed.runs import Record, Runs
+from gdp.host.cgroups import Cgroup
+from gdp.host.processes import Process
+from gdp.host.run_registry import Record, Runs
 
 __all__ = ["Standing", "find", "standing"]
 

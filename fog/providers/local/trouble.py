@@ -19,8 +19,8 @@ from fog.providers.local.begin import begin
 from fog.providers.local.standing import Standing, find
 from fog.providers.local.wire import delete, exists, join_within, plug
 from gdp.errors import LocalError
-from gdp.testbed.processes import end_all
-from gdp.testbed.runs import Runs
+from gdp.host.processes import end_all
+from gdp.host.run_registry import Runs
 
 __all__ = ["delay", "freeze", "hold", "kill", "notice", "slow", "thaw"]
 

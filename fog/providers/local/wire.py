@@ -17,7 +17,7 @@ the robot up while the role moves::
     up ---- uplink (a bridge) ---- g-1f2e3d ==== up of the machine that is the gateway
 
 Two ends of a pair must not share an index, or Linux may tell of a lost carrier a whole second late (see
-``gdp/testbed/namespaces.py``); so one end has a high one. No device but the loopback has an address.
+``gdp/simulation/namespaces.py``); so one end has a high one. No device but the loopback has an address.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from gdp.errors import LocalError
-from gdp.testbed import netns_files
-from gdp.testbed.runs import in_first_user_namespace
+from gdp.host import netns_files
+from gdp.host.run_registry import in_first_user_namespace
 
 if TYPE_CHECKING:
     from pyroute2 import IPRoute  # and what imports it: 0.2 s to load, which most commands need not wait for
@@ -77,10 +77,8 @@ def make_space(path: Path, address: str) -> None:
     Raises:
         LocalError: the kernel refuses.
     """
-    from gdp.testbed.namespaces import silence
-
     netns_files.create(path)
-    netns_files.inside(path, silence)
+    netns_files.inside(path, netns_files.disable_ipv6)
     _ask(path, partial(_raise_loopback, address))
 
 

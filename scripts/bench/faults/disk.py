@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from gdp.testbed.mounts import mount_tmpfs
-from gdp.testbed.runs import Run
+from gdp.host.mounts import mount_tmpfs
+from gdp.host.run_registry import Run
 
 __all__ = ["BROKEN", "NOT_WRITTEN", "Disk", "snapshot_faults"]
 

@@ -29,11 +29,11 @@ from typing import Final
 from pyroute2 import IPRoute
 
 from gdp.frame.kinds import ETHERTYPE
+from gdp.host import netns_files
 from gdp.ports.kernel.assembler import Assembler, Reg
 from gdp.ports.kernel.maps import KernelMap, MapKind
 from gdp.ports.kernel.syscall import Command, bpf, load_program
 from gdp.ports.sockets import large_buffers
-from gdp.testbed import netns_files
 
 __all__ = ["FrameFaults", "LinkFaults"]
 

@@ -11,7 +11,7 @@ import random
 from typing import Final
 
 from faults.plan import Flow, Plan, Service, make_topology
-from gdp.testbed.topology import Link
+from gdp.simulation.topology import Link
 
 __all__ = ["VICTIM", "random_network"]
 

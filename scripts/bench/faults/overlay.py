@@ -1,7 +1,7 @@
 """The real processes and links of a plan, and every fault that can be made there.
 
-Place: shell; namespaces and processes through ``gdp.testbed``, the commands that robots run, and ``faults.member`` at
-the ends. A process is called ``switch s1``, ``rib s1`` or ``member m1``. Each may be killed, restarted, frozen.
+Place: shell; namespaces and processes through ``gdp.simulation``, the commands that robots run, and ``faults.member``
+at the ends. A process is called ``switch s1``, ``rib s1`` or ``member m1``. Each may be killed, restarted, frozen.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from faults.link_faults import FrameFaults, LinkFaults
 from faults.plan import Churn, Flow, Plan, Service
 from faults.records import Record, RecordReader
 from faults.store import StoreCluster
+from gdp.host import netns_files
+from gdp.host.processes import Process, end_all
+from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
+from gdp.simulation.namespaces import Namespaces
 from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, ROOT_CERTIFICATE, load_domain, load_identity
-from gdp.testbed import netns_files
-from gdp.testbed.namespaces import Namespaces
-from gdp.testbed.processes import Process, end_all
-from gdp.testbed.runs import Run
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 from proxy.ring.materials import Materials

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 
 __all__ = ["Churn", "Flow", "Plan", "Service", "make_topology"]
 

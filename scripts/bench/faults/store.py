@@ -24,9 +24,9 @@ from redis import Redis
 from redis.exceptions import RedisError
 
 from gdp.errors import LocalError
-from gdp.testbed import netns_files
-from gdp.testbed.namespaces import Namespaces, silence
-from gdp.testbed.runs import Run
+from gdp.host import netns_files
+from gdp.host.run_registry import Run
+from gdp.simulation.namespaces import Namespaces
 
 __all__ = ["StoreCluster", "has_server"]
 
@@ -66,7 +66,7 @@ class StoreCluster:
         self._path = spaces.path(ribs[0]).with_name(f"gdp-{run.id}-store")
         run.plan_namespace(self._path)
         netns_files.create(self._path)
-        netns_files.inside(self._path, silence)
+        netns_files.inside(self._path, netns_files.disable_ipv6)
         netns_files.inside(self._path, _make_bridge)
         for at, node in enumerate(ribs, 2):
             self._join(spaces.path(node), f"to-{node}", _OF_RIBS.format(at))

@@ -1,6 +1,6 @@
 """Five machines in a row, A - s1 - s2 - s3 - B, that all contenders use in turn: by names, by routers, by IPv4.
 
-Place: I/O; namespaces through ``gdp.testbed``. Link ``n`` (from 0) has the network 10.99.n.0/24, its left end .1, its
+I/O; namespaces through ``gdp.simulation``. Link ``n`` (from 0) has the network 10.99.n.0/24, its left end .1, its
 right end .2; the three in the middle forward IPv4::
 
     a  .1 --10.99.0-- .2  s1  .1 --10.99.1-- .2  s2  .1 --10.99.2-- .2  s3  .1 --10.99.3-- .2  b
@@ -17,10 +17,10 @@ from typing import Final, TypeVar
 from machine import offload_text, offloads, set_offloads
 from pyroute2 import IPRoute
 
-from gdp.testbed import netns_files
-from gdp.testbed.namespaces import Namespaces
-from gdp.testbed.runs import Run
-from gdp.testbed.topology import Attachment, DomainPlan, Link, Topology
+from gdp.host import netns_files
+from gdp.host.run_registry import Run
+from gdp.simulation.namespaces import Namespaces
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from peers.process import Started
 
 __all__ = ["LEFT", "MIDDLE", "NODES", "RIGHT", "Chain", "address", "five", "routes"]

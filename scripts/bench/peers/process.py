@@ -17,8 +17,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final
 
-from gdp.testbed.processes import Process, end_all
-from gdp.testbed.runs import Run
+from gdp.host.processes import Process, end_all
+from gdp.host.run_registry import Run
 
 __all__ = ["FailedError", "Started"]
 

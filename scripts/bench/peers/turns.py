@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from report import Rounds, percentile, progress
 
-from gdp.testbed.runs import Runs
+from gdp.host.run_registry import Runs
 from peers.chain import Chain
 from peers.contender import Contender, Measured
 from peers.exchange import Load

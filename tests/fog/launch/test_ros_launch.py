@@ -79,7 +79,7 @@ def launched(
     script = written(folder, FOG, "fog.py")
     text = FILE.replace("BODY", body).replace("CLUSTER", CLUSTER).replace("KEEP", str(keep)).replace("LOG", str(log))
     path = written(folder, text)
-    monkeypatch.setattr(importlib.import_module("gdp.testbed.runs"), "_default_directory", lambda: folder / "runs")
+    monkeypatch.setattr(importlib.import_module("gdp.host.run_registry"), "_default_directory", lambda: folder / "runs")
     action = importlib.import_module("fog.launch.ros_action")
     monkeypatch.setattr(action, "FOG", (sys.executable, str(script), str(log), str(code)))
     service = launch.LaunchService(noninteractive=True)

@@ -20,8 +20,8 @@ from fog.providers.local.provider import LocalProvider
 from fog.providers.local.standing import find, standing
 from fog.topology import Gateway
 from gdp.errors import LocalError
-from gdp.testbed.processes import Process
-from gdp.testbed.runs import Run
+from gdp.host.processes import Process
+from gdp.host.run_registry import Run
 
 SPEC = MachineSpec("c", "m1", Offer("local", "local-a", "local.small", Hardware(2, 4.0), True, 0.01))
 _MS = 1_000_000

@@ -11,8 +11,8 @@ from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
 from gdp.limits import CLAIM_LEASE_S
 from gdp.metadata import Metadata
-from gdp.testbed.topology import ring5
-from gdp.testbed.world import World
+from gdp.simulation.topology import ring5
+from gdp.simulation.world import World
 from gdp.trust.right import Right
 from tests.journeys.flows import ROBOT, SERVER, Tap, advertise, ring
 

@@ -10,7 +10,7 @@ from gdp.client.member import Member
 from gdp.effects import Arrival
 from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import Kind
-from gdp.testbed.world import World
+from gdp.simulation.world import World
 from gdp.trust.right import Right
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, advertise, flowing, ring
 

@@ -17,8 +17,8 @@ from gdp.client.publisher import Publisher
 from gdp.crypto.certificates import Role
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.testbed.topology import ring5
-from gdp.testbed.world import World
+from gdp.simulation.topology import ring5
+from gdp.simulation.world import World
 from gdp.trust.owner import Owner
 from gdp.trust.right import Right
 from proxy.bridge.bridge import Bridge

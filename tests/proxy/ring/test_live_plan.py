@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from gdp.simulation.topology import ring5
 from gdp.stores.keyring import load_delegations
-from gdp.testbed.topology import ring5
 from gdp.trust.right import Right
 from proxy.config import ProxyConfig
 from proxy.ring.live_plan import CARRIED, Graph, graphs_of, messages_in

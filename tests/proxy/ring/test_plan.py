@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from gdp.nodes.config import RibConfig, SwitchConfig
+from gdp.simulation.topology import ring5
 from gdp.stores.keyring import load_delegations, load_identity
-from gdp.testbed.topology import ring5
 from gdp.trust.right import Right
 from proxy.config import ProxyConfig
 from proxy.ring.materials import Materials

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from gdp.testbed.runs import Run, Runs
+from gdp.host.run_registry import Run, Runs
 from proxy.ring import replay as replay_module
 from proxy.ring.child import Child, ChildError
 from proxy.ring.children import Children

@@ -21,10 +21,10 @@ from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.rib.machine import Rib, RibSettings
 from gdp.rib.store import MemoryStore
+from gdp.simulation.memory import EPOCH_UNIX_S, Cable, MemoryNetwork
+from gdp.simulation.topology import Attachment, Topology
 from gdp.switch.machine import Switch
 from gdp.switch.table import Table
-from gdp.testbed.memory import EPOCH_UNIX_S, Cable, MemoryNetwork
-from gdp.testbed.topology import Attachment, Topology
 from gdp.trust.card import Card
 from gdp.trust.domain import Policy
 from gdp.trust.owner import Owner

@@ -1,6 +1,6 @@
 """A network as data: who stands where and who is joined to whom. Realising it is another file's work.
 
-Place: pure. ``gdp/testbed/namespaces.py`` makes kernel namespaces of it, the in-memory network machines in one process.
+Sans-I/O. ``namespaces.py`` makes kernel namespaces of it, the in-memory network machines in one process.
 """
 
 from __future__ import annotations

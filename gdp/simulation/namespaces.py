@@ -16,18 +16,16 @@ from typing import Final
 from pyroute2 import IPRoute
 
 from gdp.errors import LocalError
-from gdp.testbed import netns_files
-from gdp.testbed.runs import Run, in_first_user_namespace
-from gdp.testbed.topology import Link, Topology
+from gdp.host import netns_files
+from gdp.host.run_registry import Run, in_first_user_namespace
+from gdp.simulation.topology import Link, Topology
 
-__all__ = ["Namespaces", "silence"]
+__all__ = ["Namespaces"]
 
 _MAC_PREFIX: Final = "02:67:64:70"  # locally administered; "gdp" in ASCII
 _LOOPBACK: Final = 1  # the index of lo in every namespace
 _INDEX_FROM: Final = 100
 _PLUG_FROM: Final = 10_000
-_NO_IPV6: Final = ("all", "default")
-_IPV6_SETTINGS: Final = Path("/proc/sys/net/ipv6/conf")
 
 
 class Namespaces:
@@ -47,7 +45,7 @@ class Namespaces:
         for path in self._paths.values():
             run.plan_namespace(path)
             netns_files.create(path)
-            netns_files.inside(path, silence)
+            netns_files.inside(path, netns_files.disable_ipv6)
         self._join()
         for node in topology.nodes:
             self._inside(node, partial(_raise, [link.other(node) for link in topology.links_of(node)]))
@@ -114,14 +112,6 @@ class Namespaces:
             netns_files.inside(self._paths[node], ask)
         except Exception as error:  # pyroute2 raises NetlinkError, which is no OSError
             raise LocalError(f"namespace of {node}: {error}") from error
-
-
-def silence() -> None:
-    """Switch IPv6 off in this namespace before its first device comes: not even a neighbour solicitation leaves it."""
-    for scope in _NO_IPV6:
-        setting = _IPV6_SETTINGS / scope / "disable_ipv6"
-        if setting.exists() and os.access(setting, os.W_OK):  # containers may have it read-only
-            setting.write_text("1", encoding="ascii")
 
 
 def _add(links: Sequence[Link], number: dict[str, int], files: dict[str, int], ipr: IPRoute) -> None:

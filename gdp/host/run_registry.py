@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.host.cgroups import Cgroup
+from gdp.host.mounts import unmount
+from gdp.host.processes import Process, boot_id, end_all
 from gdp.stores.ownership import refuse_foreign_folder
-from gdp.testbed.cgroups import Cgroup
-from gdp.testbed.mounts import unmount
-from gdp.testbed.processes import Process, boot_id, end_all
 
 __all__ = ["Record", "Run", "Runs", "in_first_user_namespace", "outer_uid"]
 
@@ -240,7 +240,7 @@ def _default_directory() -> Path:
 def _take_down(record: Record, path: Path) -> bool:
     """Undo what the record names; what is gone already is fine."""
     # pyroute2 takes 0.2 s to load, and most records need none of it
-    from gdp.testbed.netns_files import processes_inside, release
+    from gdp.host.netns_files import processes_inside, release
 
     if record.boot == boot_id():
         end_all(record.processes)

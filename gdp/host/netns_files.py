@@ -16,12 +16,14 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from gdp.errors import LocalError
-from gdp.testbed.mounts import unmount
-from gdp.testbed.processes import Process
+from gdp.host.mounts import unmount
+from gdp.host.processes import Process
 
-__all__ = ["IP_NETNS_DIRECTORY", "create", "inside", "processes_inside", "release"]
+__all__ = ["IP_NETNS_DIRECTORY", "create", "disable_ipv6", "inside", "processes_inside", "release"]
 
 IP_NETNS_DIRECTORY: Final = Path("/run/netns")
+_NO_IPV6: Final = ("all", "default")
+_IPV6_SETTINGS: Final = Path("/proc/sys/net/ipv6/conf")
 
 T = TypeVar("T")
 
@@ -100,3 +102,11 @@ def _identity(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return status.st_dev, status.st_ino
+
+
+def disable_ipv6() -> None:
+    """Disable IPv6 in the current namespace; called before its first device, it prevents neighbour solicitations."""
+    for scope in _NO_IPV6:
+        setting = _IPV6_SETTINGS / scope / "disable_ipv6"
+        if setting.exists() and os.access(setting, os.W_OK):  # containers may have it read-only
+            setting.write_text("1", encoding="ascii")

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import LocalError
-from gdp.testbed.cgroups import Cgroup
-from gdp.testbed.runs import Runs
+from gdp.host.cgroups import Cgroup
+from gdp.host.run_registry import Runs
 
 _PATIENCE_S = 10.0
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import LocalError
-from gdp.testbed.mounts import mount_tmpfs
-from gdp.testbed.processes import Process
-from gdp.testbed.runs import Record, Run, Runs
+from gdp.host.mounts import mount_tmpfs
+from gdp.host.processes import Process
+from gdp.host.run_registry import Record, Run, Runs
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import pytest
 
-from gdp.testbed.processes import Process, boot_id, end_all
+from gdp.host.processes import Process, boot_id, end_all
 
 STUBBORN = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); signal.pause()"
 WILLING = "import signal; print(flush=True); signal.pause()"

@@ -8,7 +8,7 @@ import pytest
 
 from gdp.effects import BROADCAST, Arrival, Instant, Transmit
 from gdp.errors import DropReason, LocalError
-from gdp.testbed.memory import Cable, MemoryNetwork
+from gdp.simulation.memory import Cable, MemoryNetwork
 
 
 class Talker:

@@ -1,0 +1,1 @@
+"""Networks for tests: a topology as data, realised in kernel namespaces or in memory under a virtual clock."""
