@@ -4,7 +4,7 @@ from fog import FogCluster, LaunchDescription, Node, SpotMachine
 
 
 def generate_launch_description() -> LaunchDescription:
-    counter = Node(package="fog.demo", executable="counter")
+    counter = Node(package="fog_demo", executable="counter")
     cluster = FogCluster(
         name="counter",
         cloud_nodes=[counter],

@@ -10,14 +10,14 @@ def generate_launch_description():
     rate = DeclareLaunchArgument("rate", default_value="20.0", description="Calls a second.")
     cluster = FogCluster(
         name="echo",
-        cloud_nodes=[Node(package="fog.demo", executable="echo")],
+        cloud_nodes=[Node(package="fog_demo", executable="echo")],
         deployments=[SpotMachine(hardware="cpu:1"), SpotMachine(hardware="cpu:1")],
         services={"/echo": "std_srvs/srv/SetBool"},
         idle="30min",
         budget_usd=5.0,
     )
     caller = Node(
-        package="fog.demo",
+        package="fog_demo",
         executable="caller",
         parameters=[{"rate_hz": LaunchConfiguration("rate")}],
         output="screen",

@@ -13,9 +13,15 @@ from gdp.switch.table import Table
 from netns_tests import lifetimes
 from netns_tests.spaces import Space
 from tests.fixtures_forwarding import IN, IN_MAC, MTUS, NARROW, NARROW_MAC, PEER_MACS, WIDE, WIDE_MAC
+from tests.script_packages import share_script_packages
 
 MakeKernel = Callable[..., KernelPlane]
 PORT_MACS = {IN: IN_MAC, WIDE: WIDE_MAC, NARROW: NARROW_MAC}
+
+
+def pytest_configure() -> None:
+    """Let the processes that tests start import the ring and the demonstration."""
+    share_script_packages()
 
 
 @pytest.hookimpl(wrapper=True)

@@ -40,7 +40,7 @@ from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
 from gdp.trust.right import Right
 from netns_tests.lifetimes import LEASE_S, LEASES, Lifetime, noted
 from proxy.endpoints.endpoint import proxy_node_name
-from proxy.ring.plan import Credentials, rib_yaml, switch_yaml
+from ring.plan import Credentials, rib_yaml, switch_yaml
 from tests.pages import ROOT
 from tests.proxy.endpoints.dds_peers import CYCLONE
 from tests.proxy.endpoints.ros1_net import need_ros1
@@ -258,7 +258,7 @@ class Pair:
         """Start the ROS 1 master, if it does not run."""
         if self._master is None:
             need_ros1()
-            argv = ["proxy.ring.nodes.master", _MASTER.rpartition(":")[2]]
+            argv = ["ring.nodes.master", _MASTER.rpartition(":")[2]]
             self._master = self.start("b", argv, self.folder / "master.log", "ready")
 
     def stop_master(self) -> None:

@@ -90,7 +90,7 @@ def fog(tmp_path: Path, space: Space) -> Iterator[Fog]:
 
 def test_calls_go_on_while_machines_are_taken_and_killed_and_the_supervisor_is(fog: Fog) -> None:
     fog.run("launch", str(_LAUNCH), "--detach")
-    words = ["-m", "fog.demo.caller", "--ros-args", "-p", "rate_hz:=20.0"]
+    words = ["-m", "fog_demo.caller", "--ros-args", "-p", "rate_hz:=20.0"]
     caller = subprocess.Popen(
         [sys.executable, *words], env=fog.environment, cwd=fog.state.parent, stdout=subprocess.PIPE, text=True
     )

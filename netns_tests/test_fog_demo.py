@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from fog.demo.stage import STATE, standing_runs, sweep
+from fog_demo.stage import STATE, standing_runs, sweep
 from gdp.host.run_registry import Runs
 from netns_tests.local_site import leftovers
 from tests.pages import ROOT
@@ -27,7 +27,7 @@ _PATIENCE_S = 200.0
 def command(*options: object) -> list[str]:
     """Return the command line of a demonstration."""
     launch_file = ROOT / "examples" / "echo.launch.py"
-    return [sys.executable, "-m", "fog.demo", str(launch_file), *map(str, options)]
+    return [sys.executable, "-m", "fog_demo", str(launch_file), *map(str, options)]
 
 
 def all_of(record_of: int) -> tuple[Path, list[str]]:

@@ -149,7 +149,7 @@ def test_calls_go_on_when_the_machine_that_is_the_gateway_is_killed(fog: Fog) ->
     fog.run("launch", str(ECHO), "--gateway", "replica", "--detach")
     fog.run("scale", "up")
     fog.until(lambda: len(fog.serving()) == 3 and all(each.up_unix_s for each in fog.living()), "three replicas serve")
-    words = ["-m", "fog.demo.caller", "--ros-args", "-p", "rate_hz:=20.0", "-p", "depth:=1000"]
+    words = ["-m", "fog_demo.caller", "--ros-args", "-p", "rate_hz:=20.0", "-p", "depth:=1000"]
     caller = subprocess.Popen(
         [sys.executable, *words], env=fog.environment, cwd=fog.state.parent, stdout=subprocess.PIPE, text=True
     )

@@ -38,7 +38,7 @@ WHERE: Final = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.
 
 
 def command(*arguments: object) -> list[str]:
-    return [sys.executable, "-m", "proxy.ring", *map(str, arguments)]
+    return [sys.executable, "-m", "ring", *map(str, arguments)]
 
 
 def ring(*arguments: object) -> subprocess.CompletedProcess[str]:

@@ -16,7 +16,7 @@ from gdp.host.run_registry import Runs
 from netns_tests.lifetimes import LEASE_S
 from netns_tests.test_ring import PROJECT, WHERE, command, crossed, left_of, ring, topics
 from proxy.endpoints.ros1.install import rospy_folder
-from proxy.ring.nodes.content import LAMP, TALKS
+from ring.nodes.content import LAMP, TALKS
 
 pytestmark = pytest.mark.netns
 

@@ -27,7 +27,7 @@ from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, ROOT_CERTIFICATE
 from gdp.trust.right import Right
-from proxy.ring.plan import Credentials, rib_yaml, switch_yaml
+from ring.plan import Credentials, rib_yaml, switch_yaml
 from tests.pages import ROOT
 
 pytestmark = pytest.mark.netns

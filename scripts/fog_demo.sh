@@ -14,4 +14,4 @@ if [[ -z "${AMENT_PREFIX_PATH-}" ]]; then  # a sourced ROS 2 is used as it is
 else
     "$root/scripts/setup.sh"
 fi
-exec "$root/scripts/privileged.sh" "$root/.venv/bin/python" -m fog.demo "$root/examples/echo.launch.py" "$@"
+exec "$root/scripts/privileged.sh" "$root/.venv/bin/python" -m fog_demo "$root/examples/echo.launch.py" "$@"

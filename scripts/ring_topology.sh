@@ -26,4 +26,4 @@ fi
 if [[ " ${ros[*]-} " == *" 1 "* ]] && ! (cd "$root" && "$python" -c "$has_ros1" 2>/dev/null); then
     "$root/scripts/setup_ros1.sh"
 fi
-exec "$root/scripts/privileged.sh" "$python" -m proxy.ring "$@"
+exec "$root/scripts/privileged.sh" "$python" -m ring "$@"

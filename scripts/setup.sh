@@ -57,11 +57,18 @@ hand_over() {
     fi
 }
 
+# link_scripts: lets every Python of the environment import the packages below scripts/, which no wheel contains
+link_scripts() {
+    local folder
+    folder=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
+    printf '%s\n' "$root/scripts" >"$folder/gdp_scripts.pth"
+}
+
 # compile_own: byte-compiles our packages, lest root leaves caches that their owner cannot delete
 compile_own() {
-    "$venv/bin/python" -m compileall -q gdp proxy fog || fail "the source does not compile"
+    "$venv/bin/python" -m compileall -q gdp proxy fog scripts/ring scripts/fog_demo || fail "the source does not compile"
     if [[ $(id -u) -eq 0 && -n "${SUDO_UID:-}" ]]; then
-        find gdp proxy fog -name __pycache__ -user 0 -exec chown -R "$SUDO_UID:${SUDO_GID:-$SUDO_UID}" {} +
+        find gdp proxy fog scripts -name __pycache__ -user 0 -exec chown -R "$SUDO_UID:${SUDO_GID:-$SUDO_UID}" {} +
     fi
 }
 
@@ -70,6 +77,7 @@ wanted=$({ cat pyproject.toml requirements/*.lock; "$python" --version; echo "$r
 # What was installed for testing is enough for running.
 for stamp in "$venv/.installed$extras" "$venv/.installed[ros2]" "$venv/.installed$dev"; do
     if [[ -f "$stamp" && $(<"$stamp") == "$wanted" ]] && "$venv/bin/python" -c '' 2>/dev/null; then
+        link_scripts
         compile_own
         exit 0
     fi
@@ -114,6 +122,7 @@ if [[ "$extras" == "$dev" ]] && command -v apt-get >/dev/null; then
 fi
 rm -f "$venv"/.installed*
 printf '%s\n' "$wanted" >"$venv/.installed$extras"
+link_scripts
 compile_own
 hand_over "$venv" ./*.egg-info
 say "done"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 
 from gdp.control.boundary import ErrorBoundary
+from tests.script_packages import share_script_packages
 
 
 def pytest_configure() -> None:
@@ -13,5 +14,6 @@ def pytest_configure() -> None:
     Errors that a node would contain fail the test that draws them.
     """
     ErrorBoundary.reraises = True
+    share_script_packages()
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)

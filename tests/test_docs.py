@@ -14,11 +14,11 @@ import typer
 import yaml
 
 from fog.cli.app import app as fog
-from fog.demo import cli as demo
 from fog.launch.load import load as load_launch_file
 from fog.providers.aws.config import AwsConfig
 from fog.providers.cloud_init import Setup
 from fog.site import SiteConfig
+from fog_demo import cli as demo
 from gdp import limits
 from gdp.cli import gdp, rib, switch
 from gdp.crypto.keys import SigningKey
@@ -27,7 +27,7 @@ from gdp.nodes.config import RibConfig, SwitchConfig
 from gdp.nodes.schema import Section
 from proxy import cli, delegate_cli, replay_cli
 from proxy.config import ProxyConfig, Rule
-from proxy.ring import cli as ring
+from ring import cli as ring
 from tests.machines import Machines
 from tests.pages import PAGES, ROOT, Block, anchors, blocks, blocks_between, commands, links, rows
 

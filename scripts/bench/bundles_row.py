@@ -18,7 +18,7 @@ from gdp.metadata import Metadata
 from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, ROOT_CERTIFICATE
 from gdp.trust.right import Right
-from proxy.ring.materials import Materials
+from ring.materials import Materials
 
 __all__ = ["READY_S", "Row"]
 

@@ -18,13 +18,13 @@ from typing import Final, TypeVar
 from peers.process import FailedError, Started
 from report import progress
 
-from fog.demo.stage import ENVIRONMENT, STATE, end_all_of, fog_command, standing_runs, sweep
 from fog.providers.local import trouble
 from fog.site import open_site
 from fog.supervisor.background import pid_of
 from fog.supervisor.ground import local_provider
 from fog.supervisor.journal import Journal
 from fog.supervisor.record import Record
+from fog_demo.stage import ENVIRONMENT, STATE, end_all_of, fog_command, standing_runs, sweep
 from gdp.simulation.namespaces import Namespaces
 from gdp.simulation.topology import DomainPlan, Topology
 
@@ -70,7 +70,7 @@ class Cluster:
             self._site = open_site(None, self._run.directory / STATE)
             self._journal = undo.enter_context(closing(Journal(self._site.journal)))
             self._runs = local_provider(self._site).runs
-            told = ["-m", "fog.demo.caller", "--ros-args", "-p", f"rate_hz:={rate_hz}", "-p", f"report_s:={_REPORT_S}"]
+            told = ["-m", "fog_demo.caller", "--ros-args", "-p", f"rate_hz:={rate_hz}", "-p", f"report_s:={_REPORT_S}"]
             told += ["-p", f"depth:={_DEPTH}"]
             self._caller = undo.enter_context(self._start("caller", told))
             end_s = time.monotonic() + _PATIENCE_S

@@ -43,7 +43,7 @@ from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
 from gdp.trust.right import Right
 from proxy.config import Encoding
-from proxy.ring.materials import Materials
+from ring.materials import Materials
 
 __all__ = ["BUFFER_BYTES", "DIRECT_DOMAIN", "LEFT", "READY_S", "RIGHT", "Carried", "Row"]
 

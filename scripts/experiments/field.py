@@ -33,7 +33,7 @@ from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
 from gdp.trust.right import Right
-from proxy.ring.materials import Materials
+from ring.materials import Materials
 
 __all__ = ["READY_S", "ROBOT", "Field", "Served", "Server", "Work"]
 

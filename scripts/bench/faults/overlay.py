@@ -36,7 +36,7 @@ from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, ROOT_CERTIFICATE, load_domain, load_identity
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
-from proxy.ring.materials import Materials
+from ring.materials import Materials
 
 __all__ = ["Overlay"]
 

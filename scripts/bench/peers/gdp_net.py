@@ -18,7 +18,7 @@ from peers.contender import READY_S, Measured, ask_end, start_end
 from peers.exchange import Load
 from peers.gdp_end import PONG, ping_topic
 from peers.process import FailedError, Started
-from proxy.ring.materials import Materials
+from ring.materials import Materials
 
 __all__ = ["ENCODINGS", "GdpNet"]
 

@@ -194,7 +194,7 @@ def test_a_cluster_that_nobody_knows_is_not_ended_in_silence(fog: Run, journal: 
 LAUNCH = """
 from fog import *
 def generate_launch_description():
-    FogCluster(cloud_nodes=[Node(package="fog.demo", executable="echo")], deployments=[SpotMachine(%s)], services={}%s)
+    FogCluster(cloud_nodes=[Node(package="fog_demo", executable="echo")], deployments=[SpotMachine(%s)], services={}%s)
     return LaunchDescription()
 """
 

@@ -12,7 +12,7 @@ from fog.launch.probing import offers
 from gdp.errors import LocalError
 from proxy.endpoints.endpoint import End, Role
 
-ECHO = (CloudNode("fog.demo", "echo"),)
+ECHO = (CloudNode("fog_demo", "echo"),)
 
 
 def test_what_a_node_offers_is_found_out_and_kept(tmp_path: Path) -> None:

@@ -10,18 +10,18 @@ from gdp.errors import LocalError
 
 
 def test_an_installed_executable_comes_before_a_module(tmp_path: Path) -> None:
-    path = tmp_path / "lib" / "fog.demo" / "echo"
+    path = tmp_path / "lib" / "fog_demo" / "echo"
     path.parent.mkdir(parents=True)
     path.touch(mode=0o755)
     environment = {"AMENT_PREFIX_PATH": f"/nowhere:{tmp_path}"}
-    assert command_line(CloudNode("fog.demo", "echo", ("-x",)), environment) == (str(path), "-x")
+    assert command_line(CloudNode("fog_demo", "echo", ("-x",)), environment) == (str(path), "-x")
 
 
 def test_a_python_module_is_run_by_the_machines_python() -> None:
-    assert command_line(CloudNode("fog.demo", "echo"), {}) == ("{python}", "-m", "fog.demo.echo")
+    assert command_line(CloudNode("fog_demo", "echo"), {}) == ("{python}", "-m", "fog_demo.echo")
 
 
-@pytest.mark.parametrize("package", ["fog.demo", "no_such_package"])
+@pytest.mark.parametrize("package", ["fog_demo", "no_such_package"])
 def test_what_is_nowhere_is_refused(package: str) -> None:
     with pytest.raises(LocalError, match=f"{package}/talker: not found"):
         command_line(CloudNode(package, "talker"), {"AMENT_PREFIX_PATH": ""})

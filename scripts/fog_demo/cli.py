@@ -1,0 +1,125 @@
+"""``python -m fog_demo``, which ``scripts/fog_demo.sh`` runs once everything is set up.
+
+Place: shell. Exit codes: 0 nothing failed, 1 something did, 2 wrong input, 130 and 143 for Ctrl-C and SIGTERM.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from fog_demo.play import Outcome, Pace, play
+from fog_demo.stage import Stage, end_all_of, standing_runs, sweep
+from fog_demo.view import View
+from gdp.errors import GdpError
+from gdp.host.interruption import Interrupted, interruptible, let_nothing_interrupt
+from gdp.host.run_registry import Run
+from ring.child import ChildError
+
+__all__ = ["main"]
+
+_PASSED: Final = 0
+_FAILED: Final = 1
+_WRONG_INPUT: Final = 2
+_PACE: Final = Pace()
+_WIDE: Final = 160  # columns where no terminal says how many there are
+
+_EXAMPLES: Final = """\b
+Examples:
+  sudo scripts/fog_demo.sh
+  sudo scripts/fog_demo.sh --rate 200 --notice 30
+  sudo scripts/fog_demo.sh --json > outcome.json
+"""
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+@app.command(epilog=_EXAMPLES)
+def demo(
+    launch_file: Annotated[Path, typer.Argument(metavar="FILE", exists=True, hidden=True)],
+    rate: Annotated[float, typer.Option(min=1, max=1_000, help="Requests a second.")] = _PACE.rate_hz,
+    calm: Annotated[float, typer.Option(min=0.5, help="Seconds of plain traffic in between.")] = _PACE.calm_s,
+    notice: Annotated[float, typer.Option(min=1, help="Seconds from the notice to the preemption.")] = _PACE.notice_s,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the outcome as JSON; all else on stderr.")] = False,
+) -> None:
+    """A robot in a ring of five switches calls a service on two spot machines, which are taken away.
+
+    One machine is preempted with notice, the other one killed, and each is replaced elsewhere while requests flow. It
+    takes about a minute; the last line says how many of the requests failed. Everything is gone afterwards, also after
+    Ctrl-C; what a killed demonstration left, the next one takes down.
+    """
+    console = Console(stderr=as_json)
+    if not console.is_terminal:
+        console = Console(stderr=as_json, width=_WIDE)
+    errors = Console(stderr=True, highlight=False, soft_wrap=True)
+    try:
+        runs = standing_runs("demo")
+        for swept in sweep(runs):
+            errors.print(f"took down what run {swept} had left behind")
+        run = runs.start()
+        code = _run(run, launch_file.absolute(), Pace(rate, calm, notice), console, as_json=as_json)
+    except ChildError as error:
+        errors.print(f"[bold red]failed[/bold red]: {escape(str(error))}")
+        code = _FAILED
+    except GdpError as error:
+        errors.print(escape(str(error)))
+        code = _WRONG_INPUT
+    raise typer.Exit(code)
+
+
+def main() -> None:
+    """Run the command; never returns."""
+    app(prog_name="fog_demo.sh")
+
+
+def _run(run: Run, launch_file: Path, pace: Pace, console: Console, *, as_json: bool) -> int:
+    """Play, and take down everything."""
+    try:
+        outcome = asyncio.run(interruptible(_play(run, launch_file, pace, console)))
+    except Interrupted as interrupted:
+        console.print("interrupted")
+        return interrupted.exit_code
+    finally:
+        let_nothing_interrupt()
+        console.print("[dim]giving machines back, taking the ring down[/dim]")
+        end_all_of(run)
+    _tell(outcome, console, as_json=as_json)
+    return _FAILED if outcome.counts.failed or not outcome.counts.requests else _PASSED
+
+
+async def _play(run: Run, launch_file: Path, pace: Pace, console: Console) -> Outcome:
+    stage = Stage(run)
+    try:
+        with View(console) as view:
+            return await play(stage, launch_file, pace, view)
+    finally:
+        stage.children.forget()
+
+
+def _tell(outcome: Outcome, console: Console, *, as_json: bool) -> None:
+    for line in outcome.complaints:
+        console.print(escape(line), highlight=False, soft_wrap=True)
+    for what, seconds in outcome.steps_s.items():
+        console.print(f"{what}: {seconds:.2f} s", highlight=False)
+    if as_json:
+        told = {
+            "requests": outcome.counts.requests,
+            "failed": outcome.counts.failed,
+            "median_ms": outcome.counts.median_ms,
+            "p99_ms": outcome.counts.p99_ms,
+            "by_machine": dict(outcome.counts.by_machine),
+            "steps_s": outcome.steps_s,
+            "events": [asdict(each) for each in outcome.events],
+        }
+        json.dump(told, sys.stdout, indent=1)
+        sys.stdout.write("\n")
+    else:
+        console.print(outcome.verdict, style="bold red" if outcome.counts.failed else "bold green", highlight=False)

@@ -1,0 +1,212 @@
+"""What happens in the demonstration: requests flow, one machine is preempted, the other one killed, nothing fails.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from fog.providers.local.trouble import kill, notice
+from fog.site import Site, open_site
+from fog.supervisor.ground import local_provider
+from fog.supervisor.journal import Entry, Journal
+from fog.supervisor.record import Record
+from fog_demo.stage import Stage
+from fog_demo.view import Counts, View
+from gdp.errors import LocalError
+from ring.child import Child
+from ring.children import cancel
+from ring.events import Event
+
+__all__ = ["Outcome", "Pace", "play"]
+
+_LOOK_S: Final = 0.2
+_BOOT_S: Final = 90.0
+_END_S: Final = 20.0  # more than the caller waits for an answer
+_PATIENCE_S: Final = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """How fast things go.
+
+    Args:
+        rate_hz: requests a second.
+        calm_s: of plain traffic before, between and after what befalls the machines.
+        notice_s: between a preemption's notice and its end.
+    """
+
+    rate_hz: float = 50.0
+    calm_s: float = 6.0
+    notice_s: float = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What came of it.
+
+    Args:
+        steps_s: how long it took from the notice, or the death, until it was seen, and until a replacement served.
+        complaints: lines of the robot's node, about requests that failed.
+    """
+
+    counts: Counts
+    steps_s: dict[str, float]
+    events: list[Entry] = field(default_factory=list)
+    complaints: list[str] = field(default_factory=list)
+
+    @property
+    def verdict(self) -> str:
+        """Return the last line."""
+        return f"{self.counts.failed} failed of {self.counts.requests} requests"
+
+
+class _Looking:
+    """Looks at the journal and at the caller's lines, and shows both, until it is cancelled."""
+
+    def __init__(self, journal: Journal, view: View) -> None:
+        self._journal = journal
+        self._view = view
+        self.counts = Counts()
+        self.events: list[Entry] = []
+        self._told_s = 0.0
+
+    async def run(self) -> None:
+        """Look again and again."""
+        while True:
+            self.look()
+            await asyncio.sleep(_LOOK_S)
+
+    async def hear(self, caller: Child) -> None:
+        """Take in what the caller says, to its last line."""
+        async for event in caller.events():
+            self._take(event)
+
+    def machines(self) -> list[Record]:
+        """Return all machines, those that are gone included."""
+        return [each for cluster in self._journal.clusters() for each in self._journal.machines(cluster.plan.name)]
+
+    def look(self) -> None:
+        """Look once."""
+        news = self._journal.events(after=self.events[-1].id if self.events else 0)
+        self.events += news
+        self._view.happened(news)
+        self._view.show(self.machines(), self.counts)
+
+    def first_event(self, machine: str, what: set[str]) -> Entry | None:
+        """Return the first that the journal tells of a machine and is one of these."""
+        return next((each for each in self.events if each.machine == machine and each.what in what), None)
+
+    def _take(self, event: Event) -> None:
+        now_s, before, answered = time.monotonic(), self.counts, event.count("answered")
+        rate = (answered - before.answered) / (now_s - self._told_s) if self._told_s else 0.0
+        self._told_s = now_s
+        left = event.count("under_way") if event.fields.get("done") else 0
+        won = sorted((name, int(str(count))) for name, count in event.part("by_machine").fields.items())
+        self.counts = Counts(
+            event.count("calls") + event.count("unserved"),
+            answered,
+            event.count("failed") + event.count("wrong") + event.count("unserved") + left,
+            event.number_or_none("median_ms"),
+            event.number_or_none("p99_ms"),
+            rate,
+            tuple(won),
+        )
+
+
+async def play(stage: Stage, launch_file: Path, pace: Pace, view: View) -> Outcome:
+    """Play it on a stage that was just made.
+
+    Raises:
+        ChildError: a process failed.
+        LocalError: something did not happen in time.
+    """
+    view.step("a ring of five switches, the RIB at nuc3, the robot at nuc1, the site of fog beyond nuc5")
+    plane = await stage.stand_up()
+    site = open_site(stage.site_file, stage.state)
+    with closing(Journal(site.journal)) as journal:
+        looking = _Looking(journal, view)
+        shown = asyncio.ensure_future(looking.run())
+        try:
+            view.step(f"data plane {plane}; fog launch {launch_file.name} --detach")
+            await stage.fog("launch", str(launch_file), "--detach", patience_s=_BOOT_S)
+            caller = stage.start_caller(pace.rate_hz)
+            heard = asyncio.ensure_future(looking.hear(caller))
+            try:
+                steps_s = await stage.children.guarded(_befall(site, looking, pace, view))
+                view.step("that was all; the robot's node makes no further request")
+                caller.go()
+                await asyncio.wait_for(heard, _END_S)
+            finally:
+                await cancel(heard)
+            looking.look()
+            complaints = caller.log.read_text(encoding="utf-8", errors="replace").splitlines()
+        finally:
+            await cancel(shown)
+        return Outcome(looking.counts, steps_s, looking.events, complaints)
+
+
+async def _befall(site: Site, looking: _Looking, pace: Pace, view: View) -> dict[str, float]:
+    """Let one machine be preempted, then the other one die; return how long what took."""
+    runs = local_provider(site).runs
+    steps_s: dict[str, float] = {}
+    await _until(lambda: looking.counts.answered > 0, "the first answer")
+    view.step(f"requests flow, {pace.rate_hz:g} a second; each goes to both machines, the first answer wins")
+    await asyncio.sleep(pace.calm_s)
+    first, second = looking.machines()[:2]
+
+    view.step(f"{first.name} is preempted, with a notice of {pace.notice_s:g} s")
+    at_s = time.time()
+    notice(runs, first.id, pace.notice_s)
+    steps_s |= await _replaced(looking, first, {"notice"}, at_s, "preemption")
+    await _until(lambda: _is_gone(looking, first), f"the end of {first.name}")
+    await asyncio.sleep(pace.calm_s)
+
+    view.step(f"{second.name} is killed: SIGKILL to all of it, its link gone")
+    at_s = time.time()
+    kill(runs, second.id)
+    steps_s |= await _replaced(looking, second, {"taken", "unheard"}, at_s, "death")
+    await asyncio.sleep(pace.calm_s)
+    return steps_s
+
+
+async def _replaced(looking: _Looking, machine: Record, signs: set[str], at_s: float, what: str) -> dict[str, float]:
+    """Wait until a machine that was asked for after this moment serves."""
+
+    def serving() -> Record | None:
+        later = (each for each in looking.machines() if each.asked_unix_s >= at_s and each.is_serving)
+        return next(later, None)
+
+    await _until(lambda: serving() is not None, f"a replacement of {machine.name}")
+    seen, served = looking.first_event(machine.name, signs), serving()
+    found = {}
+    if seen is not None:
+        found[f"{what} to detection"] = seen.unix_s - at_s
+    if served is not None and served.served_unix_s is not None:
+        found[f"{what} to a serving replacement"] = served.served_unix_s - at_s
+    return found
+
+
+def _is_gone(looking: _Looking, machine: Record) -> bool:
+    return any(each.name == machine.name and each.is_gone for each in looking.machines())
+
+
+async def _until(is_met: Callable[[], bool], what: str) -> None:
+    """Look until something holds that tells nobody when it does.
+
+    Raises:
+        LocalError: it does not in time.
+    """
+    end_s = time.monotonic() + _PATIENCE_S
+    while not is_met():
+        if time.monotonic() > end_s:
+            raise LocalError(f"waited {_PATIENCE_S:g} s for {what}; load of this machine: {os.getloadavg()[0]:.1f}")
+        await asyncio.sleep(_LOOK_S / 4)

@@ -1,0 +1,198 @@
+"""Where the demonstration takes place: a ring of five switches, the robot at nuc1, a site of ``fog`` beyond nuc5.
+
+Place: shell; makes namespaces, keys and files, all of one run.
+::
+
+    caller -- proxy -- nuc1 -- nuc2 -- nuc3 (RIB) -- nuc4 -- nuc5 -- gateway --+-- m1
+                         |____________ cost 100 ______________|                +-- m2 ...
+
+What ``fog`` makes stands without us, as machines elsewhere do. So a run ends with ``fog down``, and whatever a killed
+one left is found by its record: the records lie in a folder of their own, which nobody else sweeps.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+import yaml
+
+from gdp.errors import LocalError
+from gdp.host.run_registry import Run, Runs, outer_uid
+from gdp.simulation.namespaces import Namespaces
+from gdp.simulation.topology import Attachment, DomainPlan, Topology, ring5
+from gdp.stores.keyring import CARD, DELEGATIONS, ROOT_CERTIFICATE
+from ring.child import Child
+from ring.children import Children
+from ring.materials import Materials
+
+__all__ = ["ENVIRONMENT", "SITE", "STATE", "Stage", "end_all_of", "fog_command", "standing_runs", "sweep"]
+
+ROBOT: Final = "nuc1"
+FAR: Final = "nuc5"
+_RIB_AT: Final = "nuc3"
+_WATCH: Final = "watch"
+_DOMAIN: Final = 30
+_DOWN_S: Final = 60.0
+STATE: Final = "state"
+SITE: Final = "fog.yaml"
+ENVIRONMENT: Final = {
+    "ROS_DOMAIN_ID": str(_DOMAIN),
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",  # LOCALHOST brings shared memory, which crosses namespaces
+    "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
+}
+
+
+class Stage:
+    """The ring of one run and its site.
+
+    Args:
+        run: takes down what is made here; ``end_all_of`` first takes down what ``fog`` made.
+
+    Raises:
+        LocalError: the kernel refuses.
+    """
+
+    def __init__(self, run: Run) -> None:
+        ring = ring5()
+        attached = (
+            Attachment(_RIB_AT, "rib", "rib"),
+            Attachment(ROBOT, "proxy", "robot"),
+            Attachment(FAR, "proxy", _WATCH),
+        )
+        self._topology = Topology(ring.links, (DomainPlan("ring", ring.nodes),), attached)
+        self._run = run
+        self._namespaces = Namespaces(self._topology, run)
+        self._materials = Materials(self._topology, run.directory, metrics=False)
+        self.children = Children(run, kept=False)
+        self.state = run.directory / STATE
+        self.site_file = run.directory / SITE
+
+    async def stand_up(self) -> str:
+        """Start switches, RIB and the robot's proxy; return the data plane that the switches took.
+
+        Raises:
+            ChildError: a process failed.
+        """
+        uplink = f"fog{self._run.id}-up"
+        proxy, far_switch = self._write_proxy(), self._write_far_switch(uplink)
+        self._write_site(uplink, proxy, far_switch)
+        switches = []
+        for node in self._topology.nodes:
+            config = far_switch if node == FAR else self._materials.switch(node, "auto")
+            switches.append(self._start(node, "switch", ["-m", "gdp.cli.switch", "--config", str(config), "--json"]))
+        planes = {each.text("data_plane") for each in await self.children.ready(switches)}
+        (at,) = self._topology.attached("rib")
+        rib = ["-m", "gdp.cli.rib", "--config", str(self._materials.rib(at)), "--json"]
+        await self.children.ready([self._start(at.switch, "rib", rib)])
+        await self.children.ready([self._start(ROBOT, "proxy", ["-m", "proxy.cli", "--config", str(proxy), "--json"])])
+        return ", ".join(sorted(planes))
+
+    async def fog(self, *words: str, patience_s: float) -> None:
+        """Run a command of ``fog`` beside the far switch, to its end.
+
+        Raises:
+            ChildError: it failed; the text has its last words.
+        """
+        argv = fog_command(self._run, words)
+        child = self._start(FAR, f"fog-{words[0]}", argv, heard=False)
+        if await self.children.guarded(child.wait(patience_s)):
+            raise child.failed("failed")
+
+    def start_caller(self, rate_hz: float) -> Child:
+        """Start the robot's node: it calls ``/echo`` at this rate until it is interrupted."""
+        told = ["-p", f"rate_hz:={rate_hz}", "-p", "report_s:=0.5"]
+        return self._start(ROBOT, "caller", ["-m", "fog_demo.caller", "--ros-args", *told])
+
+    def _start(self, node: str, role: str, arguments: list[str], *, heard: bool = True) -> Child:
+        return self.children.start_in(self._namespaces, node, role, arguments, heard=heard, environment=ENVIRONMENT)
+
+    def _write_proxy(self) -> Path:
+        """Write the robot's ``proxy.yaml``, without a rule: ``fog`` adds them."""
+        keys = self._keys("proxy", ROBOT)
+        (keys / DELEGATIONS).mkdir(mode=0o700, exist_ok=True)
+        (at,) = (each for each in self._topology.attached("proxy") if each.switch == ROBOT)
+        content = {
+            **self._who(keys),
+            "iface": at.ifname,
+            "delegations": str(keys / DELEGATIONS),
+            "ros": {"endpoint": "ros2", "domain": _DOMAIN},
+        }
+        return self._write("proxy.yaml", content)
+
+    def _write_far_switch(self, uplink: str) -> Path:
+        """Write ``switch.yaml`` of the switch towards the machines: a port more, and where revocations come."""
+        path = self._materials.switch(FAR, "auto")
+        revocations = self._run.directory / "revocations"
+        revocations.mkdir(mode=0o700)
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content["ports"].append({"iface": uplink, "optional": True})
+        return self._write(path.name, {**content, "revocations": str(revocations)})
+
+    def _write_site(self, uplink: str, proxy: Path, switch: Path) -> None:
+        folder = self._run.directory
+        content = {
+            "domain": str(folder / "domains" / "ring"),
+            "owner": str(folder / "owner"),
+            "robots": [str(proxy)],
+            "switch": str(switch),
+            "watch": _WATCH,
+            "uplink": uplink,
+        }
+        self._write(SITE, content)
+
+    def _who(self, keys: Path) -> dict[str, object]:
+        if not (keys / CARD).exists():
+            raise LocalError(f"{keys}: not admitted")
+        root = self._run.directory / "domains" / "ring" / ROOT_CERTIFICATE
+        return {"identity": str(keys), "domain": {"root": str(root)}}
+
+    def _keys(self, role: str, node: str) -> Path:
+        return self._run.directory / "nodes" / f"{role}-{node}"
+
+    def _write(self, name: str, content: Mapping[str, object]) -> Path:
+        path = self._run.directory / name
+        path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+        return path
+
+
+def standing_runs(what: str) -> Runs:
+    """Return the records of runs of one kind, such as ``demo``, that ``fog`` made machines for.
+
+    Raises:
+        LocalError: the folder belongs to somebody else.
+    """
+    return Runs(Path(tempfile.gettempdir()) / f"gdp-fog-{what}-{outer_uid()}")
+
+
+def sweep(runs: Runs) -> list[str]:
+    """Take down what killed ones left; return their ids."""
+    dead = [each.run for each in runs.all() if each.dead]
+    for run in dead:
+        end_all_of(runs.resume(run))
+    return dead
+
+
+def end_all_of(run: Run) -> None:
+    """Give the machines of a run back, and take down the rest.
+
+    Raises:
+        LocalError: machines are left; the text says what ``fog down`` had to say.
+    """
+    if (run.directory / STATE).exists():
+        argv = [sys.executable, *fog_command(run, ["down", "--all"])]
+        ended = subprocess.run(argv, capture_output=True, text=True, timeout=_DOWN_S, check=False)
+        if ended.returncode:
+            raise LocalError(f"run {run.id}: fog down: {(ended.stderr or ended.stdout).strip()}")
+    run.end()
+
+
+def fog_command(run: Run, words: Sequence[str]) -> list[str]:
+    """Return what Python is told so that ``fog`` does something in a run's folder."""
+    site = run.directory / SITE
+    told = ["--site", str(site)] if site.exists() else []
+    return ["-m", "fog.cli.app", *words, *told, "--state", str(run.directory / STATE)]

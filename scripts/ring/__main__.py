@@ -1,0 +1,13 @@
+"""``python -m ring``.
+
+Place: shell. Importing takes half a second, in which nothing has been made yet: Ctrl-C then simply ends the process.
+"""
+
+import os
+import signal
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, lambda number, _: os._exit(128 + number))
+    from ring.cli import main
+
+    main()

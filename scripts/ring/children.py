@@ -1,0 +1,132 @@
+"""All processes of a run, watched together: while one thing is awaited, the end of any that must stand ends the wait.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections.abc import Coroutine, Iterable, Mapping, Sequence
+from typing import Final, TypeVar
+
+from gdp.host.run_registry import Run
+from gdp.simulation.namespaces import Namespaces
+from ring.child import Child
+from ring.events import Event
+
+__all__ = ["READY_S", "Children", "cancel"]
+
+READY_S: Final = 60.0
+
+T = TypeVar("T")
+
+
+class Children:
+    """The processes of one run.
+
+    Args:
+        run: notes each of them, so that whoever takes the run down ends it.
+        kept: they are to outlive us; otherwise the kernel kills them when we end, however that comes about.
+    """
+
+    def __init__(self, run: Run, *, kept: bool) -> None:
+        self._run = run
+        self._kept = kept
+        self._all: list[Child] = []
+        self._standing: list[Child] = []
+        self._changed = asyncio.Event()  # what must stand is another set than before
+
+    def start(self, label: str, argv: Sequence[str], *, heard: bool = True) -> Child:
+        """Start a process; its log is called like its label."""
+        child = Child(label, argv, self._run.directory / f"{label.replace(' ', '-')}.log", heard=heard)
+        self._run.note_process(child.pid)
+        self._all.append(child)
+        return child
+
+    def start_in(
+        self,
+        namespaces: Namespaces,
+        node: str,
+        role: str,
+        arguments: Sequence[str],
+        *,
+        heard: bool = True,
+        environment: Mapping[str, str] | None = None,
+    ) -> Child:
+        """Start Python with these arguments in the namespace of a switch; ``environment``: beside that of ours."""
+        told = ["env", *(f"{name}={value}" for name, value in environment.items())] if environment else []
+        argv = namespaces.command(node, [*told, sys.executable, *arguments], dies_with_us=not self._kept)
+        return self.start(f"{role} {node}", argv, heard=heard)
+
+    async def ready(self, children: Sequence[Child]) -> list[Event]:
+        """Wait until each has said ``ready``, and return how; from then on they must stand.
+
+        Raises:
+            ChildError: one did not, or one that must stand ended.
+        """
+        said = await self.guarded(_all(child.wait_for("ready", READY_S) for child in children))
+        self._standing += children
+        self._changed.set()
+        return said
+
+    def may_end(self, child: Child) -> None:
+        """Expect the end of this process from now on."""
+        self._standing.remove(child)
+        self._changed.set()
+
+    async def kill(self, child: Child) -> None:
+        """Kill a process that must stand; return when it has ended."""
+        self.may_end(child)
+        child.kill()
+        await child.ended
+
+    async def guarded(self, work: Coroutine[None, None, T]) -> T:
+        """Do ``work``, but stop at once if a process that must stand ends.
+
+        Raises:
+            ChildError: one ended.
+        """
+        task = asyncio.ensure_future(work)
+        fallen = asyncio.ensure_future(self._first_to_fall())
+        try:
+            await asyncio.wait([task, fallen], return_when=asyncio.FIRST_COMPLETED)
+            if not task.done():
+                child = fallen.result()
+                raise child.failed(f"ended with code {child.ended.result()}")
+            return task.result()
+        finally:
+            await cancel(task, fallen)
+
+    def forget(self) -> None:
+        """Close our ends; the processes are left as they are."""
+        for child in self._all:
+            child.forget()
+
+    async def _first_to_fall(self) -> Child:
+        while True:
+            for child in self._standing:
+                if child.ended.done():
+                    return child
+            self._changed.clear()
+            changed = asyncio.ensure_future(self._change())
+            try:
+                endings = [child.ended for child in self._standing]
+                await asyncio.wait([changed, *endings], return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                changed.cancel()
+
+    async def _change(self) -> int:
+        await self._changed.wait()
+        return len(self._standing)
+
+
+async def cancel(*tasks: asyncio.Future[T] | asyncio.Future[Child]) -> None:
+    """Cancel what is still under way and wait until it has stopped; what it raises then, others have told already."""
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _all(works: Iterable[Coroutine[None, None, Event]]) -> list[Event]:
+    return await asyncio.gather(*works)

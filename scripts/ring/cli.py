@@ -1,0 +1,248 @@
+"""``python -m ring``, which ``scripts/ring_topology.sh`` runs once everything is set up.
+
+Place: shell. Exit codes: 0 passed, 1 failed, 2 wrong input, 130 and 143 for Ctrl-C and SIGTERM.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from itertools import zip_longest
+from pathlib import Path
+from typing import Annotated, Final, TypeVar, get_args
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from gdp.errors import GdpError, LocalError
+from gdp.host.interruption import Interrupted, interruptible, let_nothing_interrupt
+from gdp.host.run_registry import Run, Runs
+from gdp.limits import CLAIM_LEASE_S
+from gdp.simulation.topology import MTU_BYTES
+from proxy.config import Encoding
+from ring.child import ChildError
+from ring.faults import Cut, Kill, Roam
+from ring.hints import hints, live_hints
+from ring.live_run import LiveRing
+from ring.options import LIVE_S, Live, Options, RingPlane
+from ring.progress import Teller
+from ring.result import Result
+from ring.run import DEMO_S, Ring, make_demo
+from ring.table import table, verdict
+
+__all__ = ["main", "spelled_out"]
+
+ENCODINGS: Final[tuple[Encoding, ...]] = get_args(Encoding)
+PLANES: Final[tuple[RingPlane, ...]] = get_args(RingPlane)
+LIVES: Final[tuple[Live, ...]] = get_args(Live)
+_PASSED: Final = 0
+_FAILED: Final = 1
+_WRONG_INPUT: Final = 2
+_WIDE: Final = 200  # columns where no terminal says how many there are
+
+_EXAMPLES: Final = """\b
+Examples:
+  scripts/ring_topology.sh                           a generated robot drive
+  scripts/ring_topology.sh my.bag --encoding cdr     the bytes as they are
+  scripts/ring_topology.sh --live                    real ROS 2 nodes at both ends
+  scripts/ring_topology.sh --live mixed              ROS 1 at the robot, ROS 2 at the server
+  scripts/ring_topology.sh --rate 0 --json out.json  as fast as it goes
+  scripts/ring_topology.sh --cut nuc2-nuc3@5         a link fails after 5 s
+  scripts/ring_topology.sh --cut nuc4-nuc5@3-6       and one that comes back
+  scripts/ring_topology.sh --roam robot:nuc3@5       the robot drives on to another switch
+  scripts/ring_topology.sh --kill rib:school@5       a RIB dies
+  scripts/ring_topology.sh --live --seconds 70 --cut nuc1-nuc2@5 --kill switch:nuc3@20-30 --roam server:nuc4@40
+  scripts/ring_topology.sh --keep                    leave it up to look around
+  scripts/ring_topology.sh --down                    and take it down
+"""
+
+T = TypeVar("T")
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+@app.command(epilog=_EXAMPLES)
+def ring(
+    bag: Annotated[Path | None, typer.Argument(metavar="[BAG]", help="A recording: .bag, .mcap, .db3, folder.")] = None,
+    live: Annotated[
+        str | None, typer.Option(metavar="[ROS]", help=f"Real nodes instead: {', '.join(LIVES)}; ros2 where not said.")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help=f"Of traffic; a recording is stretched. Live: {LIVE_S:g} where not said.")
+    ] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON.")] = None,
+    rate: Annotated[float, typer.Option(help="Pace of the replay; 0: as fast as it goes.")] = 1.0,
+    encoding: Annotated[str, typer.Option(help=f"Of messages: {', '.join(ENCODINGS)}.")] = "json",
+    data_plane: Annotated[str, typer.Option(help=f"Of the switches: {', '.join(PLANES)}.")] = "auto",
+    mtu: Annotated[int, typer.Option(help="Of the links, in bytes.")] = MTU_BYTES,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the received recording here.")] = None,
+    pcap: Annotated[Path | None, typer.Option(metavar="FILE", help="Write what an eavesdropper on nuc3 sees.")] = None,
+    cut: Annotated[
+        list[str] | None, typer.Option(metavar="A-B@S[-T]", help="Cut a link after S seconds; heal it after T.")
+    ] = None,
+    roam: Annotated[
+        list[str] | None, typer.Option(metavar="WHO:SWITCH@S", help="Plug the robot or server in at another switch.")
+    ] = None,
+    kill: Annotated[
+        list[str] | None,
+        typer.Option(metavar="WHAT@S[-T]", help="Kill rib:DOMAIN or switch:NAME after S seconds; restart it after T."),
+    ] = None,
+    lease: Annotated[
+        float, typer.Option(help="Of names, in seconds: what is not renewed is forgotten.")
+    ] = CLAIM_LEASE_S,
+    keep: Annotated[bool, typer.Option("--keep", help="Leave the ring up, and say what to try.")] = False,
+    down: Annotated[bool, typer.Option("--down", help="Take down every ring that was kept, and end.")] = False,
+) -> None:
+    """Send a recording from a robot at nuc1 over a ring of five name-routed switches to a server at nuc5, and compare.
+
+    With --live it is real nodes that talk: a talker, a camera, a mapper and a service at nuc1, and at nuc5 those who
+    listen and call. Switches, RIBs and proxies are processes in network namespaces; keys and certificates are made for
+    the run. Links, switches and RIBs may fail meanwhile, and the ends may move: --cut, --kill and --roam, each as often
+    as wanted. The exit code is 0 only if every message came out identical and in order, and every call was answered.
+    """
+    errors = Console(stderr=True)
+    try:
+        runs = Runs()
+        if down:
+            taken = runs.take_down()
+            errors.print(f"taken down: {', '.join(taken)}" if taken else "nothing was left up", highlight=False)
+            raise typer.Exit(_PASSED)
+        options = Options(
+            bag=_absolute(bag),
+            rate=rate,
+            encoding=_one_of("encoding", encoding, ENCODINGS),
+            data_plane=_one_of("data-plane", data_plane, PLANES),
+            mtu=mtu,
+            out=_absolute(out),
+            json=_absolute(json_file),
+            pcap=_absolute(pcap),
+            cuts=tuple(Cut.from_text(text) for text in cut or ()),
+            roams=tuple(Roam.from_text(text) for text in roam or ()),
+            kills=tuple(Kill.from_text(text) for text in kill or ()),
+            lease_s=lease,
+            keep=keep,
+            live=None if live is None else _one_of("live", live, LIVES),
+            seconds=seconds,
+        )
+        for swept in runs.sweep():
+            errors.print(f"took down what run {swept} had left behind", highlight=False)
+        code = _run(options, runs.start(), errors)
+    except ChildError as error:
+        errors.print(f"[bold red]failed[/bold red]: {escape(str(error))}", highlight=False, soft_wrap=True)
+        code = _FAILED
+    except GdpError as error:
+        errors.print(escape(str(error)), highlight=False, soft_wrap=True)
+        code = _WRONG_INPUT
+    raise typer.Exit(code)
+
+
+def main() -> None:
+    """Run the command; never returns."""
+    app(list(spelled_out(sys.argv[1:])), prog_name="ring_topology.sh")
+
+
+def spelled_out(words: Sequence[str]) -> Iterator[str]:
+    """Yield the command line with ``ros2`` after each ``--live`` that stands without a word of its own."""
+    for word, following in zip_longest(words, words[1:], fillvalue="-"):
+        yield word
+        if word == "--live" and following.startswith("-"):
+            yield LIVES[0]
+
+
+def _run(options: Options, run: Run, errors: Console) -> int:
+    """Do one run, and take down what it made unless it is to be kept."""
+    kept = False
+    try:
+        code = asyncio.run(interruptible(_go(options, run, errors)))
+        kept = options.keep and code in (_PASSED, _FAILED)
+    except Interrupted as interrupted:
+        errors.print("interrupted; taking everything down")
+        code = interrupted.exit_code
+    finally:
+        if kept:
+            run.keep()
+        else:
+            let_nothing_interrupt()
+            run.end()
+    return code
+
+
+async def _go(options: Options, run: Run, errors: Console) -> int:
+    if options.live is not None:
+        return await _go_live(options, options.live, run, errors)
+    with Teller(errors) as teller:
+        bag = options.bag
+        if bag is None:
+            duration_s = options.seconds or DEMO_S
+            teller.step(f"making a recording: {duration_s:g} seconds of a robot's drive")
+            bag = await make_demo(run, duration_s)
+        if options.out is not None:
+            options.out.mkdir(parents=True, exist_ok=True)
+        standing = Ring(options, run, teller, bag)
+        try:
+            result = await standing.result()
+        finally:
+            standing.forget()
+    _show(result)
+    _write(options, result, standing.recording)
+    if options.keep:
+        _hint(run, hints(standing, standing.start_again()), errors)
+        standing.forget()
+    return _PASSED if result.passed else _FAILED
+
+
+async def _go_live(options: Options, live: Live, run: Run, errors: Console) -> int:
+    with Teller(errors) as teller:
+        standing = LiveRing(options, live, run, teller)
+        try:
+            result = await standing.result()
+        finally:
+            standing.forget()
+    _show(result)
+    _write(options, result)
+    if options.keep:
+        standing.go_on()
+        _hint(run, live_hints(standing), errors)
+        standing.forget()
+    return _PASSED if result.passed else _FAILED
+
+
+def _hint(run: Run, hinted: Sequence[tuple[str, str]], errors: Console) -> None:
+    errors.print(f"\nThe ring of run {run.id} stands. Try:", highlight=False)
+    for purpose, command in hinted:
+        errors.print(f"  [dim]# {escape(purpose)}[/dim]\n  {escape(command)}", highlight=False, soft_wrap=True)
+
+
+def _show(result: Result) -> None:
+    output = Console()
+    if not output.is_terminal:
+        output = Console(width=_WIDE)
+    output.print(table(result))
+    output.print(verdict(result), highlight=False, soft_wrap=True)
+
+
+def _write(options: Options, result: Result, recording: Path | None = None) -> None:
+    """Write the files that were asked for; under sudo they belong to the person who asked."""
+    if options.json is not None:
+        options.json.write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")
+    person = os.environ.get("SUDO_UID"), os.environ.get("SUDO_GID")
+    if os.getuid() == 0 and all(person):
+        recorded = (options.out, recording) if options.out is not None else ()
+        for made in (options.json, options.pcap, *recorded):
+            if made is not None and made.exists():
+                os.chown(made, int(person[0] or 0), int(person[1] or 0))
+
+
+def _absolute(path: Path | None) -> Path | None:
+    return path.expanduser().absolute() if path is not None else None
+
+
+def _one_of(option: str, text: str, choices: tuple[T, ...]) -> T:
+    for choice in choices:
+        if choice == text:
+            return choice
+    raise LocalError(f"--{option} is one of {', '.join(map(str, choices))}, not {text!r}")

@@ -1,0 +1,153 @@
+"""What every run stands on: five namespaces, with a switch in each and a RIB in each domain; and what breaks in it.
+
+Place: shell. Nothing is waited for by the clock: every stage begins when the one before has said that it is ready, and
+every process is watched, so that one which dies ends the run at once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from gdp.host.run_registry import Run
+from gdp.simulation.namespaces import Namespaces
+from ring.child import Child
+from ring.children import READY_S, Children
+from ring.faults import Cut, Kill, Roam, roamers
+from ring.materials import Materials
+from ring.options import Options
+from ring.progress import Teller
+
+__all__ = ["Fabric"]
+
+_MIDDLE: Final = "nuc3"
+
+
+class Fabric:
+    """The overlay of one run, from its laying on; the ends are others' work.
+
+    Args:
+        options: what was asked for.
+        run: takes down what is made here, whoever asks it to.
+        teller: hears of progress.
+
+    Raises:
+        LocalError: the kernel refuses namespaces.
+    """
+
+    def __init__(self, options: Options, run: Run, teller: Teller) -> None:
+        self.options = options
+        self.topology = options.topology()
+        self.robot, self.server = self.topology.attached("proxy")
+        self.teller = teller
+        teller.step(f"run {run.id}: five namespaces, keys and certificates")
+        self.namespaces = Namespaces(self.topology, run)
+        roaming = roamers(options.faults, self.topology)
+        for at in roaming:
+            self.namespaces.plug(at.switch, at.ifname, at.switch)
+        self.materials = Materials(
+            self.topology, run.directory, metrics=options.keep, roamers=roaming, lease_s=options.lease_s
+        )
+        self.children = Children(run, kept=options.keep)
+        self.switches: dict[str, Child] = {}
+        self._ribs: dict[str, Child] = {}
+        self._restarts = 0
+        self._planes: list[str] = []  # what the switches took
+
+    @property
+    def settings(self) -> dict[str, object]:
+        """Return the options as the JSON result states them, with the data plane that was taken."""
+        return {**self.options.settings(), "data_plane": ", ".join(self._planes)}
+
+    async def stand_up(self) -> None:
+        """Start switches and RIBs; return when all are ready.
+
+        Raises:
+            ChildError: a process failed.
+        """
+        if self.options.pcap is not None:
+            ifaces = [f"--iface={link.other(_MIDDLE)}" for link in self.topology.links_of(_MIDDLE)]
+            capture = self.start(_MIDDLE, "capture", ["-m", "gdp.ports.capture", *ifaces, str(self.options.pcap)])
+            await self.children.ready([capture])
+        self.teller.step("starting a switch in each")
+        for node in self.topology.nodes:
+            config = self.materials.switch(node, self.options.data_plane)
+            self.switches[node] = self._start_switch(node, config)
+        said = await self.children.ready(list(self.switches.values()))
+        self._planes = sorted({each.text("data_plane") for each in said})
+        for reason in sorted({each.text("reason") for each in said} - {""}):
+            self.teller.step(f"data plane {', '.join(self._planes)}: {reason}")
+        self.teller.step("starting the RIB of each domain")
+        configs = {at.switch: self.materials.rib(at) for at in self.topology.attached("rib")}
+        self._ribs = {node: self._start_rib(node, config) for node, config in configs.items()}
+        await self.children.ready(list(self._ribs.values()))
+        self.teller.step(f"starting the proxies at {self.robot.switch} and {self.server.switch}")
+
+    def start(
+        self,
+        node: str,
+        role: str,
+        arguments: Sequence[str],
+        *,
+        heard: bool = True,
+        environment: Mapping[str, str] | None = None,
+    ) -> Child:
+        """Start Python with these arguments in the namespace of a switch; ``environment``: beside that of ours."""
+        return self.children.start_in(self.namespaces, node, role, arguments, heard=heard, environment=environment)
+
+    async def cut(self, cut: Cut) -> None:
+        """Take a link down.
+
+        Raises:
+            LocalError: the kernel refuses.
+        """
+        await asyncio.to_thread(self.namespaces.cut, cut.a, cut.b)
+
+    async def heal(self, cut: Cut) -> None:
+        """Bring a link back.
+
+        Raises:
+            LocalError: the kernel refuses.
+        """
+        await asyncio.to_thread(self.namespaces.mend, cut.a, cut.b)
+
+    async def kill(self, kill: Kill) -> None:
+        """Kill a switch, or the RIBs of a domain."""
+        running = self.switches if kill.role == "switch" else self._ribs
+        for node in kill.victims(self.topology):
+            await self.children.kill(running[node])
+
+    async def restart(self, kill: Kill) -> None:
+        """Start what was killed again; return when it is ready.
+
+        Raises:
+            ChildError: it does not start.
+        """
+        self._restarts += 1
+        running, start = (self.switches, self._start_switch) if kill.role == "switch" else (self._ribs, self._start_rib)
+        for node in kill.victims(self.topology):
+            child = running[node] = start(node, self.materials.file(kill.role, node), f"restart-{self._restarts}-")
+            await self.children.ready([child])
+
+    async def roam(self, roam: Roam) -> None:
+        """Pull a proxy's cable and plug it in at another switch.
+
+        Raises:
+            LocalError: the kernel refuses.
+        """
+        home = roam.proxy(self.topology).switch
+        await asyncio.to_thread(self.namespaces.unplug, home, roam.who)
+        await asyncio.to_thread(self.namespaces.plug, home, roam.who, roam.to)
+
+    def _start_switch(self, node: str, config: Path, prefix: str = "") -> Child:
+        return self.start(node, f"{prefix}switch", ["-m", "gdp.cli.switch", "--config", str(config), "--json"])
+
+    def _start_rib(self, node: str, config: Path, prefix: str = "") -> Child:
+        argv = ["-m", "gdp.cli.rib", "--config", str(config), "--json", "--await-iface", f"{READY_S:g}"]
+        return self.start(node, f"{prefix}rib", argv)
+
+    def forget(self) -> None:
+        """Close our ends of the processes; they are left as they are."""
+        self.children.forget()

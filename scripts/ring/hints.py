@@ -1,0 +1,68 @@
+"""What to try with a ring that was left standing.
+
+Place: shell; makes text, prints nothing.
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+
+from gdp.host.run_registry import in_first_user_namespace
+from ring.fabric import Fabric
+from ring.live_run import LiveRing
+from ring.plan import METRICS_PORTS
+from ring.run import Ring
+
+__all__ = ["common", "hints", "inside", "live_hints"]
+
+
+def hints(ring: Ring, again: Path) -> list[tuple[str, str]]:
+    """Return (what it does, command line) in the order in which a person might try them.
+
+    Args:
+        ring: still standing.
+        again: what its new receiver records into.
+    """
+    replay = Path(sys.executable).with_name("gdp-replay")
+    sender = f"{replay} {shlex.quote(str(ring.bag))} --config {ring.sender_config}"
+    return [(f"send the recording again, into {again}", inside(ring.fabric, "nuc1", sender)), *common(ring.fabric)]
+
+
+def live_hints(ring: LiveRing) -> list[tuple[str, str]]:
+    """Return, likewise, what to try with a live ring."""
+    found = []
+    for at, graph in zip(("nuc1", "nuc5"), ring.graphs, strict=True):
+        if graph.ros == 1:
+            found.append((f"the topics at {at}", inside(ring.fabric, at, "rostopic list")))
+            found.append((f"what is said at {at}", inside(ring.fabric, at, "rostopic echo -n 5 /chatter")))
+        else:
+            told = " ".join(f"{name}={value}" for name, value in ring.environment(graph).items())
+            listener = f"env {told} timeout 5 {sys.executable} -m ring.nodes 2 listener 0"
+            found.append((f"one more listener at {at}, for five seconds", inside(ring.fabric, at, listener)))
+    proxy = inside(ring.fabric, "nuc5", _metrics("proxy"))
+    logs = f"tail -n 3 {ring.directory}/*.log"
+    return [*found, ("what the proxy at nuc5 counts", proxy), ("what all log", logs), *common(ring.fabric)]
+
+
+def common(fabric: Fabric) -> list[tuple[str, str]]:
+    """Return what may be tried with every ring."""
+    script = Path(__file__).parents[2] / "scripts" / "ring_topology.sh"
+    return [
+        ("what the switch in the middle counts", inside(fabric, "nuc3", _metrics("switch"))),
+        ("what passes it", inside(fabric, "nuc3", "tcpdump -e -i nuc4 ether proto 0x88b5")),
+        ("cut the usual way, and watch the other be taken", inside(fabric, "nuc2", "ip link set nuc3 down")),
+        ("take everything down", f"{script} --down"),
+    ]
+
+
+def inside(fabric: Fabric, node: str, command: str) -> str:
+    """Return what a person types, from outside, to run a command in the namespace of a switch."""
+    if in_first_user_namespace():
+        return f"ip netns exec {fabric.namespaces.path(node).name} {command}"
+    return f"nsenter --target {fabric.switches[node].pid} --user --mount --net --preserve-credentials {command}"
+
+
+def _metrics(role: str) -> str:
+    return f"curl -s http://127.0.0.1:{METRICS_PORTS[role]}/metrics"

@@ -1,0 +1,153 @@
+"""What a live run consists of, as data: the graphs of both ends, what crosses, and how much of it.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+from gdp.metadata import Metadata
+from gdp.trust.right import Right
+from proxy.config import Encoding
+from proxy.serial.channel import RosVersion
+from ring.nodes.content import LAMP, LAMP_HZ, LAMP_TYPE, TALKS
+from ring.options import Live
+from ring.plan import AUTHOR, Yaml
+
+__all__ = [
+    "CARRIED",
+    "FAST_DDS_PROFILES",
+    "MASTER_PORT",
+    "Carried",
+    "Graph",
+    "Side",
+    "calls_in",
+    "graphs_of",
+    "messages_in",
+]
+
+Side = Literal["expose", "import"]
+
+MASTER_PORT: Final = 11_311
+_RIGHTS: Final[dict[tuple[str, Side], Right]] = {
+    ("topic", "expose"): Right.PUBLISH,
+    ("topic", "import"): Right.READ,
+    ("service", "expose"): Right.SERVE,
+    ("service", "import"): Right.CALL,
+}
+# A picture comes as fifteen datagrams at once: what Linux lets wait by default is less.
+FAST_DDS_PROFILES: Final = """\
+<?xml version="1.0" encoding="UTF-8"?>
+<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
+  <transport_descriptors>
+    <transport_descriptor>
+      <transport_id>udp</transport_id>
+      <type>UDPv4</type>
+      <receiveBufferSize>4194304</receiveBufferSize>
+      <sendBufferSize>4194304</sendBufferSize>
+    </transport_descriptor>
+  </transport_descriptors>
+  <participant profile_name="udp" is_default_profile="true">
+    <rtps>
+      <userTransports><transport_id>udp</transport_id></userTransports>
+      <useBuiltinTransports>false</useBuiltinTransports>
+    </rtps>
+  </participant>
+</profiles>
+"""
+_DOMAINS: Final = 100  # above that, a domain's ports are among those that Linux gives to anyone
+
+
+@dataclass(frozen=True, slots=True)
+class Carried:
+    """A topic or a service that the proxies carry from the robot to the server."""
+
+    name: str
+    type_name: str
+    kind: Literal["topic", "service"] = "topic"
+
+    @property
+    def metadata(self) -> Metadata:
+        """Return what its name in the overlay digests."""
+        return Metadata({"kind": self.kind, "name": self.name, "type": self.type_name, "author": AUTHOR})
+
+    def right(self, side: Side) -> Right:
+        """Return what the proxy of one side must be allowed."""
+        return _RIGHTS[self.kind, side]
+
+    def rule(self, owner: Path, encoding: Encoding) -> Yaml:
+        """Return its rule in either ``proxy.yaml``; what kind of topic it is, the nodes' QoS says."""
+        return {
+            "name": self.name,
+            "kind": self.kind,
+            "type": self.type_name,
+            "metadata": {"author": AUTHOR},
+            "owner": str(owner),
+            "encoding": encoding,
+        }
+
+
+CARRIED: Final = (*(Carried(talk.topic, talk.type_name) for talk in TALKS), Carried(LAMP, LAMP_TYPE, "service"))
+
+
+@dataclass(frozen=True, slots=True)
+class Graph:
+    """The ROS graph of one end, alone in its network namespace. ``domain``: of ROS 2."""
+
+    ros: RosVersion
+    domain: int
+
+    def to_yaml(self) -> Yaml:
+        """Return the ``ros`` section of ``proxy.yaml``."""
+        if self.ros == 1:
+            return {"endpoint": "ros1", "master": self._master}
+        return {"endpoint": "ros2", "domain": self.domain}
+
+    def environment(self, logs: Path, profiles: Path) -> Mapping[str, str]:
+        """Return what its nodes and its proxy find in their environment.
+
+        Fast DDS's shared memory is left out: it crosses the network namespaces of a machine. So ROS 2 is not told to
+        keep to LOCALHOST, which would bring it back; there is no other network in the namespace anyway.
+
+        Args:
+            logs: directory for what ROS logs.
+            profiles: file that holds ``FAST_DDS_PROFILES``.
+        """
+        if self.ros == 1:
+            return {"ROS_MASTER_URI": self._master, "ROS_HOSTNAME": "127.0.0.1", "ROS_LOG_DIR": str(logs)}
+        return {
+            "ROS_DOMAIN_ID": str(self.domain),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
+            "ROS_LOCALHOST_ONLY": "",
+            "ROS_STATIC_PEERS": "",
+            "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
+            "FASTRTPS_DEFAULT_PROFILES_FILE": str(profiles),
+            "FASTDDS_DEFAULT_PROFILES_FILE": str(profiles),
+            "ROS_LOG_DIR": str(logs),
+        }
+
+    @property
+    def _master(self) -> str:
+        return f"http://127.0.0.1:{MASTER_PORT}"
+
+
+def graphs_of(live: Live, run: str) -> tuple[Graph, Graph]:
+    """Return the robot's graph and the server's; ``run`` is an id in hex, from which their domains follow."""
+    domain = 1 + int(run, 16) % _DOMAINS
+    robot: RosVersion = 2 if live == "ros2" else 1
+    server: RosVersion = 1 if live == "ros1" else 2
+    return Graph(robot, domain), Graph(server, domain % _DOMAINS + 1)
+
+
+def messages_in(seconds: float) -> dict[str, int]:
+    """Return how many messages each talking node publishes."""
+    return {talk.node: max(round(talk.hz * seconds), 1) for talk in TALKS}
+
+
+def calls_in(seconds: float) -> int:
+    """Return how often the lamp is switched."""
+    return max(round(LAMP_HZ * seconds), 1)

@@ -1,0 +1,167 @@
+"""One live run: real ROS nodes at both ends of the ring, and a proxy beside each in their graph.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from gdp.errors import LocalError
+from gdp.host.run_registry import Run
+from gdp.simulation.topology import Attachment
+from proxy.endpoints.ros1.install import rospy_folder
+from ring.child import Child
+from ring.events import Event
+from ring.fabric import Fabric
+from ring.injection import Injection
+from ring.live_plan import CARRIED, FAST_DDS_PROFILES, MASTER_PORT, Graph, Side, calls_in, graphs_of, messages_in
+from ring.live_result import Heard, rows
+from ring.live_session import ENDING_S, Cast, LiveSession
+from ring.options import Live, Options
+from ring.progress import Teller
+from ring.result import Result
+
+__all__ = ["LiveRing"]
+
+_ROS2: Final = ("rclpy", "std_msgs", "sensor_msgs", "nav_msgs", "std_srvs")
+_SIDES: Final[tuple[Side, Side]] = ("expose", "import")
+
+
+class LiveRing:
+    """The ring of one live run, from its laying on.
+
+    Args:
+        options: what was asked for.
+        live: of which ROS the ends are.
+        run: takes down what is made here, whoever asks it to.
+        teller: hears of progress.
+
+    Raises:
+        LocalError: a ROS is missing, or the kernel refuses namespaces.
+    """
+
+    def __init__(self, options: Options, live: Live, run: Run, teller: Teller) -> None:
+        self.graphs = graphs_of(live, run.id)
+        _require({graph.ros for graph in self.graphs})
+        self._options = options
+        self._run = run
+        self._teller = teller
+        self._profiles = run.directory / "fast-dds.xml"
+        self._profiles.write_text(FAST_DDS_PROFILES, encoding="utf-8")
+        self.fabric = Fabric(options, run, teller)
+        self._ends = tuple(zip((self.fabric.robot, self.fabric.server), self.graphs, _SIDES, strict=True))
+        self._proxies: list[Child] = []
+        self._nodes: list[Child] = []
+
+    async def result(self) -> Result:
+        """Let robot and server talk over the ring, and compare.
+
+        Raises:
+            ChildError: a process failed.
+            LocalError: a fault cannot be injected.
+        """
+        fabric, children = self.fabric, self.fabric.children
+        await fabric.stand_up()
+        await children.ready([self._start_master(at, graph) for at, graph, _ in self._ends if graph.ros == 1])
+        self._proxies = [self._start_proxy(*end) for end in self._ends]
+        await children.ready(self._proxies)
+        cast = await self._cast()
+        session = LiveSession(children, cast, self._teller)
+        await session.meet()
+        self._teller.step(f"they hear each other; {self._options.live_s:g} s of traffic")
+        injection, begun_s = Injection(fabric, self._options.faults, self._teller), time.monotonic()
+        try:
+            heard = await session.talk(self._options.live_s)
+        finally:
+            await injection.stop()
+        traffic_s = time.monotonic() - begun_s
+        self._teller.step("comparing what was published with what was heard")
+        result = await self._compare(heard, injection.complaints())
+        return replace(result, traffic_s=traffic_s, silent_s=session.silent_s)
+
+    def go_on(self) -> None:
+        """Start proxies that outlive us, in place of those that have reported, and let the nodes talk on."""
+        for end in self._ends:
+            self._start_proxy(*end, heard=False)
+        for node in self._nodes:
+            node.go()
+
+    @property
+    def directory(self) -> Path:
+        """Return where the processes' logs are."""
+        return self._run.directory
+
+    def environment(self, graph: Graph) -> Mapping[str, str]:
+        """Return what the processes in a graph find in their environment."""
+        return graph.environment(self._run.directory / "ros-logs", self._profiles)
+
+    def forget(self) -> None:
+        """Close our ends of the processes; they are left as they are."""
+        self.fabric.forget()
+
+    async def _cast(self) -> Cast:
+        """Start the nodes; return when all are ready."""
+        (robot, at_robot, _), (server, at_server, _) = self._ends
+        talking, calls = messages_in(self._options.live_s), calls_in(self._options.live_s)
+        self._teller.step(f"starting nodes at {robot.switch}, ROS {at_robot.ros}: {', '.join(talking)}, lamp")
+        self._teller.step(f"starting nodes at {server.switch}, ROS {at_server.ros}: listener, caller")
+        talkers = {self._start_node(robot, at_robot, name, count): count for name, count in talking.items()}
+        lamp = self._start_node(robot, at_robot, "lamp", 0)
+        listener = self._start_node(server, at_server, "listener", 0)
+        caller = self._start_node(server, at_server, "caller", calls)
+        self._nodes = [*talkers, lamp, listener, caller]
+        await self.fabric.children.ready(self._nodes)
+        return Cast(talkers, lamp, listener, caller, calls)
+
+    async def _compare(self, heard: Heard, complaints: list[str]) -> Result:
+        said = [await self._finish(proxy) for proxy in self._proxies]
+        result = Result(rows(heard, said[1].parts("topics")), self.fabric.settings, complaints=tuple(complaints))
+        if result.passed:
+            return result
+        ends = zip(self._proxies, said, strict=True)
+        counted = [f"{proxy.label} counts {words}" for proxy, each in ends if (words := _faults(each))]
+        return replace(result, complaints=(*complaints, *counted))
+
+    async def _finish(self, proxy: Child) -> Event:
+        """Ask a proxy to end; return what it carried."""
+        children = self.fabric.children
+        children.may_end(proxy)
+        proxy.interrupt()
+        return await children.guarded(proxy.wait_for("done", ENDING_S))
+
+    def _start_master(self, at: Attachment, graph: Graph) -> Child:
+        return self._start(at, graph, "master", ["-m", "ring.nodes.master", str(MASTER_PORT)])
+
+    def _start_proxy(self, at: Attachment, graph: Graph, side: Side, *, heard: bool = True) -> Child:
+        config = self.fabric.materials.live(at, side, CARRIED, self._options.encoding, graph.to_yaml())
+        argv = ["-m", "proxy.cli", "--config", str(config), *(["--json"] if heard else [])]
+        return self._start(at, graph, "proxy", argv, heard=heard)
+
+    def _start_node(self, at: Attachment, graph: Graph, name: str, count: int) -> Child:
+        return self._start(at, graph, name, ["-m", "ring.nodes", str(graph.ros), name, str(count)])
+
+    def _start(self, at: Attachment, graph: Graph, role: str, argv: list[str], *, heard: bool = True) -> Child:
+        return self.fabric.start(at.switch, role, argv, heard=heard, environment=self.environment(graph))
+
+
+def _require(versions: set[int]) -> None:
+    """Refuse, in one sentence, a ROS that is not here."""
+    if 1 in versions and not (Path(rospy_folder()) / "rosmaster").is_dir():
+        raise LocalError("ROS 1 needs rosmaster, which is not installed here: run sudo scripts/setup_ros1.sh")
+    missing = [name for name in _ROS2 if 2 in versions and importlib.util.find_spec(name) is None]
+    if missing:
+        raise LocalError(
+            f"ROS 2 needs {', '.join(missing)}, which this Python does not have: run scripts/setup.sh --ros2, or source"
+            " your ROS 2"
+        )
+
+
+def _faults(done: Event) -> str:
+    """Return what a proxy counted that was not as wanted; empty: nothing."""
+    return ", ".join(f"{count} {label}" for label, count in done.part("faults").fields.items() if count)

@@ -1,0 +1,158 @@
+"""The time in which live nodes talk: all are listened to, until nothing is under way any more.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Awaitable, Coroutine, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from ring.child import Child
+from ring.children import Children, cancel
+from ring.events import Event
+from ring.live_result import Heard
+from ring.nodes.content import LAMP
+from ring.progress import Teller, Traffic
+from ring.silence import Silence
+
+__all__ = ["Cast", "LiveSession"]
+
+MEET_S: Final = 60.0
+ENDING_S: Final = 30.0
+QUIET_S: Final = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Cast:
+    """The nodes of a live run; each has said that it is ready. ``talkers``: how many messages each will publish."""
+
+    talkers: Mapping[Child, int]
+    lamp: Child
+    listener: Child
+    caller: Child
+    calls: int
+
+    @property
+    def messages(self) -> int:
+        """Return how many messages will be published in all."""
+        return sum(self.talkers.values())
+
+
+class LiveSession:
+    """One run's traffic. The nodes stand as long as ``children`` says."""
+
+    def __init__(self, children: Children, cast: Cast, teller: Teller) -> None:
+        self._children = children
+        self._cast = cast
+        self._teller = teller
+        self._sent: dict[Child, int] = {}
+        self._received: dict[str, int] = {}
+        self._asked = 0
+        self._answered = 0
+        self._silence = Silence()
+        self._latency_ms: float | None = None
+        self._moved = asyncio.Event()
+
+    @property
+    def silent_s(self) -> float:
+        """Return the longest time that something was due and nothing came, to half a second."""
+        return self._silence.longest_s
+
+    async def meet(self) -> None:
+        """Wait until the far end hears every topic and sees the service.
+
+        Raises:
+            ChildError: a process failed, or it took too long.
+        """
+        far = (self._cast.listener, self._cast.caller)
+        await self._children.guarded(_all(*(child.wait_for("hears", MEET_S) for child in far)))
+
+    async def talk(self, seconds: float) -> Heard:
+        """Let them talk for so long, wait for what is under way, and return what each has to report.
+
+        Raises:
+            ChildError: a process failed, or did not report.
+        """
+        cast = self._cast
+        self._teller.begin_traffic(cast.messages + cast.calls)
+        ear = asyncio.ensure_future(self._follow(cast.listener))
+        lamp = asyncio.ensure_future(self._follow(cast.lamp))
+        try:
+            for child in (*cast.talkers, cast.caller):
+                child.go()
+            patience_s = seconds + ENDING_S
+            speaking = [_in_time(child, self._follow(child), patience_s) for child in (*cast.talkers, cast.caller)]
+            *talkers, caller = await self._children.guarded(_all(*speaking))
+            self._answered = caller.count("answered")
+            await self._children.guarded(self._until_quiet())
+            cast.listener.interrupt()
+            cast.lamp.interrupt()
+            ending = _all(_in_time(cast.listener, ear, ENDING_S), _in_time(cast.lamp, lamp, ENDING_S))
+            listener_said, lamp_said = await self._children.guarded(ending)
+        finally:
+            await cancel(ear, lamp)
+            self._teller.end_traffic()
+        return Heard(tuple(talkers), lamp_said, listener_said, caller)
+
+    async def _follow(self, child: Child) -> Event:
+        """Follow a node until its report."""
+        async with contextlib.aclosing(child.events()) as events:
+            async for event in events:
+                if event.name == "done":
+                    return event
+                if event.name == "progress":
+                    self._note(child, event)
+        raise child.failed(f"ended with code {await child.ended} before its report")
+
+    def _note(self, child: Child, event: Event) -> None:
+        now_s, silence = time.monotonic(), self._silence
+        if child is self._cast.listener:
+            received = {each.text("topic"): each.count("received") for each in event.parts("topics")}
+            if received != self._received:
+                self._moved.set()
+            for topic, count in received.items():
+                silence.received(topic, count, now_s)
+            self._received = received
+            self._latency_ms = event.number_or_none("latency_ms")
+        elif child is self._cast.caller:
+            self._asked, self._answered = event.count("asked"), event.count("answered")
+            silence.sent(LAMP, self._asked, now_s)
+            silence.received(LAMP, self._answered, now_s)
+        else:
+            self._sent[child] = event.count("sent")
+            silence.sent(event.text("topic"), event.count("sent"), now_s)
+        self._teller.traffic(
+            Traffic(
+                total=self._cast.messages + self._cast.calls,
+                sent=sum(self._sent.values()) + self._asked,
+                received=sum(self._received.values()) + self._answered,
+                behind=silence.behind,
+                silent=tuple(silence.silent(now_s)),
+                latency_ms=self._latency_ms,
+            )
+        )
+
+    async def _until_quiet(self) -> None:
+        """Wait until all came, or nothing came for a while."""
+        while sum(self._received.values()) < self._cast.messages:
+            self._moved.clear()
+            try:
+                await asyncio.wait_for(self._moved.wait(), QUIET_S)
+            except asyncio.TimeoutError:
+                return
+
+
+async def _all(*works: Coroutine[None, None, Event]) -> list[Event]:
+    return await asyncio.gather(*works)
+
+
+async def _in_time(child: Child, report: Awaitable[Event], patience_s: float) -> Event:
+    try:
+        return await asyncio.wait_for(report, patience_s)
+    except asyncio.TimeoutError:
+        raise child.failed(f"did not report within {patience_s:g} s") from None

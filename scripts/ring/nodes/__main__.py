@@ -1,0 +1,45 @@
+"""``python -m ring.nodes ROS NODE COUNT``: ROS is 1 or 2; COUNT messages or calls, where the node has any.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from ring.nodes import roles
+from ring.nodes.content import TALKS
+from ring.nodes.node import Node
+from ring.nodes.orders import Orders
+
+
+def _node(ros: str, name: str) -> Node:
+    if ros == "2":
+        from ring.nodes.ros2 import Ros2Node
+
+        return Ros2Node(name)
+    from proxy.endpoints.ros1.install import rospy_folder
+
+    sys.path.insert(0, rospy_folder())  # first: a ROS 2 of this interpreter has packages of the same names
+    from ring.nodes.ros1 import Ros1Node
+
+    return Ros1Node(name)
+
+
+def main() -> None:
+    """Be one of the nodes until killed."""
+    ros, name, count = sys.argv[1], sys.argv[2], int(sys.argv[3])
+    orders = Orders()
+    node = _node(ros, name)
+    if name == "listener":
+        roles.listen(node, orders, TALKS)
+    elif name == "lamp":
+        roles.serve(node, orders)
+    elif name == "caller":
+        roles.call(node, orders, count)
+    else:
+        roles.talk(node, orders, next(talk for talk in TALKS if talk.node == name), count)
+
+
+if __name__ == "__main__":
+    main()

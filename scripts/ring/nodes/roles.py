@@ -1,0 +1,215 @@
+"""The roles of a live ring: who talks, listens, serves and calls, written for either ROS.
+
+Place: shell. Nobody ends by itself: what was said must stay to be had, and a kept ring lives on.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Final, NoReturn
+
+from proxy.tally import percentile
+from ring.nodes.content import LAMP, LAMP_HZ, LAMP_TYPE, Mark, Talk, digest, lamp_says
+from ring.nodes.node import Call, Node
+from ring.nodes.orders import Order, Orders, say
+
+__all__ = ["call", "listen", "serve", "talk"]
+
+_GREETING_S: Final = 0.2
+_LOOK_S: Final = 0.25
+_CALL_S: Final = 8.0  # longer than proxies let a client wait
+
+
+class _Pace:
+    """Steps at an even rate."""
+
+    def __init__(self, hz: float, orders: Orders) -> None:
+        self._period_s = 1 / hz
+        self._orders = orders
+        self._next_s = time.monotonic()
+        self._tell_at_s = self._next_s
+
+    def step(self, **progress: object) -> None:
+        """Wait for the next step; twice a second, tell how far we are, if anything is given to tell."""
+        self._next_s += self._period_s
+        self._orders.wait_until(self._next_s)
+        if progress and time.monotonic() >= self._tell_at_s:
+            self._tell_at_s = time.monotonic() + 0.5
+            say("progress", **progress)
+
+
+def talk(node: Node, orders: Orders, of: Talk, count: int) -> NoReturn:
+    """Greet until told to go, publish ``count`` messages, report, and after that talk on when told to."""
+    out = node.publisher(of.topic, of.type_name, latched=of.latched)
+    size = 0
+    sent = list[str]()
+
+    def publish(number: int) -> object:
+        message = out.message()
+        of.fill(message, number, time.time_ns(), node.fit)
+        out.publish(message)
+        return message
+
+    def publish_counted(number: int) -> None:
+        nonlocal size
+        message = publish(number)
+        size += node.size(message)
+        sent.append(digest(message))
+
+    say("ready")
+    if of.latched:
+        publish_counted(1)  # for those who are not there yet
+    while orders.wait(_GREETING_S) is not Order.GO:
+        if not of.latched:
+            publish(0)
+    pace = _Pace(of.hz, orders)
+    for number in range(len(sent) + 1, count + 1):
+        pace.step(topic=of.topic, sent=len(sent))
+        publish_counted(number)
+    say("done", topic=of.topic, type=of.type_name, bytes=size, sent=sent)
+    orders.wait_for(Order.GO)
+    while True:
+        count += 1
+        orders.wait(1 / of.hz)
+        publish(count)
+
+
+class Gap:
+    """The longest time between two of a series of moments."""
+
+    def __init__(self) -> None:
+        self._newest_ns: int | None = None
+        self.longest_ms: float | None = None
+
+    def note(self, now_ns: int) -> None:
+        """Note a moment."""
+        if self._newest_ns is not None:
+            self.longest_ms = max(self.longest_ms or 0.0, (now_ns - self._newest_ns) / 1e6)
+        self._newest_ns = now_ns
+
+
+class _Ear:
+    """What came on one topic. The first message is not timed: it may have waited for us."""
+
+    def __init__(self, of: Talk) -> None:
+        self._of = of
+        self.is_awake = False
+        self.heard: list[str] = []
+        self.latencies_ms: list[float] = []
+        self._gap = Gap()
+
+    def take(self, message: object) -> None:
+        now_ns = time.time_ns()
+        mark: Mark = self._of.read(message)
+        if mark.number:
+            self.heard.append(digest(message))
+            self._gap.note(now_ns)
+            if self.is_awake:
+                self.latencies_ms.append((now_ns - mark.stamp_ns) / 1e6)
+        self.is_awake = True
+
+    def progress(self) -> dict[str, object]:
+        return {"topic": self._of.topic, "received": len(self.heard)}
+
+    def report(self) -> dict[str, object]:
+        return {
+            "topic": self._of.topic,
+            "type": self._of.type_name,
+            "heard": list(self.heard),
+            "latency_ms": _latency(list(self.latencies_ms)),
+            "silent_ms": self._gap.longest_ms,
+        }
+
+
+def listen(node: Node, orders: Orders, talks: Sequence[Talk]) -> NoReturn:
+    """Hear all topics; tell when each was heard, how many messages came, and at the end which."""
+    ears = [_Ear(of) for of in talks]
+    for of, ear in zip(talks, ears, strict=True):
+        node.subscribe(of.topic, of.type_name, ear.take, latched=of.latched)
+    say("ready")
+    _until(lambda: all(ear.is_awake for ear in ears), orders)
+    say("hears")
+    while orders.wait(_LOOK_S) is not Order.REPORT:
+        latest = [ear.latencies_ms[-1] for ear in ears if ear.latencies_ms]
+        mean = sum(latest) / len(latest) if latest else None
+        say("progress", topics=[ear.progress() for ear in ears], latency_ms=mean)
+    say("done", topics=[ear.report() for ear in ears])
+    orders.wait_for_the_end()
+
+
+def serve(node: Node, orders: Orders) -> NoReturn:
+    """Be a lamp; report how often it was switched."""
+    switched = 0
+
+    def lamp(on: bool) -> tuple[bool, str]:
+        nonlocal switched
+        switched += 1
+        return True, lamp_says(switched, on=on)
+
+    node.serve(LAMP, LAMP_TYPE, lamp)
+    say("ready")
+    orders.wait_for(Order.REPORT)
+    say("done", served=switched)
+    orders.wait_for_the_end()
+
+
+def call(node: Node, orders: Orders, count: int) -> NoReturn:
+    """Switch the lamp ``count`` times at a steady pace, one call after the other; report which answers were right."""
+    client = node.caller(LAMP, LAMP_TYPE)
+    say("ready")
+    _until(lambda: client.wait(_LOOK_S), orders)
+    say("hears")
+    orders.wait_for(Order.GO)
+    pace = _Pace(LAMP_HZ, orders)
+    size = right = newest = 0
+    latencies_ms = list[float]()
+    gap = Gap()
+    give_up_s = time.monotonic() + count / LAMP_HZ + _CALL_S
+    for number in range(1, count + 1):
+        pace.step()
+        if time.monotonic() > give_up_s:
+            break  # calls that wait for nothing take long
+        say("progress", asked=number, answered=len(latencies_ms))
+        on = bool(number % 2)
+        began_ns = time.perf_counter_ns()
+        answer = client.call(on=on, patience_s=_CALL_S)
+        if answer is not None:
+            latencies_ms.append((time.perf_counter_ns() - began_ns) / 1e6)
+            gap.note(time.perf_counter_ns())
+            size += answer.size
+            at = _switched(answer, on=on)
+            right += at > newest
+            newest = max(newest, at)
+    say("progress", asked=count, answered=len(latencies_ms))
+    say(
+        "done",
+        calls=count,
+        bytes=size,
+        answered=len(latencies_ms),
+        right=right,
+        latency_ms=_latency(latencies_ms),
+        silent_ms=gap.longest_ms,
+    )
+    orders.wait_for(Order.GO)
+    while True:
+        orders.wait(1 / LAMP_HZ)
+        count += 1
+        client.call(on=bool(count % 2), patience_s=_CALL_S)
+
+
+def _switched(answer: Call, *, on: bool) -> int:
+    """Return how often the lamp was switched, as a right answer says; 0: a wrong one."""
+    words = answer.message.split()
+    number = int(words[2]) if len(words) == 4 and words[2].isdigit() else 0
+    return number if answer.success and answer.message == lamp_says(number, on=on) else 0
+
+
+def _until(is_so: Callable[[], bool], orders: Orders) -> None:
+    while not is_so():
+        orders.wait(_LOOK_S)
+
+
+def _latency(of: Sequence[float]) -> dict[str, float | None]:
+    ordered = sorted(of)
+    return {"median": percentile(ordered, 0.5), "p99": percentile(ordered, 0.99), "max": percentile(ordered, 1)}

@@ -1,0 +1,97 @@
+"""A node of ROS 1.
+
+Place: imports rospy; I/O.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable
+from importlib import import_module
+from io import BytesIO
+from typing import Final
+
+import rospy
+
+from ring.nodes.node import Call, Caller, Lamp, Publisher
+
+__all__ = ["Ros1Node"]
+
+_QUEUE: Final = 100
+
+
+class _Publisher:
+    def __init__(self, topic: str, type_name: str, *, latched: bool) -> None:
+        self._kind = _load(type_name)
+        self._publisher = rospy.Publisher(topic, self._kind, queue_size=_QUEUE, latch=latched)
+
+    def message(self) -> object:
+        return self._kind()
+
+    def publish(self, message: object) -> None:
+        self._publisher.publish(message)
+
+
+class _Caller:
+    def __init__(self, name: str, type_name: str) -> None:
+        self._name = name
+        self._call = rospy.ServiceProxy(name, _load(type_name))
+
+    def wait(self, seconds: float) -> bool:
+        try:
+            rospy.wait_for_service(self._name, timeout=seconds)
+        except rospy.ROSException:
+            return False
+        return True
+
+    def call(self, *, on: bool, patience_s: float) -> Call | None:
+        del patience_s  # rospy has none; who serves must answer or refuse
+        try:
+            response = self._call(on)
+        except rospy.ServiceException:
+            return None
+        return Call(response.success, response.message, 1 + _size(response))
+
+
+class Ros1Node:
+    """A node; rospy brings the threads. The environment says where its master is."""
+
+    def __init__(self, name: str) -> None:
+        rospy.init_node(name, disable_signals=True)
+
+    def publisher(self, topic: str, type_name: str, *, latched: bool) -> Publisher:
+        """Publish a topic."""
+        return _Publisher(topic, type_name, latched=latched)
+
+    def subscribe(self, topic: str, type_name: str, take: Callable[[object], None], *, latched: bool) -> None:
+        """Hear a topic."""
+        del latched  # the publisher's business
+        rospy.Subscriber(topic, _load(type_name), take, buff_size=1 << 22, tcp_nodelay=True)
+
+    def serve(self, name: str, type_name: str, lamp: Lamp) -> None:
+        """Serve a ``SetBool``."""
+        rospy.Service(name, _load(type_name), lambda request: lamp(request.data))
+
+    def caller(self, name: str, type_name: str) -> Caller:
+        """Be a client of a ``SetBool``."""
+        return _Caller(name, type_name)
+
+    def fit(self, values: array[int]) -> object:
+        """Return bytes for ``uint8[]``, a list for any other."""
+        return values.tobytes() if values.typecode == "B" else values.tolist()
+
+    def size(self, message: object) -> int:
+        """Return the bytes of its ROS 1 form."""
+        return _size(message)
+
+
+def _size(message: object) -> int:
+    buffer = BytesIO()
+    message.serialize(buffer)  # type: ignore[attr-defined]  # every message of genpy has it
+    return buffer.tell()
+
+
+def _load(type_name: str) -> type:
+    package, kind, name = type_name.split("/")
+    found: type = getattr(import_module(f"{package}.{kind}"), name)
+    return found

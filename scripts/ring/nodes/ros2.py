@@ -1,0 +1,118 @@
+"""A node of ROS 2.
+
+Place: imports rclpy; I/O.
+"""
+
+from __future__ import annotations
+
+import threading
+from array import array
+from collections.abc import Callable
+from importlib import import_module
+from typing import Final, Protocol, cast
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import serialize_message
+from rclpy.signals import SignalHandlerOptions
+
+from ring.nodes.node import Call, Caller, Lamp, Publisher
+
+__all__ = ["Ros2Node"]
+
+_DEPTH: Final = 50  # some seconds of pictures: Fast DDS may take three until it asks for what it lost
+
+
+class _SetBool(Protocol):
+    Request: Callable[..., object]
+    Response: Callable[..., object]
+
+
+class _Publisher:
+    def __init__(self, node: rclpy.node.Node, topic: str, type_name: str, profile: QoSProfile) -> None:
+        self._kind = _load(type_name)
+        self._publisher = node.create_publisher(self._kind, topic, profile)
+
+    def message(self) -> object:
+        return self._kind()
+
+    def publish(self, message: object) -> None:
+        self._publisher.publish(message)
+
+
+class _Caller:
+    def __init__(self, node: rclpy.node.Node, name: str, type_name: str) -> None:
+        self._kind = _load(type_name)
+        self._request = cast("_SetBool", self._kind).Request
+        self._client = node.create_client(self._kind, name)
+
+    def wait(self, seconds: float) -> bool:
+        return bool(self._client.wait_for_service(timeout_sec=seconds))
+
+    def call(self, *, on: bool, patience_s: float) -> Call | None:
+        request = self._request(data=on)
+        came = threading.Event()
+        future = self._client.call_async(request)
+        future.add_done_callback(lambda _: came.set())
+        if not came.wait(patience_s):
+            self._client.remove_pending_request(future)
+            return None
+        response = future.result()
+        size = len(serialize_message(request)) + len(serialize_message(response))
+        return Call(response.success, response.message, size)
+
+
+class Ros2Node:
+    """A node that is spun in a thread of its own. The environment says in which domain, through which middleware."""
+
+    def __init__(self, name: str) -> None:
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        self._node = rclpy.create_node(name)
+        executor = SingleThreadedExecutor()
+        executor.add_node(self._node)
+        threading.Thread(target=executor.spin, name="spin", daemon=True).start()
+
+    def publisher(self, topic: str, type_name: str, *, latched: bool) -> Publisher:
+        """Publish a topic, reliably."""
+        return _Publisher(self._node, topic, type_name, _profile(latched=latched))
+
+    def subscribe(self, topic: str, type_name: str, take: Callable[[object], None], *, latched: bool) -> None:
+        """Hear a topic."""
+        self._node.create_subscription(_load(type_name), topic, take, _profile(latched=latched))
+
+    def serve(self, name: str, type_name: str, lamp: Lamp) -> None:
+        """Serve a ``SetBool``."""
+        kind = _load(type_name)
+        make = cast("_SetBool", kind).Response
+
+        def answer(request: object, response: object) -> object:
+            del response
+            success, message = lamp(bool(getattr(request, "data", False)))
+            return make(success=success, message=message)
+
+        self._node.create_service(kind, name, answer)
+
+    def caller(self, name: str, type_name: str) -> Caller:
+        """Be a client of a ``SetBool``."""
+        return _Caller(self._node, name, type_name)
+
+    def fit(self, values: array[int]) -> object:
+        """Return the array itself."""
+        return values
+
+    def size(self, message: object) -> int:
+        """Return the bytes of its CDR."""
+        return len(serialize_message(message))
+
+
+def _profile(*, latched: bool) -> QoSProfile:
+    if latched:
+        return QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    return QoSProfile(depth=_DEPTH)
+
+
+def _load(type_name: str) -> type:
+    package, kind, name = type_name.split("/")
+    found: type = getattr(import_module(f"{package}.{kind}"), name)
+    return found

@@ -1,0 +1,116 @@
+"""What a person may ask of the ring.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+from gdp.errors import LocalError
+from gdp.limits import CLAIM_LEASE_S, LEASE_MAX_S, LEASE_MIN_S
+from gdp.simulation.topology import MTU_BYTES, Topology, ring5
+from proxy.config import Encoding
+from ring.faults import Cut, Fault, Kill, Roam, check_faults
+
+__all__ = ["LIVE_S", "Live", "Options", "RingPlane"]
+
+RingPlane = Literal["auto", "kernel", "raw", "scapy"]
+Live = Literal["ros2", "ros1", "mixed"]
+
+LIVE_S: Final = 10.0
+_LIVE_MAX_S: Final = 3_600.0
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """One run of the ring. Paths are absolute, for the processes that read them stand elsewhere.
+
+    Args:
+        bag: the recording; None: a generated robot drive.
+        rate: 1 is the recorded pace, 0 as fast as it goes.
+        keep: leave everything up afterwards.
+        out: directory, made if need be, where the received recording stays; None: it goes with the run.
+        pcap: where to write what passes through the middle of the ring.
+        live: real nodes instead of a recording; of which ROS. ``mixed``: ROS 1 at the robot, ROS 2 at the server.
+        seconds: of traffic; a recording is replayed slower or faster to last so long, a generated one is made so
+            long. None: ``LIVE_S`` live, else the recording's own time.
+        lease_s: of every node's claims and watches.
+
+    Raises:
+        LocalError: a rate that is no pace, a fault that cannot be injected, a directory that is missing, a recording
+            for a live run.
+    """
+
+    bag: Path | None = None
+    rate: float = 1.0
+    encoding: Encoding = "json"
+    data_plane: RingPlane = "auto"
+    mtu: int = MTU_BYTES
+    out: Path | None = None
+    json: Path | None = None
+    pcap: Path | None = None
+    cuts: tuple[Cut, ...] = ()
+    roams: tuple[Roam, ...] = ()
+    kills: tuple[Kill, ...] = ()
+    keep: bool = False
+    live: Live | None = None
+    seconds: float | None = None
+    lease_s: float = CLAIM_LEASE_S
+
+    def __post_init__(self) -> None:
+        if self.live is not None and (self.bag is not None or self.rate != 1 or self.out is not None):
+            raise LocalError("--live is without a recording: neither BAG nor --rate nor --out goes with it")
+        if self.seconds is not None and self.rate != 1:
+            raise LocalError("--seconds and --rate both say how fast: give one of them")
+        if self.seconds is not None and not 1 <= self.seconds <= _LIVE_MAX_S:
+            raise LocalError(f"--seconds is 1 to {_LIVE_MAX_S:g}, not {self.seconds:g}")
+        if not LEASE_MIN_S <= self.lease_s <= LEASE_MAX_S:
+            raise LocalError(f"--lease is {LEASE_MIN_S:g} to {LEASE_MAX_S:g} seconds, not {self.lease_s:g}")
+        if not 0 <= self.rate < math.inf:
+            raise LocalError(f"a rate is 0 or more, not {self.rate:g}")
+        if self.bag is not None and not self.bag.exists():
+            raise LocalError(f"no such recording: {self.bag}")
+        for file in (self.json, self.pcap):
+            if file is not None and not file.parent.is_dir():
+                raise LocalError(f"no such directory: {file.parent}")
+            if file is not None and file.is_dir():
+                raise LocalError(f"a directory, where a file was expected: {file}")
+        if self.out is not None and self.out.exists() and not self.out.is_dir():
+            raise LocalError(f"a file, where a directory was expected: {self.out}")
+        check_faults(self.topology(), self.faults, self.live_s if self.live is not None else self.seconds)
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """Return all that is to go wrong."""
+        return (*self.cuts, *self.roams, *self.kills)
+
+    @property
+    def live_s(self) -> float:
+        """Return how long live nodes talk."""
+        return LIVE_S if self.seconds is None else self.seconds
+
+    def topology(self) -> Topology:
+        """Return the ring with the wanted MTU.
+
+        Raises:
+            LocalError: no link can have that MTU.
+        """
+        return ring5(self.mtu)
+
+    def settings(self) -> dict[str, object]:
+        """Return the options as the JSON result states them."""
+        recorded = {"recording": str(self.bag) if self.bag else "demo", "rate": self.rate, "seconds": self.seconds}
+        return {
+            **({"live": self.live, "seconds": self.live_s} if self.live else recorded),
+            "encoding": self.encoding,
+            "data_plane": self.data_plane,
+            "mtu": self.mtu,
+            "lease_s": self.lease_s,
+            "cuts": [str(cut) for cut in self.cuts],
+            "roams": [str(roam) for roam in self.roams],
+            "kills": [str(kill) for kill in self.kills],
+        }

@@ -1,0 +1,158 @@
+"""The time between the first message and the last: both ends are listened to until both have finished.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass, replace
+from typing import Final, TypeVar
+
+from ring.child import Child, ChildError
+from ring.children import Children, cancel
+from ring.events import Event
+from ring.injection import Injection
+from ring.progress import Teller, Traffic
+from ring.silence import Silence
+
+__all__ = ["Replay", "Report"]
+
+ENDING_S: Final = 30.0  # to close a recording, or to get the last acknowledgements
+STALL_S: Final = 30.0
+_ALL: Final = "recording"  # its topics are counted together
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What the ends said last.
+
+    Args:
+        topics: the receiver's measurements, one event a topic.
+        unread: why some of the recording could not be read; None if all could.
+        complaints: what went otherwise than wanted.
+        traffic_s: from the first message until all was confirmed or given up.
+        silent_s: the longest time that messages were due and none came, to half a second.
+    """
+
+    topics: tuple[Event, ...]
+    unread: str | None
+    complaints: tuple[str, ...]
+    traffic_s: float
+    silent_s: float
+
+
+class Replay:
+    """One replay under way.
+
+    Args:
+        children: watched all the while; the receiver among them is let go when it is asked to finish.
+        sender: has said that it is ready.
+        receiver: likewise.
+        total: messages expected.
+        teller: hears of the traffic.
+    """
+
+    def __init__(self, children: Children, sender: Child, receiver: Child, total: int, teller: Teller) -> None:
+        self._children = children
+        self._sender = sender
+        self._receiver = receiver
+        self._teller = teller
+        self._traffic = Traffic(total)
+        self._silence = Silence()
+        self._unconfirmed = ""  # topics
+        self._moved = asyncio.Event()
+
+    async def report(self, inject: Callable[[], Injection]) -> Report:
+        """Follow the traffic to its end, while ``inject`` lets faults happen.
+
+        Raises:
+            ChildError: a process failed, nothing moved for long, or an end did not finish.
+            LocalError: a fault cannot be injected.
+        """
+        self._teller.begin_traffic(self._traffic.total)
+        heard = asyncio.ensure_future(self._listen(self._receiver))
+        injection, begun_s = inject(), time.monotonic()
+        try:
+            sent = await self._children.guarded(self._unstalled(self._listen(self._sender)))
+            traffic_s = time.monotonic() - begun_s
+            sender_code = await self._sender.wait(ENDING_S)
+            if sent is None:
+                raise self._sender.failed(f"ended with code {sender_code} in the middle")
+            received, receiver_code = await self._finish(heard)
+        finally:
+            await cancel(heard)
+            await injection.stop()
+            self._teller.end_traffic()
+        complaints = injection.complaints()
+        complaints += [_not_confirmed(topic) for topic in sent.parts("unconfirmed")]
+        complaints += [f"the sender ended with code {sender_code}"] if sender_code else []
+        complaints += [f"the receiver ended with code {receiver_code}"] if receiver_code else []
+        unread = sent.text_or_none("unread") or None
+        topics = tuple(received.parts("topics"))
+        return Report(topics, unread, tuple(complaints), traffic_s, self._silence.longest_s)
+
+    async def _finish(self, heard: asyncio.Future[Event | None]) -> tuple[Event, int]:
+        """Ask the receiver to close its recording; return its last word and its exit code."""
+        self._children.may_end(self._receiver)
+        self._receiver.interrupt()
+        try:
+            received = await self._children.guarded(asyncio.wait_for(heard, ENDING_S))
+        except asyncio.TimeoutError:
+            raise self._receiver.failed(f"did not finish within {ENDING_S:g} s") from None
+        code = await self._receiver.wait(ENDING_S)
+        if received is None:
+            raise self._receiver.failed(f"ended with code {code} without a report")
+        return received, code
+
+    async def _listen(self, child: Child) -> Event | None:
+        """Follow a child until it closes its output; return its last word, None if it did not say it."""
+        done = None
+        async for event in child.events():
+            if event.name == "progress":
+                self._follow(event)
+            elif event.name == "done":
+                done = event
+        return done
+
+    def _follow(self, event: Event) -> None:
+        before, now_s = self._traffic, time.monotonic()
+        if "sent" in event.fields:
+            self._silence.sent(_ALL, event.count("sent"), now_s)
+            self._unconfirmed = ", ".join(event.part("unconfirmed").fields)
+            self._traffic = replace(before, sent=event.count("sent"))
+            waiting = before.sent < before.total  # for a moment of the recording, which may be silent for long
+        else:
+            received, lost = event.count("received"), event.count("lost")
+            latency_ms = event.number_or_none("latency_ms")
+            self._silence.received(_ALL, received + lost, now_s)
+            self._traffic = replace(before, received=received, lost=lost, latency_ms=latency_ms)
+            waiting = False
+        if waiting or self._traffic != before:
+            self._moved.set()
+        silent = tuple((self._unconfirmed or flow, seconds) for flow, seconds in self._silence.silent(now_s))
+        self._teller.traffic(replace(self._traffic, behind=self._silence.behind, silent=silent))
+
+    async def _unstalled(self, work: Coroutine[None, None, T]) -> T:
+        """Do ``work`` as long as traffic moves."""
+        task = asyncio.ensure_future(work)
+        try:
+            while not task.done():
+                self._moved.clear()
+                moved = asyncio.ensure_future(self._moved.wait())
+                done, _ = await asyncio.wait([task, moved], timeout=STALL_S, return_when=asyncio.FIRST_COMPLETED)
+                await cancel(moved)
+                if not done:
+                    raise ChildError(f"nothing moved for {STALL_S:g} s: {self._traffic.words(0.0)}")
+            return task.result()
+        finally:
+            await cancel(task)
+
+
+def _not_confirmed(topic: Event) -> str:
+    messages, confirmed = topic.count("messages"), topic.count("confirmed")
+    return f"{topic.text('topic')}: {messages - confirmed} of {messages} were never confirmed"

@@ -1,0 +1,152 @@
+"""What a run showed, topic by topic, and whether that is what was wanted.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from proxy.compare import TopicComparison
+from ring.events import Event
+
+__all__ = ["Journey", "Result", "TopicResult", "put_together"]
+
+
+@dataclass(frozen=True, slots=True)
+class Journey:
+    """What the receiver measured on one topic.
+
+    Args:
+        parts: of the largest message.
+        hops: switches that most messages passed.
+        hops_seen: every number of switches that some message passed.
+        silent_ms: the longest time between two messages, or between two answers; None: not measured.
+    """
+
+    median_ms: float | None = None
+    p99_ms: float | None = None
+    max_ms: float | None = None
+    duplicated: int = 0
+    parts: int = 0
+    hops: int = 0
+    hops_seen: tuple[int, ...] = ()
+    silent_ms: float | None = None
+
+    @classmethod
+    def from_event(cls, topic: Event) -> Journey:
+        """Read one entry of a receiver's report."""
+        latency = topic.part("latency_ms")
+        return cls(
+            median_ms=latency.number_or_none("median"),
+            p99_ms=latency.number_or_none("p99"),
+            max_ms=latency.number_or_none("max"),
+            duplicated=topic.count("duplicated"),
+            parts=topic.count("parts"),
+            hops=topic.count("hops"),
+            hops_seen=tuple(topic.counts("hops_seen")),
+            silent_ms=topic.number_or_none("silent_ms"),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class TopicResult:
+    """One row of the table. Of a service the messages are calls, and those lost are without an answer."""
+
+    comparison: TopicComparison
+    journey: Journey
+    is_service: bool = False
+
+    @property
+    def duplicated(self) -> int:
+        """Return messages that came out twice: by what was recorded, and by what the receiver saw."""
+        return max(self.comparison.duplicated, self.journey.duplicated)
+
+    @property
+    def faults(self) -> list[str]:
+        """Return what is wrong with this topic, in words."""
+        of = self.comparison
+        found = []
+        if of.lost:
+            found.append(f"{of.lost} {'calls without an answer' if self.is_service else 'lost'}")
+        if self.duplicated:
+            found.append(f"{self.duplicated} {'served twice' if self.is_service else 'duplicated'}")
+        if of.altered:
+            found.append(f"{of.altered} {'wrong answers' if self.is_service else 'with other bytes than were sent'}")
+        if not of.in_order:
+            found.append("out of order")
+        return found
+
+    def to_json(self) -> dict[str, object]:
+        """Return the row as ``--json`` states it."""
+        of, way = self.comparison, self.journey
+        return {
+            "topic": of.topic,
+            "kind": "service" if self.is_service else "topic",
+            "type": of.type_name,
+            "messages": of.messages,
+            "bytes": of.bytes,
+            "delivered": of.delivered,
+            "lost": of.lost,
+            "duplicated": self.duplicated,
+            "identical": of.identical,
+            "in_order": of.in_order,
+            "latency_ms": {"median": way.median_ms, "p99": way.p99_ms, "max": way.max_ms},
+            "silent_ms": way.silent_ms,
+            "parts": way.parts,
+            "hops": way.hops,
+            "hops_seen": list(way.hops_seen),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """A whole run.
+
+    Args:
+        unread: why the end of the recording could not be read; None if all of it was.
+        complaints: what else went wrong, such as an end that did not finish.
+        traffic_s: how long the traffic took.
+        silent_s: the longest time that something was due and nothing came, to half a second.
+    """
+
+    topics: tuple[TopicResult, ...]
+    settings: Mapping[str, object]
+    unread: str | None = None
+    complaints: tuple[str, ...] = ()
+    traffic_s: float = 0.0
+    silent_s: float = 0.0
+
+    @property
+    def faults(self) -> list[str]:
+        """Return everything that keeps the run from having passed."""
+        per_topic = [f"{row.comparison.topic}: {', '.join(row.faults)}" for row in self.topics if row.faults]
+        nothing = [] if any(row.comparison.messages for row in self.topics) else ["no message was sent"]
+        return [*self.complaints, *nothing, *per_topic]
+
+    @property
+    def passed(self) -> bool:
+        """Tell whether every message came out identical and in order."""
+        return not self.faults
+
+    def to_json(self) -> dict[str, object]:
+        """Return the result as ``--json`` states it."""
+        return {
+            "passed": self.passed,
+            "topics": [row.to_json() for row in self.topics],
+            "settings": dict(self.settings),
+            "unread": self.unread,
+            "traffic_s": round(self.traffic_s, 3),
+            "silent_s": round(self.silent_s, 3),
+            "faults": self.faults,
+        }
+
+
+def put_together(comparisons: Iterable[TopicComparison], reports: Sequence[Event]) -> tuple[TopicResult, ...]:
+    """Return one row per compared topic, with what the receiver measured on it where it did."""
+    journeys = {(report.text("topic"), report.text("type")): Journey.from_event(report) for report in reports}
+    return tuple(
+        TopicResult(comparison, journeys.get((comparison.topic, comparison.type_name), Journey()))
+        for comparison in comparisons
+    )

@@ -1,0 +1,142 @@
+"""One run of the ring, from the recording to the result.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from pathlib import Path
+from typing import Final
+
+from gdp.errors import ConfigError
+from gdp.host.run_registry import Run
+from proxy.compare import compare
+from proxy.endpoints.bag import BagReader
+from proxy.serial.channel import RosVersion
+from ring.child import Child
+from ring.children import READY_S, Children
+from ring.fabric import Fabric
+from ring.injection import Injection
+from ring.options import Options
+from ring.plan import Topic, topics_of
+from ring.progress import Teller
+from ring.replay import Replay
+from ring.result import Result, put_together
+
+__all__ = ["DEMO_S", "Ring", "make_demo"]
+
+DEMO_S: Final = 10.0
+_MAKING_S: Final = 240.0  # patience with the making of the demonstration recording
+_DEMO_SCRIPT: Final = Path(__file__).parents[2] / "scripts" / "make_demo_bag.py"
+
+
+class Ring:
+    """The ring of one run, from its laying on.
+
+    Args:
+        options: what was asked for.
+        run: takes down what is made here, whoever asks it to.
+        teller: hears of progress.
+        bag: the recording.
+
+    Raises:
+        ConfigError: the recording cannot be read or is empty.
+        LocalError: the kernel refuses namespaces.
+    """
+
+    def __init__(self, options: Options, run: Run, teller: Teller, bag: Path) -> None:
+        with BagReader(bag) as reader:
+            channels, self._total = list(reader.channels), reader.count
+            self._rate = options.rate if options.seconds is None else _recorded_s(reader) / options.seconds
+        if not channels:
+            raise ConfigError(str(bag), "", "holds no topic")
+        self.bag = bag
+        self.options = options
+        self._run = run
+        self._teller = teller
+        self._ros: RosVersion = channels[0].ros
+        self._topics: tuple[Topic, ...] = topics_of(channels)
+        if self.recording.exists():
+            raise ConfigError(str(self.recording), "", "exists already; choose another --out")
+        self.fabric = Fabric(options, run, teller)
+        self._children = self.fabric.children
+
+    @property
+    def recording(self) -> Path:
+        """Return where the receiver writes."""
+        name = "recording.bag" if self._ros == 1 else "recording.mcap"
+        return (self.options.out or self._run.directory) / name
+
+    async def result(self) -> Result:
+        """Send the recording through the ring, and compare.
+
+        Raises:
+            ChildError: a process failed.
+            LocalError: a link cannot be cut.
+        """
+        await self.fabric.stand_up()
+        receiver = self._start_receiver(self.recording)
+        await self._children.ready([receiver])
+        self._teller.step(f"replaying {self._total} messages at {self.fabric.robot.switch}")
+        sender = self._start_sender()
+        await self._children.guarded(sender.wait_for("ready", READY_S))
+        replay = Replay(self._children, sender, receiver, self._total, self._teller)
+        report = await replay.report(lambda: Injection(self.fabric, self.options.faults, self._teller))
+        self._teller.step("comparing what was sent with what was recorded")
+        exact = self.options.encoding == "cdr"
+        comparisons = await self._children.guarded(asyncio.to_thread(compare, self.bag, self.recording, exact=exact))
+        topics = put_together(comparisons, report.topics)
+        return Result(topics, self.fabric.settings, report.unread, report.complaints, report.traffic_s, report.silent_s)
+
+    def start_again(self) -> Path:
+        """Start a receiver that outlives us, in place of the one that has ended; return the file it records into."""
+        path = self.recording.with_name(f"again-{self.recording.name}")
+        self._start_receiver(path, heard=False)
+        return path
+
+    @property
+    def sender_config(self) -> Path:
+        """Return the ``proxy.yaml`` of the robot."""
+        return self.fabric.materials.proxy_file(self.fabric.robot)
+
+    def forget(self) -> None:
+        """Close our ends of the processes; they are left as they are."""
+        self.fabric.forget()
+
+    def _start_receiver(self, record: Path, *, heard: bool = True) -> Child:
+        at, encoding = self.fabric.server, self.options.encoding
+        config = self.fabric.materials.receiver(at, self._topics, encoding, self._ros, record)
+        argv = ["-m", "proxy.cli", "--config", str(config), *(["--json"] if heard else [])]
+        return self.fabric.start(at.switch, "proxy", argv, heard=heard)
+
+    def _start_sender(self) -> Child:
+        at, encoding = self.fabric.robot, self.options.encoding
+        config = self.fabric.materials.sender(at, self._topics, encoding, self._ros)
+        argv = ["-m", "proxy.replay_cli", str(self.bag), "--config", str(config), "--json"]
+        return self.fabric.start(at.switch, "replay", [*argv, "--rate", str(self._rate)])
+
+
+def _recorded_s(reader: BagReader) -> float:
+    stamps_ns = [stamp_ns for _, stamp_ns, _ in reader.messages()]
+    return max((max(stamps_ns) - min(stamps_ns)) / 1e9, 1e-3) if stamps_ns else 1.0
+
+
+async def make_demo(run: Run, seconds: float) -> Path:
+    """Make a demonstration recording of this length in the run's directory; return the file.
+
+    Raises:
+        ChildError: the script fails.
+    """
+    path = run.directory / "demo.mcap"
+    children = Children(run, kept=False)
+    try:
+        maker = children.start(
+            "recording", [sys.executable, str(_DEMO_SCRIPT), "--seconds", str(seconds), "-o", str(path)], heard=False
+        )
+        if code := await maker.wait(_MAKING_S):
+            raise maker.failed(f"ended with code {code}")
+    finally:
+        children.forget()
+    return path

@@ -1,0 +1,84 @@
+"""The table at the end of a run.
+
+Place: shell; makes rich renderables, prints nothing.
+"""
+
+from __future__ import annotations
+
+from rich.markup import escape
+from rich.table import Table
+
+from ring.result import Journey, Result, TopicResult
+
+__all__ = ["hops_in_words", "table", "verdict"]
+
+_EDGE_SWITCHES = 2
+
+
+def table(result: Result) -> Table:
+    """Return one row per topic."""
+    of = result.settings
+    title = f"{of['encoding']}, {of['data_plane']}, MTU {of['mtu']}"
+    if "live" in of:
+        title = f"live {of['live']}, {title}"
+    for what in ("cuts", "roams", "kills"):
+        faults = of.get(what)
+        if isinstance(faults, list) and faults:
+            title += f", {what.removesuffix('s')} " + ", ".join(f"{fault} s" for fault in faults)
+    drawn = Table(title=title, title_justify="left", title_style="bold")
+    for heading in ("topic", "type"):
+        drawn.add_column(heading, overflow="fold")
+    for heading in ("messages", "bytes", "delivered", "lost", "duplicated"):
+        drawn.add_column(heading, justify="right", no_wrap=True)
+    drawn.add_column("identical", no_wrap=True)
+    for heading in ("median ms", "p99 ms", "max ms", "silent ms", "parts"):
+        drawn.add_column(heading, justify="right", no_wrap=True)
+    drawn.add_column("hops")
+    for row in result.topics:
+        drawn.add_row(*_cells(row), style="red" if row.faults else None)
+    return drawn
+
+
+def verdict(result: Result) -> str:
+    """Return the last line, with markup."""
+    if result.passed:
+        topics = [row for row in result.topics if not row.is_service]
+        calls = sum(row.comparison.messages for row in result.topics if row.is_service)
+        count = sum(row.comparison.messages for row in topics)
+        what = f"{count} messages on {len(topics)} topics, all identical"
+        what += f"; {calls} calls, all answered" if calls else ""
+        note = f" [yellow]Not all could be read: {escape(result.unread)}[/yellow]" if result.unread else ""
+        return f"[bold green]passed[/bold green]: {what}.{note}"
+    return f"[bold red]failed[/bold red]: {escape('; '.join(result.faults))}"
+
+
+def hops_in_words(journey: Journey) -> str:
+    """Return the switches that messages passed, such as ``5 (3 between)``: the usual number first, then others."""
+    if not journey.hops:
+        return "-"
+    others = "".join(f", also {hops}" for hops in journey.hops_seen if hops != journey.hops)
+    return f"{journey.hops} ({max(journey.hops - _EDGE_SWITCHES, 0)} between){others}"
+
+
+def _cells(row: TopicResult) -> list[str]:
+    of, way = row.comparison, row.journey
+    return [
+        escape(of.topic),
+        escape(of.type_name),
+        str(of.messages),
+        f"{of.bytes:,}",
+        str(of.delivered),
+        str(of.lost),
+        str(row.duplicated),
+        "yes" if of.identical else "no",
+        _ms(way.median_ms),
+        _ms(way.p99_ms),
+        _ms(way.max_ms),
+        _ms(way.silent_ms),
+        str(way.parts or "-"),
+        hops_in_words(way),
+    ]
+
+
+def _ms(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"

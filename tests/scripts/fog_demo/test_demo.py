@@ -1,0 +1,65 @@
+"""The demonstration's two nodes, real ones, in a graph of their own on this machine."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2's rclpy")
+
+from fog.launch.probe import free_domain
+from fog_demo.caller import Tally
+
+
+def test_the_robot_is_answered_by_the_machine_and_both_end_cleanly() -> None:
+    environment = {
+        **os.environ,
+        "ROS_DOMAIN_ID": str(free_domain()),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "FOG_MACHINE": "m7",
+    }
+    echo = subprocess.Popen([sys.executable, "-m", "fog_demo.echo"], env=environment, stderr=subprocess.DEVNULL)
+    try:
+        words = ["--ros-args", "-p", "calls:=10", "-p", "rate_hz:=50", "-p", "report_s:=60"]
+        caller = subprocess.run(
+            [sys.executable, "-m", "fog_demo.caller", *words],
+            env=environment,
+            stdout=subprocess.PIPE,
+            check=True,
+            timeout=30,
+        )
+    finally:
+        echo.send_signal(signal.SIGINT)
+        left = echo.wait(10)
+    last = json.loads(caller.stdout.splitlines()[-1])
+    assert (last["answered"], last["failed"], last["wrong"], last["done"]) == (10, 0, 0, True)
+    assert last["by_machine"] == {"m7": 10}
+    assert left == 0
+
+
+def test_a_wrong_answer_is_counted() -> None:
+    tally = Tally(calls=2)
+    tally.answered(True, Tallied(success=False, message="a"), 0.001, 5.0)
+    line = json.loads(tally.line(unix_s=1.0, done=False))
+    assert (line["wrong"], line["under_way"], line["median_ms"]) == (1, 1, 1.0)
+
+
+def test_the_longest_silence_since_the_line_before_is_told() -> None:
+    tally = Tally()
+    for now_s in (5.0, 5.5, 5.6):
+        tally.answered(True, Tallied(success=True, message="a"), 0.001, now_s)
+    assert json.loads(tally.line(unix_s=1.0, done=False))["silence_ms"] == 500.0
+    assert json.loads(tally.line(unix_s=2.0, done=True))["silence_ms"] == 0.0
+
+
+class Tallied:
+    """An answer."""
+
+    def __init__(self, *, success: bool, message: str) -> None:
+        self.success = success
+        self.message = message

@@ -1,0 +1,87 @@
+"""Processes that play live nodes: how a session follows them to their reports."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from gdp.host.run_registry import Run, Runs
+from ring import live_session
+from ring.child import ChildError
+from ring.children import Children
+from ring.live_result import Heard
+from ring.live_session import Cast, LiveSession
+from ring.progress import Teller
+
+HEAD = """
+import json, signal, sys
+signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT, signal.SIGUSR1])
+def say(event, **fields): print(json.dumps(dict(event=event, **fields)), flush=True)
+def wait(number):
+    while signal.sigwait([signal.SIGINT, signal.SIGUSR1]) != number: pass
+say('ready')
+"""
+SAYS = "say('progress', topic='/a', sent=1); say('done', sent=['aa', 'bb']);"
+TALKER = HEAD + "wait(signal.SIGUSR1);" + SAYS + "signal.pause()"
+LAMP = HEAD + "wait(signal.SIGINT); say('done', served=1); signal.pause()"
+HEARS = "say('hears'); say('progress', topics=[dict(topic='/a', received=2)], latency_ms=1.5);"
+LISTENER = HEAD + HEARS + "wait(signal.SIGINT); say('done'); signal.pause()"
+CALLER = HEAD + "say('hears'); wait(signal.SIGUSR1); say('done', answered=1); signal.pause()"
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    started = Runs(tmp_path / "runs").start()
+    yield started
+    started.end()
+
+
+def play(run: Run, talker: str = TALKER, lamp: str = LAMP, listener: str = LISTENER, caller: str = CALLER) -> Heard:
+    async def main() -> Heard:
+        children = Children(run, kept=True)
+        try:
+            nodes = [
+                children.start(name, [sys.executable, "-c", code])
+                for name, code in (("talker", talker), ("lamp", lamp), ("listener", listener), ("caller", caller))
+            ]
+            await children.ready(nodes)
+            cast = Cast({nodes[0]: 2}, nodes[1], nodes[2], nodes[3], 1)
+            session = LiveSession(children, cast, Teller(Console(file=io.StringIO())))
+            await session.meet()
+            return await asyncio.wait_for(session.talk(0.1), 20)
+        finally:
+            run.end()
+            await asyncio.gather(*(child.ended for child in children._all))
+            children.forget()
+
+    return asyncio.run(main())
+
+
+def test_every_node_is_told_to_go_and_asked_for_its_report(run: Run) -> None:
+    heard = play(run)
+    assert [talker.texts("sent") for talker in heard.talkers] == [["aa", "bb"]]
+    assert (heard.lamp.count("served"), heard.caller.count("answered")) == (1, 1)
+
+
+def test_what_does_not_come_is_waited_for_only_while_something_moves(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_session, "QUIET_S", 0.2)
+    heard = play(run, listener=LISTENER.replace("received=2", "received=1"))
+    assert heard.listener.name == "done"
+
+
+def test_a_node_that_does_not_report_is_named(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_session, "ENDING_S", 0.2)
+    with pytest.raises(ChildError, match=r"lamp did not report within 0\.2 s"):
+        play(run, lamp=HEAD + "signal.pause()")
+
+
+def test_a_node_that_dies_ends_the_run_and_shows_its_last_lines(run: Run) -> None:
+    with pytest.raises(ChildError, match=r"(?s)talker ended with code 1.*no such topic"):
+        play(run, talker=HEAD + "wait(signal.SIGUSR1); sys.exit('no such topic')")

@@ -1,0 +1,136 @@
+"""Processes that play the two ends: what the ring makes of what they say, and of how they end."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import sys
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from gdp.host.run_registry import Run, Runs
+from ring import replay as replay_module
+from ring.child import Child, ChildError
+from ring.children import Children
+from ring.injection import Injection
+from ring.progress import Teller
+from ring.replay import Replay, Report
+
+HEAD = """
+import json, signal, sys
+def say(**fields): print(json.dumps(fields), flush=True)
+"""
+SENDER = HEAD + "say(event='ready'); say(event='progress', sent=2); say(event='done', unread=None, unconfirmed=[])"
+RECEIVER = """
+def finish(*_): say(event='done', topics=[{'topic': '/a'}]); sys.exit(0)
+signal.signal(signal.SIGINT, finish); say(event='ready'); say(event='progress', received=2, lost=0, latency_ms=1.5)
+while True: signal.pause()
+"""
+RECEIVER = HEAD + RECEIVER
+
+
+class Nothing:
+    """An overlay in which nothing fails."""
+
+    async def cut(self, cut: object) -> None: ...
+    async def heal(self, cut: object) -> None: ...
+    async def kill(self, kill: object) -> None: ...
+    async def restart(self, kill: object) -> None: ...
+    async def roam(self, roam: object) -> None: ...
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    started = Runs(tmp_path / "runs").start()
+    yield started
+    started.end()
+
+
+def play(run: Run, sender: str, receiver: str, told: io.StringIO | None = None) -> Report:
+    teller = Teller(Console(file=told or io.StringIO(), width=120))
+
+    async def both(children: Children) -> Report:
+        far = children.start("receiver", [sys.executable, "-c", receiver])
+        await children.ready([far])
+        near = children.start("sender", [sys.executable, "-c", sender])
+        await children.guarded(near.wait_for("ready", 10))
+        return await Replay(children, near, far, 2, teller).report(lambda: Injection(Nothing(), (), teller))
+
+    return within(run, both)
+
+
+def within(run: Run, work: Callable[[Children], Awaitable[Report]]) -> Report:
+    async def main() -> Report:
+        children = Children(run, kept=True)
+        try:
+            return await asyncio.wait_for(work(children), 20)
+        finally:
+            run.end()
+            await asyncio.gather(*(child.ended for child in children._all))
+            children.forget()
+
+    return asyncio.run(main())
+
+
+def test_when_the_sender_has_finished_the_receiver_is_asked_for_its_report(run: Run) -> None:
+    report = play(run, SENDER, RECEIVER)
+    assert [topic.text("topic") for topic in report.topics] == ["/a"]
+    assert report.complaints == ()
+    assert report.unread is None
+
+
+def test_what_could_not_be_read_is_passed_on(run: Run) -> None:
+    assert play(run, SENDER.replace("unread=None", "unread='cut off'"), RECEIVER).unread == "cut off"
+
+
+def test_what_was_never_confirmed_is_a_complaint_that_names_the_topic(run: Run) -> None:
+    lacking = "unconfirmed=[{'topic': '/imu', 'messages': 9, 'confirmed': 7}]"
+    report = play(run, SENDER.replace("unconfirmed=[]", lacking), RECEIVER)
+    assert report.complaints == ("/imu: 2 of 9 were never confirmed",)
+
+
+def test_an_end_that_ends_badly_is_a_complaint(run: Run) -> None:
+    report = play(run, SENDER + "; sys.exit(1)", RECEIVER.replace("sys.exit(0)", "sys.exit(3)"))
+    assert report.complaints == ("the sender ended with code 1", "the receiver ended with code 3")
+
+
+def test_a_sender_that_dies_in_the_middle_is_told_with_its_last_lines(run: Run) -> None:
+    with pytest.raises(ChildError, match=r"(?s)sender ended with code 1 in the middle\n    a boom"):
+        play(run, HEAD + "say(event='ready'); sys.exit('a boom')", RECEIVER)
+
+
+def test_a_process_that_never_gets_ready_is_told_with_its_last_lines(run: Run) -> None:
+    with pytest.raises(ChildError, match=r"(?s)receiver ended with code 1 before it said 'ready'\n    no such key"):
+        play(run, SENDER, "import sys; sys.exit('no such key')")
+
+
+def test_the_death_of_a_process_that_must_stand_ends_the_wait_at_once(run: Run) -> None:
+    dying = HEAD + "say(event='ready'); sys.exit('fell over')"
+    waiting = HEAD + "say(event='ready'); signal.pause()"
+    with pytest.raises(ChildError, match=r"receiver ended with code 1\n    fell over"):
+        play(run, waiting, dying)
+
+
+def test_traffic_that_stands_still_ends_the_run(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(replay_module, "STALL_S", 0.2)
+    with pytest.raises(ChildError, match=r"nothing moved for 0\.2 s: .*delivered 2"):
+        play(run, HEAD + "say(event='ready'); signal.pause()", RECEIVER)
+
+
+def test_a_line_of_a_megabyte_is_read(run: Run) -> None:
+    long = RECEIVER.replace("'/a'", "'/' + 'a' * 1_000_000")
+    assert len(play(run, SENDER, long).topics[0].text("topic")) == 1_000_001
+
+
+def test_a_child_that_does_not_answer_in_time_is_told(run: Run, tmp_path: Path) -> None:
+    async def impatient(children: Children) -> Report:
+        child: Child = children.start("mute", [sys.executable, "-c", "import signal; signal.pause()"])
+        await child.wait_for("ready", 0.05)
+        raise AssertionError
+
+    with pytest.raises(ChildError, match=r"mute did not say 'ready' within 0\.05 s"):
+        within(run, impatient)
