@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import (
+    AfterValidator,
     Field,
     ValidationError,
     ValidationInfo,
@@ -25,6 +26,7 @@ from gdp.limits import CLAIM_LEASE_S
 from gdp.nodes.config import LeaseSeconds
 from gdp.nodes.schema import Directory, Domain, Ifname, Metrics, NewFile, Section, load
 from gdp.nodes.spin import SPIN_MAX_US, SPIN_US
+from proxy.drop_ins import DROP_INS, DropIns, add_drop_in_rules
 from proxy.json_schema import JsonSchema, editor_schema
 from proxy.rules.choice import Fault, clashes
 from proxy.rules.ros_end import RosEnd
@@ -66,8 +68,12 @@ class ProxyConfig(Section):
         description="The ROS graph, or a list of graphs, to take part in. Without it there are only recordings.",
         json_schema_extra=_or_one,
     )
-    expose: tuple[Rule, ...] = Field(default=(), description="Rules for what leaves this machine.")
-    imports: tuple[Rule, ...] = Field(default=(), alias="import", description="Rules for what comes from elsewhere.")
+    expose: Annotated[tuple[Rule, ...], AfterValidator(add_drop_in_rules)] = Field(
+        default=(), validate_default=True, description="Rules for what leaves this machine."
+    )
+    imports: Annotated[tuple[Rule, ...], AfterValidator(add_drop_in_rules)] = Field(
+        default=(), alias="import", validate_default=True, description="Rules for what comes from elsewhere."
+    )
     record: Record | None = Field(default=None, description="Write what arrives into a file.")
     state: Directory | None = Field(
         default=None, description="Directory that keeps revocations across restarts, for this user alone."
@@ -83,18 +89,22 @@ class ProxyConfig(Section):
         le=SPIN_MAX_US,
         description="Microseconds to look for more frames before sleeping, where most waits were shorter. 0: never.",
     )
+    control_socket: NewFile | None = Field(
+        default=None, description="Socket for `gdp reload`, `status` and `drain`. Default: beside the locks of nodes."
+    )
     sandbox: bool = Field(
         default=True, description="Whether the process gives away the rights that it needs no more once it is up."
     )
 
     @classmethod
     def load(cls, path: Path) -> ProxyConfig:
-        """Read ``proxy.yaml``.
+        """Read ``proxy.yaml`` and the rules of its drop-in directory ``proxy.yaml.d``.
 
         Raises:
-            ConfigError: every error of the file, each with line and column.
+            ConfigError: every error of a file, each with line and column.
         """
-        return load(cls, path)
+        drop_ins = DropIns.load(path)
+        return load(cls, path, more={DROP_INS: drop_ins}, locate=drop_ins.locate)
 
     @classmethod
     def json_schema(cls) -> JsonSchema:

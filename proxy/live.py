@@ -14,7 +14,7 @@ from typing import Final
 import typer
 
 from gdp.cli.node import emit, emit_wait
-from gdp.errors import GdpError
+from gdp.errors import LocalError
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.site import Site
 from proxy.config import ProxyConfig
@@ -91,7 +91,8 @@ def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
                 log.info("leaving; what is under way is answered")
                 leave_at_s = now_s + DRAIN_MAX_S
             bridge.drain(now_s)  # again and again: a local server may appear meanwhile
-            if now_s >= leave_at_s or bridge.is_drained(now_s):
+            node.has_drained = bridge.is_drained(now_s)
+            if now_s >= leave_at_s or node.has_drained:
                 return
         if not is_ready and node.member.attachment.is_attached and bridge.is_settled:
             is_ready = True
@@ -135,16 +136,15 @@ def _tell_progress(node: ProxyNode, bridge: Bridge) -> None:
 
 
 def _reload(path: Path, first: ProxyConfig, node: ProxyNode, bridge: Bridge) -> None:
-    """Read the configuration and the delegations again; flows whose rule is the same go on."""
-    try:
-        settings = ProxyConfig.load(path)
-        held = Held(settings.delegations, node.identity)
-    except GdpError as error:
-        log.error("configuration not reloaded, the old one holds reason=%s", error)
-        return
-    for key in ("identity", "domain", "iface", "ros", "metrics", "sandbox", "state"):
+    """Read the configuration and the delegations again; flows whose rule is the same go on.
+
+    Raises:
+        GdpError: the old configuration stays in use.
+    """
+    settings = ProxyConfig.load(path)
+    held = Held(settings.delegations, node.identity)
+    for key in ("identity", "domain", "iface", "ros", "metrics", "sandbox", "state", "control_socket"):
         if getattr(settings, key) != getattr(first, key):
-            log.error("configuration not reloaded, the old one holds reason=%s needs a restart to change", key)
-            return
+            raise LocalError(f"{path}: {key} changed; restart the proxy to change it")
     bridge.reload(settings, held)
     log.info("configuration reloaded rules=%d", len(settings.expose) + len(settings.imports))

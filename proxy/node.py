@@ -22,6 +22,9 @@ from gdp.crypto.identity import Identity
 from gdp.errors import GdpError, LocalError
 from gdp.message.loss import by_label
 from gdp.names import Name
+from gdp.nodes.control_client import control_path
+from gdp.nodes.control_socket import ControlHandlers
+from gdp.nodes.control_status import node_status
 from gdp.nodes.counts import count_list
 from gdp.nodes.credentials import Credentials, watched_folders
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
@@ -33,7 +36,7 @@ from gdp.nodes.single_instance import run_alone
 from gdp.nodes.uplink import open_uplink
 from gdp.ports.plane import Plane
 from gdp.telemetry.sources import Sources
-from proxy.config import ProxyConfig
+from proxy.config import ProxyConfig, Record
 from proxy.faults import Faults
 from proxy.held import Held
 from proxy.traffic import Traffic
@@ -50,8 +53,9 @@ class ProxyNode:
     """What runs, for the command that drives it.
 
     Attributes:
-        on_reload: called after a SIGHUP; None: nothing is read anew.
-        is_leaving: a SIGUSR1 came: answer what is under way, then end.
+        on_reload: reads the configuration again; raises ``GdpError`` where the old one stays. None: there is nothing.
+        is_leaving: a SIGUSR1 or a drain came: answer what is under way, then end.
+        has_drained: all that was under way was answered.
         drains: whether the command looks at that; else a SIGUSR1 ends it at once.
     """
 
@@ -64,21 +68,49 @@ class ProxyNode:
     on_reload: Callable[[], None] | None = None
     is_leaving: bool = False
     drains: bool = False
+    has_drained: bool = False
+    begun_s: float = field(default_factory=time.monotonic)
     traffic: Traffic = field(default_factory=Traffic)
     faults: Faults = field(default_factory=Faults)
 
     def reload(self) -> None:
-        """Read anew what can be."""
+        """Read again the certificates, the configuration and the delegations.
+
+        Raises:
+            GdpError: the old configuration stays in use; the text says why.
+        """
         self.credentials.look(now())
         if self.on_reload is not None:
             self.on_reload()
 
+    def reload_on_signal(self) -> None:
+        """Reload after a SIGHUP; an error is logged."""
+        try:
+            self.reload()
+        except GdpError as error:
+            log.error("configuration not reloaded, the old one stays in use reason=%s", error)
+
+    def drain(self) -> None:
+        """Answer what is under way, then end; a command that does not look at ``is_leaving`` ends after this step."""
+        self.is_leaving = True
+        if not self.drains:
+            self.has_drained = True  # what arrived is written
+            self.runtime.stop()
+
     def leave_soon(self, number: int, frame: FrameType | None) -> None:
         """Take a SIGUSR1, which wakes the loop."""
         del number, frame
-        self.is_leaving = True
-        if not self.drains:
-            self.runtime.stop()
+        self.drain()
+
+    def control_handlers(self) -> ControlHandlers:
+        """Return what the control socket does."""
+        sources = self.sources()
+
+        def status() -> dict[str, object]:
+            attached = self.member.attachment.is_attached
+            return node_status(self.identity, sources, uptime_s=time.monotonic() - self.begun_s, attached=attached)
+
+        return ControlHandlers(reload=self.reload, status=status, drain=self.drain, is_drained=lambda: self.has_drained)
 
     def linger(self, duration_s: float) -> None:
         """Work on for a while, so that a goodbye is heard."""
@@ -143,10 +175,13 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
         runtime.every(LOOK_S, credentials.look)
         node = ProxyNode(identity, member, runtime, plane, node_log, credentials)
         stack.callback(signal.signal, signal.SIGUSR1, signal.signal(signal.SIGUSR1, node.leave_soon))
-        stack.enter_context(runtime.signals(node.reload))
+        stack.enter_context(runtime.signals(node.reload_on_signal))
+        control = config.control_socket or control_path(identity.name)
+        stack.enter_context(runtime.control(control, node.control_handlers()))
         if config.sandbox:
             again = watched_folders(config.identity, config.domain)
-            kept = (None if config.record is None else config.record.path.parent, config.state)
+            files = (each.path if isinstance(each, Record) else each for each in (config.record, config.control_socket))
+            kept = (*(None if each is None else each.parent for each in files), config.state)
             written = [folder for folder in kept if folder is not None]
             confine_proxy((*again, config.delegations), written, has_ros=bool(config.ros))
         revocations.start(runtime)
@@ -186,12 +221,12 @@ def open_topics(config: ProxyConfig, held: Held) -> dict[Name, Topic]:
 
 
 def renew_topics(node: ProxyNode, config: ProxyConfig) -> None:
-    """Read the delegations anew: new epochs and longer validity take effect without a message lost."""
-    try:
-        topics = open_topics(config, Held(config.delegations, node.identity))
-    except GdpError as error:
-        log.error("delegations not renewed reason=%s", error)
-        return
+    """Read the delegations again: new epochs and longer validity take effect without a message lost.
+
+    Raises:
+        GdpError: a delegation is missing or does not hold; the old ones stay in use.
+    """
+    topics = open_topics(config, Held(config.delegations, node.identity))
     for topic in topics.values():
         node.member.renew(topic)
     log.info("delegations renewed topics=%d", len(topics))

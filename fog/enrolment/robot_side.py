@@ -1,54 +1,59 @@
-"""The robot's proxies learn what a cluster serves: a rule in their file, a delegation beside it, a SIGHUP.
+"""Rules and delegations by which a robot's proxy uses a cluster.
 
-Place: I/O; edits files that are at hand, signals processes of this machine.
-A rule that the file already has, also one with a pattern, is enough. Otherwise one line is added for each name, marked
-with the cluster's, and taken out again when the cluster is gone; nothing else of the file is touched. A file that is
-private, or that has the salt of a name in it, is private afterwards.
+I/O; writes drop-in files and delegations, and asks running nodes to reload through their control sockets.
+``proxy.yaml`` never changes. The rules of a cluster are the file ``fog-CLUSTER.yaml`` of the drop-in directory
+(``proxy.drop_ins``), which ``forget_rules`` removes. A rule that the proxy already has is not written again. The file
+is private (0600) if ``proxy.yaml`` is, or if a rule contains a name's salt.
 """
 
 from __future__ import annotations
 
 import fcntl
 import json
+import logging
 import os
 import re
-import signal
 import stat
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
 from fog.cluster import Carried
 from fog.enrolment.boots import robot_rule
 from fog.enrolment.members import Authority, metadata_of
-from gdp.errors import LocalError
+from gdp.errors import GdpError, LocalError
+from gdp.nodes.control_client import NotRunningError, ask_node, find_control_socket
+from gdp.nodes.control_protocol import Command
 from gdp.stores.files import private, public, write_all
 from gdp.stores.keyring import load_public_key
 from proxy.config import ProxyConfig
+from proxy.drop_ins import drop_in_directory
 from proxy.rules import choice
 
-__all__ = ["forget_rules", "introduce", "processes_of", "reload"]
+__all__ = ["control_socket_of", "forget_rules", "introduce", "reload", "reload_proxy"]
 
-_MARK: Final = "  # fog: "
-_IMPORT: Final = re.compile(r"^import:[ \t]*(#.*)?$", re.MULTILINE)
-_EMPTY: Final = re.compile(r"^import:[ \t]*\n(?=[^\s#-]|\Z)", re.MULTILINE)  # a list whose last line we took
-_NEXT: Final = re.compile(r"^[^\s#-]", re.MULTILINE)
-_PROGRAMS: Final = ("gdp-proxy", "proxy.cli")
-_CAUGHT: Final = re.compile(r"^SigCgt:\s*([0-9a-f]+)$", re.MULTILINE)
+log = logging.getLogger(__name__)
+
 _SALT: Final = re.compile(r"""\bsalt["']?[ \t]*:""")  # under `metadata`
-_ITEM: Final = re.compile(r"^(?P<indent>[ \t]*)-[ \t]", re.MULTILINE)
+_HEAD: Final = "# Rules of cluster {cluster}; fog writes this file, and removes it with the cluster.\nimport:\n"
+_OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
+_RELOAD_S: Final = 10.0
 
 
 def introduce(path: Path, authority: Authority, cluster: str, carried: Sequence[Carried], *, days: float) -> None:
-    """Let the proxy whose file this is take what a cluster serves, by rule and delegation; running or not.
+    """Let a robot's proxy use what a cluster serves, by rule and delegation; the proxy may run or not.
+
+    Args:
+        path: ``proxy.yaml`` of the robot.
+        days: validity of the delegations.
 
     Raises:
-        ConfigError: the file is not a proxy's, or a rule cannot be added by a line.
-        LocalError: keys are missing.
+        ConfigError: the configuration is not a proxy's, or a rule conflicts with one of its own.
+        LocalError: keys are missing, or the drop-in cannot be written.
     """
     key = load_public_key(authority.owner_key).compressed
-    with _alone(path):
+    with _locked(path):
         config = ProxyConfig.load(path)
         lacking = [
             each
@@ -56,64 +61,101 @@ def introduce(path: Path, authority: Authority, cluster: str, carried: Sequence[
             if choice.imported(config.imports, metadata_of(each).name(key), metadata_of(each)) is None
         ]
         if lacking:
-            owner = os.path.relpath(authority.owner_key, path.parent)
-            lines = [json.dumps({**robot_rule(each), "owner": owner}) + _MARK + cluster for each in lacking]
-            before = path.read_text(encoding="utf-8")
-            _write(path, _with_lines(before, lines))
-            try:
-                ProxyConfig.load(path)
-            except Exception:
-                _write(path, before)
-                raise
+            _add_rules(path, authority, cluster, lacking)
         authority.let(config.identity, config.delegations, carried, days=days)
 
 
 def forget_rules(path: Path, cluster: str) -> bool:
-    """Take out the lines that were added for a cluster; return whether there were any."""
-    mark = f"{_MARK}{cluster}"
-    with _alone(path):
-        before = path.read_text(encoding="utf-8")
-        after = "".join(line for line in before.splitlines(keepends=True) if not line.rstrip("\n").endswith(mark))
-        if after != before:
-            _write(path, _EMPTY.sub("", after))
-    return after != before
+    """Remove the drop-in file of a cluster; return whether there was one."""
+    file = _drop_in(path, cluster)
+    with _locked(path):
+        try:
+            file.unlink()
+        except FileNotFoundError:
+            return False
+        except OSError as error:
+            raise LocalError(f"{file}: {error.strerror}") from error
+    return True
 
 
-def processes_of(path: Path) -> Iterator[int]:
-    """Yield the ids of proxies that run with this file, and that a SIGHUP does not end.
+def control_socket_of(identity: Path, configured: Path | None) -> Path:
+    """Return the control socket of a node of this host.
 
-    Not one that only checks the file, nor one that is still starting: that has no handler yet.
+    Args:
+        identity: directory of its keys.
+        configured: ``control_socket`` of its configuration.
+
+    Raises:
+        LocalError: the directory is of no node.
     """
-    for folder in Path("/proc").iterdir():
-        if not folder.name.isdigit():
-            continue
-        with suppress(OSError):  # it has ended, or is somebody else's
-            words = (folder / "cmdline").read_bytes().decode("utf-8", "replace").split("\0")
-            if not any(Path(word).name in _PROGRAMS for word in words) or "--config" not in words[:-1]:
-                continue
-            file = (folder / "cwd").resolve() / words[words.index("--config") + 1]
-            if file.exists() and file.samefile(path) and _catches_hang_up(folder):
-                yield int(folder.name)
+    return configured or find_control_socket(identity)
 
 
-def reload(path: Path) -> int:
-    """Have the processes of this file read it again; return how many there are."""
-    told = 0
-    for pid in processes_of(path):
-        with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGHUP)
-            told += 1
-    return told
+def reload(identity: Path, configured: Path | None = None) -> bool:
+    """Have a node of this host read its configuration again, if it runs; return whether it did.
+
+    A node that refuses keeps its old configuration; the reason is logged.
+
+    Args:
+        identity: directory of its keys.
+        configured: ``control_socket`` of its configuration.
+    """
+    try:
+        answer = ask_node(control_socket_of(identity, configured), Command.RELOAD, _RELOAD_S)
+    except NotRunningError:
+        return False
+    except GdpError as error:
+        log.warning("node not reloaded identity=%s reason=%s", identity, error)
+        return False
+    if not answer.is_ok:
+        log.warning("node not reloaded identity=%s reason=%s", identity, answer.error)
+    return answer.is_ok
 
 
-def _catches_hang_up(process: Path) -> bool:
-    caught = _CAUGHT.search((process / "status").read_text(encoding="utf-8"))
-    return caught is not None and bool(int(caught[1], 16) >> (signal.SIGHUP - 1) & 1)
+def reload_proxy(path: Path) -> bool:
+    """Have the proxy of this ``proxy.yaml`` read it again, if it runs; return whether it did.
+
+    Raises:
+        ConfigError: the file is not a proxy's.
+    """
+    config = ProxyConfig.load(path)
+    return reload(config.identity, config.control_socket)
+
+
+def _drop_in(path: Path, cluster: str) -> Path:
+    return drop_in_directory(path) / f"fog-{cluster}.yaml"
+
+
+def _add_rules(path: Path, authority: Authority, cluster: str, carried: Sequence[Carried]) -> None:
+    """Append rules to the drop-in file of a cluster; restore it if the proxy does not accept the result."""
+    file = _drop_in(path, cluster)
+    is_private = not path.stat().st_mode & _OTHERS
+    try:
+        file.parent.mkdir(mode=0o700 if is_private else 0o755, exist_ok=True)
+        before = file.read_text(encoding="utf-8") if file.exists() else None
+    except OSError as error:
+        raise LocalError(f"{file}: {error.strerror}") from error
+    owner = os.path.relpath(authority.owner_key, file.parent)
+    lines = [f"- {json.dumps({**robot_rule(each), 'owner': owner})}\n" for each in carried]
+    _write(file, (before or _HEAD.format(cluster=cluster)) + "".join(lines), is_private=is_private)
+    try:
+        ProxyConfig.load(path)
+    except Exception:
+        if before is None:
+            file.unlink()
+        else:
+            _write(file, before, is_private=is_private)
+        raise
+
+
+def _write(file: Path, text: str, *, is_private: bool) -> None:
+    new = private if is_private or _SALT.search(text) else public
+    write_all(file.parent, {file.name: new(text.encode())}, force=True)
 
 
 @contextmanager
-def _alone(path: Path) -> Iterator[None]:
-    """Hold off other launches that change this file; its folder is locked, for the file itself is replaced."""
+def _locked(path: Path) -> Iterator[None]:
+    """Exclude other launches that change this robot's rules, by a lock on the folder of ``proxy.yaml``."""
     try:
         folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as error:
@@ -123,25 +165,3 @@ def _alone(path: Path) -> Iterator[None]:
         yield
     finally:
         os.close(folder)
-
-
-def _with_lines(text: str, rules: Sequence[str]) -> str:
-    """Return a YAML file with further items of its list ``import``."""
-    if not text.endswith("\n"):
-        text += "\n"
-    head = _IMPORT.search(text)
-    if head is None:
-        if re.search(r"^import:", text, re.MULTILINE):
-            raise LocalError("import: is written in one line, so no rule can be added; begin a line for each rule")
-        return text + "import:\n" + "".join(f"- {rule}\n" for rule in rules)
-    begin = head.end() + 1
-    following = _NEXT.search(text, begin)
-    item = _ITEM.search(text, begin, following.start() if following is not None else len(text))
-    indent = item["indent"] if item is not None else ""
-    return text[:begin] + "".join(f"{indent}- {rule}\n" for rule in rules) + text[begin:]
-
-
-def _write(path: Path, text: str) -> None:
-    is_private = not path.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO)
-    new = private if is_private or _SALT.search(text) else public
-    write_all(path.parent, {path.name: new(text.encode())}, force=True)

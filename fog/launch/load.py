@@ -19,28 +19,17 @@ from fog.cluster import Carried, CloudNode, ClusterPlan
 from fog.launch.cloud_node import cloud_node
 from fog.launch.description import DeclareLaunchArgument, LaunchDescription, Node
 from fog.launch.entity import FogCluster
+from fog.launch.robot_node import RobotNode
 from fog.launch.unreturned import watch
 from fog.launch.wish import Wish
 from fog.launch.words import has_ros_launch
 from gdp.errors import ConfigError, GdpError, LocalError
 
-__all__ = ["Loaded", "Probe", "RobotNode", "key_values", "load"]
+__all__ = ["Loaded", "Probe", "key_values", "load"]
 
 Probe: TypeAlias = Callable[[Sequence[CloudNode]], Sequence[tuple[str, str, str]]]
 
 _ENTRY: Final = "generate_launch_description"
-
-
-@dataclass(frozen=True, slots=True)
-class RobotNode:
-    """A node of the robot's side.
-
-    Args:
-        output: ``screen``, ``both`` or ``log``: where its output goes.
-    """
-
-    node: CloudNode
-    output: str = "screen"
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +86,7 @@ def load(path: Path, arguments: Mapping[str, str], probe: Probe | None = None) -
             raise ConfigError(str(path), "", str(error)) from error
     description = _described(path)
     if has_ros_launch():
-        from fog.launch.real_node import gathered
+        from fog.launch.ros_description import gathered
 
         return _planned(*gathered(description, arguments), probe)
     return _planned(*_gathered(description, arguments), probe)

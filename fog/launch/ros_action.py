@@ -28,6 +28,7 @@ from fog.cluster import CloudNode, ClusterPlan
 from fog.launch import entity
 from fog.launch.hold import Gate
 from fog.launch.probe import offered
+from fog.launch.real_node import cloud_node
 from fog.launch.unreturned import watch_ros_launch
 from gdp.errors import GdpError, LocalError
 from gdp.host.run_registry import Run, Runs
@@ -53,8 +54,6 @@ class FogCluster(entity.FogCluster, Action):  # type: ignore[misc]  # launch has
         Raises:
             LocalError: a node cannot be what it says.
         """
-        from fog.launch.real_node import cloud_node
-
         if self._starting is not None:
             return  # it stands twice in the description
         nodes = tuple(cloud_node(node, context) for node in self.cloud_nodes)

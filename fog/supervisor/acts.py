@@ -55,6 +55,11 @@ class Acts:
         """Return whether something is being done about a machine, or without one about any of the cluster."""
         return any(key == (cluster, machine) or (not machine and key[0] == cluster) for key in self._futures)
 
+    @property
+    def running(self) -> int:
+        """Return how many acts are not over."""
+        return sum(not future.done() for _, future in list(self._futures.values()))
+
     def take_done(self) -> list[Done]:
         """Return, once, what is over. An error that is none of ours is raised."""
         over = [(key, what, future) for key, (what, future) in self._futures.items() if future.done()]

@@ -70,14 +70,14 @@ def _run(site: Site, journal: Journal, tickets: Tickets, *, stays: bool) -> None
     offered = _offered(site, journal)
     provider = open_provider(replace(site, topology=offered[1]), offered[0])
     supervisor = Supervisor(
-        site,
-        journal,
-        tickets,
-        provider,
-        partial(command_of, site),
-        watch.heard if watch is not None else lambda: None,
-        watch.reload if watch is not None else lambda: None,
-        Patience() if provider.name == "local" else Patience(boot_s=_ELSEWHERE_S),
+        site=site,
+        journal=journal,
+        tickets=tickets,
+        provider=provider,
+        command=partial(command_of, site),
+        heard=watch.heard if watch is not None else lambda: None,
+        on_names=watch.reload if watch is not None else lambda: None,
+        patience=Patience() if provider.name == "local" else Patience(boot_s=_ELSEWHERE_S),
     )
 
     def end(number: int, frame: FrameType | None) -> None:

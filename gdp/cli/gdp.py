@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import typer
 
-from gdp.cli import audit, cert, delegate, domain, key, keygen
+from gdp.cli import audit, cert, control, delegate, domain, key, keygen
 from gdp.cli.lab import lab
 from gdp.cli.name import name
 from gdp.errors import GdpError
@@ -26,6 +26,8 @@ app = typer.Typer(
 )
 app.command("name", no_args_is_help=True)(name)
 app.command("lab", no_args_is_help=True)(lab)
+for command in (control.reload, control.status, control.drain):
+    app.command(command.__name__, no_args_is_help=True)(command)
 app.add_typer(keygen.app, name="keygen")
 app.add_typer(key.app, name="key")
 app.add_typer(domain.app, name="domain")

@@ -113,6 +113,7 @@ class SwitchConfig(Section):
     lease_s: LeaseSeconds = CLAIM_LEASE_S
     keepalive_ms: KeepaliveMs = KEEPALIVE_MS
     detect_multiplier: DetectMultiplier = DETECT_MULTIPLIER
+    control_socket: NewFile | None = None
     sandbox: bool = True
 
     def timing_of(self, port: PortConfig) -> Timing:
@@ -225,6 +226,7 @@ class RibConfig(Section):
     metrics: Metrics | None = None
     audit: NewFile | None = None
     token_folders: Annotated[tuple[Directory, ...], Unique] = ()
+    control_socket: NewFile | None = None
     sandbox: bool = True
 
     @model_validator(mode="after")

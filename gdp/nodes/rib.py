@@ -16,6 +16,9 @@ from gdp.crypto.certificates import Role
 from gdp.names import Name
 from gdp.nodes.audit import audit_folder, keep_audit
 from gdp.nodes.config import RibConfig
+from gdp.nodes.control_client import control_path
+from gdp.nodes.control_socket import ControlHandlers
+from gdp.nodes.control_status import node_status
 from gdp.nodes.counts import count_list
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
@@ -23,7 +26,7 @@ from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rib_upkeep import MemoryUpkeep, Upkeep
 from gdp.nodes.rights import confine_rib
-from gdp.nodes.runtime import Runtime, now
+from gdp.nodes.runtime import DRAIN_MAX_S, Runtime, now
 from gdp.nodes.single_instance import run_alone
 from gdp.nodes.uplink import open_uplink
 from gdp.ports.plane import Plane
@@ -83,12 +86,22 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
         credentials = Credentials(config.identity, config.domain, identity, policy)
         runtime.every(LOOK_S, credentials.look)
         stack.enter_context(runtime.signals(lambda: credentials.look(now())))
+        sources, begun_s = _sources(host, plane, node_log), now().mono_s
+        handlers = ControlHandlers(
+            reload=lambda: credentials.look(now()),
+            status=lambda: node_status(
+                identity, sources, uptime_s=now().mono_s - begun_s, attached=host.attachment.switch is not None
+            ),
+            drain=lambda: runtime.drain(lambda: True, DRAIN_MAX_S),
+            is_drained=lambda: runtime.has_drained,
+        )
+        stack.enter_context(runtime.control(config.control_socket or control_path(identity.name), handlers))
         for source in upkeep.sources():
             runtime.watch(source, lambda: upkeep.work(now()))
         if config.metrics is not None:
             from gdp.telemetry.metrics import Metrics
 
-            metrics = Metrics(_sources(host, plane, node_log))
+            metrics = Metrics(sources)
             metrics.serve(config.metrics.port)
             stack.callback(metrics.close)
         log.info("rib up name=%s iface=%s", identity.name.short, config.iface)

@@ -45,6 +45,7 @@ def confine_switch(config: SwitchConfig, plane: str) -> None:
     again = watched_folders(config.identity, config.domain)
     again += () if config.revocations is None else (config.revocations,)
     state = () if config.state is None else (config.state,)
+    state += _folder_of(config.control_socket)
     kept = (*state, *_audits(config.audit), *config.token_folders)
     is_kernel = plane == "kernel"
     _confine(
@@ -64,7 +65,7 @@ def confine_rib(config: RibConfig) -> None:
     again = watched_folders(config.identity, config.domain)
     secrets = () if config.store == "memory" else _files_of(config.store.cluster)
     folders = (None if config.snapshot is None else config.snapshot.parent, config.state)
-    snapshots = tuple(folder for folder in folders if folder is not None)
+    snapshots = tuple(folder for folder in folders if folder is not None) + _folder_of(config.control_socket)
     kept = (*snapshots, *_audits(config.audit), *config.token_folders)
     ports = () if config.metrics is None else (config.metrics.port,)
     _confine(
@@ -113,6 +114,11 @@ def _past_owners(reads: Iterable[Path] = (), writes: Iterable[Path] = ()) -> fro
 def _audits(configured: Path | None) -> tuple[Path, ...]:
     folder = audit_folder(configured)
     return () if folder is None else (folder,)
+
+
+def _folder_of(file: Path | None) -> tuple[Path, ...]:
+    """Return the folder of a file that the node removes at its end."""
+    return () if file is None else (file.parent,)
 
 
 def _files_of(store: ClusterConfig) -> tuple[Path, ...]:

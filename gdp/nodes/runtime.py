@@ -14,19 +14,23 @@ import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from types import FrameType
 
 from gdp.effects import Arrival, Instant, Machine
 from gdp.nodes.allocator import settle_memory
+from gdp.nodes.control_socket import ControlHandlers, ControlServer
 from gdp.nodes.spin import Spin
 from gdp.ports.plane import HasFileno, Plane
 
-__all__ = ["Runtime", "now"]
+__all__ = ["DRAIN_MAX_S", "Runtime", "now"]
 
 log = logging.getLogger(__name__)
 
 COST_DEFAULT = 10
+DRAIN_MAX_S = 2.0  # a switch or RIB that drains ends then, finished or not
 _STREAK_MAX = 8
+_DRAIN_LOOK_S = 0.05  # between looks at what is left, where nothing else wakes the loop
 
 
 def now() -> Instant:
@@ -61,6 +65,9 @@ class Runtime:
         self._streak = 0  # steps in a row that brought frames, without a look at the timers
         self._deadline_s: float | None = None
         self._looks: list[_Look] = []
+        self._drain_until_s: float | None = None
+        self._is_finished: Callable[[], bool] = lambda: True
+        self.has_drained = False
         moment = now()
         for port in list(plane.ports.values()):
             self._add(port.index, moment)
@@ -85,7 +92,8 @@ class Runtime:
                 return True
             if deadline_s is not None and time.monotonic() >= deadline_s:
                 return False
-            self.step(deadline_s)
+            self.step(time.monotonic() + _DRAIN_LOOK_S if self.is_draining else deadline_s)
+            self._end_when_drained()
         return until is None
 
     def watch(self, source: HasFileno, ready: Callable[[], None] | None = None) -> None:
@@ -97,6 +105,35 @@ class Runtime:
                 ready()
 
         self._plane.watch(source, wake)
+
+    @contextlib.contextmanager
+    def control(self, path: Path, handlers: ControlHandlers) -> Iterator[None]:
+        """Serve a control socket from within the loop while within.
+
+        Raises:
+            LocalError: the socket cannot be made.
+        """
+        if not path.parent.is_dir():  # no locks can be held here either, and that was logged
+            log.warning("no control socket: no such directory path=%s", path.parent)
+            yield
+            return
+        server = ControlServer(path, handlers)
+        self.watch(server, server.handle_events)
+        try:
+            yield
+        finally:
+            self.unwatch(server)
+            server.close()
+
+    def drain(self, is_finished: Callable[[], bool], timeout_s: float) -> None:
+        """End ``run`` when ``is_finished`` and nothing is left to send, or after ``timeout_s`` seconds."""
+        self._drain_until_s = time.monotonic() + timeout_s
+        self._is_finished = is_finished
+
+    @property
+    def is_draining(self) -> bool:
+        """Return whether ``drain`` was called."""
+        return self._drain_until_s is not None
 
     def every(self, period_s: float, look: Callable[[Instant], None]) -> None:
         """Call ``look`` from within the loop each ``period_s``, the first time at once."""
@@ -132,6 +169,13 @@ class Runtime:
             if moment.mono_s >= look.due_s:
                 look.due_s = moment.mono_s + look.period_s
                 look.call(moment)
+
+    def _end_when_drained(self) -> None:
+        if self._drain_until_s is None:
+            return
+        self.has_drained = self._is_finished() and not self.send()
+        if self.has_drained or time.monotonic() >= self._drain_until_s:
+            self.stop()
 
     def _wait(self, timeout_s: float | None) -> list[Arrival]:
         """Wait for frames; where they follow each other closely, look again for a moment before going to sleep."""

@@ -5,7 +5,7 @@ Place: shell; loading reads files and changes nothing. ``gdp/nodes/config.py`` a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Final, TypeVar, get_args
 
@@ -137,17 +137,33 @@ class Metrics(Section):
     port: int = Field(ge=1, le=65_535)
 
 
-def load(model: type[M], path: Path) -> M:
+def load(
+    model: type[M],
+    path: Path,
+    *,
+    more: Mapping[str, object] | None = None,
+    locate: Callable[[YamlSource, KeyPath], tuple[YamlSource, KeyPath]] | None = None,
+) -> M:
     """Read a YAML file as this model.
+
+    Args:
+        more: further context of the model's validators.
+        locate: which file, and which key of it, a key of the model comes from; None: the same key of this file.
 
     Raises:
         ConfigError: the file cannot be read, or holds anything but what the model states (then every error is listed).
     """
     source = read_yaml(path)
+    context = {"base": path.parent, **(more or {})}
     try:
-        return model.model_validate_json(orjson.dumps(source.data), strict=True, context={"base": path.parent})
+        return model.model_validate_json(orjson.dumps(source.data), strict=True, context=context)
     except ValidationError as invalid:
-        errors = _translated(model, source, invalid.errors(include_url=False))
+        found: dict[Path, tuple[YamlSource, list[ErrorDetails]]] = {}
+        for detail in invalid.errors(include_url=False):
+            key = tuple(detail["loc"])
+            at, key = (source, key) if locate is None else locate(source, key)
+            found.setdefault(at.path, (at, []))[1].append({**detail, "loc": key})
+        errors = [error for at, details in found.values() for error in _translated(model, at, details)]
         raise ConfigFileError(sorted(errors, key=lambda error: _line_and_column(error.where))) from invalid
     except TypeError as error:  # a number beyond 64 bits
         raise ConfigError(str(path), "", str(error)) from error

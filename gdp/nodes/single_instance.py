@@ -29,7 +29,7 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.names import Name
 
-__all__ = ["lock_directory", "own_devices", "run_alone"]
+__all__ = ["lock_directories", "lock_directory", "own_devices", "run_alone"]
 
 log = logging.getLogger(__name__)
 
@@ -150,6 +150,11 @@ def _command(pid: int) -> str:
 def lock_directory() -> Path:
     """Return where this user's locks lie, whether it is there or not."""
     return _place()
+
+
+def lock_directories() -> tuple[Path, ...]:
+    """Return where locks that concern this user lie: its own directory, then that of root."""
+    return tuple(dict.fromkeys((_place(), _ROOT_DIRECTORY)))
 
 
 def _directory() -> Path | None:

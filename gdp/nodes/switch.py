@@ -16,6 +16,9 @@ from gdp.crypto.identity import Identity
 from gdp.errors import LocalError, StatementError
 from gdp.nodes.audit import keep_audit
 from gdp.nodes.config import SwitchConfig
+from gdp.nodes.control_client import control_path
+from gdp.nodes.control_socket import ControlHandlers
+from gdp.nodes.control_status import node_status
 from gdp.nodes.counts import count_list
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.data_plane import Chosen, choose_plane
@@ -24,7 +27,7 @@ from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.pairs import attach_pairs, switch_end
 from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rights import confine_switch
-from gdp.nodes.runtime import Runtime, now
+from gdp.nodes.runtime import DRAIN_MAX_S, Runtime, now
 from gdp.nodes.single_instance import own_devices, run_alone
 from gdp.nodes.uplink import refuse_loopback
 from gdp.ports.link import LinkWatch
@@ -108,23 +111,54 @@ def run_switch(
             _revoke(switch, config.revocations)
 
         stack.enter_context(runtime.signals(reload))
+        sources = _sources(switch, chosen, node_log)
+        handlers = _control_handlers(identity, switch, chosen, runtime, reload, sources)
+        stack.enter_context(runtime.control(config.control_socket or control_path(identity.name), handlers))
         _revoke(switch, config.revocations)
         keep_audit(config.audit, policy.audit, switch.drops, runtime, stack)
         if config.sandbox:
             confine_switch(config, chosen.name)
         revocations.start(runtime)
         if config.metrics is not None:
-            from gdp.telemetry.metrics import Metrics
-
-            metrics = Metrics(_sources(switch, chosen, node_log))
-            metrics.serve(config.metrics.port)
-            stack.callback(metrics.close)
+            stack.callback(_serve_metrics(sources, config.metrics.port))
         said = identity.name.short, identity.role.value, chosen.name, len(plane.ports)
         log.info("switch up name=%s role=%s plane=%s ports=%d", *said)
         if chosen.reason:
             log.warning("not the best data plane plane=%s reason=%s", chosen.name, chosen.reason)
         ready(identity, chosen.name, chosen.reason)
         runtime.run()
+
+
+def _serve_metrics(sources: Sources, port: int) -> Callable[[], None]:
+    """Serve metrics on a loopback port; return what ends that."""
+    from gdp.telemetry.metrics import Metrics
+
+    metrics = Metrics(sources)
+    metrics.serve(port)
+    return metrics.close
+
+
+def _control_handlers(
+    identity: Identity,
+    switch: Switch,
+    chosen: Chosen,
+    runtime: Runtime,
+    reload: Callable[[], None],
+    sources: Sources,
+) -> ControlHandlers:
+    begun_s = now().mono_s
+
+    def status() -> dict[str, object]:
+        neighbours = len(list(switch.greeter.all_up()))
+        more = {"data_plane": chosen.name, "ports": len(chosen.plane.ports), "neighbours": neighbours}
+        return node_status(identity, sources, uptime_s=now().mono_s - begun_s, **more)
+
+    return ControlHandlers(
+        reload=reload,
+        status=status,
+        drain=lambda: runtime.drain(lambda: not len(switch.parked), DRAIN_MAX_S),
+        is_drained=lambda: runtime.has_drained,
+    )
 
 
 def _absent(plane: Plane, ports: Collection[int]) -> set[int]:

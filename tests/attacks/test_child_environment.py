@@ -14,8 +14,8 @@ from fog.cli.robot_nodes import run
 from fog.cluster import CloudNode
 from fog.host.bounded_log import BoundedLog
 from fog.host.life import Life
-from fog.launch.load import RobotNode
 from fog.launch.probing import _started
+from fog.launch.robot_node import RobotNode
 from fog.machine import Program
 
 SECRETS = {"AWS_SECRET_ACCESS_KEY": "s", "AWS_PROFILE": "s", "SSH_AUTH_SOCK": "s", "GITHUB_TOKEN": "s"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,10 +15,12 @@ from fog.site import open_site
 from gdp.errors import ConfigError
 from gdp.metadata import Metadata
 from proxy.config import ProxyConfig
+from proxy.drop_ins import drop_in_directory
 from tests.gdp.cli.test_gdp import Run, gdp, keys
 
 __all__ = ["gdp", "keys"]
 
+PLAN = Carried("service", "/plan", "std_srvs/srv/Trigger")
 NAME = "name --kind topic --name /a --json"
 SALTED = Metadata({"kind": "topic", "name": "/a", "salt": "unguessable"}).name().to_text()
 
@@ -83,24 +86,34 @@ def test_a68_a_rule_names_the_file_of_its_salt(tmp_path: Path) -> None:
         ProxyConfig.load(path)
 
 
+@pytest.mark.parametrize("mode", [0o600, 0o644])
 @pytest.mark.parametrize("line", ["metadata: {salt: x}", 'metadata: {"salt": x}'])
-def test_a68_a_file_with_a_salt_is_private_after_fog_wrote_it(tmp_path: Path, line: str) -> None:
+def test_a68_fog_changes_neither_a_file_with_a_salt_nor_its_mode(tmp_path: Path, line: str, mode: int) -> None:
     site = open_site(None, tmp_path / "state")
     path = site.robots[0]
     with path.open("a") as file:
         file.write(f"import:\n- {{name: /a, type: std_msgs/msg/Empty, owner: ../owner/owner.pub, {line}}}\n")
-    path.chmod(0o644)
-    introduce(path, site.authority, "c", [Carried("service", "/plan", "std_srvs/srv/Trigger")], days=1.0)
-    assert path.stat().st_mode & 0o777 == 0o600
-    path.chmod(0o644)
+    path.chmod(mode)
+    before = path.read_bytes(), path.stat()
+    introduce(path, site.authority, "c", [PLAN], days=1.0)
     forget_rules(path, "c")
-    assert path.stat().st_mode & 0o777 == 0o600
+    assert (path.read_bytes(), path.stat()) == before
 
 
-def test_a68_a_private_file_stays_private(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("mode", "folder_mode"), [(0o600, 0o700), (0o644, 0o755)])
+def test_a68_rules_of_fog_are_as_private_as_the_robots_file(tmp_path: Path, mode: int, folder_mode: int) -> None:
     site = open_site(None, tmp_path / "state")
     path = site.robots[0]
-    for mode in (0o600, 0o644):
-        path.chmod(mode)
-        introduce(path, site.authority, "c", [Carried("service", f"/plan{mode}", "std_srvs/srv/Trigger")], days=1.0)
-        assert path.stat().st_mode & 0o777 == mode
+    path.chmod(mode)
+    introduce(path, site.authority, "c", [PLAN], days=1.0)
+    (rules,) = drop_in_directory(path).iterdir()
+    assert (rules.stat().st_mode & 0o777, rules.parent.stat().st_mode & 0o777) == (mode, folder_mode)
+
+
+def test_a68_rules_of_fog_with_a_salt_are_private(tmp_path: Path) -> None:
+    site = open_site(None, tmp_path / "state")
+    path = site.robots[0]
+    path.chmod(0o644)
+    introduce(path, site.authority, "c", [replace(PLAN, options={"metadata": {"salt": "x"}})], days=1.0)
+    (rules,) = drop_in_directory(path).iterdir()
+    assert rules.stat().st_mode & 0o777 == 0o600

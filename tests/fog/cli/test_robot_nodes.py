@@ -10,7 +10,7 @@ import pytest
 
 from fog.cli.robot_nodes import Started, run
 from fog.cluster import CloudNode
-from fog.launch.load import RobotNode
+from fog.launch.robot_node import RobotNode
 from gdp.errors import LocalError
 from tests.pages import ROOT
 

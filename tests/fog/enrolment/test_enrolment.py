@@ -1,11 +1,8 @@
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -15,19 +12,21 @@ from fog.enrolment.boots import gateway_boot
 from fog.enrolment.listener import bind_tcp
 from fog.enrolment.members import Authority, metadata_of
 from fog.enrolment.revoking import take_back
-from fog.enrolment.robot_side import forget_rules, introduce, processes_of
+from fog.enrolment.robot_side import forget_rules, introduce, reload_proxy
 from fog.host.bundle import install
 from fog.host.enrolment import enrol
 from fog.site import open_site
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import parse
-from gdp.errors import LocalError
+from gdp.errors import ConfigError, LocalError
 from gdp.nodes.config import RibConfig, SwitchConfig
+from gdp.nodes.control_socket import ControlHandlers, serve_control_in_thread
 from gdp.nodes.membership import load_member
 from gdp.stores.keyring import load_identity, load_owner
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 from proxy.config import ProxyConfig
+from proxy.drop_ins import drop_in_directory
 from proxy.held import Held
 from tests.fog.enrolment.desk import CLUSTER, MAP, PLAN, Desk, made_desk
 
@@ -144,11 +143,8 @@ def test_a_site_of_its_own_is_made_once_and_its_robot_can_start(tmp_path: Path) 
 OWN = "# mine\nimport:\n  # those\n  - {name: /own, type: std_msgs/msg/Empty, owner: ../owner/owner.pub}\n"
 
 
-FLAT = OWN.replace("  ", "").replace("# those\n", "") + "spin_us: 0\n"
-
-
-@pytest.mark.parametrize("own", ["", OWN, FLAT])
-def test_the_robots_file_gets_a_line_a_name_and_is_as_before_when_they_are_taken_out(tmp_path: Path, own: str) -> None:
+@pytest.mark.parametrize("own", ["", OWN, "import: []\n"])
+def test_the_robot_gets_a_rule_a_name_and_none_is_left_when_the_cluster_is_gone(tmp_path: Path, own: str) -> None:
     site = open_site(None, tmp_path / "state")
     path = site.robots[0]
     with path.open("a") as file:
@@ -160,8 +156,9 @@ def test_the_robots_file_gets_a_line_a_name_and_is_as_before_when_they_are_taken
     assert next(rule for rule in config.imports if rule.name == "/plan").timeout_s == 9.0
     held = Held(config.delegations, load_identity(config.identity, time.time()))
     assert sorted(right.value for topic in held for right in topic.delegation.rights) == ["call", "read"]
-    assert forget_rules(path, "c")
     assert path.read_text() == first
+    assert forget_rules(path, "c")
+    assert {rule.name for rule in ProxyConfig.load(path).imports} == ({"/own"} if own == OWN else set())
     assert not forget_rules(path, "c")
 
 
@@ -170,20 +167,29 @@ def test_a_rule_that_the_robot_has_already_is_enough(tmp_path: Path) -> None:
     path = site.robots[0]
     with path.open("a") as file:
         file.write('import:\n- {name: "/**", kind: service, owner: ../owner/owner.pub}\n')
-    before = path.read_text()
     introduce(path, site.authority, "c", [PLAN], days=1.0)
-    assert path.read_text() == before
+    assert not drop_in_directory(path).exists()
 
 
-def test_a_list_in_one_line_is_refused_and_left_alone(tmp_path: Path) -> None:
+def test_further_names_of_a_cluster_are_added_to_its_file(tmp_path: Path) -> None:
+    site = open_site(None, tmp_path / "state")
+    path = site.robots[0]
+    introduce(path, site.authority, "c", [PLAN], days=1.0)
+    introduce(path, site.authority, "c", [PLAN, MAP], days=1.0)
+    assert [rule.name for rule in ProxyConfig.load(path).imports] == [PLAN.name, MAP.name]
+    assert [file.name for file in drop_in_directory(path).iterdir()] == ["fog-c.yaml"]
+
+
+def test_a_rule_that_conflicts_with_the_robots_is_refused_and_leaves_no_file(tmp_path: Path) -> None:
     site = open_site(None, tmp_path / "state")
     path = site.robots[0]
     with path.open("a") as file:
-        file.write("import: []\n")
-    before = path.read_text()
-    with pytest.raises(LocalError, match="a line for each rule"):
+        file.write(
+            f"expose:\n- {{name: {PLAN.name}, kind: service, type: {PLAN.type_name}, owner: ../owner/owner.pub}}\n"
+        )
+    with pytest.raises(ConfigError, match=r"proxy\.yaml\.d/fog-c\.yaml:3:.*import\[0\]"):
         introduce(path, site.authority, "c", [PLAN], days=1.0)
-    assert path.read_text() == before
+    assert not list(drop_in_directory(path).iterdir())
 
 
 def test_what_is_gone_is_revoked_once_and_forgotten_when_it_would_have_run_out(
@@ -200,26 +206,38 @@ def test_what_is_gone_is_revoked_once_and_forgotten_when_it_would_have_run_out(
     assert [path.name for path in folder.iterdir()] == [f"{second[:32]}.revoke"]
 
 
-def test_only_proxies_that_run_with_the_file_and_take_the_signal_are_told(tmp_path: Path) -> None:
-    path = tmp_path / "proxy.yaml"
-    path.touch()
-    takes, says = "import signal; signal.signal(signal.SIGHUP, print); ", "print(1, flush=True); signal.pause()"
-    programs = [
-        (f"{takes}{says}", "gdp-proxy", path),
-        (f"{takes}{says}", "gdp-proxy", tmp_path / "other.yaml"),
-        (f"{takes}{says}", "editor", path),
-        (f"import signal; {says}", "gdp-proxy", path),  # it only checks, or is still starting
-    ]
-    with ExitStack() as stack:
-        running = []
-        for code, name, file in programs:
-            argv = [sys.executable, "-c", code, name, "--config", str(file)]
-            program = stack.enter_context(subprocess.Popen(argv, stdout=subprocess.PIPE))
-            stack.callback(program.kill)
-            assert program.stdout is not None
-            assert program.stdout.readline()
-            running.append(program.pid)
-        assert list(processes_of(path)) == running[:1]
+class Proxy:
+    """Control handlers of a proxy that counts reloads."""
+
+    def __init__(self, refusal: str = "") -> None:
+        self.reloads = 0
+        self.refusal = refusal
+
+    def handlers(self) -> ControlHandlers:
+        return ControlHandlers(reload=self._reload, status=dict, drain=lambda: None)
+
+    def _reload(self) -> None:
+        self.reloads += 1
+        if self.refusal:
+            raise LocalError(self.refusal)
+
+
+def test_a_running_proxy_reloads_by_its_control_socket(tmp_path: Path) -> None:
+    path = open_site(None, tmp_path / "state").robots[0]
+    path.write_text(f"{path.read_text()}control_socket: {tmp_path}/proxy.sock\n")
+    proxy = Proxy()
+    assert not reload_proxy(path)
+    with serve_control_in_thread(tmp_path / "proxy.sock", proxy.handlers()):
+        assert reload_proxy(path)
+    assert proxy.reloads == 1
+
+
+def test_a_proxy_that_refuses_its_new_configuration_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = open_site(None, tmp_path / "state").robots[0]
+    path.write_text(f"{path.read_text()}control_socket: {tmp_path}/proxy.sock\n")
+    with serve_control_in_thread(tmp_path / "proxy.sock", Proxy("iface changed").handlers()):
+        assert not reload_proxy(path)
+    assert "iface changed" in caplog.text
 
 
 def test_two_launches_change_the_robots_file_one_after_the_other(tmp_path: Path) -> None:

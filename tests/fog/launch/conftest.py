@@ -17,6 +17,7 @@ _OURS = (
     "fog.launch.ros_action",
     "fog.launch.ros_node",
     "fog.launch.real_node",
+    "fog.launch.ros_description",
     "fog.ros2cli.command",
     "fog.ros2cli.option",
     "fog.ros2cli.verb",

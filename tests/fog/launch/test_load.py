@@ -6,7 +6,8 @@ import pytest
 
 from fog.cluster import Carried, CloudNode, Wanted
 from fog.hardware import Hardware
-from fog.launch.load import RobotNode, key_values, load
+from fog.launch.load import key_values, load
+from fog.launch.robot_node import RobotNode
 from gdp.errors import ConfigError, LocalError
 
 LISTING = """

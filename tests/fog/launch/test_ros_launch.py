@@ -13,7 +13,8 @@ import pytest
 
 from fog.cluster import CloudNode, ClusterPlan, Wanted
 from fog.hardware import Hardware
-from fog.launch.load import RobotNode, load
+from fog.launch.load import load
+from fog.launch.robot_node import RobotNode
 from fog.launch.words import has_ros_launch
 from gdp.errors import LocalError
 from tests.fog.launch.test_load import LISTING, WITH_ARGUMENTS, written

@@ -1,18 +1,6 @@
 from __future__ import annotations
 
-from fog.supervisor.activity import Activity, requests_in
-
-LOG = """{"event":"ready"}
-{"event":"progress","sent":1,"received":4}
-{"event":"progress","sent":2,"received":7}
-word
-"""
-
-
-def test_the_last_word_of_a_proxy_counts() -> None:
-    assert requests_in(LOG) == 7
-    assert requests_in(LOG + '{"event":"progress","rec') == 7
-    assert requests_in("nothing\n") is None
+from fog.supervisor.activity import Activity
 
 
 def test_a_cluster_is_idle_since_its_last_request() -> None:

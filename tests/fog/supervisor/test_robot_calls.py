@@ -6,9 +6,14 @@ from pathlib import Path
 import pytest
 
 from fog.site import Site, open_site
-from fog.supervisor.robot_calls import sent_by
+from fog.supervisor.robot_calls import received_by, sent_by
+from gdp.crypto.certificates import Role
+from gdp.nodes.control_client import control_path
+from gdp.nodes.control_socket import ControlHandlers, serve_control_in_thread
+from gdp.nodes.membership import load_member
 from gdp.telemetry.metrics import Metrics
 from gdp.telemetry.sources import Sources
+from proxy.config import ProxyConfig
 
 
 @pytest.fixture
@@ -34,3 +39,25 @@ def test_a_proxy_that_shows_its_metrics_tells_how_much_it_sent(site: Site) -> No
 
 def test_a_proxy_without_metrics_does_not_tell(site: Site) -> None:
     assert sent_by(site.robots[0]) is None
+
+
+@pytest.mark.parametrize(
+    ("counters", "sent", "received"), [({"messages": {"in": 3, "out": 41}}, 41, 3), ({}, None, None)]
+)
+def test_counters_come_from_the_control_socket(
+    site: Site, tmp_path: Path, counters: dict[str, object], sent: int | None, received: int | None
+) -> None:
+    (path,) = site.robots
+    config = ProxyConfig.load(path)
+    name = load_member(config.identity, config.domain, Role.PROXY)[0].name
+    handlers = ControlHandlers(reload=lambda: None, status=lambda: {"counters": counters}, drain=lambda: None)
+    socket_file = control_path(name)
+    socket_file.parent.mkdir(mode=0o755, exist_ok=True)
+    with serve_control_in_thread(socket_file, handlers):
+        assert sent_by(path) == sent
+        assert received_by(name.to_text()) == received
+
+
+def test_a_proxy_that_does_not_run_has_no_counters(site: Site) -> None:
+    assert sent_by(site.robots[0]) is None
+    assert received_by("ab" * 32) is None

@@ -11,7 +11,6 @@ import pytest
 import yaml
 
 from fog.cluster import Carried, CloudNode, ClusterPlan
-from fog.enrolment.boots import PROXY
 from fog.enrolment.tickets import Tickets
 from fog.hardware import Hardware
 from fog.machine import Boot, Machine, MachineSpec, MachineState
@@ -118,7 +117,14 @@ def journal(site: Site) -> Iterator[Journal]:
 
 
 def supervisor(site: Site, journal: Journal, provider: Memory) -> Supervisor:
-    return Supervisor(site, journal, Tickets(site.enrolment_folder), provider, lambda _: ("run",), lambda: None)
+    return Supervisor(
+        site=site,
+        journal=journal,
+        tickets=Tickets(site.enrolment_folder),
+        provider=provider,
+        command=lambda _: ("run",),
+        heard=lambda: None,
+    )
 
 
 def work(each: Supervisor, is_met: Callable[[], object]) -> None:
@@ -201,12 +207,14 @@ def test_a_cluster_that_nobody_calls_is_ended_and_one_that_is_called_is_not(
     site: Site, journal: Journal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     provider, now_s = Memory(), time.time()
-    provider.said = {PROXY: '{"event":"progress","received":1}'}
+    provider.name = "local"
+    received = [1]
+    monkeypatch.setattr("fog.supervisor.usage_limits.received_by", lambda proxy: received[-1])
     ours = supervisor(site, journal, provider)
     journal.want(replace(PLAN, idle_s=60.0), now_s)
     work(ours, lambda: len(serving(journal)) == 2)
-    for later_s, requests in ((40.0, 2), (80.0, 3), (120.0, 3)):
-        provider.said = {PROXY: f'{{"event":"progress","received":{requests}}}'}
+    for later_s, count in ((40.0, 2), (80.0, 3), (120.0, 3)):
+        received.append(count)
         monkeypatch.setattr(time, "time", lambda at_s=now_s + later_s: at_s)
         ours.look()
         assert journal.cluster("c").is_up
@@ -267,12 +275,12 @@ def test_a_region_that_is_nearer_is_taken_and_said(site: Site, journal: Journal)
 
 
 @pytest.mark.parametrize(("sent", "is_up"), [(7, False), (None, True)])
-def test_where_logs_come_late_the_robot_tells_whether_it_calls_and_else_it_counts_as_used(
+def test_of_machines_elsewhere_the_robots_counters_decide_and_without_them_a_cluster_counts_as_used(
     site: Site, journal: Journal, monkeypatch: pytest.MonkeyPatch, sent: int | None, is_up: bool
 ) -> None:
     provider, now_s = Memory(), time.time()
     provider.name = "aws"
-    monkeypatch.setattr("fog.supervisor.supervisor.sent_by", lambda path: sent)
+    monkeypatch.setattr("fog.supervisor.usage_limits.sent_by", lambda path: sent)
     ours = supervisor(site, journal, provider)
     journal.want(replace(PLAN, idle_s=60.0), now_s)
     work(ours, lambda: len(serving(journal)) == 2)

@@ -1,0 +1,24 @@
+"""A node of the robot's side, as a launch file describes it.
+
+Sans-I/O.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fog.cluster import CloudNode
+
+__all__ = ["RobotNode"]
+
+
+@dataclass(frozen=True, slots=True)
+class RobotNode:
+    """A node of the robot's side.
+
+    Args:
+        output: ``screen``, ``both`` or ``log``: where its output goes.
+    """
+
+    node: CloudNode
+    output: str = "screen"

@@ -1,0 +1,71 @@
+"""Whole descriptions of ROS 2's ``launch`` as clusters and nodes of the robot's side.
+
+I/O; imports ROS 2's ``launch``. Conditions are evaluated, includes and groups are followed; nothing is started.
+Source: launch 3.4 and launch_ros 0.26 (jazzy).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from launch import LaunchContext, LaunchDescription
+from launch.actions import ExecuteProcess
+from launch.utilities import perform_substitutions
+from launch_ros.actions import Node
+
+from fog.cluster import CloudNode
+from fog.launch.real_node import cloud_node
+from fog.launch.robot_node import RobotNode
+from fog.launch.ros_action import FogCluster
+from fog.launch.wish import Wish
+from gdp.errors import LocalError
+
+__all__ = ["gathered"]
+
+
+def gathered(
+    description: object, arguments: Mapping[str, str]
+) -> tuple[list[tuple[Wish, list[CloudNode]]], list[RobotNode]]:
+    """Return the clusters of a description and the nodes of the robot's side, includes and groups followed.
+
+    Raises:
+        LocalError: something in it can only be run by ``ros2 launch``, or an argument is missing.
+    """
+    if not isinstance(description, LaunchDescription):
+        raise LocalError(f"expected a LaunchDescription, not {type(description).__name__}")
+    context = LaunchContext(noninteractive=True)
+    context.launch_configurations.update(arguments)
+    clusters: list[tuple[Wish, list[CloudNode]]] = []
+    robot: list[RobotNode] = []
+    waiting: list[object] = [description]
+    while waiting:
+        entity = waiting.pop(0)
+        condition = getattr(entity, "condition", None)
+        if condition is not None and not condition.evaluate(context):
+            continue
+        if isinstance(entity, FogCluster):
+            clusters.append((entity.wish, [cloud_node(each, context) for each in entity.cloud_nodes]))
+        elif isinstance(entity, Node):
+            robot.append(RobotNode(cloud_node(entity, context), _output(entity, context)))
+        elif isinstance(entity, ExecuteProcess):
+            raise LocalError("the launch description starts a process that is no Node: run it with ros2 launch")
+        else:
+            waiting = [*_inside(entity, context), *waiting]
+    return clusters, robot
+
+
+def _output(node: Node, context: LaunchContext) -> str:
+    """Return where a node's standard output goes, ``screen`` or ``log``, as ``launch.logging`` reads it."""
+    said = node.output
+    if isinstance(said, dict):
+        words = {*said.get("stdout", ()), *said.get("both", ())}
+    else:
+        words = {perform_substitutions(context, said)}
+    return "screen" if words & {"screen", "both", "full"} else "log"
+
+
+def _inside(entity: object, context: LaunchContext) -> Iterable[object]:
+    try:
+        return entity.visit(context) or ()  # type: ignore[attr-defined]
+    except Exception as error:  # an action may do anything when visited
+        raise LocalError(f"{type(entity).__name__}: {error}; does ros2 launch take it?") from error

@@ -1,0 +1,45 @@
+"""Events of clusters and machines: written into the journal, and logged.
+
+I/O.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+
+from fog.supervisor.journal import Journal
+from fog.supervisor.record import Record
+
+__all__ = ["EventLog"]
+
+log = logging.getLogger(__name__)
+
+
+class EventLog:
+    """Writes what happens to clusters and machines; each trouble once, until it is over."""
+
+    def __init__(self, journal: Journal) -> None:
+        self._journal = journal
+        self._troubles: dict[str, str] = {}
+
+    def put(self, record: Record, what: str, detail: str, now_s: float, since_unix_s: float | None = None) -> None:
+        """Store a machine's record, with the event if ``what`` names one; ``since_unix_s``: when it happened."""
+        self._journal.put(record, now_s, what, detail, since_unix_s)
+        if what:
+            log.info("machine %s cluster=%s machine=%s %s", what, record.spec.cluster, record.name, detail)
+
+    def add_trouble(self, cluster: str, reason: str, *, key: str = "") -> None:
+        """Write what is wrong with a cluster, once; ``key``: of several troubles of one cluster."""
+        if self._troubles.get(key or cluster) != reason:
+            self._troubles[key or cluster] = reason
+            self._journal.tell(time.time(), cluster, "", "trouble", reason)
+            log.warning("trouble cluster=%s reason=%s", cluster, reason)
+
+    def clear_trouble(self, key: str) -> None:
+        """Note that a trouble is over."""
+        self._troubles.pop(key, None)
+
+    def has_trouble(self, key: str) -> bool:
+        """Return whether a trouble lasts."""
+        return key in self._troubles

@@ -1,0 +1,80 @@
+"""Gateways of groups of machines: who is elected, and the moves of uplinks that follow.
+
+I/O; writes the journal and asks the provider.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+
+from fog.machine import Machine, MachineState
+from fog.providers.provider import GatewayProvider
+from fog.supervisor.decide import Patience
+from fog.supervisor.event_log import EventLog
+from fog.supervisor.gateway_election import elect, is_settling
+from fog.supervisor.journal import Journal
+from fog.supervisor.machine_actions import ATTACH, DETACH, MachineActions
+from fog.supervisor.record import Record
+
+__all__ = ["GatewayUplinks"]
+
+
+class GatewayUplinks:
+    """Keeps one gateway in each group of machines."""
+
+    def __init__(self, journal: Journal, events: EventLog, actions: MachineActions, patience: Patience) -> None:
+        self._journal = journal
+        self._events = events
+        self._actions = actions
+        self._patience = patience
+        self._uplinks: set[str] = set()  # machines whose uplink was seen to, since this supervisor began
+
+    def reconcile(
+        self, cluster: str, records: list[Record], seen: Mapping[str, Machine], now_s: float
+    ) -> frozenset[str]:
+        """Elect gateways among machines, and have the provider move their uplinks.
+
+        Args:
+            records: of the cluster; those whose role changes are replaced.
+
+        Returns the machines that may be silent because their gateway is new.
+        """
+        provider = self._actions.provider
+        if not isinstance(provider, GatewayProvider):
+            return frozenset()
+        groups: dict[str, list[Record]] = {}
+        others = [each.plan.name for each in self._journal.clusters() if each.plan.name != cluster]
+        everyone = [*records, *(each for other in others for each in self._journal.machines(other, gone=False))]
+        for each in everyone:
+            if label := provider.replica_gateway(each.spec.offer.region):
+                groups.setdefault(label, []).append(each)
+        excused: set[str] = set()
+        for label, group in groups.items():
+            if (election := elect(group, label, now_s, self._patience)) is not None:
+                new = replace(election.new, gateway=label, gateway_unix_s=now_s)
+                old = election.old and replace(election.old, gateway="", gateway_unix_s=now_s)
+                for changed in (new, *([old] if old else [])):
+                    group[:] = [changed if each.spec == changed.spec else each for each in group]
+                    records[:] = [changed if each.spec == changed.spec else each for each in records]
+                if old is not None:
+                    self._events.put(old, "", "", now_s)
+                self._events.put(new, "gateway", f"of {label}: {election.reason}", now_s)
+            if is_settling(group, label, now_s, self._patience):
+                excused.update(each.name for each in group if each.spec.cluster == cluster)
+        for record in records:
+            if record.id and record.name in seen and not self._actions.is_busy(cluster, record.name):
+                self._reconcile_uplink(provider, record, seen[record.name])
+        return frozenset(excused)
+
+    def _reconcile_uplink(self, provider: GatewayProvider, record: Record, seen: Machine) -> None:
+        """Begin to move an uplink where the provider has it otherwise; a machine on its way out keeps its own."""
+        if record.is_gone or seen.state is MachineState.GONE:
+            return
+        cluster, name = record.spec.cluster, record.name
+        if record.gateway and not (seen.is_gateway and record.id in self._uplinks):
+            self._uplinks.add(record.id)
+            self._actions.begin(cluster, name, ATTACH, partial(provider.attach_uplink, record.id))
+        elif seen.is_gateway and not record.gateway and not record.is_outgoing:
+            self._actions.begin(cluster, name, DETACH, partial(provider.detach_uplink, record.id))

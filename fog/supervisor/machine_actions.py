@@ -1,0 +1,193 @@
+"""Actions on machines: create, drain, release, and what became of them.
+
+I/O; asks the provider, in threads. The journal is written before an action begins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Final
+
+from fog.cluster import CloudNode, ClusterPlan, Wanted
+from fog.enrolment.boots import machine_boot, node_names
+from fog.enrolment.papers import Papers
+from fog.machine import Machine, MachineSpec, MachineState
+from fog.providers.provider import GatewayProvider, Provider
+from fog.site import Site
+from fog.supervisor.acts import Acts
+from fog.supervisor.decide import Action, Drain, Launch
+from fog.supervisor.event_log import EventLog
+from fog.supervisor.journal import LAST_WORDS, Journal
+from fog.supervisor.last_words import keep, kept
+from fog.supervisor.machine_credentials import MachineCredentials
+from fog.supervisor.offer_cache import OfferCache
+from fog.supervisor.place import place
+from fog.supervisor.record import Ending, Record
+
+__all__ = ["ATTACH", "DETACH", "MachineActions"]
+
+ATTACH: Final = "attach uplink"
+DETACH: Final = "detach uplink"
+
+
+class MachineActions:
+    """Begins actions on the machines of a site, and writes their results.
+
+    Args:
+        provider: whose machines they are; may be replaced.
+        command: how a node is started on a machine.
+        wake: called when an action is over, from its thread.
+    """
+
+    def __init__(
+        self,
+        *,
+        site: Site,
+        journal: Journal,
+        events: EventLog,
+        credentials: MachineCredentials,
+        provider: Provider,
+        command: Callable[[CloudNode], Sequence[str]],
+        wake: Callable[[], None],
+    ) -> None:
+        self.provider = provider
+        self._site = site
+        self._journal = journal
+        self._events = events
+        self._credentials = credentials
+        self._command = command
+        self._acts = Acts(wake)
+        self._offers = OfferCache(site.latencies)
+        self._swept: set[str] = set()  # machines of which nothing is left
+
+    @property
+    def running(self) -> int:
+        """Return how many actions have not ended."""
+        return self._acts.running
+
+    def use(self, provider: Provider) -> None:
+        """Ask another adapter of the same provider from now on."""
+        self.provider = provider
+        self._offers.clear()
+
+    def is_busy(self, cluster: str, machine: str = "") -> bool:
+        """Return whether an action on a machine runs, or without a machine on any of the cluster."""
+        return self._acts.is_busy(cluster, machine)
+
+    def begin(self, cluster: str, machine: str, what: str, act: Callable[[], str | None]) -> None:
+        """Begin an action on a machine that is not busy."""
+        self._acts.begin(cluster, machine, what, act)
+
+    def close(self) -> None:
+        """Wait until all actions have ended."""
+        self._acts.close()
+
+    def apply(self, plan: ClusterPlan, action: Action, records: list[Record], now_s: float) -> None:
+        """Begin what was decided about a machine; a machine that is busy keeps its action."""
+        if isinstance(action, Launch):
+            self._launch(plan, action.wanted, records, now_s)
+            return
+        (record,) = (each for each in records if each.name == action.name)
+        if self.is_busy(plan.name, record.name):
+            return
+        if isinstance(action, Drain):
+            known = replace(record, drained_unix_s=now_s, reason=action.reason)
+            self._events.put(known, "draining", action.reason, now_s)
+            self._acts.begin(plan.name, record.name, "drain", partial(self.provider.drain, record.id))
+        elif not record.id:
+            self._events.put(
+                record.ended(action.ending, action.reason, now_s), action.ending.value, action.reason, now_s
+            )
+        else:
+            known = replace(record, released_unix_s=now_s, ending=action.ending, reason=action.reason)
+            self._events.put(known, "leaving", action.reason, now_s)
+            self._credentials.revoke(known, now_s)
+            self.release(plan, record.name, record.id, is_lost=action.ending is not Ending.RELEASED)
+
+    def collect_results(self, now_s: float) -> None:
+        """Write the results of finished actions into the journal."""
+        for done in self._acts.take_done():
+            if done.what == "create":
+                record = next(each for each in self._journal.machines(done.cluster) if each.name == done.machine)
+                if done.error is not None:
+                    reason = str(done.error)
+                    self._events.put(record.ended(Ending.FAILED, reason, now_s), "refused", reason, now_s)
+                elif not record.is_gone:
+                    self._events.put(replace(record, id=done.result), "", "", now_s)
+            elif done.what in (ATTACH, DETACH) and done.error is not None:  # tried again at the next look
+                self._events.add_trouble(
+                    done.cluster, f"{done.machine}: {done.what}: {done.error}", key=f"{done.cluster} uplink"
+                )
+            elif done.error is not None:
+                self._journal.tell(now_s, done.cluster, done.machine, "trouble", f"{done.what}: {done.error}")
+            for program, lines in kept(done.result) if done.what == "release" else ():
+                self._journal.tell(now_s, done.cluster, done.machine, LAST_WORDS, program, lines=lines)
+
+    def release(self, plan: ClusterPlan, name: str, machine: str, *, is_lost: bool) -> None:
+        """Begin to give a machine back; of one that was lost, what its programs said last is kept."""
+        provider, programs = self.provider, node_names(plan)
+
+        def act() -> str:
+            words = keep(provider, machine, programs) if is_lost else ""
+            provider.terminate([machine])
+            return words
+
+        self._acts.begin(plan.name, name, "release", act)
+
+    def release_orphans(
+        self, plan: ClusterPlan, records: Sequence[Record], seen: Mapping[str, Machine], now_s: float
+    ) -> None:
+        """Give back what the journal does not know, or thought gone; and what is left of a machine that is gone."""
+        cluster = plan.name
+        known = {each.name for each in records if not each.is_gone}
+        lost = {each.name for each in records if each.is_gone and each.ending is not Ending.RELEASED}
+        for name, machine in seen.items():
+            if name in known or machine.id in self._swept or self.is_busy(cluster, name):
+                continue
+            if machine.state is MachineState.GONE:
+                self._swept.add(machine.id)
+            else:
+                self._journal.tell(now_s, cluster, name, "orphan", "nobody wants it: given back")
+            self.release(plan, name, machine.id, is_lost=name in lost)
+
+    def _launch(self, plan: ClusterPlan, wanted: Wanted, records: list[Record], now_s: float) -> None:
+        begun_s = self._journal.cluster(plan.name).begun_unix_s
+        past = [each for each in self._journal.machines(plan.name) if each.is_gone and each.asked_unix_s >= begun_s]
+        offers = self._offers.get(self.provider, wanted, now_s)
+        latency_ms = self._offers.latencies.ms((each.region for each in offers), now_s)
+        choice = place(wanted, offers, [*past, *records], now_s, latency_ms)
+        resting = f"{plan.name} rests"
+        if choice is None:
+            self._events.add_trouble(
+                plan.name, "machines fail one after another: it is too early to ask again", key=resting
+            )
+            return
+        self._events.clear_trouble(resting)
+        offer = choice.offer
+        spec = MachineSpec(plan.name, self._journal.next_machine(plan.name), offer)
+        uplink = self._uplink_iface(offer.region)
+        ticket, until_unix_s = self._credentials.issue_ticket(plan, spec.name, now_s, is_gateway=bool(uplink))
+        boot = machine_boot(
+            self._site.authority,
+            plan,
+            spec.name,
+            self._command,
+            ticket,
+            iface=self._site.machine_iface,
+            lease_s=self._site.lease_s,
+            shares_host=self.provider.name == "local",
+            uplink=uplink,
+        )
+        record = Record(spec, wanted, Papers("", until_unix_s), now_s)
+        records.append(record)
+        detail = f"{offer.region} {offer.type_name}, {offer.usd_per_hour:.4f} USD an hour: {choice.why}"
+        self._events.put(record, "asked", detail, now_s)
+        self._acts.begin(plan.name, spec.name, "create", partial(self.provider.create, spec, boot))
+
+    def _uplink_iface(self, region: str) -> str:
+        provider = self.provider
+        if isinstance(provider, GatewayProvider) and provider.replica_gateway(region):
+            return provider.uplink_iface
+        return ""

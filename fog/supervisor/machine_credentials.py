@@ -1,0 +1,115 @@
+"""Credentials of machines: tickets to enrol, what was issued, and revocation.
+
+I/O; writes tickets, the journal and revocations.
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TypeAlias
+
+from fog.cluster import ClusterPlan
+from fog.enrolment.boots import machine_seats
+from fog.enrolment.revoking import take_back
+from fog.enrolment.robot_side import reload
+from fog.enrolment.tickets import News, Report, Tickets
+from fog.site import Site
+from fog.supervisor.event_log import EventLog
+from fog.supervisor.journal import Journal
+from fog.supervisor.record import Ending, Record
+from gdp.errors import LocalError
+from gdp.nodes.config import SwitchConfig
+from gdp.stores.issue import DAY_S
+from gdp.stores.keyring import load_domain
+from gdp.trust.enrolment import TOKEN_BYTES, Ticket
+
+__all__ = ["MachineCredentials", "Release"]
+
+log = logging.getLogger(__name__)
+
+Release: TypeAlias = "Callable[[ClusterPlan, str, str], None]"  # of a plan, a machine's name and the provider's id
+
+
+class MachineCredentials:
+    """Issues and revokes what machines prove themselves with.
+
+    Args:
+        boot_s: seconds that a machine has to enrol.
+    """
+
+    def __init__(self, site: Site, journal: Journal, events: EventLog, tickets: Tickets, *, boot_s: float) -> None:
+        self._site = site
+        self._journal = journal
+        self._events = events
+        self._tickets = tickets
+        self._boot_s = boot_s
+
+    def issue_ticket(self, plan: ClusterPlan, name: str, now_s: float, *, is_gateway: bool) -> tuple[Ticket, float]:
+        """Return a new machine's ticket, and until when what is issued for it will hold.
+
+        Args:
+            is_gateway: the machine may become the gateway of its group.
+
+        Raises:
+            LocalError: no domain there, or its root has run out.
+        """
+        root = load_domain(self._site.authority.domain).root
+        until_s = min(now_s + self._site.papers_days * DAY_S, float(root.validity.not_after_unix_s))
+        if until_s <= now_s:
+            raise LocalError("the root of the domain has run out")
+        ticket = self._tickets.issue(
+            plan.name,
+            name,
+            machine_seats(plan, name, is_gateway=is_gateway),
+            secrets.token_bytes(TOKEN_BYTES),
+            addresses=[self._site.enrolment_url],
+            unix_s=now_s,
+            expires_unix_s=now_s + self._boot_s,
+            until_unix_s=until_s,
+        )
+        return ticket, until_s
+
+    def handle_reports(self, release: Release, now_s: float) -> None:
+        """Take in which machines enrolled, and release those whose token somebody else used."""
+        for news in self._tickets.news():
+            record = next((each for each in self._journal.machines(news.cluster) if each.name == news.machine), None)
+            if record is not None:
+                if news.papers is not None:
+                    record = replace(record, papers=news.papers)
+                if news.report is Report.ENROLLED:
+                    self._events.put(record, "enrolled", news.detail, now_s)
+                    if record.is_gone or record.is_released:
+                        self.revoke(record, now_s)
+                else:
+                    self._handle_misused(record, news, release, now_s)
+            self._tickets.taken(news)
+
+    def revoke(self, record: Record, now_s: float) -> None:
+        """Take the memberships of a machine back, and its ticket."""
+        self._tickets.take_back(record.spec.cluster, record.name)
+        if self._site.revocations is None:
+            return
+        folder, switch = self._site.revocations
+        papers = record.papers
+        domain = self._site.authority.domain
+        try:
+            if take_back(domain, folder, papers.fingerprints, until_unix_s=papers.until_unix_s, unix_s=now_s):
+                config = SwitchConfig.load(switch)
+                reload(config.identity, config.control_socket)
+        except LocalError as error:
+            self._journal.tell(now_s, record.spec.cluster, record.name, "trouble", f"not revoked: {error}")
+
+    def _handle_misused(self, record: Record, news: News, release: Release, now_s: float) -> None:
+        log.error("token misused cluster=%s machine=%s: %s", news.cluster, news.machine, news.detail)
+        if not self._site.enrolment.revoke_misused or record.is_gone:
+            self._events.put(record, "alarm", news.detail, now_s)
+            return
+        ending = Ending.FAILED if record.served_unix_s is None else Ending.TAKEN
+        known = replace(record, released_unix_s=now_s, ending=ending, reason="its enrolment token was misused")
+        self._events.put(known, "alarm", f"{news.detail}; it is revoked and replaced", now_s)
+        self.revoke(known, now_s)
+        if record.id:
+            release(self._journal.cluster(news.cluster).plan, news.machine, record.id)

@@ -1,0 +1,60 @@
+"""Access of robots to clusters: rules and delegations of their proxies, and names for the watch.
+
+I/O; writes the robots' drop-in files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from fog.cluster import ClusterPlan
+from fog.enrolment.robot_side import forget_rules, introduce, reload_proxy
+from fog.site import Site
+
+__all__ = ["RobotAccess"]
+
+_ROBOT_DAYS: Final = 365.0
+
+
+class RobotAccess:
+    """Gives the robots of a site access to clusters.
+
+    Args:
+        on_names: called when the watch is to know more names.
+    """
+
+    def __init__(self, site: Site, on_names: Callable[[], None]) -> None:
+        self._site = site
+        self._on_names = on_names
+        self._plans: dict[str, ClusterPlan] = {}  # that the robots have access to
+
+    def has(self, plan: ClusterPlan) -> bool:
+        """Return whether the robots have access to exactly this plan."""
+        return self._plans.get(plan.name) == plan
+
+    def grant(self, plan: ClusterPlan) -> None:
+        """Give robots, and the watch, rules and delegations for what a cluster serves.
+
+        Raises:
+            LocalError: keys are missing, or a rule cannot be added.
+        """
+        authority = self._site.authority
+        for path in self._site.robots:
+            introduce(path, authority, plan.name, plan.carried, days=_ROBOT_DAYS)
+            reload_proxy(path)
+        if self._site.watch is not None:
+            keys, _ = self._site.watch
+            services = [each for each in plan.carried if each.kind != "topic"]
+            authority.let(keys, keys / "delegations", services, days=_ROBOT_DAYS)
+            self._on_names()
+        self._plans[plan.name] = plan
+
+    def remove(self, name: str) -> None:
+        """Remove the rules of a cluster; other clusters may serve the same names."""
+        self._plans.pop(name, None)
+        for path in self._site.robots:
+            if forget_rules(path, name):
+                for plan in self._plans.values():
+                    introduce(path, self._site.authority, plan.name, plan.carried, days=_ROBOT_DAYS)
+                reload_proxy(path)

@@ -1,0 +1,105 @@
+"""``gdp reload``, ``gdp status`` and ``gdp drain``: commands to a running node.
+
+Command. Exit codes: 0 done, 1 the node refused or ended before it was done, 2 wrong input, 3 no node runs there.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Final, Optional
+
+import typer
+
+from gdp.cli import options
+from gdp.cli.output import show
+from gdp.errors import LocalError
+from gdp.nodes.control_client import NotRunningError, find_control_socket, request_control
+from gdp.nodes.control_protocol import Command, Response
+
+__all__ = ["drain", "reload", "status"]
+
+_FAILED: Final = 1
+_NOT_RUNNING: Final = 3
+_DRAIN_S: Final = 60.0
+
+NodeDirectory = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Argument(metavar="NODE_DIR", help="Directory of the node's keys, or of the state of fog."),
+]
+Socket = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option("--socket", metavar="FILE", help="The node's control_socket, where its configuration names one."),
+]
+Timeout = Annotated[float, typer.Option(min=0.1, metavar="SECONDS", help="How long to wait for each response.")]
+
+
+def reload(
+    node: NodeDirectory = None, socket: Socket = None, timeout: Timeout = 10.0, as_json: options.Json = False
+) -> None:
+    """Have a running node read its configuration, certificates and delegations again.
+
+    The exit code is 1 if the node keeps the old configuration; the text says why.
+
+    \b
+    Example:
+      gdp reload robot/proxy
+      gdp reload --socket /run/gdp/proxy.sock --json
+    """
+    _run(Command.RELOAD, node, socket, timeout, as_json=as_json)
+
+
+def status(
+    node: NodeDirectory = None, socket: Socket = None, timeout: Timeout = 10.0, as_json: options.Json = False
+) -> None:
+    """Show who a running node is, how long it runs, and its counters.
+
+    \b
+    Example:
+      gdp status robot/switch
+      gdp status robot/proxy --json
+    """
+    _run(Command.STATUS, node, socket, timeout, as_json=as_json)
+
+
+def drain(
+    node: NodeDirectory = None, socket: Socket = None, timeout: Timeout = _DRAIN_S, as_json: options.Json = False
+) -> None:
+    """Have a running node finish its work and end; return when it has ended its work.
+
+    The exit code is 1 if work was left unfinished.
+
+    \b
+    Example:
+      gdp drain robot/proxy
+      gdp drain robot/rib --timeout 5
+    """
+    _run(Command.DRAIN, node, socket, timeout, as_json=as_json)
+
+
+def _run(command: Command, node: Path | None, socket: Path | None, timeout_s: float, *, as_json: bool) -> None:
+    if (node is None) == (socket is None):
+        raise LocalError(f"{command.value}: name either NODE_DIR or --socket FILE")
+    path = socket if socket is not None else find_control_socket(node or Path())
+    last = Response()
+    try:
+        for last in request_control(path, command, timeout_s):
+            if command is not Command.DRAIN or not last.is_ok or last.result.get("state") == "drained":
+                break
+        else:
+            last = Response(error="the node ended before it answered")
+    except NotRunningError as error:
+        _fail(str(error), _NOT_RUNNING, as_json=as_json)
+    if not last.is_ok:
+        _fail(f"{path}: {last.error}", _FAILED, as_json=as_json)
+    show(last.result, as_json=as_json)
+    if last.result.get("complete") is False:
+        typer.echo(f"gdp: {path}: the node ended with unfinished work", err=True)
+        raise typer.Exit(_FAILED)
+
+
+def _fail(reason: str, code: int, *, as_json: bool) -> None:
+    if as_json:
+        typer.echo(json.dumps({"error": reason}))
+    typer.echo(f"gdp: {reason}", err=True)
+    raise typer.Exit(code)
