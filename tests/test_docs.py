@@ -122,7 +122,7 @@ def _constant(dotted: str) -> float:
     room, _, name = dotted.rpartition(".")
     if not room:
         return getattr(limits, name)
-    return getattr(importlib.import_module(room if room.startswith("proxy.") else f"gdp.{room}"), name)
+    return getattr(importlib.import_module(room if room.startswith(("proxy.", "ring.")) else f"gdp.{room}"), name)
 
 
 def test_limits_that_a_page_states_are_the_limits() -> None:

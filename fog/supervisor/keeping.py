@@ -11,7 +11,8 @@ import signal
 import socket
 import threading
 import time
-from contextlib import closing
+from collections.abc import Callable
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
 from types import FrameType
@@ -30,6 +31,7 @@ from fog.supervisor.watch import Watch
 from fog.topology import Gateway
 from gdp.errors import StoreError
 from gdp.host.processes import Process
+from gdp.nodes.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
 
 __all__ = ["supervise"]
 
@@ -65,7 +67,7 @@ def _bound(site: Site) -> socket.socket:
 
 
 def _run(site: Site, journal: Journal, tickets: Tickets, *, stays: bool) -> None:
-    ended = threading.Event()
+    ended, drained = threading.Event(), threading.Event()
     watch = Watch(*site.watch) if site.watch is not None else None
     offered = _offered(site, journal)
     provider = open_provider(replace(site, topology=offered[1]), offered[0])
@@ -80,17 +82,23 @@ def _run(site: Site, journal: Journal, tickets: Tickets, *, stays: bool) -> None
         patience=Patience() if provider.name == "local" else Patience(boot_s=_ELSEWHERE_S),
     )
 
-    def end(number: int, frame: FrameType | None) -> None:
-        del number, frame
+    def drain() -> None:
         ended.set()
         supervisor.wake()
 
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, end)
+    handlers = ControlHandlers(
+        reload=supervisor.wake,
+        status=partial(_status, site, supervisor, time.monotonic()),
+        drain=drain,
+        is_drained=drained.is_set,
+    )
+    _call_on_signals(drain)
     log.info("supervisor begins site=%s provider=%s pid=%d", site.state, provider.name, os.getpid())
     done_at_s: float | None = None
     is_reconciled = False
+    stack = ExitStack()
     try:
+        stack.enter_context(serve_control_in_thread(site.state / CONTROL_SOCKET, handlers))
         if any(each.is_up for each in journal.clusters()):
             stand(site)  # after a crash of this machine nothing stands
         while not ended.is_set():
@@ -115,10 +123,35 @@ def _run(site: Site, journal: Journal, tickets: Tickets, *, stays: bool) -> None
             supervisor.wait()
     finally:
         supervisor.close()
+        drained.set()  # no action runs any more, and all results are in the journal
+        stack.close()
         if watch is not None:
             watch.close()
         provider.close()
     log.info("supervisor ends")
+
+
+def _call_on_signals(drain: Callable[[], None]) -> None:
+    def handle(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        drain()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, handle)
+
+
+def _status(site: Site, supervisor: Supervisor, begun_s: float) -> dict[str, object]:
+    """Return what ``gdp status`` shows of the supervisor; called from the thread of the control socket."""
+    with closing(Journal(site.journal)) as journal:
+        clusters = [each.plan.name for each in journal.clusters() if each.is_up]
+        machines = sum(len(journal.machines(each, gone=False)) for each in clusters)
+    return {
+        "role": "supervisor",
+        "uptime_s": round(time.monotonic() - begun_s, 1),
+        "clusters": clusters,
+        "machines": machines,
+        "actions": supervisor.running_actions,
+    }
 
 
 def _offered(site: Site, journal: Journal) -> tuple[tuple[str, ...], Gateway]:

@@ -45,8 +45,7 @@ def confine_switch(config: SwitchConfig, plane: str) -> None:
     again = watched_folders(config.identity, config.domain)
     again += () if config.revocations is None else (config.revocations,)
     state = () if config.state is None else (config.state,)
-    state += _folder_of(config.control_socket)
-    kept = (*state, *_audits(config.audit), *config.token_folders)
+    kept = (*state, *_folder_of(config.control_socket), *_audits(config.audit), *config.token_folders)
     is_kernel = plane == "kernel"
     _confine(
         Needs(

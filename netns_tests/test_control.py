@@ -1,0 +1,113 @@
+"""``gdp reload``, ``status`` and ``drain`` on real nodes that have given their rights away."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from gdp.nodes.control_client import find_control_socket
+from netns_tests.spaces import Space
+from netns_tests.test_rights import PATIENCE_S, Commands, Node, commands
+from tests.pages import ROOT
+
+__all__ = ["commands"]  # a fixture
+
+pytestmark = [
+    pytest.mark.netns,
+    pytest.mark.momentary("about control sockets, no lease matters"),
+]
+
+
+class Nodes:
+    """A switch, a RIB and a recording proxy that run."""
+
+    def __init__(self, commands: Commands) -> None:
+        self.commands = commands
+        self.switch = self._start("gdp.cli.switch", "switch", "--data-plane", "raw")
+        self.rib = self._start("gdp.cli.rib", "rib", "--await-iface", "30")
+        self.proxy = self._start("proxy.cli", "proxy", "--await-iface", "30")
+
+    def gdp(self, *words: str) -> tuple[int, str]:
+        """Run ``gdp`` in the folder of the nodes; return its exit code and all that it printed."""
+        argv = [sys.executable, "-m", "gdp.cli.gdp", *words]
+        ended = subprocess.run(
+            argv,
+            cwd=self.commands.home,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            timeout=PATIENCE_S,
+            check=False,
+        )
+        return ended.returncode, ended.stdout
+
+    def socket(self, name: str) -> Path:
+        """Return the control socket of a node."""
+        return find_control_socket(self.commands.home / name)
+
+    def _start(self, module: str, name: str, *more: str) -> Node:
+        node = self.commands.start(module, name, *more)
+        node.until('"ready"')
+        return node
+
+
+@pytest.fixture
+def nodes(space: Space, commands: Commands) -> Iterator[Nodes]:
+    """Running nodes of one domain."""
+    del space
+    return Nodes(commands)
+
+
+@pytest.mark.parametrize("name", ["switch", "rib", "proxy"])
+def test_a_running_node_shows_its_status(nodes: Nodes, name: str) -> None:
+    code, text = nodes.gdp("status", name, "--json")
+    shown = json.loads(text)
+    assert code == 0
+    assert (shown["state"], shown["role"]) == ("running", name)
+    assert shown["counters"]["frames"]["in"] > 0
+
+
+def test_nodes_that_drain_end_and_leave_no_socket(nodes: Nodes) -> None:
+    sockets = [nodes.socket(name) for name in ("proxy", "rib", "switch")]
+    assert all(path.stat().st_mode & 0o777 == 0o600 for path in sockets)
+    for name, node in (("proxy", nodes.proxy), ("rib", nodes.rib), ("switch", nodes.switch)):
+        code, text = nodes.gdp("drain", name, "--json")
+        assert (code, json.loads(text)) == (0, {"state": "drained", "complete": True})
+        assert node.process.wait(PATIENCE_S) == 0
+    assert not any(path.exists() for path in sockets)
+    assert {path.name for path in (nodes.commands.home / "kept").iterdir()} == {"received.mcap", "routes"}
+
+
+def test_a_reload_reads_what_sighup_reads(nodes: Nodes) -> None:
+    (nodes.commands.home / "revoked" / "x").write_bytes(b"no statement")
+    assert nodes.gdp("reload", "switch")[0] == 0
+    nodes.switch.until("revocation not taken")
+    assert nodes.gdp("reload", "rib")[0] == 0
+
+
+def test_a_reload_that_a_node_refuses_says_why(nodes: Nodes) -> None:
+    for file in (nodes.commands.home / "proxy" / "delegations").iterdir():
+        file.unlink()
+    code, text = nodes.gdp("reload", "proxy")
+    assert code == 1
+    assert "no delegation for" in text
+
+
+def test_the_socket_of_a_killed_node_is_replaced(nodes: Nodes) -> None:
+    nodes.proxy.process.send_signal(signal.SIGKILL)
+    nodes.proxy.process.wait(PATIENCE_S)
+    assert nodes.socket("proxy").exists()
+    code, text = nodes.gdp("status", "proxy")
+    assert (code, "no process serves this control socket" in text) == (3, True)
+    (nodes.commands.home / "kept" / "received.mcap").unlink(missing_ok=True)
+    again = nodes.commands.start("proxy.cli", "proxy")
+    again.until('"ready"')
+    assert nodes.gdp("status", "proxy")[0] == 0
