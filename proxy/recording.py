@@ -15,10 +15,10 @@ import typer
 from gdp.cli.node import emit, emit_wait
 from gdp.errors import LocalError
 from proxy.config import ProxyConfig
-from proxy.endpoints.bag import BagWriter
 from proxy.held import Held
 from proxy.inbound import Inbound
 from proxy.node import GOODBYE_S, ProxyNode, open_topics, renew_topics, run_node
+from proxy.recordings.writer import BagWriter
 
 __all__ = ["record", "refuse_existing_file"]
 

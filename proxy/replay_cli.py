@@ -20,10 +20,12 @@ from gdp.cli.node import Check, Config, Json, Verbose, emit, emit_wait, failing_
 from gdp.errors import LocalError
 from proxy.checking import check_proxy
 from proxy.config import ProxyConfig
-from proxy.endpoints.bag import BagLimits, BagReader, RecordingError
 from proxy.held import Held
 from proxy.node import GOODBYE_S, ProxyNode, open_topics, renew_topics, run_node
 from proxy.outbound import Outbound
+from proxy.recordings.limits import BagLimits
+from proxy.recordings.process import RecordingError
+from proxy.recordings.reader import BagReader
 from proxy.replayer import Played, Replayer, Unconfirmed
 
 __all__ = ["main"]

@@ -14,9 +14,9 @@ from typing import Final
 
 from gdp.client.publisher import Publisher
 from gdp.message.loss import LossReason
-from proxy.endpoints.bag import BagReader
 from proxy.node import ProxyNode
 from proxy.outbound import Outbound
+from proxy.recordings.reader import BagReader
 
 __all__ = ["Played", "Replayer", "Unconfirmed"]
 

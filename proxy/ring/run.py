@@ -12,8 +12,8 @@ from typing import Final
 
 from gdp.errors import ConfigError
 from gdp.testbed.runs import Run
-from proxy.compare import compare
-from proxy.endpoints.bag import BagReader
+from proxy.recordings.compare import compare
+from proxy.recordings.reader import BagReader
 from proxy.ring.child import Child
 from proxy.ring.children import READY_S, Children
 from proxy.ring.fabric import Fabric

@@ -20,7 +20,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.rosbag2 import WriterError as WriterError2
 
 from gdp.errors import LocalError
-from proxy.endpoints.bag_channel import to_qos
+from proxy.recordings.channels import to_qos
 from proxy.serial.bounded_cache import digest_of
 from proxy.serial.channel import Channel, RosVersion
 from proxy.serial.schema import definition_bytes
