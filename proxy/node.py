@@ -19,7 +19,7 @@ from gdp.client.waiting import attachment_waits
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
-from gdp.errors import GdpError, LocalError
+from gdp.errors import LocalError
 from gdp.message.loss import by_label
 from gdp.names import Name
 from gdp.nodes.counts import count_list
@@ -38,7 +38,7 @@ from proxy.faults import Faults
 from proxy.held import Held
 from proxy.traffic import Traffic
 
-__all__ = ["GOODBYE_S", "ProxyNode", "open_topics", "renew_topics", "run_node"]
+__all__ = ["GOODBYE_S", "ProxyNode", "open_topics", "run_node"]
 
 log = logging.getLogger(__name__)
 
@@ -183,15 +183,3 @@ def open_topics(config: ProxyConfig, held: Held) -> dict[Name, Topic]:
             )
         topics[rule.overlay_name] = topic
     return topics
-
-
-def renew_topics(node: ProxyNode, config: ProxyConfig) -> None:
-    """Read the delegations anew: new epochs and longer validity take effect without a message lost."""
-    try:
-        topics = open_topics(config, Held(config.delegations, node.identity))
-    except GdpError as error:
-        log.error("delegations not renewed reason=%s", error)
-        return
-    for topic in topics.values():
-        node.member.renew(topic)
-    log.info("delegations renewed topics=%d", len(topics))

@@ -66,6 +66,11 @@ class BagWriter:
             self._writer2 = Writer2(self._folder / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
             self._writer2.open()
 
+    @property
+    def ros(self) -> RosVersion:
+        """Return whose messages it takes."""
+        return self._ros
+
     def add(self, channel: Channel) -> int:
         """Return the handle of a channel, the same for an equal one.
 
