@@ -1,8 +1,8 @@
 """What every endpoint does: look at a ROS graph, take part in it as one virtual node, and move raw messages.
 
 Place: pure; ``ros2``, ``ros1``, ``dds``, ``fake`` and ``proxy/recordings/endpoint.py`` do the I/O. An endpoint speaks
-one dialect and knows nothing of names, rules or the overlay. All methods are called from one thread and none of them waits; whatever an endpoint runs
-beside that (a wait set, another process) is its own business.
+one dialect and knows nothing of names, rules or the overlay. All methods are called from one thread and none of them
+waits; whatever an endpoint runs beside that (a wait set, another process) is its own business.
 
 Handles are whole numbers of the endpoint's choosing, never used twice in its life. After ``close(handle)`` no event
 names it any more.
