@@ -8,7 +8,7 @@ import pytest
 
 from netns_tests.cable import Terminals, cable
 from netns_tests.spaces import Space
-from proxy.compare import compare
+from proxy.recordings.compare import compare
 from tests.machines import Machines
 from tests.pages import ROOT, Block, blocks_between
 

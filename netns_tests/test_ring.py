@@ -16,7 +16,7 @@ import pytest
 
 from gdp.host.run_registry import Runs
 from netns_tests.lifetimes import LEASE_S, Lifetime, noted
-from proxy.endpoints.bag import BagReader
+from proxy.recordings.reader import BagReader
 
 pytestmark = pytest.mark.netns
 

@@ -38,7 +38,7 @@ def proxy(
             from proxy.checking import check_proxy
 
             if not settings.ros:
-                from proxy.recording import refuse_existing_file
+                from proxy.record_node import refuse_existing_file
 
                 refuse_existing_file(settings)
             check_proxy(settings, json=json)
@@ -49,7 +49,7 @@ def proxy(
             await_device(settings.iface, await_iface)
             carry(config, settings, json=json)
         else:
-            from proxy.recording import record
+            from proxy.record_node import record
 
             await_device(settings.iface, await_iface)
             record(settings, json=json)

@@ -41,7 +41,7 @@ from proxy.faults import Faults
 from proxy.held import Held
 from proxy.traffic import Traffic
 
-__all__ = ["GOODBYE_S", "ProxyNode", "open_topics", "renew_topics", "run_node"]
+__all__ = ["GOODBYE_S", "ProxyNode", "open_topics", "run_node"]
 
 log = logging.getLogger(__name__)
 
@@ -218,15 +218,3 @@ def open_topics(config: ProxyConfig, held: Held) -> dict[Name, Topic]:
             )
         topics[rule.overlay_name] = topic
     return topics
-
-
-def renew_topics(node: ProxyNode, config: ProxyConfig) -> None:
-    """Read the delegations again: new epochs and longer validity take effect without a message lost.
-
-    Raises:
-        GdpError: a delegation is missing or does not hold; the old ones stay in use.
-    """
-    topics = open_topics(config, Held(config.delegations, node.identity))
-    for topic in topics.values():
-        node.member.renew(topic)
-    log.info("delegations renewed topics=%d", len(topics))

@@ -10,7 +10,6 @@ import logging
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -20,11 +19,14 @@ from gdp.cli.node import Check, Config, Json, Verbose, emit, emit_wait, failing_
 from gdp.errors import LocalError
 from proxy.checking import check_proxy
 from proxy.config import ProxyConfig
-from proxy.endpoints.bag import BagLimits, BagReader, RecordingError
-from proxy.held import Held
-from proxy.node import GOODBYE_S, ProxyNode, open_topics, renew_topics, run_node
-from proxy.outbound import Outbound
-from proxy.replayer import Played, Replayer, Unconfirmed
+from proxy.node import GOODBYE_S, ProxyNode, run_node
+from proxy.recording_bridge import open_recording_bridge
+from proxy.recordings.endpoint import ReplayEndpoint
+from proxy.recordings.limits import BagLimits
+from proxy.recordings.process import RecordingError
+from proxy.recordings.reader import BagReader
+from proxy.replay_node import Replay, Unconfirmed
+from proxy.rules.recorded import RecordedRules
 
 __all__ = ["main"]
 
@@ -86,92 +88,94 @@ def _failing_decoder() -> Iterator[None]:
 def _replay(
     node: ProxyNode, reader: BagReader, settings: ProxyConfig, rate: float, wait_s: float, *, json: bool
 ) -> bool:
-    topics = open_topics(settings, Held(settings.delegations, node.identity))
-    node.on_reload = partial(renew_topics, node, settings)
-    outbound = Outbound(node, settings.expose, topics, reader.channels)
-    if not outbound.publishers:
-        raise LocalError(f"{reader.path}: no topic of it is exposed by the configuration")
-    if not node.runtime.run(lambda: node.member.attachment.is_attached, time.monotonic() + ATTACH_PATIENCE_S):
-        raise LocalError(f"no switch answered on {settings.iface} within {ATTACH_PATIENCE_S:g} s")
-    refused = [each for each in node.member.attachment.claims if each.refused is not None]
-    for each in refused:
-        log.warning("claim refused name=%s reason=%s", each.subject.name.short, each.refused)
-    if json:
-        emit("ready", name=node.member.name.to_text())
+    endpoint = ReplayEndpoint(reader)
+    rules = RecordedRules.of(expose=settings.expose)
+    with open_recording_bridge(node, settings, rules, endpoint) as bridge:
 
-    total = _exposed_total(reader, outbound)
+        def report() -> None:
+            if json:
+                _report_progress(replay, total)
 
-    def tick(played: Played) -> None:
+        replay = Replay(node, bridge, endpoint, rate, report)
+        total = _exposed_total(reader, endpoint)
+        if not replay.topics:
+            raise LocalError(f"{reader.path}: no topic of it is exposed by the configuration")
+        if not node.runtime.run(lambda: node.member.attachment.is_attached, time.monotonic() + ATTACH_PATIENCE_S):
+            raise LocalError(f"no switch answered on {settings.iface} within {ATTACH_PATIENCE_S:g} s")
+        refused = [each for each in node.member.attachment.claims if each.refused is not None]
+        for each in refused:
+            log.warning("claim refused name=%s reason=%s", each.subject.name.short, each.refused)
         if json:
-            emit(
-                "progress",
-                sent=played.sent,
-                total=total,
-                bytes=played.sent_bytes,
-                confirmed=replayer.confirmed,
-                unconfirmed={each.topic: each.messages - each.confirmed for each in replayer.unconfirmed()},
-            )
-
-    replayer = Replayer(node, reader, outbound, rate, tick)
-    for topic in replayer.wait_for_readers(wait_s):
-        log.warning("nobody reads topic=%s", topic)
-    is_whole = replayer.play() and replayer.finish()
-    tick(replayer.played)
-    unconfirmed = replayer.unconfirmed()
-    is_complete = is_whole and not (unconfirmed or refused or outbound.too_large)
-    _report(reader, replayer, outbound, unconfirmed, json=json)
-    node.member.leave()
-    node.linger(GOODBYE_S)
-    return is_complete
+            emit("ready", name=node.member.name.to_text())
+        for topic in replay.wait_for_readers(wait_s):
+            log.warning("nobody reads topic=%s", topic)
+        is_whole = replay.run() and replay.finish()
+        report()
+        unconfirmed = replay.unconfirmed()
+        _report(reader, replay, unconfirmed, json=json)
+        node.member.leave()
+        node.linger(GOODBYE_S)
+    return is_whole and not (unconfirmed or refused or replay.too_large)
 
 
-def _exposed_total(reader: BagReader, outbound: Outbound) -> int | None:
+def _report_progress(replay: Replay, total: int | None) -> None:
+    emit(
+        "progress",
+        sent=replay.sent,
+        total=total,
+        bytes=replay.sent_bytes,
+        confirmed=replay.confirmed,
+        unconfirmed={each.topic: each.messages - each.confirmed for each in replay.unconfirmed()},
+    )
+
+
+def _exposed_total(reader: BagReader, endpoint: ReplayEndpoint) -> int | None:
     """Return how many messages of the recording are exposed; None where its index does not say."""
-    if all(outbound.is_exposed(at) for at in range(len(reader.channels))):
+    if all(endpoint.is_subscribed(index) for index in range(len(reader.channels))):
         return reader.count
     if reader.counts is None:
         return None
-    return sum(count for at, count in enumerate(reader.counts) if outbound.is_exposed(at))
+    return sum(count for index, count in enumerate(reader.counts) if endpoint.is_subscribed(index))
 
 
-def _report(
-    reader: BagReader, replayer: Replayer, outbound: Outbound, unconfirmed: Sequence[Unconfirmed], *, json: bool
-) -> None:
-    played = replayer.played
-    confirming = {
-        at for topic, each in outbound.publishers.items() if each.confirms for at in outbound.channels_of[topic]
-    }
-    topics = [
-        {
-            "topic": channel.topic,
-            "type": channel.type_name,
-            "messages": played.by_channel[at],
-            "bytes": played.bytes_by_channel[at],
-            "reliable": at in confirming,
-        }
-        for at, channel in enumerate(reader.channels)
-        if played.by_channel[at]
-    ]
+def _report(reader: BagReader, replay: Replay, unconfirmed: Sequence[Unconfirmed], *, json: bool) -> None:
     if json:
         emit(
             "done",
-            sent=played.sent,
-            confirmed=replayer.confirmed,
-            best_effort=replayer.sent_best_effort,
+            sent=replay.sent,
+            confirmed=replay.confirmed,
+            best_effort=replay.sent_best_effort,
             unconfirmed=[asdict(each) for each in unconfirmed],
-            topics=topics,
+            topics=_topic_fields(replay),
             unread=reader.unread or None,
         )
         return
-    reliable = sum(played.by_channel[at] for at in confirming)
-    told = [f"{reliable} messages sent, {replayer.confirmed} confirmed"] if confirming else []
-    if reliable < played.sent:
-        told.append(f"{played.sent - reliable} messages sent, best effort")
-    typer.echo("; ".join(told) or "0 messages sent")
+    confirming = [each for each in replay.topics if each.publisher.confirms]
+    reliable = sum(each.flow.published.total() for each in confirming)
+    lines = [f"{reliable} messages sent, {replay.confirmed} confirmed"] if confirming else []
+    if reliable < replay.sent:
+        lines.append(f"{replay.sent - reliable} messages sent, best effort")
+    typer.echo("; ".join(lines) or "0 messages sent")
     if reader.unread:
         typer.echo(f"the recording could not be read to its end: {reader.unread}", err=True)
     for each in unconfirmed:
         typer.echo(each.words(), err=True)
+
+
+def _topic_fields(replay: Replay) -> list[dict[str, object]]:
+    """Return the figures of each channel of which something was sent, in the recording's order."""
+    channels = [(index, number, each) for each in replay.topics for number, index in enumerate(each.indexes)]
+    return [
+        {
+            "topic": each.topic,
+            "type": each.type_name,
+            "messages": each.flow.published[number],
+            "bytes": each.flow.published_bytes[number],
+            "reliable": each.publisher.confirms,
+        }
+        for _, number, each in sorted(channels, key=lambda channel: channel[0])
+        if each.flow.published[number]
+    ]
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ from typing import Final
 
 from gdp.message.loss import Losses
 
-__all__ = ["Tally", "percentile"]
+__all__ = ["SAMPLES_MAX", "Tally", "percentile"]
 
 SAMPLES_MAX: Final = 200_000  # latencies kept for percentiles; the oldest go
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gdp.errors import LocalError
-from proxy.endpoints.bag import BagWriter
+from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import Channel, Qos, RosVersion
 
 START_NS: Final = 1_700_000_000_000_000_000

@@ -12,7 +12,7 @@ import logging
 import secrets
 from collections import deque
 from collections.abc import Iterator, Sequence
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple, Protocol, TypeAlias
 
 from gdp.client.member import Message, Topic
 from gdp.errors import LocalError
@@ -26,13 +26,13 @@ from proxy.bridge.rivals import SIGN, Rivals, mark_of, sign
 from proxy.bridge.seat import Seat
 from proxy.bridge.site import Site
 from proxy.bridge.wishes import Complaint, Wish, exposed, imported
-from proxy.config import ProxyConfig
 from proxy.endpoints.endpoint import End, Endpoint, Event, Faulted, Graph, Role, proxy_node_name
 from proxy.faults import Fault
 from proxy.held import Held
+from proxy.rules.rule import Rule
 from proxy.tally import Tally
 
-__all__ = ["Bridge"]
+__all__ = ["Bridge", "BridgeRules"]
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +40,21 @@ _ENDED_MAX: Final = 256
 TICK_S: Final = 0.05  # how often services look whom they hear, and who may begin is looked at
 
 Flow: TypeAlias = ExposedTopic | ImportedTopic | ExposedService | ImportedService
+
+
+class BridgeRules(Protocol):
+    """Rules of a bridge: those of ``proxy.yaml``, or of a recording."""
+
+    @property
+    def expose(self) -> Sequence[Rule]:
+        """Return the rules for what leaves this machine."""
+
+    @property
+    def imports(self) -> Sequence[Rule]:
+        """Return the rules for what comes from elsewhere."""
+
+    def endpoint_of(self, rule: Rule) -> int:
+        """Return which of the bridge's endpoints a rule is about."""
 
 
 class _Key(NamedTuple):
@@ -80,12 +95,12 @@ class Bridge:
     """Carries what the rules say between endpoints and the overlay.
 
     Args:
-        endpoints: in the order of the configuration's ``ros`` section.
+        endpoints: as the rules number them, in the order of the configuration's ``ros`` section.
         look_s: seconds to look around before anything begins: what graphs take to show the other proxies in them.
     """
 
     def __init__(
-        self, site: Site, config: ProxyConfig, endpoints: Sequence[Endpoint], held: Held, *, look_s: float = 0.0
+        self, site: Site, config: BridgeRules, endpoints: Sequence[Endpoint], held: Held, *, look_s: float = 0.0
     ) -> None:
         self._site = site
         self._config = config
@@ -106,6 +121,8 @@ class Bridge:
         self._now_s = 0.0
         self.unknown_names = 0
         for seat in self._seats:
+            if not seat.endpoint.is_live:
+                continue  # no other proxy looks into a recording
             try:
                 seat.advertise(_Signboard(), sign(SIGN, seat.endpoint.ros))
             except LocalError as error:
@@ -167,7 +184,7 @@ class Bridge:
         times = [flow.next_timeout() for flow in self._timed]
         return min([self._tick_at_s, *(time for time in times if time is not None)])
 
-    def reload(self, config: ProxyConfig, held: Held) -> None:
+    def reload(self, config: BridgeRules, held: Held) -> None:
         """Take rules and delegations anew; flows whose rule is the same go on undisturbed while it is delegated."""
         self._config, self._held = config, held
         for key, (wish, flow) in list(self._flows.items()):

@@ -1,8 +1,7 @@
 """A topic of far publishers on its way in: joined while somebody local reads it, decoded, converted, published here.
 
-Place: shell; endpoint and member do the I/O. The virtual publisher stands as long as the rule does, so that local
-tools see the topic; the overlay's tree stands while a local reader does. Where another one must take its place, to
-promise more, that one has what a latched topic keeps: readers get it again, as from any publisher that restarts.
+Place: shell; endpoint and member do the I/O. The local publisher (``local_output``) stands as long as the rule does, so
+that local tools see the topic; the overlay's tree stands while a local reader does. A recording reads always.
 """
 
 from __future__ import annotations
@@ -10,12 +9,13 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Sequence, Set
-from dataclasses import replace
+from typing import NamedTuple
 
 from gdp.client.member import Message, Topic
 from gdp.errors import LocalError, RemoteError
 from gdp.message.loss import Losses
 from proxy.bridge.incoming import Incoming
+from proxy.bridge.local_output import ChannelPublishers, LocalOutput, MergedPublisher
 from proxy.bridge.pace import Pace
 from proxy.bridge.seat import Seat
 from proxy.bridge.site import Site
@@ -23,16 +23,21 @@ from proxy.bridge.wishes import Wish
 from proxy.endpoints.endpoint import End, Event, Faulted
 from proxy.faults import Fault
 from proxy.parcel import Description, Parcel
-from proxy.qos import default, offer, unmatched
-from proxy.serial.channel import Channel, Qos
+from proxy.qos import unmatched
 from proxy.serial.schema import DefinitionError
 from proxy.sources import Sources
-from proxy.tally import Tally
+from proxy.tally import SAMPLES_MAX, Tally
 
 __all__ = ["ImportedTopic"]
 
-_SAMPLES_MAX = 4_096  # latencies kept
-_FAR_MAX = 1_024  # publishers whose QoS is kept; the oldest go
+_SAMPLES_MAX = 4_096  # latencies kept of a live topic
+
+
+class _Decoded(NamedTuple):
+    """One far channel, made ready."""
+
+    incoming: Incoming
+    handle: int  # of the local output
 
 
 class ImportedTopic:
@@ -44,37 +49,28 @@ class ImportedTopic:
 
     def __init__(self, site: Site, seat: Seat, wish: Wish, topic: Topic) -> None:
         self._site = site
-        self._seat = seat
         self._wish = wish
         self._topic = topic
-        self._wants: tuple[Qos, ...] = ()
         self._unmatched: Set[str] = frozenset()  # keys of readers that want what cannot be had
-        self._handle: int | None = None
-        self._channel: Channel | None = None  # as it is offered here
-        self._far: dict[bytes, Qos] = {}  # what publishers offer, by name
-        self._kept = deque[bytes]()  # what the virtual publisher keeps for late joiners, for another one in its place
-        self._sources = Sources[Incoming]()
+        self._sources = Sources[tuple[_Decoded, ...]]()
         self._is_joined = False
         self._past_losses = Losses()  # of when a local reader stood before
         self._pace = Pace(wish.rule.max_hz)
-        self.tally = Tally(wish.local, wish.type_name, latencies_ms=deque(maxlen=_SAMPLES_MAX))
-        if (known := self._known()) is not None:  # else the far side's own definition may do
-            self._offer(known)
+        samples = _SAMPLES_MAX if seat.endpoint.is_live else SAMPLES_MAX
+        self.tally = Tally(wish.local, wish.type_name, latencies_ms=deque(maxlen=samples))
+        kind = MergedPublisher if seat.endpoint.is_live else ChannelPublishers
+        self._output: LocalOutput = kind(seat, self, wish)
 
     def follow(self, ends: Sequence[End]) -> None:
         """Learn who reads here now."""
-        self._wants = tuple(end.qos for end in sorted(ends, key=lambda end: end.key) if end.qos is not None)
         self._tell_unmatched(ends)
         if ends and not self._is_joined:
             self._is_joined = True
             self._site.member.subscribe(self._topic)
         elif not ends and self._is_joined:
             self._leave()
-            if self._channel is not None and self._channel.latched:
-                self._kept.clear()
-                self._shut()  # what it keeps grows old, and comes again with the next reader
-        if self._channel is not None:
-            self._offer(self._channel)
+            self._output.drop_kept()
+        self._output.receive_readers(ends)
         self._sources.forget_refused()  # others may do now
 
     def receive(self, message: Message, now_s: float) -> None:
@@ -82,11 +78,12 @@ class ImportedTopic:
         try:
             self._receive(message, now_s)
         except RemoteError as error:
-            self.tally.refused += 1
-            self._site.faults.tell(self._wish.local, Fault.MALFORMED, str(error))
+            self._refuse(Fault.MALFORMED, str(error))
+        except LocalError as error:
+            self._refuse(Fault.REFUSED, str(error))
 
     def take(self, event: Event, now_s: float) -> None:
-        """Take what the endpoint says of the virtual publisher."""
+        """Take what the endpoint says of the local publisher."""
         del now_s
         if isinstance(event, Faulted):
             self._site.tell(self._wish.local, event, Fault.QOS)
@@ -97,7 +94,7 @@ class ImportedTopic:
         if self._is_joined:
             self._leave()
         self.count_losses()
-        self._shut()
+        self._output.close()
 
     def renew(self, topic: Topic) -> None:
         """Take the delegation anew."""
@@ -117,11 +114,6 @@ class ImportedTopic:
         self._past_losses.update(self._site.member.losses_of(self._topic.name))
         self._site.member.unsubscribe(self._topic.name)
 
-    def _shut(self) -> None:
-        if self._handle is not None:
-            self._seat.close(self._handle)
-            self._handle = None
-
     def _tell_unmatched(self, ends: Sequence[End]) -> None:
         """Tell, once, of each reader that wants what cannot be had."""
         odd = {end.key: (end.node or "a node", policy) for end in ends if end.qos and (policy := unmatched(end.qos))}
@@ -132,6 +124,10 @@ class ImportedTopic:
             self._site.faults.over(self._wish.local, Fault.QOS)
         self._unmatched = odd.keys()
 
+    def _refuse(self, fault: Fault, detail: str) -> None:
+        self.tally.refused += 1
+        self._site.faults.tell(self._wish.local, fault, detail)
+
     def _receive(self, message: Message, now_s: float) -> None:
         delivered, traffic, rule = message.delivered, self._site.traffic, self._wish.rule
         publisher = delivered.publisher
@@ -139,73 +135,45 @@ class ImportedTopic:
             self._sources.put(publisher, message.description, None)
             ready = self._describe(publisher, Description.from_wire(message.description))
             self._sources.put(publisher, message.description, ready)
-        incoming = self._sources.get(publisher, message.description)
-        if incoming is None or self._handle is None:
+        channels = self._sources.get(publisher, message.description)
+        if channels is None or not self._output.is_open:
             self.tally.refused += 1
             return
         if not self._pace.may_pass(now_s):
             traffic.thinned += 1
             return
         parcel = Parcel.from_wire(delivered.message)
+        if parcel.channel >= len(channels):
+            self._refuse(Fault.MALFORMED, f"a message of channel {parcel.channel}, of {len(channels)} described")
+            return
+        incoming, handle = channels[parcel.channel]
         raw = incoming.decode(parcel.body)
         if len(raw) > rule.max_bytes:
-            self.tally.refused += 1
             detail = f"a message of {len(raw)} bytes; the rule's max_bytes is {rule.max_bytes}"
-            self._site.faults.tell(self._wish.local, Fault.TOO_LARGE, detail)
+            self._refuse(Fault.TOO_LARGE, detail)
             return
-        self._seat.endpoint.publish(self._handle, raw)
-        self._kept.append(raw)
+        self._output.publish(handle, raw)
         latency_ms = (time.time_ns() - parcel.stamp_ns) / 1e6
         self.tally.count_number(delivered.publisher, delivered.incarnation, delivered.number, delivered.place)
         self.tally.add(latency_ms, delivered.parts, delivered.hops)
         traffic.latency.observe(latency_ms / 1e3)
         traffic.received(len(delivered.message))
 
-    def _describe(self, publisher: bytes, description: Description) -> Incoming | None:
+    def _describe(self, publisher: bytes, description: Description) -> tuple[_Decoded, ...] | None:
         """Make ready for a publisher's messages; None if they cannot be had here."""
-        source, what = description.channels[0], self._wish.local
-        if source.type_name != self._wish.type_name:
-            self._site.faults.tell(what, Fault.OTHER_TYPE, f"the far side sends {source.type_name}")
+        what, sources = self._wish.local, description.channels
+        other = next((each.type_name for each in sources if each.type_name != self._wish.type_name), None)
+        if other is not None:
+            self._site.faults.tell(what, Fault.OTHER_TYPE, f"the far side sends {other}")
             return None
         try:
-            incoming = Incoming.ready(source, description.encoding, self._known(), self._seat.endpoint.ros)
+            incoming = [self._output.decoder(source, description.encoding) for source in sources]
         except DefinitionError as error:
             self._site.faults.tell(what, Fault.OTHER_TYPE, f"the far side's definition does not fit: {error}")
             return None
-        self._far[publisher] = source.qos[0] if source.qos else default(latched=source.latched)
-        while len(self._far) > _FAR_MAX:
-            del self._far[next(iter(self._far))]
         try:
-            self._offer(incoming.target)
+            handles = self._output.add(publisher, sources, [each.target for each in incoming])
         except LocalError as error:
-            self._site.faults.tell(what, Fault.UNKNOWN_TYPE, str(error))
+            self._site.faults.tell(what, self._output.refusal, str(error))
             return None
-        return incoming
-
-    def _known(self) -> Channel | None:
-        try:
-            return self._seat.endpoint.channel(self._wish.local, self._wish.type_name)
-        except LocalError:
-            return None
-
-    def _offer(self, channel: Channel) -> None:
-        """Be the publisher that the far one is, as far as local readers allow; again where that has changed."""
-        profile = offer(tuple(self._far.values()), self._wants, is_latched=self._wish.rule.wants_latched)
-        latched = profile.durability == "transient_local"
-        offered = replace(channel, topic=self._wish.local, qos=(profile,), latched=latched, callerid=None)
-        if self._handle is not None and self._channel is not None and _is_served(self._channel, offered):
-            return
-        self._shut()
-        self._handle = self._seat.advertise(self, offered)
-        self._channel = offered
-        self._kept = deque(self._kept if latched else (), maxlen=profile.depth if latched else 0)
-        for raw in self._kept:  # who joins late finds them at the new one, too
-            self._seat.endpoint.publish(self._handle, raw)
-
-
-def _is_served(standing: Channel, wanted: Channel) -> bool:
-    """Return whether a publisher that stands does for what is wanted: the same, or only with a smaller depth."""
-    if replace(standing, qos=()) != replace(wanted, qos=()):
-        return False
-    before, after = standing.qos[0], wanted.qos[0]
-    return replace(before, depth=0) == replace(after, depth=0) and before.depth >= after.depth
+        return tuple(map(_Decoded, incoming, handles))

@@ -46,15 +46,18 @@ class Complaint(NamedTuple):
 def exposed(rules: Sequence[Rule], graph: Graph, complaints: list[Complaint]) -> Iterator[Wish]:
     """Yield what local nodes publish or serve, and a rule makes global; what is odd goes to ``complaints``."""
     for (kind, local), types in _shown(graph, _SHOWS).items():
-        rule = choose(rules, kind, local)
-        if rule is None:
+        first = choose(rules, kind, local)
+        if first is None:
             continue
-        wanted = {type_name for type_name in types if rule.fits_type(type_name)}
-        if len(types) > 1 or not wanted:
-            said = f"; the rule says {rule.type_name}" if rule.type_name else ""
+        wanted: dict[int, tuple[str, Rule]] = {}  # of each rule the first type: topics of a recording may have several
+        for type_name in sorted(types):
+            rule = choose(rules, kind, local, type_name)
+            if rule is not None:
+                wanted.setdefault(id(rule), (type_name, rule))
+        if len(wanted) < len(types):
+            said = f"; the rule says {first.type_name}" if first.type_name else ""
             complaints.append(Complaint(local, Fault.OTHER_TYPE, f"local nodes use {', '.join(sorted(types))}{said}"))
-        if wanted:
-            type_name = min(wanted)
+        for type_name, rule in wanted.values():
             yield Wish(True, local, type_name, rule.overlay_name_of(local, type_name), rule)
 
 

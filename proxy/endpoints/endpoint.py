@@ -1,8 +1,8 @@
-"""What every live endpoint does: look at a ROS graph, take part in it as one virtual node, and move raw messages.
+"""What every endpoint does: look at a ROS graph, take part in it as one virtual node, and move raw messages.
 
-Place: pure; ``ros2``, ``ros1``, ``dds`` and ``fake`` do the I/O. An endpoint speaks one dialect and knows nothing of
-names, rules or the overlay. All methods are called from one thread and none of them waits; whatever an endpoint runs
-beside that (a wait set, another process) is its own business.
+Place: pure; ``ros2``, ``ros1``, ``dds``, ``fake`` and ``proxy/recordings/endpoint.py`` do the I/O. An endpoint speaks
+one dialect and knows nothing of names, rules or the overlay. All methods are called from one thread and none of them
+waits; whatever an endpoint runs beside that (a wait set, another process) is its own business.
 
 Handles are whole numbers of the endpoint's choosing, never used twice in its life. After ``close(handle)`` no event
 names it any more.
@@ -86,10 +86,14 @@ class GraphChanged(NamedTuple):
 
 
 class Described(NamedTuple):
-    """What the messages of a subscription are; comes before its first ``Heard``, and again if that changes."""
+    """What the messages of a subscription are; comes before its first ``Heard``, and again if that changes.
+
+    ``others`` are the channels of further publishers, where the endpoint tells publishers apart: a recording does.
+    """
 
     handle: int
     channel: Channel
+    others: tuple[Channel, ...] = ()
 
 
 class Heard(NamedTuple):
@@ -98,6 +102,7 @@ class Heard(NamedTuple):
     handle: int
     stamp_ns: int  # wall clock, when the endpoint took it
     raw: bytes  # the channel's wire form: CDR with its four bytes of encapsulation, or ROS 1
+    channel: int = 0  # 0: ``Described.channel``; n: number n - 1 of ``Described.others``
 
 
 class Asked(NamedTuple):
@@ -147,6 +152,10 @@ class Endpoint(Protocol):
         """Return what people call it, such as ``ros2 domain 0`` or ``ros1 http://localhost:11311``."""
 
     @property
+    def is_live(self) -> bool:
+        """Return whether nodes and other bridges take part in it; a recording has neither, and keeps every channel."""
+
+    @property
     def dropped(self) -> int:
         """Return how many messages it let go for want of room; what a middleware drops by its QoS is not known."""
 
@@ -193,7 +202,11 @@ class Endpoint(Protocol):
         """
 
     def publish(self, handle: int, raw: bytes) -> None:
-        """Publish one message, in the wire form of the channel."""
+        """Publish one message, in the wire form of the channel.
+
+        Raises:
+            LocalError: a recording cannot be written.
+        """
 
     def subscribers(self, handle: int) -> int:
         """Return how many local subscriptions a publisher of ours has now."""

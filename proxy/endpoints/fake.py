@@ -214,6 +214,11 @@ class FakeEndpoint:
         return self._graph.ros
 
     @property
+    def is_live(self) -> bool:
+        """Return True: other nodes take part in the graph."""
+        return True
+
+    @property
     def label(self) -> str:
         """Return what people call it."""
         return f"fake ros{self._graph.ros}"

@@ -18,7 +18,7 @@ from typing import get_args
 from rich.console import Console
 from rich.table import Table
 
-from proxy.endpoints.bag import BagReader
+from proxy.recordings.reader import BagReader
 from proxy.serial.channel import Channel
 from proxy.serial.serializer import Encoding, Serializer
 

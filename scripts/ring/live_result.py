@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from gdp.errors import LocalError
-from proxy.compare import TopicComparison, compare_digests
+from proxy.recordings.compare import TopicComparison, compare_digests
 from ring.events import Event
 from ring.nodes.content import LAMP, LAMP_TYPE
 from ring.result import Journey, TopicResult, put_together

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from proxy.compare import TopicComparison
+from proxy.recordings.compare import TopicComparison
 from ring.events import Event
 
 __all__ = ["Journey", "Result", "TopicResult", "put_together"]

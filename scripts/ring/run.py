@@ -12,8 +12,8 @@ from typing import Final
 
 from gdp.errors import ConfigError
 from gdp.host.run_registry import Run
-from proxy.compare import compare
-from proxy.endpoints.bag import BagReader
+from proxy.recordings.compare import compare
+from proxy.recordings.reader import BagReader
 from proxy.serial.channel import RosVersion
 from ring.child import Child
 from ring.children import READY_S, Children

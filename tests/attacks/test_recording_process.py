@@ -24,9 +24,11 @@ from gdp.errors import ConfigError, GdpError
 from gdp.ports.confine import landlock, seccomp
 from proxy import replay_cli
 from proxy.config import ProxyConfig
-from proxy.endpoints.bag import BagLimits, BagReader, BagWriter, RecordingError
-from proxy.endpoints.bag_process import BagProcess, Cost
-from proxy.endpoints.bag_stream import BLOCK_BYTES, FrameReader, Kind
+from proxy.recordings.limits import BagLimits
+from proxy.recordings.process import BagProcess, Cost, RecordingError
+from proxy.recordings.reader import BagReader
+from proxy.recordings.stream import BLOCK_BYTES, FrameReader, Kind
+from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import Channel
 from tests.attacks.test_recordings import BOMB_BYTES, MESSAGES, TOPICS, database, mcap, packed, ros1
 from tests.pages import ROOT
@@ -69,7 +71,7 @@ def ends(process: int) -> bool:
 
 PROBE = """
 import ctypes, json, os, pathlib, resource, socket, sys
-from proxy.endpoints.bag_child import confine_decoder
+from proxy.recordings.child import confine_decoder
 path, scratch, port, parent = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
 confine_decoder(path, scratch, 256 << 20, 20, 1 << 20)
 found = {}
@@ -310,7 +312,7 @@ HOLDS = """
 import os, sys, threading, time
 from pathlib import Path
 from gdp.ports.sandbox import Needs, confine
-from proxy.endpoints.bag_reader import BagReader
+from proxy.recordings.reader import BagReader
 bag = BagReader(sys.argv[1])
 next(bag.messages())
 children = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()

@@ -19,8 +19,8 @@ from rosbags.rosbag2 import storage_mcap
 from rosbags.rosbag2.reader import zstd
 
 from gdp.errors import ConfigError, LocalError
-from proxy.endpoints.bag_channel import offered_qos
-from proxy.endpoints.bag_decoder import BagDecoder
+from proxy.recordings.channels import offered_qos
+from proxy.recordings.decoder import BagDecoder
 from tests.attacks.work import lines_run
 
 BOMB_BYTES = 320 << 20

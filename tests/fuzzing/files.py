@@ -21,11 +21,11 @@ from gdp.nodes.config import SwitchConfig
 from gdp.nodes.yaml_source import read_yaml
 from gdp.stores.token_uri import TokenUri
 from proxy.config import ProxyConfig
-from proxy.endpoints.bag import BagWriter
-from proxy.endpoints.bag_channel import offered_qos
-from proxy.endpoints.bag_decoder import BagDecoder
-from proxy.endpoints.bag_source import Message
-from proxy.endpoints.bag_stream import FrameReader, Kind, frame_head, message_head, opened_to
+from proxy.recordings.channels import offered_qos
+from proxy.recordings.decoder import BagDecoder
+from proxy.recordings.source import Message
+from proxy.recordings.stream import FrameReader, Kind, frame_head, message_head, opened_to
+from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import Channel
 from tests.fuzzing.decoder import Decoder
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from proxy.endpoints.bag import BagReader
+from proxy.recordings.reader import BagReader
 from proxy.serial.serializer import canonical
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "make_demo_bag.py"

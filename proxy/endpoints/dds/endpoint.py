@@ -59,6 +59,11 @@ class DdsEndpoint:
         return 2
 
     @property
+    def is_live(self) -> bool:
+        """Return True: other nodes take part in the graph."""
+        return True
+
+    @property
     def label(self) -> str:
         """Return what people call it."""
         return f"dds domain {self._domain}"

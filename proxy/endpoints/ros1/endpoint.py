@@ -103,6 +103,11 @@ class Ros1Endpoint:
         return 1
 
     @property
+    def is_live(self) -> bool:
+        """Return True: other nodes take part in the graph."""
+        return True
+
+    @property
     def label(self) -> str:
         """Return ``ros1`` and the master's URI."""
         return f"ros1 {self._master_uri}"

@@ -45,6 +45,7 @@ class Ros2Endpoint:
     """
 
     ros: Final[RosVersion] = 2
+    is_live: Final = True
 
     def __init__(self, domain: int, node: str) -> None:
         self.label = f"ros2 domain {domain}"

@@ -4,9 +4,9 @@ from typing import get_args
 
 import pytest
 
-from proxy.endpoints.bag import BagReader
+from proxy.recordings.reader import BagReader
 from proxy.serial.serializer import Encoding, Serializer, canonical
-from tests.proxy.recordings import READABLE, recording
+from tests.proxy.recordings.samples import READABLE, recording
 
 
 @pytest.mark.parametrize("encoding", get_args(Encoding))

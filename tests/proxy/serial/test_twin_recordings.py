@@ -5,11 +5,11 @@ import json
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from proxy.endpoints.bag import BagReader
+from proxy.recordings.reader import BagReader
 from proxy.serial.channel import Channel
 from proxy.serial.serializer import Serializer, canonical
 from proxy.serial.twin import Twin, twin_channel
-from tests.proxy.recordings import READABLE, recording
+from tests.proxy.recordings.samples import READABLE, recording
 
 
 @pytest.mark.parametrize("name", READABLE)

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from gdp.errors import LocalError
-from proxy.compare import TopicComparison
+from proxy.recordings.compare import TopicComparison
 from ring.events import Event
 from ring.options import Options
 from ring.result import Journey, Result, put_together

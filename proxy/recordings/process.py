@@ -28,7 +28,7 @@ _ROOT: Final = Path(__file__).resolve().parents[2]
 _CODE: Final = """
 import sys
 sys.path[:] = [folder for folder in sys.path if folder]
-from proxy.endpoints.bag_child import main
+from proxy.recordings.child import main
 main(sys.argv[1:])
 """
 _PASSED: Final = ("PATH", "LD_LIBRARY_PATH", "PYTHONHOME", "LANG", "LC_ALL", "LC_CTYPE")

@@ -17,12 +17,12 @@ from types import TracebackType
 from typing import Final
 
 from gdp.errors import ConfigError, LocalError, RemoteError
-from proxy.endpoints.bag_limits import BagLimits
-from proxy.endpoints.bag_process import BagProcess, Cost, RecordingError, StoppedError
-from proxy.endpoints.bag_source import Message
-from proxy.endpoints.bag_stream import FailedError, FrameReader, RefusedError
-from proxy.endpoints.unpacking import file_max_bytes
 from proxy.printable import printable
+from proxy.recordings.limits import BagLimits
+from proxy.recordings.process import BagProcess, Cost, RecordingError, StoppedError
+from proxy.recordings.source import Message
+from proxy.recordings.stream import FailedError, FrameReader, RefusedError
+from proxy.recordings.unpacking import file_max_bytes
 from proxy.serial.channel import Channel
 
 __all__ = ["BagReader"]

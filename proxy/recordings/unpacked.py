@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from proxy.endpoints.bag_source import Message, Source
-from proxy.endpoints.unpacking import SalvageError, unpack
+from proxy.recordings.source import Message, Source
+from proxy.recordings.unpacking import SalvageError, unpack
 
 __all__ = ["UnpackedSource"]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator, Sequence
 
-from proxy.endpoints.bag_source import Message, Source
+from proxy.recordings.source import Message, Source
 from proxy.serial.channel import Channel
 
 __all__ = ["JoinedSource"]

@@ -13,7 +13,7 @@ from typing import Final
 
 import apsw
 
-from proxy.endpoints.unpacking import CHUNK_MAX_BYTES, SalvageError
+from proxy.recordings.unpacking import CHUNK_MAX_BYTES, SalvageError
 
 __all__ = ["check_schema", "guard", "guarded"]
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple, Protocol
 
-from proxy.endpoints.unpacking import CHUNK_MAX_BYTES, unpack
+from proxy.recordings.unpacking import CHUNK_MAX_BYTES, unpack
 from proxy.serial.channel import Channel
 
 __all__ = ["Chunk", "Message", "Place", "ScannedSource", "Source", "Tally"]

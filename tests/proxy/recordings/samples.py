@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "bags"
+SHARED = Path(__file__).resolve().parents[3].parent / "shared" / "data" / "bags"
 READABLE = (
     "tilt_laser.bag",
     "rosbag2_test",

@@ -13,7 +13,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Final, TypeAlias
 
-from proxy.endpoints.bag import BagReader
+from proxy.recordings.reader import BagReader
 from proxy.serial.channel import Channel
 from proxy.serial.serializer import canonical
 

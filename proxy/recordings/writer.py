@@ -20,7 +20,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.rosbag2 import WriterError as WriterError2
 
 from gdp.errors import LocalError
-from proxy.endpoints.bag_channel import to_qos
+from proxy.recordings.channels import to_qos
 from proxy.serial.bounded_cache import digest_of
 from proxy.serial.channel import Channel, RosVersion
 from proxy.serial.schema import definition_bytes
@@ -65,6 +65,11 @@ class BagWriter:
         else:
             self._writer2 = Writer2(self._folder / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
             self._writer2.open()
+
+    @property
+    def ros(self) -> RosVersion:
+        """Return whose messages it takes."""
+        return self._ros
 
     def add(self, channel: Channel) -> int:
         """Return the handle of a channel, the same for an equal one.

@@ -13,8 +13,8 @@ from typing import BinaryIO, Final
 
 from rosbags.typesys.msg import normalize_msgtype
 
-from proxy.endpoints.bag_source import Chunk, Place, ScannedSource, Tally
-from proxy.endpoints.unpacking import SalvageError, unpack
+from proxy.recordings.source import Chunk, Place, ScannedSource, Tally
+from proxy.recordings.unpacking import SalvageError, unpack
 from proxy.serial.channel import Channel
 
 __all__ = ["MAGIC", "scan"]

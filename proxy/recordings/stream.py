@@ -21,7 +21,7 @@ from enum import IntEnum
 from typing import Final, TypeAlias
 
 from gdp.errors import LocalError
-from proxy.endpoints.bag_source import Message
+from proxy.recordings.source import Message
 from proxy.serial.channel import CHANNEL_MAX_BYTES, Channel
 
 __all__ = [

@@ -12,10 +12,12 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
 from gdp.errors import ConfigError, LocalError
-from proxy.endpoints.bag import BagReader, BagWriter, Message
-from proxy.endpoints.bag_decoder import BagDecoder
+from proxy.recordings.decoder import BagDecoder
+from proxy.recordings.reader import BagReader
+from proxy.recordings.source import Message
+from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import Channel, Qos, RosVersion
-from tests.proxy.recordings import READABLE, UNREADABLE, recording
+from tests.proxy.recordings.samples import READABLE, UNREADABLE, recording
 
 NEVER = (9_223_372_036, 854_775_807)
 LATCHED = Qos("keep_last", 1, "reliable", "transient_local", NEVER, NEVER, "automatic", NEVER, plain_names=False)

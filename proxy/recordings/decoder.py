@@ -1,7 +1,7 @@
 """Decoder of a recording: ROS 1 bag, sqlite3, MCAP, alone or as a rosbag2 folder; also one that ends in the middle.
 
 Place: I/O, reading only. What is whole is read by rosbags; what is not, by a walk from its beginning (``salvage_*``).
-It runs in a process of its own (``bag_child``), for what it decodes may come from anyone.
+It runs in a process of its own (``child``), for what it decodes may come from anyone.
 Errors: a recording that cannot be read at all raises ``ConfigError`` naming the file and why; a loss is reported in
 ``unread``.
 """
@@ -26,14 +26,14 @@ from rosbags.rosbag2 import reader as rosbag2_reader
 from ruamel.yaml.error import YAMLError
 
 from gdp.errors import ConfigError, LocalError
-from proxy.endpoints import salvage_mcap, salvage_ros1, salvage_sqlite
-from proxy.endpoints.bag_channel import from_connection
-from proxy.endpoints.bag_source import Message, Source
-from proxy.endpoints.joined import JoinedSource
-from proxy.endpoints.plain_yaml import BoundedYaml, load_plain
-from proxy.endpoints.sqlite_guard import guarded
-from proxy.endpoints.unpacked import UnpackedSource
-from proxy.endpoints.unpacking import bound_rosbags, check_file
+from proxy.recordings import salvage_mcap, salvage_ros1, salvage_sqlite
+from proxy.recordings.channels import from_connection
+from proxy.recordings.plain_yaml import BoundedYaml, load_plain
+from proxy.recordings.source import Message, Source
+from proxy.recordings.split import JoinedSource
+from proxy.recordings.sqlite_guard import guarded
+from proxy.recordings.unpacked import UnpackedSource
+from proxy.recordings.unpacking import bound_rosbags, check_file
 from proxy.serial.channel import Channel
 from proxy.serial.schema import DefinitionError, UnparsedError, parse
 

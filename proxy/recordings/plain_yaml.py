@@ -12,7 +12,7 @@ from typing import Any, Final
 import yaml
 from ruamel.yaml import YAML
 
-from proxy.endpoints.unpacking import SalvageError
+from proxy.recordings.unpacking import SalvageError
 
 __all__ = ["BoundedYaml", "load_plain"]
 

@@ -11,9 +11,9 @@ import struct
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from proxy.endpoints.bag_channel import from_ros2, offered_qos
-from proxy.endpoints.bag_source import Chunk, Place, ScannedSource, Tally
-from proxy.endpoints.unpacking import SalvageError, unpack
+from proxy.recordings.channels import from_ros2, offered_qos
+from proxy.recordings.source import Chunk, Place, ScannedSource, Tally
+from proxy.recordings.unpacking import SalvageError, unpack
 from proxy.serial.channel import Channel, DefinitionFormat
 
 __all__ = ["MAGIC", "is_indexed", "scan"]

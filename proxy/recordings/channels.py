@@ -26,8 +26,8 @@ from rosbags.rosbag2.metadata import parse_qos
 from ruamel.yaml.error import YAMLError
 
 from gdp.errors import LocalError
-from proxy.endpoints.plain_yaml import load_plain
-from proxy.endpoints.unpacking import SalvageError
+from proxy.recordings.plain_yaml import load_plain
+from proxy.recordings.unpacking import SalvageError
 from proxy.serial.channel import Channel, DefinitionFormat, Qos
 from proxy.serial.standard import standard_definition, type_hash
 

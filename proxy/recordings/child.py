@@ -1,6 +1,6 @@
 """The process that decodes one recording, and can do nothing else.
 
-Place: command, started by ``bag_process``. It reads the recording and writes frames (``bag_stream``) to a pipe. Limits
+Place: command, started by ``process``. It reads the recording and writes frames (``stream``) to a pipe. Limits
 of memory and time, Landlock and seccomp come before it opens the file. The kernel kills it when the other end of its
 lifeline is closed, even while it decodes. ``PR_SET_PDEATHSIG`` would not do: it follows the thread that started the
 process, and Landlock takes the right to signal it from a parent that is confined later.
@@ -23,9 +23,9 @@ from typing import Final
 
 from gdp.errors import ConfigError, LocalError
 from gdp.ports.sandbox import Capability, Needs, confine
-from proxy.endpoints.bag_decoder import BagDecoder
-from proxy.endpoints.bag_source import Message
-from proxy.endpoints.bag_stream import (
+from proxy.recordings.decoder import BagDecoder
+from proxy.recordings.source import Message
+from proxy.recordings.stream import (
     BLOCK_BYTES,
     CHANNELS_MAX,
     CHANNELS_MAX_BYTES,

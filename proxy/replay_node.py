@@ -1,40 +1,27 @@
-"""Playing a recording onto the overlay, with its own timing.
+"""Replay of a recording over the bridge, with its own timing, and the figures of its end.
 
 Place: shell; drives the node's loop between messages.
 """
 
 from __future__ import annotations
 
-import logging
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 from gdp.client.publisher import Publisher
 from gdp.message.loss import LossReason
-from proxy.endpoints.bag import BagReader
+from proxy.bridge.bridge import Bridge
+from proxy.bridge.exposed_topic import ExposedTopic
 from proxy.node import ProxyNode
-from proxy.outbound import Outbound
+from proxy.recording_bridge import work
+from proxy.recordings.endpoint import ReplayEndpoint
 
-__all__ = ["Played", "Replayer", "Unconfirmed"]
-
-log = logging.getLogger(__name__)
+__all__ = ["Replay", "ReplayedTopic", "Unconfirmed"]
 
 STALL_S: Final = 20.0  # without any acknowledgement, readers are given up
 TICK_S: Final = 0.5
-
-
-@dataclass(slots=True)
-class Played:
-    """What was played so far."""
-
-    sent: int = 0
-    sent_bytes: int = 0  # as recorded
-    by_channel: Counter[int] = field(default_factory=Counter)
-    bytes_by_channel: Counter[int] = field(default_factory=Counter)
-
 
 _WHY: Final = {
     LossReason.NO_READER: "published while nobody read it",
@@ -65,76 +52,116 @@ class Unconfirmed:
         return f"{self.topic}: {self.confirmed} of {self.messages} confirmed: {self.why}"
 
 
-class Replayer:
-    """Plays one recording.
+@dataclass(frozen=True, slots=True)
+class ReplayedTopic:
+    """One topic of the recording that a rule exposes.
+
+    Attributes:
+        topic: as it was recorded.
+        indexes: of its channels in the recording.
+    """
+
+    topic: str
+    type_name: str
+    flow: ExposedTopic
+    publisher: Publisher
+    indexes: tuple[int, ...]
+
+
+class Replay:
+    """One recording on its way out.
 
     Args:
+        bridge: its flows stand.
         rate: 1: as recorded, 2: twice as fast, 0: as fast as readers confirm.
-        tick: called about twice a second while playing.
+        report: called about twice a second while replaying.
     """
 
     def __init__(
-        self, node: ProxyNode, bag: BagReader, outbound: Outbound, rate: float, tick: Callable[[Played], None]
+        self, node: ProxyNode, bridge: Bridge, endpoint: ReplayEndpoint, rate: float, report: Callable[[], None]
     ) -> None:
         self._node = node
-        self._bag = bag
-        self._outbound = outbound
+        self._bridge = bridge
+        self._endpoint = endpoint
         self._rate = rate
-        self._tick = tick
+        self._report = report
         self._tick_at_s = 0.0
-        self.played = Played()
+        self.topics = [
+            ReplayedTopic(
+                wish.local,
+                wish.type_name,
+                flow,
+                flow.publisher,
+                tuple(endpoint.channels_of(wish.local, wish.type_name)),
+            )
+            for wish, flow in bridge.flows
+            if isinstance(flow, ExposedTopic) and flow.publisher is not None
+        ]
+        self._flows = {each.flow.handle: each.flow for each in self.topics}
+
+    @property
+    def sent(self) -> int:
+        """Return how many messages were published, those that nobody read included."""
+        return sum(each.flow.published.total() for each in self.topics)
+
+    @property
+    def sent_bytes(self) -> int:
+        """Return their bytes, as recorded."""
+        return sum(each.flow.published_bytes.total() for each in self.topics)
 
     @property
     def confirmed(self) -> int:
         """Return how many messages of reliable topics every reader has confirmed."""
-        return sum(publisher.acknowledged for publisher in self._outbound.publishers.values() if publisher.confirms)
+        return sum(each.publisher.acknowledged for each in self.topics if each.publisher.confirms)
 
     @property
     def sent_best_effort(self) -> int:
         """Return how many messages of best-effort topics were sent: nobody confirms them."""
-        publishers = [publisher for publisher in self._outbound.publishers.values() if not publisher.confirms]
+        publishers = [each.publisher for each in self.topics if not each.publisher.confirms]
         return sum(publisher.messages - publisher.losses.total for publisher in publishers)
+
+    @property
+    def too_large(self) -> int:
+        """Return how many messages were above a limit, and not sent."""
+        return sum(each.publisher.losses.counts.get(LossReason.TOO_LARGE, 0) for each in self.topics)
 
     def unconfirmed(self) -> list[Unconfirmed]:
         """Return the reliable topics of which something was not confirmed."""
-        publishers = self._outbound.publishers.items()
+        publishers = [(each.topic, each.publisher) for each in self.topics]
         return [
             Unconfirmed(topic, each.messages, each.acknowledged, _why(each), each.losses.by_label())
             for topic, each in publishers
             if each.confirms and each.acknowledged < each.messages
         ]
 
-    def wait_for_readers(self, patience_s: float) -> list[str]:
-        """Wait until every topic has a reader; return the topics that have none when patience ends."""
-        publishers = self._outbound.publishers
-        deadline_s = time.monotonic() + patience_s
-        self._node.runtime.run(lambda: all(each.readers for each in publishers.values()), deadline_s)
-        return [topic for topic, publisher in publishers.items() if not publisher.readers]
+    def wait_for_readers(self, timeout_s: float) -> list[str]:
+        """Wait until every topic has a reader; return the topics that have none after ``timeout_s`` seconds."""
+        deadline_s = time.monotonic() + timeout_s
+        self._node.runtime.run(lambda: all(each.publisher.readers for each in self.topics), deadline_s)
+        return [each.topic for each in self.topics if not each.publisher.readers]
 
-    def play(self) -> bool:
-        """Play to the end; return False when the node was stopped before."""
-        begun_s = time.monotonic()
+    def run(self) -> bool:
+        """Replay to the end; return False when the node was stopped before."""
+        runtime, begun_s = self._node.runtime, time.monotonic()
         first_ns: int | None = None
-        for channel, stamp_ns, raw in self._bag.messages(self._goes_on):
-            if not self._outbound.is_exposed(channel):
-                continue
-            first_ns = stamp_ns if first_ns is None else first_ns
+        for message in self._endpoint.messages(self._continue):
+            first_ns = message.stamp_ns if first_ns is None else first_ns
             if self._rate > 0:
-                self._work_until(begun_s + (stamp_ns - first_ns) / 1e9 / self._rate)
-            while not self._outbound.has_room(channel) and not self._node.runtime.is_stopped:
+                self._step_until(begun_s + (message.stamp_ns - first_ns) / 1e9 / self._rate)
+            flow = self._flows[message.handle]
+            while not flow.has_room() and not runtime.is_stopped:
                 self._step(None)
-            if self._node.runtime.is_stopped:
+            if runtime.is_stopped:
                 return False
-            if self._outbound.publish(channel, raw):
-                self._count(channel, raw)
+            self._endpoint.deliver(message)
+            work(self._node, self._bridge)
             self._step(0.0)
-        return not self._node.runtime.is_stopped
+        return not runtime.is_stopped
 
     def finish(self) -> bool:
         """Wait until readers have confirmed what they may get; return False when they stop to, or when stopped."""
-        publishers = self._outbound.publishers.values()
         progress, stalled_s = self.confirmed, time.monotonic()
-        while any(publisher.is_wanted and not publisher.is_acknowledged() for publisher in publishers):
+        while any(each.publisher.is_wanted and not each.publisher.is_acknowledged() for each in self.topics):
             if self._node.runtime.is_stopped:
                 return False
             self._step(TICK_S)
@@ -144,30 +171,24 @@ class Replayer:
                 return False
         return True
 
-    def _count(self, channel: int, raw: bytes) -> None:
-        played = self.played
-        played.sent += 1
-        played.sent_bytes += len(raw)
-        played.by_channel[channel] += 1
-        played.bytes_by_channel[channel] += len(raw)
-
-    def _goes_on(self) -> bool:
+    def _continue(self) -> bool:
         """Let the node work while the recording is waited for; return whether it was not stopped."""
         self._step(0.0)
         return not self._node.runtime.is_stopped
 
-    def _work_until(self, due_s: float) -> None:
+    def _step_until(self, due_s: float) -> None:
         while time.monotonic() < due_s and not self._node.runtime.is_stopped:
             self._step(due_s - time.monotonic())
 
     def _step(self, at_most_s: float | None) -> None:
-        """Let the node work once, for no longer than so many seconds."""
-        moment_s = time.monotonic()
+        """Let the node and the bridge work once, for no longer than so many seconds."""
+        now_s = time.monotonic()
         wait_s = TICK_S if at_most_s is None else min(max(at_most_s, 0.0), TICK_S)
-        self._node.runtime.step(moment_s + wait_s)
-        if moment_s >= self._tick_at_s:
-            self._tick_at_s = moment_s + TICK_S
-            self._tick(self.played)
+        self._node.runtime.step(now_s + wait_s)
+        self._bridge.work(now_s)
+        if now_s >= self._tick_at_s:
+            self._tick_at_s = now_s + TICK_S
+            self._report()
 
 
 def _why(publisher: Publisher) -> str:

@@ -17,10 +17,10 @@ from urllib.parse import quote
 
 import apsw
 
-from proxy.endpoints.bag_channel import from_ros2, offered_qos
-from proxy.endpoints.bag_source import Message, Tally
-from proxy.endpoints.sqlite_guard import check_schema, guard
-from proxy.endpoints.unpacking import SalvageError
+from proxy.recordings.channels import from_ros2, offered_qos
+from proxy.recordings.source import Message, Tally
+from proxy.recordings.sqlite_guard import check_schema, guard
+from proxy.recordings.unpacking import SalvageError
 from proxy.serial.channel import Channel, DefinitionFormat
 
 __all__ = ["MAGIC", "SqliteSource", "is_whole"]

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from proxy.compare import TopicComparison, compare
-from proxy.endpoints.bag import BagWriter
+from proxy.recordings.compare import TopicComparison, compare
+from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import Channel
-from tests.proxy.recordings import READABLE, recording
+from tests.proxy.recordings.samples import READABLE, recording
 
 TYPE = "std_msgs/msg/UInt8"
 

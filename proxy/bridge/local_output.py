@@ -1,0 +1,213 @@
+"""Local publishers of an imported topic: one that stands for all far publishers, or one for each of their channels.
+
+Place: shell; the endpoint does the I/O. A live graph gets one virtual publisher. Where another one must replace it, to
+promise more, the new one gets the messages that a latched topic keeps: readers get them again, as from any publisher
+that restarts. A recording gets every channel as its far publisher describes it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final, Protocol
+
+from gdp.errors import LocalError
+from proxy.bridge.incoming import Incoming
+from proxy.bridge.seat import Owner, Seat
+from proxy.bridge.wishes import Wish
+from proxy.endpoints.endpoint import End
+from proxy.faults import Fault
+from proxy.parcel import CHANNELS_MAX
+from proxy.qos import default, offer
+from proxy.serial.channel import Channel, Qos
+from proxy.serial.serializer import Encoding
+
+__all__ = ["ChannelPublishers", "LocalOutput", "MergedPublisher"]
+
+_FAR_MAX: Final = 1_024  # publishers whose QoS is kept; the oldest go
+_PUBLISHERS_MAX: Final = 4_096  # publishers whose channels are counted; the oldest go
+
+
+class LocalOutput(Protocol):
+    """Where the messages of one imported topic go."""
+
+    refusal: Fault  # the fault of channels that cannot be added
+
+    @property
+    def is_open(self) -> bool:
+        """Return whether messages can be published now."""
+
+    def decoder(self, source: Channel, encoding: Encoding) -> Incoming:
+        """Return what turns bodies of a far channel into local messages.
+
+        Raises:
+            DefinitionError: the definitions differ, or there is no such type in this ROS.
+        """
+
+    def add(self, publisher: bytes, sources: Sequence[Channel], targets: Sequence[Channel]) -> list[int]:
+        """Make ready for the channels of a far publisher; return a handle for each.
+
+        Args:
+            sources: as the far side describes them.
+            targets: as they are here.
+
+        Raises:
+            LocalError: the endpoint does not take one of them.
+        """
+
+    def publish(self, handle: int, raw: bytes) -> None:
+        """Publish one message.
+
+        Raises:
+            LocalError: it cannot be written.
+        """
+
+    def receive_readers(self, ends: Sequence[End]) -> None:
+        """Take the local readers of now."""
+
+    def drop_kept(self) -> None:
+        """Drop messages kept for late joiners, when the last local reader has left."""
+
+    def close(self) -> None:
+        """End what was advertised."""
+
+
+class MergedPublisher:
+    """One virtual publisher in a live graph.
+
+    Raises:
+        LocalError: this graph does not take a publisher of the topic.
+    """
+
+    refusal = Fault.UNKNOWN_TYPE
+
+    def __init__(self, seat: Seat, owner: Owner, wish: Wish) -> None:
+        self._seat = seat
+        self._owner = owner
+        self._wish = wish
+        self._wants: tuple[Qos, ...] = ()
+        self._handle: int | None = None
+        self._channel: Channel | None = None  # as it is offered here
+        self._far: dict[bytes, Qos] = {}  # what publishers offer, by name
+        self._kept = deque[bytes]()  # messages that late joiners get, for a publisher that replaces this one
+        if (known := self._known()) is not None:  # else the far side's own definition may do
+            self._offer(known)
+
+    @property
+    def is_open(self) -> bool:
+        """Return whether the virtual publisher stands."""
+        return self._handle is not None
+
+    def decoder(self, source: Channel, encoding: Encoding) -> Incoming:
+        """Return what decodes by the far definition and converts into this machine's."""
+        return Incoming.ready(source, encoding, self._known(), self._seat.endpoint.ros)
+
+    def add(self, publisher: bytes, sources: Sequence[Channel], targets: Sequence[Channel]) -> list[int]:
+        """Offer what a far publisher does; its channels share the virtual publisher."""
+        source = sources[0]
+        self._far[publisher] = source.qos[0] if source.qos else default(latched=source.latched)
+        while len(self._far) > _FAR_MAX:
+            del self._far[next(iter(self._far))]
+        self._offer(targets[0])
+        return [0] * len(targets)
+
+    def publish(self, handle: int, raw: bytes) -> None:
+        """Publish one message by the virtual publisher, if it stands."""
+        del handle
+        if self._handle is not None:
+            self._seat.endpoint.publish(self._handle, raw)
+            self._kept.append(raw)
+
+    def receive_readers(self, ends: Sequence[End]) -> None:
+        """Offer what local readers insist on."""
+        self._wants = tuple(end.qos for end in sorted(ends, key=lambda end: end.key) if end.qos is not None)
+        if self._channel is not None:
+            self._offer(self._channel)
+
+    def drop_kept(self) -> None:
+        """End a latched publisher: the messages that it keeps grow old, and come again with the next reader."""
+        if self._channel is not None and self._channel.latched:
+            self._kept.clear()
+            self.close()
+
+    def close(self) -> None:
+        """End the virtual publisher."""
+        if self._handle is not None:
+            self._seat.close(self._handle)
+            self._handle = None
+
+    def _known(self) -> Channel | None:
+        try:
+            return self._seat.endpoint.channel(self._wish.local, self._wish.type_name)
+        except LocalError:
+            return None
+
+    def _offer(self, channel: Channel) -> None:
+        """Be the publisher that the far one is, as far as local readers allow; again where that has changed."""
+        profile = offer(tuple(self._far.values()), self._wants, is_latched=self._wish.rule.wants_latched)
+        latched = profile.durability == "transient_local"
+        offered = replace(channel, topic=self._wish.local, qos=(profile,), latched=latched, callerid=None)
+        if self._handle is not None and self._channel is not None and _is_served(self._channel, offered):
+            return
+        self.close()
+        self._handle = self._seat.advertise(self._owner, offered)
+        self._channel = offered
+        self._kept = deque(self._kept if latched else (), maxlen=profile.depth if latched else 0)
+        for raw in self._kept:
+            self._seat.endpoint.publish(self._handle, raw)
+
+
+class ChannelPublishers:
+    """A publisher for each far channel, under the rule's own name; nothing is converted."""
+
+    refusal = Fault.REFUSED
+    is_open = True
+
+    def __init__(self, seat: Seat, owner: Owner, wish: Wish) -> None:
+        self._seat = seat
+        self._owner = owner
+        self._wish = wish
+        self._handles: dict[bytes, set[int]] = {}  # of each far publisher
+
+    def decoder(self, source: Channel, encoding: Encoding) -> Incoming:
+        """Return what decodes by the far definition alone."""
+        return Incoming(source, encoding, source, None)
+
+    def add(self, publisher: bytes, sources: Sequence[Channel], targets: Sequence[Channel]) -> list[int]:
+        """Return the handles of a far publisher's channels, whose number is bounded; equal channels share a handle."""
+        del sources
+        known = self._handles.setdefault(publisher, set())
+        if len(self._handles) > _PUBLISHERS_MAX:
+            del self._handles[next(iter(self._handles))]
+        handles = list[int]()
+        for target in targets:
+            if len(known) >= CHANNELS_MAX:
+                raise LocalError(f"its publisher has described more than {CHANNELS_MAX} channels")
+            handles.append(self._seat.advertise(self._owner, replace(target, topic=self._wish.local)))
+            known.add(handles[-1])
+        return handles
+
+    def publish(self, handle: int, raw: bytes) -> None:
+        """Publish one message of a channel."""
+        self._seat.endpoint.publish(handle, raw)
+
+    def receive_readers(self, ends: Sequence[End]) -> None:
+        """Take the readers: a recording reads everything."""
+
+    def drop_kept(self) -> None:
+        """Drop nothing: a recording keeps what it has."""
+
+    def close(self) -> None:
+        """End every channel's publisher."""
+        for handle in set().union(*self._handles.values()):
+            self._seat.close(handle)
+        self._handles.clear()
+
+
+def _is_served(standing: Channel, wanted: Channel) -> bool:
+    """Return whether a publisher that stands does for what is wanted: the same, or only with a smaller depth."""
+    if replace(standing, qos=()) != replace(wanted, qos=()):
+        return False
+    before, after = standing.qos[0], wanted.qos[0]
+    return replace(before, depth=0) == replace(after, depth=0) and before.depth >= after.depth

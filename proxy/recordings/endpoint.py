@@ -1,0 +1,253 @@
+"""Endpoints of a recording: one plays its messages to a bridge, one records what a bridge publishes.
+
+Place: I/O, through ``reader`` and ``writer``. Both implement ``proxy/endpoints/endpoint.py``, and hold topics only. A
+recording tells publishers apart: each of its channels is one. Time belongs to the caller: a message becomes an event
+when ``deliver`` is called with it.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from typing import Final, NamedTuple, NoReturn
+
+from gdp.errors import LocalError
+from proxy.endpoints.endpoint import Described, End, Event, Graph, GraphChanged, Heard, Role
+from proxy.recordings.reader import BagReader
+from proxy.recordings.writer import BagWriter
+from proxy.serial.channel import Channel, Qos, RosVersion
+from proxy.serial.service import Service
+
+__all__ = ["RecordedMessage", "RecordingEndpoint", "ReplayEndpoint"]
+
+
+class RecordedMessage(NamedTuple):
+    """One message of a topic that is subscribed to."""
+
+    handle: int  # of the subscription
+    channel: int  # number within the topic, in the recording's order
+    stamp_ns: int  # when it was recorded, Unix time
+    raw: bytes
+
+
+class _TopicsEndpoint:
+    """What both have in common: a queue of events, and no services."""
+
+    is_live: Final = False
+    dropped: Final = 0
+
+    def __init__(self, label: str) -> None:
+        self.label = label
+        self._events = deque[Event]()
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._put(GraphChanged())
+
+    def fileno(self) -> int:
+        """Return a descriptor that is readable while ``take`` has something."""
+        return self._wake
+
+    def take(self) -> Sequence[Event]:
+        """Return, once, what happened, in order."""
+        if not self._events:
+            return ()
+        os.eventfd_read(self._wake)
+        events = list(self._events)
+        self._events.clear()
+        return events
+
+    def channel(self, topic: str, type_name: str) -> Channel:
+        """Know no type: a recording brings its own definitions.
+
+        Raises:
+            LocalError: always.
+        """
+        raise LocalError(f"{self.label}: {topic}: its messages bring the definition of {type_name}")
+
+    def service(self, name: str, type_name: str) -> Service:
+        """Refuse: a recording holds topics only; raises ``LocalError``."""
+        del type_name
+        self._refuse(name)
+
+    def serve(self, service: Service) -> int:
+        """Refuse: a recording holds topics only; raises ``LocalError``."""
+        self._refuse(service.name)
+
+    def answer(self, handle: int, ticket: int, raw: bytes) -> None:
+        """Ignore the answer: no client asked."""
+
+    def refuse(self, handle: int, ticket: int, reason: str) -> None:
+        """Ignore the refusal: no client asked."""
+
+    def dial(self, name: str, type_name: str) -> int:
+        """Refuse: a recording holds topics only; raises ``LocalError``."""
+        del type_name
+        self._refuse(name)
+
+    def call(self, handle: int, call: int, raw: bytes) -> None:
+        """Refuse: a recording holds topics only; raises ``LocalError``."""
+        del raw
+        self._refuse(f"call {call} of handle {handle}")
+
+    def drop(self, handle: int, call: int) -> None:
+        """Ignore the call: there is none."""
+
+    def shut(self) -> None:
+        """Free the descriptor; the recording itself belongs to the caller."""
+        os.close(self._wake)
+
+    def _put(self, event: Event) -> None:
+        if not self._events:
+            os.eventfd_write(self._wake, 1)
+        self._events.append(event)
+
+    def _refuse(self, what: str) -> NoReturn:
+        raise LocalError(f"{self.label}: {what}: a recording holds topics only")
+
+
+class ReplayEndpoint(_TopicsEndpoint):
+    """The publishers of a recording.
+
+    Args:
+        reader: open; its owner closes it.
+    """
+
+    def __init__(self, reader: BagReader) -> None:
+        super().__init__(f"recording {reader.path}")
+        self._reader = reader
+        self._numbers = 0
+        self._indexes: dict[tuple[str, str], list[int]] = {}  # of channels, by topic and type
+        for index, channel in enumerate(reader.channels):
+            self._indexes.setdefault((channel.topic, channel.type_name), []).append(index)
+        self._subscribed: dict[int, tuple[int, int]] = {}  # by channel index: handle, number within the topic
+
+    @property
+    def ros(self) -> RosVersion:
+        """Return whose messages it has."""
+        return self._reader.channels[0].ros if self._reader.channels else 2
+
+    def graph(self) -> Graph:
+        """Return one publisher for each channel; whose node it was says nothing about the nodes of now."""
+        channels = enumerate(self._reader.channels)
+        return frozenset(
+            End(Role.PUBLISHES, each.topic, each.type_name, "", str(index), hash=each.hash) for index, each in channels
+        )
+
+    def channels_of(self, topic: str, type_name: str) -> list[int]:
+        """Return the indexes of a topic's channels; a channel's place here is its number within the topic."""
+        return self._indexes.get((topic, type_name), [])
+
+    def is_subscribed(self, index: int) -> bool:
+        """Return whether a channel of the recording is subscribed to."""
+        return index in self._subscribed
+
+    def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
+        """Take a topic's messages from now on.
+
+        Raises:
+            LocalError: the recording does not have it.
+        """
+        del qos
+        indexes = self.channels_of(topic, type_name)
+        if not indexes:
+            raise LocalError(f"{self.label}: it has no topic {topic} of type {type_name}")
+        self._numbers += 1
+        for number, index in enumerate(indexes):
+            self._subscribed[index] = self._numbers, number
+        first, *others = (self._reader.channels[index] for index in indexes)
+        self._put(Described(self._numbers, first, tuple(others)))
+        return self._numbers
+
+    def messages(self, waiting: Callable[[], bool] | None = None) -> Iterator[RecordedMessage]:
+        """Yield the messages of subscribed topics in time order.
+
+        Args:
+            waiting: as for ``BagReader.messages``.
+
+        Raises:
+            ConfigError, RecordingError: the decoder failed.
+        """
+        for index, stamp_ns, raw in self._reader.messages(waiting):
+            subscribed = self._subscribed.get(index)
+            if subscribed is not None:
+                yield RecordedMessage(*subscribed, stamp_ns, raw)
+
+    def deliver(self, message: RecordedMessage) -> None:
+        """Let a message be published now; its stamp is that of the present."""
+        self._put(Heard(message.handle, time.time_ns(), message.raw, message.channel))
+
+    def advertise(self, channel: Channel) -> int:
+        """Refuse to publish; raises ``LocalError``."""
+        raise LocalError(f"{self.label}: {channel.topic}: a recording that is replayed takes no messages")
+
+    def publish(self, handle: int, raw: bytes) -> None:
+        """Refuse to publish; raises ``LocalError``."""
+        del raw
+        raise LocalError(f"{self.label}: handle {handle}: a recording that is replayed takes no messages")
+
+    def subscribers(self, handle: int) -> int:
+        """Return 0."""
+        del handle
+        return 0
+
+    def close(self, handle: int) -> None:
+        """End a subscription."""
+        self._subscribed = {index: each for index, each in self._subscribed.items() if each[0] != handle}
+
+
+class RecordingEndpoint(_TopicsEndpoint):
+    """The subscriber of everything that is recorded.
+
+    An equal channel has one handle, and keeps it: a recording knows channels, not publishers.
+
+    Args:
+        writer: open; its owner closes it. None: messages are only counted.
+        topics: local name and type of each topic that is recorded.
+    """
+
+    def __init__(self, writer: BagWriter | None, topics: Sequence[tuple[str, str]]) -> None:
+        super().__init__("messages that are counted" if writer is None else f"recording {writer.path}")
+        self._writer = writer
+        self._graph: Graph = frozenset(
+            End(Role.SUBSCRIBES, topic, type_name, "", str(index)) for index, (topic, type_name) in enumerate(topics)
+        )
+
+    @property
+    def ros(self) -> RosVersion:
+        """Return whose messages it takes."""
+        return 2 if self._writer is None else self._writer.ros
+
+    def graph(self) -> Graph:
+        """Return a subscriber for each topic that is recorded."""
+        return self._graph
+
+    def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
+        """Refuse to subscribe; raises ``LocalError``."""
+        del type_name, qos
+        raise LocalError(f"{self.label}: {topic}: a recording that is made has no messages to take")
+
+    def advertise(self, channel: Channel) -> int:
+        """Add a channel to the recording.
+
+        Raises:
+            LocalError: a channel of the other ROS, one that the format cannot hold, or one too many.
+        """
+        return 0 if self._writer is None else self._writer.add(channel)
+
+    def publish(self, handle: int, raw: bytes) -> None:
+        """Record one message with the present as its stamp.
+
+        Raises:
+            LocalError: it cannot be written.
+        """
+        if self._writer is not None:
+            self._writer.write(handle, time.time_ns(), raw)
+
+    def subscribers(self, handle: int) -> int:
+        """Return 1: the recording."""
+        del handle
+        return 1
+
+    def close(self, handle: int) -> None:
+        """End nothing: what is recorded stays."""
