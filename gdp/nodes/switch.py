@@ -166,7 +166,7 @@ def _sources(switch: Switch, chosen: Chosen, node_log: NodeLog) -> Sources:
         drops=[lambda: plane.counters.drops, lambda: count_list(switch.drops())],
         table_entries=lambda: len(switch.table),
         entries=chosen.entry_counts,
-        parked_frames=lambda: len(switch.parked),
+        parked_frames=lambda: switch.resolver.pending_frames,
         waiting=node_log.metrics,
         clashes=lambda: switch.greeter.clashes,
     )

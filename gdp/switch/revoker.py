@@ -27,8 +27,8 @@ from gdp.switch.attached import Attached
 from gdp.switch.evidence import Evidence
 from gdp.switch.handed_in import HandedIn
 from gdp.switch.held import AttachedClaim, Held, JoinedBranch, KnownPlace
+from gdp.switch.name_resolver import NameResolver
 from gdp.switch.outbox import Outbox
-from gdp.switch.places import Places
 from gdp.switch.planter import Planter
 from gdp.switch.unicast import Unicast
 from gdp.trust.audit import Action
@@ -51,12 +51,13 @@ class Revoker:
 
     def __init__(
         self,
+        *,
         verifier: ClaimVerifier,
         greeter: Greeter,
         attached: Attached,
         planter: Planter,
         unicast: Unicast,
-        places: Places,
+        resolver: NameResolver,
         evidence: Evidence,
         held: Held,
         sync: RevocationSync,
@@ -68,7 +69,7 @@ class Revoker:
         self._attached = attached
         self._planter = planter
         self._unicast = unicast
-        self._places = places
+        self._resolver = resolver
         self._evidence = evidence
         self._held = held
         self._sync = sync
@@ -165,9 +166,9 @@ class Revoker:
         return [holder.name] if is_last else []
 
     def _close_place(self, holder: KnownPlace, now: Instant) -> None:
-        place = self._places.get(holder.name, holder.advertiser)
+        place = self._resolver.cache.get(holder.name, holder.advertiser)
         if place is not None and not self._evidence.still_holds(place, now):
-            self._places.remove(place.name, place.advertiser, now.mono_s)
+            self._resolver.receive_removal(place.name, place.advertiser, now.mono_s)
             self._planter.publisher_gone(place.name, place.advertiser)
             self._unicast.forget(place.name)
 
