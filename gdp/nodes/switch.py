@@ -31,7 +31,6 @@ from gdp.ports.link import LinkWatch
 from gdp.ports.plane import MAC_BYTES, Plane
 from gdp.switch.machine import Switch
 from gdp.switch.table import Table
-from gdp.switch.waiting import switch_waits
 from gdp.telemetry.sources import Sources
 
 __all__ = ["run_switch"]
@@ -94,7 +93,7 @@ def run_switch(
             policy,
             plane,
             switch.boundary,
-            lambda now_s: switch_waits(switch, attachments | _absent(plane, optional), now_s),
+            lambda now_s: switch.waits(attachments | _absent(plane, optional), now_s),
             rib=lambda: switch.rib,
             on_wait=on_wait,
         )

@@ -12,7 +12,7 @@ The walk of a frame that was handed up::
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Final
 
 from gdp.control.boundary import ErrorBoundary
@@ -24,6 +24,7 @@ from gdp.control.neighbour import Neighbour, NeighbourState
 from gdp.control.query import Query
 from gdp.control.revocation_sync import RevocationSync
 from gdp.control.settings import NodeSettings
+from gdp.control.waiting import Wait, WaitReason, port_waits, stranger_waits
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
@@ -128,7 +129,6 @@ class Switch:
             planter=self.planter, unicast=self.unicast, inquirer=self.inquirer, locations=self._locations,
             relocations=self.relocations, held=self._held, outbox=self._outbox,
         )  # fmt: skip
-        self._told_rib: Name | None = None  # the RIB that what the operator revoked goes to
         self.boundary = ErrorBoundary()
         self._join_paces = Paces(JOINS_PER_S, JOINS_BURST)
         self._claim_paces = Paces(CLAIMS_PER_S, CLAIMS_BURST)
@@ -159,6 +159,24 @@ class Switch:
     def link_states(self) -> int:
         """Return how many link states are known."""
         return len(self._flooding.link_states)
+
+    def waits(self, attachments: Collection[int], now_s: float) -> list[Wait]:
+        """Return what this switch waits for before it can serve; empty when nothing is missing.
+
+        Args:
+            attachments: ports made for nodes of the same host, which may start at any time: an empty one is no reason.
+        """
+        waits = list(stranger_waits(self.greeter, now_s))
+        refusing = {wait.port for wait in waits}
+        for port in self.greeter.ports.values():
+            if port.index not in attachments:
+                found = port_waits(port, tuple(Role))
+                waits += (each for each in found if port.index not in refusing or each.reason is WaitReason.LINK_DOWN)
+        if severed := self.severed:
+            waits.append(Wait(WaitReason.THROUGH_LEAF, name=min(severed)))
+        if self.rib is None:
+            waits.append(Wait(WaitReason.NO_RIB))
+        return waits
 
     def drops(self) -> Mapping[DropReason, int]:
         """Return what the control plane dropped, by reason."""
@@ -266,7 +284,7 @@ class Switch:
             self._sync.next_timeout(),
         ]
         if self.inquirer.rib is not None:
-            times.append(self._revoker.handed_in.next_due())
+            times.append(self._revoker.next_due_for_rib())
         if self.unicast.is_refreshing:
             times.append(self._followed_s)  # past: at once
         if self._paths.refused_elsewhere():
@@ -296,13 +314,9 @@ class Switch:
 
     def _tell_rib_of_revocations(self, now_s: float) -> None:
         """Pass on to the RIB what the operator handed in."""
-        if self.inquirer.rib is None:
-            return
-        if self.inquirer.rib != self._told_rib:
-            self._told_rib = self.inquirer.rib
-            self._revoker.handed_in.say_again(now_s)
-        for wire in self._revoker.due_for_rib(now_s):
-            self.inquirer.relay(wire, now_s)
+        if self.inquirer.rib is not None:
+            for wire in self._revoker.due_for_rib(self.inquirer.rib, now_s):
+                self.inquirer.relay(wire, now_s)
 
     def _digest_for(self, port: LinkPort) -> bytes:
         return self._flooding.digest_for(port)
