@@ -19,11 +19,11 @@ from gdp.errors import LocalError
 from gdp.host.netns_files import inside
 from gdp.ports.kernel.assembler import Assembler
 from gdp.ports.kernel.device import has_free_peer
-from gdp.ports.kernel.netlink import Questions
 from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.kernel.program import UP
 from gdp.ports.kernel.shapes import PortAt, PortFlag
 from gdp.ports.kernel.syscall import Command, address, bpf, create_link, load_program
+from gdp.ports.netlink import Questions
 from netns_tests.conftest import MakeKernel
 from netns_tests.spaces import Space
 from netns_tests.test_kernel_plane import LOOK_S, PATIENCE_S, filled

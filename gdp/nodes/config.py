@@ -191,7 +191,9 @@ class ClusterConfig(Section):
         password = "" if file is None else read_private(file).decode("utf-8", "replace").strip()
         split = (node.rpartition(":") for node in self.nodes)
         nodes = tuple((host.strip("[]"), int(port)) for host, _, port in split)
-        return ClusterAddress(nodes, self.username, password, self.ca, self.cert, self.key)
+        return ClusterAddress(
+            nodes=nodes, username=self.username, password=password, ca=self.ca, cert=self.cert, key=self.key
+        )
 
 
 class SharedStore(Section):

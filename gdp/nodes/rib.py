@@ -53,7 +53,12 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
     identity, policy = load_member(config.identity, config.domain, Role.RIB)
     quotas = config.quotas
     settings = RibSettings(
-        config.upper, config.peers, config.allow_unowned, quotas.names_per_sender, quotas.watches, quotas.lease_max_s
+        upper=config.upper,
+        peers=config.peers,
+        allow_unowned=config.allow_unowned,
+        names_per_sender=quotas.names_per_sender,
+        watches=quotas.watches,
+        lease_max_s=quotas.lease_max_s,
     )
     attachment = NodeSettings(incarnation(), wall_clock_ms(), fresh_bytes, lease_s=config.lease_s)
     with contextlib.ExitStack() as stack:

@@ -49,10 +49,10 @@ def confine_switch(config: SwitchConfig, plane: str) -> None:
     is_kernel = plane == "kernel"
     _confine(
         Needs(
-            _DEVICE | (_PROGRAMS if is_kernel else frozenset()) | _past_owners(again, kept),
-            (*_CHANGED, lock_directory(), *kept),
-            (*_code(), *again),
-            () if config.metrics is None else (config.metrics.port,),
+            capabilities=_DEVICE | (_PROGRAMS if is_kernel else frozenset()) | _past_owners(again, kept),
+            writes=(*_CHANGED, lock_directory(), *kept),
+            reads=(*_code(), *again),
+            tcp_ports=() if config.metrics is None else (config.metrics.port,),
             spared_calls=frozenset({"bpf"} if is_kernel else ()),
         )
     )
@@ -69,10 +69,10 @@ def confine_rib(config: RibConfig) -> None:
     ports = () if config.metrics is None else (config.metrics.port,)
     _confine(
         Needs(
-            _DEVICE | _past_owners((*again, *secrets), kept),
-            (*_CHANGED, lock_directory(), *kept),
-            None if is_shared else (*_code(), *again),
-            None if is_shared else ports,
+            capabilities=_DEVICE | _past_owners((*again, *secrets), kept),
+            writes=(*_CHANGED, lock_directory(), *kept),
+            reads=None if is_shared else (*_code(), *again),
+            tcp_ports=None if is_shared else ports,
         )
     )
 
@@ -92,7 +92,7 @@ def confine_proxy(reads: Iterable[Path], writes: Iterable[Path], *, has_ros: boo
     if has_ros:
         changed += _ros_folders()
         kept |= {Capability.DAC_OVERRIDE}
-    _confine(Needs(kept, tuple(changed), starts_programs=has_ros))
+    _confine(Needs(capabilities=kept, writes=tuple(changed), starts_programs=has_ros))
 
 
 def _confine(needs: Needs) -> None:

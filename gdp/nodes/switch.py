@@ -34,7 +34,6 @@ from gdp.ports.link import LinkWatch
 from gdp.ports.plane import MAC_BYTES, Plane
 from gdp.switch.machine import Switch
 from gdp.switch.table import Table
-from gdp.switch.waiting import switch_waits
 from gdp.telemetry.sources import Sources
 
 __all__ = ["run_switch"]
@@ -97,7 +96,7 @@ def run_switch(
             policy,
             plane,
             switch.boundary,
-            lambda now_s: switch_waits(switch, attachments | _absent(plane, optional), now_s),
+            lambda now_s: switch.waits(attachments | _absent(plane, optional), now_s),
             rib=lambda: switch.rib,
             on_wait=on_wait,
         )
@@ -200,7 +199,7 @@ def _sources(switch: Switch, chosen: Chosen, node_log: NodeLog) -> Sources:
         drops=[lambda: plane.counters.drops, lambda: count_list(switch.drops())],
         table_entries=lambda: len(switch.table),
         entries=chosen.entry_counts,
-        parked_frames=lambda: len(switch.parked),
+        parked_frames=lambda: switch.resolver.pending_frames,
         waiting=node_log.metrics,
         clashes=lambda: switch.greeter.clashes,
     )

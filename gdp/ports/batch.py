@@ -145,6 +145,7 @@ class MmsgBatch:
         self._sizes = memoryview(self._out_vectors).cast("B").cast("L")[3::4]  # size_t
 
     def take(self, source: socket.socket) -> list[int]:
+        """Receive what waits at a socket; return the bytes of each frame after its Ethernet header, as ``Batch``."""
         got = self._receive(source.fileno(), self._in_at, self._take_max, _DONTWAIT, None)
         if got <= 0:  # nothing there, or the device went down: the link watch tells
             return []
@@ -153,12 +154,14 @@ class MmsgBatch:
         return sizes
 
     def fill(self, frames: list[bytes]) -> None:
+        """Write frames of our own into the slots, as ``Batch``."""
         pool, step = self.pool, self.slot_bytes
         for at, frame in zip(range(ETHER_BYTES, len(pool), step), frames, strict=False):
             pool[at : at + len(frame)] = frame
         self._sizes[: len(frames)] = memoryview(array("L", map(len, frames)))
 
     def send(self, sink: socket.socket, frames: Sequence[bytes], macs: bytes, drops: list[int]) -> int:
+        """Send frames to one pair of addresses; return how many left, as ``Batch``."""
         count = len(frames)
         self._pointers[:count] = list(frames)
         self._own_addresses[:count] = self._addresses[:count]
@@ -166,6 +169,7 @@ class MmsgBatch:
         return self._submit(sink, self._own_at, 0, count, macs, drops)
 
     def put(self, sink: socket.socket, first: int, count: int, macs: bytes, drops: list[int]) -> int:
+        """Send ``count`` slots from ``first`` on to one pair of addresses; return how many left, as ``Batch``."""
         return self._submit(sink, self._out_at, first, count, macs, drops)
 
     def _submit(self, sink: socket.socket, table: int, first: int, count: int, macs: bytes, drops: list[int]) -> int:
@@ -197,6 +201,7 @@ class PlainBatch:
         self._sizes: list[int] = []
 
     def take(self, source: socket.socket) -> list[int]:
+        """Receive what waits at a socket; return the bytes of each frame after its Ethernet header, as ``Batch``."""
         sizes: list[int] = []
         for slot in self._slots[: self._take_max]:
             try:
@@ -207,14 +212,17 @@ class PlainBatch:
         return sizes
 
     def fill(self, frames: list[bytes]) -> None:
+        """Write frames of our own into the slots, as ``Batch``."""
         for slot, frame in zip(self._slots, frames, strict=False):
             slot[ETHER_BYTES : ETHER_BYTES + len(frame)] = frame
         self._sizes = [len(frame) for frame in frames]
 
     def send(self, sink: socket.socket, frames: Sequence[bytes], macs: bytes, drops: list[int]) -> int:
+        """Send frames to one pair of addresses; return how many left, as ``Batch``."""
         return self._submit(sink, frames, macs, drops)
 
     def put(self, sink: socket.socket, first: int, count: int, macs: bytes, drops: list[int]) -> int:
+        """Send ``count`` slots from ``first`` on to one pair of addresses; return how many left, as ``Batch``."""
         slots = [self._slots[at][ETHER_BYTES : ETHER_BYTES + self._sizes[at]] for at in range(first, first + count)]
         return self._submit(sink, slots, macs, drops)
 

@@ -92,6 +92,7 @@ class Capture:
         self._file.flush()
 
     def close(self) -> None:
+        """Close every socket; the file stays open for its owner."""
         for opened in self._sockets:
             opened.close()
 

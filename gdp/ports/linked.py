@@ -108,19 +108,23 @@ class LinkedPlane(ABC):
         """Return the frames that the kernel dropped at open ports since last asked."""
 
     @abstractmethod
-    def transmit(self, port: int, destination_mac: bytes, frames: Sequence[bytes]) -> int: ...
+    def transmit(self, port: int, destination_mac: bytes, frames: Sequence[bytes]) -> int:
+        """Send frames to one neighbour; return how many left, as ``Plane.transmit``."""
 
     # the Plane protocol
 
     @property
     def ports(self) -> Mapping[int, Port]:
+        """Return the ports by index, up or not."""
         return self._ports
 
     @property
     def counters(self) -> Counters:
+        """Return the live counts, as ``Plane.counters``."""
         return self._counters
 
     def poll(self, timeout_s: float | None) -> list[Arrival]:
+        """Wait for events and serve them, the lowest rank first; return what is handed up, as ``Plane.poll``."""
         if self._unopened:
             timeout_s = self._open_again(timeout_s)
         events = self._epoll.poll(timeout_s)
@@ -138,18 +142,26 @@ class LinkedPlane(ABC):
         return arrivals
 
     def watch(self, source: HasFileno, ready: Callable[[], None], *, rank: int = 0) -> None:
+        """Call ``ready`` from within ``poll`` whenever ``source`` can be read; a lower ``rank`` comes first."""
         fd = source.fileno()
         self._epoll.register(fd, select.EPOLLIN)
         self._ready[fd] = ready
         self._ranks[fd] = rank
 
     def unwatch(self, source: HasFileno) -> None:
+        """Undo ``watch``; nothing happens if the source is not watched."""
         fd = source.fileno()
         if self._ready.pop(fd, None) is not None:
             del self._ranks[fd]
             self._epoll.unregister(fd)
 
     def add_port(self, ifname: str, *, may_be_absent: bool = False) -> int:
+        """Open a device and return its port index; one that may be absent is opened when it appears.
+
+        Raises:
+            NoDeviceError: there is no such device.
+            LocalError: as ``Plane.add_port``.
+        """
         if any(port.ifname == ifname for port in self._ports.values()):
             raise LocalError(f"port {ifname}: given twice")
         link = self._links.ask(ifname)
@@ -171,6 +183,7 @@ class LinkedPlane(ABC):
         return port.index
 
     def remove_port(self, index: int) -> None:
+        """Close a port; nothing happens if there is none of this index."""
         if self._ports.pop(index, None) is not None:
             self._unopened.pop(index, None)
             self._close_device(index)
@@ -178,15 +191,19 @@ class LinkedPlane(ABC):
             self._devices = {ifindex: port for ifindex, port in self._devices.items() if port != index}
 
     def port_state(self, index: int) -> bool:
+        """Return whether the port exists, is up and has a carrier."""
         return index in self._mtus
 
     def on_link(self, callback: LinkCallback) -> None:
+        """Call ``callback(port, up)`` when a port goes up or down, as ``Plane.on_link``."""
         self._on_link.append(callback)
 
     @abstractmethod
-    def set_neighbours(self, port: int, macs: Collection[bytes]) -> None: ...
+    def set_neighbours(self, port: int, macs: Collection[bytes]) -> None:
+        """Store the addresses of a port's neighbours, as ``Plane.set_neighbours``."""
 
     def close(self) -> None:
+        """Close every port, the link monitor and the poll."""
         for index in list(self._ports):
             self.remove_port(index)
         self._links.close()

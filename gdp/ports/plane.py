@@ -59,7 +59,8 @@ class Counters:
 class HasFileno(Protocol):
     """Anything that epoll can watch."""
 
-    def fileno(self) -> int: ...
+    def fileno(self) -> int:
+        """Return the descriptor to wait on."""
 
 
 LinkCallback = Callable[[int, bool], None]

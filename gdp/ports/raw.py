@@ -97,6 +97,7 @@ class RawPlane(LinkedPlane):
         tell_neighbours(opened, lane, self._neighbours.get(port.index, ()))
 
     def set_neighbours(self, port: int, macs: Collection[bytes]) -> None:
+        """Store the addresses of a port's neighbours: their frames get the lanes ahead of strangers'."""
         before, after = self._neighbours.get(port, frozenset()), frozenset(macs)
         self._neighbours[port] = after
         steps = (Lane.GUEST, before & after), (Lane.CONTROL, after), (Lane.HELLO, after), (Lane.GUEST, after)
@@ -106,6 +107,7 @@ class RawPlane(LinkedPlane):
                 tell_neighbours(opened, lane, known)
 
     def poll(self, timeout_s: float | None) -> list[Arrival]:
+        """End the rests of sockets that are due, then as ``Plane.poll``."""
         if self._resting:
             now_s = time.monotonic()
             for fd in [fd for fd, (_, until_s) in self._resting.items() if until_s <= now_s]:
@@ -116,6 +118,7 @@ class RawPlane(LinkedPlane):
         return super().poll(timeout_s)
 
     def remove_port(self, index: int) -> None:
+        """Close a port and forget its neighbours."""
         super().remove_port(index)
         self._neighbours.pop(index, None)
 
@@ -163,6 +166,7 @@ class RawPlane(LinkedPlane):
         return sum(kernel_drops(opened) for sockets in self._lanes.values() for opened in sockets.values())
 
     def transmit(self, port: int, destination_mac: bytes, frames: Sequence[bytes]) -> int:
+        """Send frames to one neighbour; return how many left, as ``Plane.transmit``."""
         counters, facts, batch = self._counters, self._ports.get(port), self._batch
         if facts is None or not facts.up:
             counters.drops[DropReason.PORT_DOWN] += len(frames)

@@ -26,7 +26,7 @@ _STATUS: Final = Path("/proc/thread-self/status")
 _TASKS: Final = Path("/proc/self/task")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Needs:
     """What a process goes on to do.
 
@@ -49,7 +49,7 @@ class Needs:
     only_reads: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Rights:
     """What this thread may still do, as the kernel says.
 
@@ -101,12 +101,12 @@ def _rights(version: int) -> Rights:
     lines = (line.partition(":") for line in _STATUS.read_text(encoding="ascii", errors="replace").splitlines())
     status = {key: value.strip() for key, _, value in lines}
     return Rights(
-        tuple(_names(int(status.get("CapEff", "0"), 16))),
-        int(status.get("CapBnd", "0"), 16).bit_count(),
-        status.get("NoNewPrivs") == "1",
-        version,
-        status.get("Seccomp") == "2",
-        sum(1 for _ in _TASKS.iterdir()),
+        capabilities=tuple(_names(int(status.get("CapEff", "0"), 16))),
+        bounding=int(status.get("CapBnd", "0"), 16).bit_count(),
+        no_new_privs=status.get("NoNewPrivs") == "1",
+        landlock=version,
+        seccomp=status.get("Seccomp") == "2",
+        threads=sum(1 for _ in _TASKS.iterdir()),
     )
 
 

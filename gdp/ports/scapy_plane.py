@@ -83,6 +83,7 @@ class ScapyPlane(LinkedPlane):
         return sum(kernel_drops(opened.ins) for opened, _ in self._sockets.values() if not opened.closed)
 
     def transmit(self, port: int, destination_mac: bytes, frames: Sequence[bytes]) -> int:
+        """Send frames to one neighbour, one by one; return how many left, as ``Plane.transmit``."""
         drops, facts, left = self._counters.drops, self._ports.get(port), 0
         if facts is None or not facts.up:
             drops[DropReason.PORT_DOWN] += len(frames)

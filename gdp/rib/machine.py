@@ -80,7 +80,7 @@ class Letter(NamedTuple):
     about: Key | None = None  # what it says was kept: not sent if the store did not take that
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RibSettings:
     """What an operator may choose.
 
@@ -384,7 +384,15 @@ class Rib:
     def _pass_up(self, route: Route, statement: bytes, sequence: int, now_s: float) -> None:
         if self._upstream.rib is not None:
             key = (route.name, route.advertiser)
-            self._upstream.put(Passed(key, sequence, statement, route.domain, route.transit, route.expires_s), now_s)
+            passed = Passed(
+                key=key,
+                sequence=sequence,
+                statement=statement,
+                domain=route.domain,
+                transit=route.transit,
+                until_s=route.expires_s,
+            )
+            self._upstream.put(passed, now_s)
             for passed in self._upstream.due(now_s):
                 self._send_up(passed)
 

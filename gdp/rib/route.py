@@ -14,7 +14,7 @@ from gdp.trust.claim import Claim
 __all__ = ["Route", "Withdrawn"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Route:
     """One advertiser of a name, verified.
 

@@ -25,7 +25,7 @@ GONE_S: Final = 1.0  # a tier above that is silent for so long is sent one adver
 WAITING_MAX: Final = 65_536
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Passed:
     """A claim or withdrawal to pass up, until ``until_s`` at most."""
 

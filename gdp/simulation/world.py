@@ -204,7 +204,7 @@ class World:
         upper, peers = self._rib_names(domain.upper), self._rib_names(domain.label)
         identity = self.identities[f"rib:{label}"]
         policy = self.policy(domain.label)
-        rib = Rib(identity, policy, MemoryStore(), RibSettings(upper, peers))
+        rib = Rib(identity, policy, MemoryStore(), RibSettings(upper=upper, peers=peers))
         host = self.ribs[label] = RibHost(identity, policy, rib, self._settings())
         return host
 

@@ -13,7 +13,7 @@ __all__ = ["Address", "ClusterAddress"]
 Address = tuple[str, int]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ClusterAddress:
     """How to reach a cluster.
 

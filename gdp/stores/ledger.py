@@ -30,7 +30,7 @@ _BEGIN: Final = "0" * 64  # what the first line has in place of a hash
 _LINE_MAX_BYTES: Final = 16 * 1024
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Issued:
     """One membership that was signed.
 
@@ -74,15 +74,15 @@ def append_issued(directory: Path, member: Membership, unix_s: float) -> None:
         fcntl.flock(file, fcntl.LOCK_EX)
         previous = _last_hash(path, file)
         line = Issued(
-            int(unix_s),
-            member.name.to_text(),
-            member.role.value,
-            member.label,
-            member.domain.to_text(),
-            member.fingerprint.hex(),
-            validity.not_before_unix_s,
-            validity.not_after_unix_s,
-            previous,
+            at_unix_s=int(unix_s),
+            name=member.name.to_text(),
+            role=member.role.value,
+            label=member.label,
+            domain=member.domain.to_text(),
+            fingerprint=member.fingerprint.hex(),
+            from_unix_s=validity.not_before_unix_s,
+            until_unix_s=validity.not_after_unix_s,
+            previous=previous,
         ).to_line()
         file.write(line + b"\n")
         file.flush()

@@ -59,6 +59,11 @@ class TokenKey(SigningKey):
     _key: _PrivateKey = field(repr=False)
 
     def sign(self, data: bytes) -> bytes:
+        """Return r || s (64 bytes) over the SHA-256 digest of the data.
+
+        Raises:
+            LocalError: the token does not sign.
+        """
         return self.sign_digest(hashlib.sha256(data).digest())
 
     def sign_digest(self, digest: bytes) -> bytes:
@@ -83,6 +88,7 @@ class TokenKey(SigningKey):
         return signature
 
     def to_file(self, protect: Callable[[bytes], bytes] | None = None) -> bytes:
+        """Return the line of a key file: the URI of the key; ``protect`` is ignored, since it is no secret."""
         del protect  # there is nothing to protect: the file names the key
         return self.uri.encode() + b"\n"
 

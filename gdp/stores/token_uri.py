@@ -21,7 +21,7 @@ SCHEME: Final = "pkcs11:"
 _EXAMPLE: Final = "pkcs11:token=robot;object=node?module-path=/usr/lib/softhsm/libsofthsm2.so"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TokenUri:
     """Where a key is.
 
@@ -58,12 +58,12 @@ class TokenUri:
             raise LocalError(f"a PKCS #11 URI names its library by an absolute module-path, as in {_EXAMPLE}")
         source = unquote(how.get("pin-source", ""))
         return cls(
-            module,
-            unquote(where.get("token", "")),
-            unquote(where.get("serial", "")),
-            unquote(where.get("object", "")),
-            unquote_to_bytes(where.get("id", "")),
-            _pin_file(source) if source else None,
+            module=module,
+            token=unquote(where.get("token", "")),
+            serial=unquote(where.get("serial", "")),
+            label=unquote(where.get("object", "")),
+            key_id=unquote_to_bytes(where.get("id", "")),
+            pin_file=_pin_file(source) if source else None,
         )
 
 

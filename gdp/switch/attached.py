@@ -22,7 +22,7 @@ RELAY_AGAIN_S: Final = 0.4
 RELAY_TRIES: Final = 20
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Attachment:
     """One claim of one attached node."""
 
@@ -67,7 +67,7 @@ class Attached:
         """
         if self.get(claim.name, claim.node) is None and not self._shares.take(claim.node):
             raise StatementError(DropReason.QUOTA, "claims of one node")
-        attachment = Attachment(claim, port, mac, now_s + claim.lease_s, now_s)
+        attachment = Attachment(claim=claim, port=port, mac=mac, expires_s=now_s + claim.lease_s, relay_at_s=now_s)
         self._by_name.setdefault(claim.name, {})[claim.node] = attachment
         self._push(self._relays, now_s, attachment)
         self._push(self._ends, attachment.expires_s, attachment)

@@ -26,8 +26,9 @@ from gdp.names import ZERO, Name
 from gdp.switch.attached import Attached
 from gdp.switch.held import Held
 from gdp.switch.inquirer import Inquirer
+from gdp.switch.locations import Locations
+from gdp.switch.name_resolver import NameResolver
 from gdp.switch.outbox import Outbox
-from gdp.switch.places import Places
 from gdp.switch.planter import Planter
 from gdp.switch.relocation import Relocations
 from gdp.switch.unicast import Unicast
@@ -59,13 +60,15 @@ class Claims:
 
     def __init__(
         self,
+        *,
         identity: Identity,
         verifier: ClaimVerifier,
         attached: Attached,
-        places: Places,
+        resolver: NameResolver,
         planter: Planter,
         unicast: Unicast,
         inquirer: Inquirer,
+        locations: Locations,
         relocations: Relocations,
         held: Held,
         outbox: Outbox,
@@ -74,10 +77,11 @@ class Claims:
         self._verifier = verifier
         self._audit = verifier.policy.audit
         self._attached = attached
-        self._places = places
+        self._resolver = resolver
         self._planter = planter
         self._unicast = unicast
         self._inquirer = inquirer
+        self._locations = locations
         self._relocations = relocations
         self._held = held
         self._outbox = outbox
@@ -105,16 +109,17 @@ class Claims:
             self._judge(neighbour, claim.name, DropReason.STALE, newest)
             raise StatementError(DropReason.STALE, "a claim that its maker has renewed")
         if claim.right in HEARS:
+            cache = self._resolver.cache
             try:
-                is_first = self._planter.add_reader(claim, at, self._places.of(claim.name, now.mono_s), now.mono_s)
+                is_first = self._planter.add_reader(claim, at, cache.of(claim.name, now.mono_s), now.mono_s)
             except StatementError as error:
                 self._refuse(neighbour, statement, error)
                 raise
             self._held.note_claim(claim, at)
             if is_first:
-                self._places.want(claim.name, now.mono_s, watch=True)
-            for place in self._places.of(claim.name, now.mono_s):
-                self._inquirer.tell_reader(at, claim.right, place, now.mono_s)
+                self._resolver.watch(claim.name, now.mono_s)
+            for place in cache.of(claim.name, now.mono_s):
+                self._locations.send_to_reader(at, claim.right, place, now.mono_s)
         is_alone = self._inquirer.rib is None and claim.previous != ZERO  # no RIB will judge a node that has moved
         if claim.right is Right.READ or is_alone:
             self._judge(neighbour, claim.name, None, claim.sequence)
@@ -195,7 +200,7 @@ class Claims:
             raise StatementError(DropReason.STALE, "a withdrawal of what was claimed anew")
         right = Right.from_wire(fields.text("right"))
         if right in HEARS and self._planter.remove_reader(name, (neighbour.port, neighbour.mac)):
-            self._places.unwatch(name)
+            self._resolver.unwatch(name)
         if right is not Right.READ and self._attached.remove(name, neighbour.name) is not None:
             self._unicast.forget(name)
             self._inquirer.relay(statement.wire, now.mono_s)

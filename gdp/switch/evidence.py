@@ -88,14 +88,14 @@ class Evidence:
 
 def _place(claim: Claim, domain: Name, transit: frozenset[Name], lease_s: float, now: Instant) -> Place:
     return Place(
-        claim.name,
-        claim.node,
-        claim.right,
-        claim.switch,
-        domain,
-        transit,
-        claim.wire,
-        now.mono_s + lease_s,
-        claim,
-        now.mono_s + claim.valid_until_unix_s - now.unix_s,
+        name=claim.name,
+        advertiser=claim.node,
+        right=claim.right,
+        switch=claim.switch,
+        domain=domain,
+        transit=transit,
+        claim=claim.wire,
+        expires_s=now.mono_s + lease_s,
+        proof=claim,
+        stale_until_s=now.mono_s + claim.valid_until_unix_s - now.unix_s,
     )

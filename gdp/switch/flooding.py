@@ -62,6 +62,7 @@ class Flooding:
 
     def __init__(
         self,
+        *,
         identity: Identity,
         policy: Policy,
         greeter: Greeter,

@@ -1,15 +1,15 @@
-"""A switch's dealings with its RIB: relay what attached nodes claim, ask where names are, take the answers in.
+"""A switch's RIB client: it relays claims, sends queries, and verifies the answers.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
 The nearest RIB of the switch's own domain is asked, over other domains where its own is parted. Where the own domain
 has none, it is the nearest RIB of a domain through which traffic may pass. One that owes an answer for ``SILENT_S`` is
-left for the next one. While none answers, what is known is served on (``places.py``).
+left for the next one. While none answers, what is known is served on (``places.py``). The name resolver says which
+queries are due; ``locations.py`` applies the answers.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Final
 
 from gdp.control.channel import Channels, Opened
@@ -26,23 +26,20 @@ from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.switch.attached import Attached
 from gdp.switch.evidence import Evidence
-from gdp.switch.held import Held
+from gdp.switch.locations import Locations
+from gdp.switch.name_resolver import NameResolver
 from gdp.switch.outbox import Outbox
-from gdp.switch.parked import Parked
 from gdp.switch.paths import Paths
-from gdp.switch.places import Place, Places
+from gdp.switch.places import Place
 from gdp.switch.planter import Planter
 from gdp.switch.presence import PresenceAnswers
 from gdp.switch.relocation import Relocations
-from gdp.switch.trees import At
 from gdp.switch.unicast import Unicast
 from gdp.trust.domain import Policy
-from gdp.trust.right import HEARS, Right
 
 __all__ = ["SILENT_S", "Inquirer"]
 
 SILENT_S: Final = 1.6  # longer than a RIB waits for the tier above
-KNOWN_MAX: Final = 8
 _AVOID_S: Final = 10.0  # a RIB that owed an answer for too long is left for so long, if there is another
 _REFILL_S: Final = 10.0  # how long a RIB that is new here may say "nobody" of what is known
 
@@ -56,17 +53,17 @@ class Inquirer:
 
     def __init__(
         self,
+        *,
         identity: Identity,
         policy: Policy,
         paths: Paths,
         attached: Attached,
-        places: Places,
-        parked: Parked,
+        resolver: NameResolver,
         planter: Planter,
         unicast: Unicast,
         relocations: Relocations,
         evidence: Evidence,
-        held: Held,
+        locations: Locations,
         outbox: Outbox,
         presence: PresenceAnswers,
         channels: Channels,
@@ -75,13 +72,12 @@ class Inquirer:
         self._policy = policy
         self._paths = paths
         self._attached = attached
-        self._places = places
-        self._parked = parked
+        self._resolver = resolver
         self._planter = planter
         self._unicast = unicast
         self._relocations = relocations
         self._evidence = evidence
-        self._held = held
+        self._locations = locations
         self._outbox = outbox
         self._presence = presence
         self._channels = channels
@@ -102,9 +98,8 @@ class Inquirer:
             self.rib, self._session, self._chosen_s, self._owed_s = rib, session, now_s, None
             if rib is not None:
                 self._channels.renew(rib)
-            self._places.serve_stale(rib is None, now_s)
             self._attached.relay_all(now_s)
-            self._places.ask_again(now_s)
+            self._resolver.rib_changed(now_s, has_rib=rib is not None)
         self.ask(now_s)
 
     def _nearest_rib(self, now_s: float) -> Name | None:
@@ -132,13 +127,10 @@ class Inquirer:
             self._leave_silent_rib(now_s)
         for attachment in self._attached.due(now_s):
             self.relay(attachment.claim.wire, now_s)
-        questions, given_up = self._places.due(now_s)
-        for name, watch_s in questions:
+        for name, watch_s in self._resolver.queries_to_send(now_s):
             is_heard = bool(self._planter.readers(name))
             query = Query(name, watch_s, self._policy.revoked.digest_about(name) if is_heard else None)
             self._to_rib(query.to_wire(self._identity.name, self._identity.key, self._identity.membership), now_s)
-        for name in given_up:
-            self._parked.refuse(name, DropReason.NO_ROUTE)
 
     def _leave_silent_rib(self, now_s: float) -> None:
         """Ask another RIB; where there is none, serve what is known."""
@@ -147,7 +139,7 @@ class Inquirer:
         self._avoided[self.rib] = self._review_s = now_s + _AVOID_S
         self._owed_s = None
         before = self.rib
-        self._places.serve_stale(True, now_s)
+        self._resolver.serve_stale(now_s, stale=True)
         if self._nearest_rib(now_s) != before:
             self.links_changed(now_s)
 
@@ -212,9 +204,9 @@ class Inquirer:
         statement.expect(StatementType.ANSWER)
         answer = Answer.from_fields(fields)
         if answer.is_nobody:
-            self._nobody(answer.name, now.mono_s)
+            self._receive_negative(answer.name, now.mono_s)
         elif not answer.claim:
-            self._gone(answer, now.mono_s)
+            self._locations.receive_removal(answer, now.mono_s)
         else:
             self._found(answer, statement.wire, now)
 
@@ -261,15 +253,19 @@ class Inquirer:
         self._avoided.pop(rib, None)
         if rib == self.rib:
             self._owed_s = None
-            self._places.serve_stale(False, now_s)
+            self._resolver.serve_stale(now_s, stale=False)
 
     def _found(self, answer: Answer, wire: bytes, now: Instant) -> None:
         try:
             place = self._evidence.from_answer(answer, now)
         except StatementError:
-            self._nobody(answer.name, now.mono_s)  # it is of no use here, and an answer all the same
+            self._receive_negative(answer.name, now.mono_s)  # it is of no use here, and an answer all the same
             raise
-        self.learn(place, wire, now.mono_s)
+        self._locations.receive(place, wire, now.mono_s)
+
+    def _receive_negative(self, name: Name, now_s: float) -> None:
+        """Store that no node advertises a name; a RIB that has just started does not know all advertisers yet."""
+        self._resolver.receive_negative(name, now_s, keep=now_s - self._chosen_s < _REFILL_S)
 
     def _take_context(self, statement: Statement, now: Instant) -> None:
         """Take from a node's former switch whom the node hears; a RIB's word counts more."""
@@ -279,96 +275,9 @@ class Inquirer:
             return
         statement.expect(StatementType.ANSWER)
         place = self._evidence.from_answer(Answer.from_fields(statement.fields), now)
-        known = self._places.get(place.name, place.advertiser)
+        known = self._locations.get(place.name, place.advertiser)
         if known is None or known.sequence < place.sequence:
-            self.learn(place, statement.wire, now.mono_s)
-
-    def learn(self, place: Place, statement: bytes, now_s: float) -> None:
-        """Take in where an advertiser is, and let everything that depends on it follow.
-
-        Args:
-            statement: what proved it.
-        """
-        is_ours = place.switch == self._identity.name
-        attachment = self._attached.get(place.name, place.advertiser)
-        was_here = self._relocations.was_here(place.name, place.advertiser, now_s)
-        if attachment is not None and attachment.claim.sequence < place.sequence and not is_ours:
-            self._attached.remove(place.name, place.advertiser)  # it has moved to another switch
-            self._relocations.departed(attachment.claim, now_s)
-            self._unicast.forget(place.name)
-            was_here = True
-        known = self._places.get(place.name, place.advertiser)
-        if known is not None and known.sequence > place.sequence:
-            place = replace(known, expires_s=max(known.expires_s, place.expires_s))  # the teller lags behind
-        has_left = is_ours and attachment is None
-        self._held.note_place(place)
-        before = self._places.put(place, now_s, is_ours=is_ours, has_left=has_left)
-        if before is None or (before.switch, before.domain) != (place.switch, place.domain):
-            self._unicast.forget(place.name)
-            self._unicast.forget(place.advertiser)
-            self._planter.publisher_moved(place, now_s)
-            if was_here and not is_ours:
-                self._relocations.moved(place, statement, now_s)
-        self._planter.publisher_found(place, now_s)
-        if before is None or before.claim != place.claim:
-            for at, right in self._planter.readers(place.name):
-                self.tell_reader(at, right, place, now_s)
-        for name in (place.name, place.advertiser):
-            self._unicast.release(name, now_s)
-
-    def answer_relocation(self, moved: Place, now_s: float) -> None:
-        """Tell the new switch of a node that it was understood, and whom the node hears on the name."""
-        identity = self._identity
-        verdict = Verdict(moved.name, moved.advertiser, None, moved.sequence)
-        statements = [verdict.to_wire(identity.name, identity.key, identity.membership)]
-        for place in self._places.of(moved.name, now_s):
-            if HEARS.get(moved.right) is place.right:
-                statements.append(self._as_answer(place, now_s))
-        for statement in statements:
-            frames = self._outbox.far(Kind.RIB_ANSWER, statement, moved.switch)
-            self._unicast.send(frames, moved.switch, identity.name, now_s)
-
-    def known_of(self, name: Name, now_s: float) -> list[bytes]:
-        """Return statements that prove where a node, or who advertises a name, is; at most ``KNOWN_MAX``."""
-        attachment = self._attached.at(name)
-        if attachment is not None:
-            return [relayed(attachment.claim.wire, self._identity, self._policy.transit)]
-        node = self._places.of_node(name, now_s)
-        places = self._places.of(name, now_s) + ([] if node is None else [node])
-        return [self._as_answer(place, now_s) for place in places[:KNOWN_MAX]]
-
-    def tell_reader(self, at: At, right: Right, place: Place, now_s: float) -> None:
-        """Hand the claim of whoever an attached node hears, by its right, on to it; it verifies that itself."""
-        if HEARS[right] is place.right:
-            self._outbox.say_at(*at, Kind.VERDICT, self._as_answer(place, now_s))
-
-    def _as_answer(self, place: Place, now_s: float) -> bytes:
-        lease_s = max(place.expires_s - now_s, 0.0)
-        answer = Answer(place.name, place.advertiser, place.claim, place.domain, tuple(sorted(place.transit)), lease_s)
-        return answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)
-
-    def _gone(self, answer: Answer, now_s: float) -> None:
-        known = self._places.get(answer.name, answer.advertiser)
-        if known is not None and known.sequence > answer.sequence:
-            raise StatementError(DropReason.STALE, "gone, of an earlier claim")
-        self._places.remove(answer.name, answer.advertiser, now_s)
-        self._planter.publisher_gone(answer.name, answer.advertiser)
-        self._unicast.forget(answer.name)
-        wire = answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)
-        for at, _ in self._planter.readers(answer.name):
-            self._outbox.say_at(*at, Kind.VERDICT, wire)
-
-    def _nobody(self, name: Name, now_s: float) -> None:
-        if self._places.of(name, now_s) and now_s - self._chosen_s < _REFILL_S:
-            self._places.answered(name, now_s)  # a RIB that has just begun does not know yet: keep what is known
-            return
-        self._places.nobody(name, now_s)
-        self._parked.refuse(name, DropReason.NO_ROUTE)
-
-    def expire(self, now_s: float) -> None:
-        """Let go of what no RIB has confirmed for a lease."""
-        for place in self._places.expire(now_s):
-            self._planter.publisher_gone(place.name, place.advertiser)
+            self._locations.receive(place, statement.wire, now.mono_s)
 
     def _take_verdict(self, statement: Statement) -> None:
         verdict = Verdict.from_fields(statement.fields)
@@ -384,6 +293,10 @@ class Inquirer:
         """Return the monotonic second of the next question, or of the moment to leave a silent RIB."""
         owed_s = None if self._owed_s is None else self._owed_s + SILENT_S
         times = [
-            self._attached.next_event(), self._places.next_due(), owed_s, self._review_s, self._channels.next_timeout(),
-        ]  # fmt: skip
+            self._attached.next_event(),
+            self._resolver.next_query(),
+            owed_s,
+            self._review_s,
+            self._channels.next_timeout(),
+        ]
         return None if self.rib is None else min((time for time in times if time is not None), default=None)

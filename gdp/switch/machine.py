@@ -12,7 +12,7 @@ The walk of a frame that was handed up::
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Final
 
 from gdp.control.boundary import ErrorBoundary
@@ -24,6 +24,7 @@ from gdp.control.neighbour import Neighbour, NeighbourState
 from gdp.control.query import Query
 from gdp.control.revocation_sync import RevocationSync
 from gdp.control.settings import NodeSettings
+from gdp.control.waiting import Wait, WaitReason, port_waits, stranger_waits
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
@@ -40,9 +41,9 @@ from gdp.switch.evidence import Evidence
 from gdp.switch.flooding import Flooding
 from gdp.switch.held import Held
 from gdp.switch.inquirer import Inquirer
+from gdp.switch.locations import Locations
+from gdp.switch.name_resolver import NameResolver
 from gdp.switch.outbox import Outbox
-from gdp.switch.parked import Parked
-from gdp.switch.places import Place, Places
 from gdp.switch.planter import Planter
 from gdp.switch.presence import PresenceAnswers
 from gdp.switch.relocation import Relocations
@@ -80,30 +81,32 @@ class Switch:
         )  # fmt: skip
         self._outbox = Outbox(self.greeter, self._splitter)
         self._flooding = Flooding(
-            identity, policy, self.greeter, self._send_link_state, settings.first_sequence, settings.life
-        )
+            identity=identity, policy=policy, greeter=self.greeter, send=self._send_link_state,
+            first_sequence=settings.first_sequence, life=settings.life,
+        )  # fmt: skip
         self._paths = self._flooding.paths
         self._verifier = ClaimVerifier(policy)
         self._incarnation = settings.incarnation
         self.attached = Attached()
-        self.places = Places(settings.lease_s)
-        self.parked = Parked()
+        self.resolver = NameResolver(identity.name, settings.lease_s)
         self.planter = Planter(
-            identity, policy, table, self._paths, self.attached, self._outbox, settings.first_sequence
-        )
+            identity=identity, policy=policy, table=table, paths=self._paths, attached=self.attached,
+            outbox=self._outbox, first_sequence=settings.first_sequence,
+        )  # fmt: skip
         self.unicast = Unicast(
-            identity.name, policy.own, policy.transit, table, self._paths, self.places, self.attached, self.parked,
-            self._outbox,
+            me=identity.name, own_domain=policy.own, transit=policy.transit, table=table, paths=self._paths,
+            resolver=self.resolver, attached=self.attached, outbox=self._outbox,
         )  # fmt: skip
         self._evidence = Evidence(policy, self._verifier)
-        self._held = Held(self.attached, self.places, self.planter)
+        self._held = Held(self.attached, self.resolver.cache, self.planter)
         self._sync = RevocationSync(
             identity, policy.revoked, self.greeter,
             lambda neighbour, wire: self._outbox.say(neighbour, Kind.REVOKED, wire), settings.first_sequence,
         )  # fmt: skip
         self._revoker = Revoker(
-            self._verifier, self.greeter, self.attached, self.planter, self.unicast, self.places, self._evidence,
-            self._held, self._sync, self._outbox,
+            verifier=self._verifier, greeter=self.greeter, attached=self.attached, planter=self.planter,
+            unicast=self.unicast, resolver=self.resolver, evidence=self._evidence, held=self._held, sync=self._sync,
+            outbox=self._outbox,
         )  # fmt: skip
         self.relocations = Relocations(identity, policy, self.planter, self.unicast, self._outbox)
         self._seen_version = -1
@@ -112,15 +115,20 @@ class Switch:
         self._followed_s = self._rivals_sought_s = float("-inf")
         self._presence = PresenceAnswers(identity, self.greeter, self.attached, self.unicast, self._outbox)
         self._channels = Channels(identity, policy, settings.random_bytes, accepts=False)
+        self._locations = Locations(
+            identity=identity, policy=policy, attached=self.attached, resolver=self.resolver, planter=self.planter,
+            unicast=self.unicast, relocations=self.relocations, held=self._held, outbox=self._outbox,
+        )  # fmt: skip
         self.inquirer = Inquirer(
-            identity, policy, self._paths, self.attached, self.places, self.parked, self.planter, self.unicast,
-            self.relocations, self._evidence, self._held, self._outbox, self._presence, self._channels,
+            identity=identity, policy=policy, paths=self._paths, attached=self.attached, resolver=self.resolver,
+            planter=self.planter, unicast=self.unicast, relocations=self.relocations, evidence=self._evidence,
+            locations=self._locations, outbox=self._outbox, presence=self._presence, channels=self._channels,
         )  # fmt: skip
         self._claims = Claims(
-            identity, self._verifier, self.attached, self.places, self.planter, self.unicast, self.inquirer,
-            self.relocations, self._held, self._outbox,
+            identity=identity, verifier=self._verifier, attached=self.attached, resolver=self.resolver,
+            planter=self.planter, unicast=self.unicast, inquirer=self.inquirer, locations=self._locations,
+            relocations=self.relocations, held=self._held, outbox=self._outbox,
         )  # fmt: skip
-        self._told_rib: Name | None = None  # the RIB that what the operator revoked goes to
         self.boundary = ErrorBoundary()
         self._join_paces = Paces(JOINS_PER_S, JOINS_BURST)
         self._claim_paces = Paces(CLAIMS_PER_S, CLAIMS_BURST)
@@ -152,10 +160,28 @@ class Switch:
         """Return how many link states are known."""
         return len(self._flooding.link_states)
 
+    def waits(self, attachments: Collection[int], now_s: float) -> list[Wait]:
+        """Return what this switch waits for before it can serve; empty when nothing is missing.
+
+        Args:
+            attachments: ports made for nodes of the same host, which may start at any time: an empty one is no reason.
+        """
+        waits = list(stranger_waits(self.greeter, now_s))
+        refusing = {wait.port for wait in waits}
+        for port in self.greeter.ports.values():
+            if port.index not in attachments:
+                found = port_waits(port, tuple(Role))
+                waits += (each for each in found if port.index not in refusing or each.reason is WaitReason.LINK_DOWN)
+        if severed := self.severed:
+            waits.append(Wait(WaitReason.THROUGH_LEAF, name=min(severed)))
+        if self.rib is None:
+            waits.append(Wait(WaitReason.NO_RIB))
+        return waits
+
     def drops(self) -> Mapping[DropReason, int]:
         """Return what the control plane dropped, by reason."""
         own = self._drops + self._joiner.drops + self.greeter.drops + self._channels.drops
-        return own + self._flooding.drops + self.parked.drops + self.planter.drops + self.unicast.drops
+        return own + self._flooding.drops + self.resolver.drops + self.planter.drops + self.unicast.drops
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Instant) -> None:
         """Begin to use a port, or learn that the MTU or cost of one that is up has changed."""
@@ -224,14 +250,13 @@ class Switch:
         if now_s >= self._rivals_sought_s + _RIVALS_S:
             self._look_for_rivals(now_s)
         self._joiner.expire(now_s)
-        self.parked.expire(now_s)
-        self.inquirer.expire(now_s)
+        self._locations.expire(now_s)
         for key in self.table.expire(now_s):
             self.unicast.expired(key)
         for attachment in self.attached.expire(now_s):
             self.unicast.forget(attachment.claim.name)
         for topic in self.planter.timeout(now_s):
-            self.places.unwatch(topic)
+            self.resolver.unwatch(topic)
         self.relocations.timeout(now_s)
         self.inquirer.ask(now_s)
         self._sync.timeout(now_s)
@@ -251,16 +276,15 @@ class Switch:
             self._spf_delay.due_s,
             self._protect_at_s,
             self._flooding.next_timeout(),
-            self.parked.next_expiry(),
             self.table.next_expiry(),
             self.planter.next_timeout(),
-            self.places.next_expiry(),
+            self.resolver.next_expiry(),
             self.relocations.next_timeout(),
             self.inquirer.next_timeout(),
             self._sync.next_timeout(),
         ]
         if self.inquirer.rib is not None:
-            times.append(self._revoker.handed_in.next_due())
+            times.append(self._revoker.next_due_for_rib())
         if self.unicast.is_refreshing:
             times.append(self._followed_s)  # past: at once
         if self._paths.refused_elsewhere():
@@ -279,7 +303,7 @@ class Switch:
 
     def _unwatch(self, orphaned: Iterable[Name]) -> None:
         for topic in orphaned:
-            self.places.unwatch(topic)
+            self.resolver.unwatch(topic)
 
     def _take_revoked(self, neighbour: Neighbour, statement: Statement, now: Instant) -> None:
         """Take part in the comparison of revocations with a neighbour."""
@@ -290,13 +314,9 @@ class Switch:
 
     def _tell_rib_of_revocations(self, now_s: float) -> None:
         """Pass on to the RIB what the operator handed in."""
-        if self.inquirer.rib is None:
-            return
-        if self.inquirer.rib != self._told_rib:
-            self._told_rib = self.inquirer.rib
-            self._revoker.handed_in.say_again(now_s)
-        for wire in self._revoker.due_for_rib(now_s):
-            self.inquirer.relay(wire, now_s)
+        if self.inquirer.rib is not None:
+            for wire in self._revoker.due_for_rib(self.inquirer.rib, now_s):
+                self.inquirer.relay(wire, now_s)
 
     def _digest_for(self, port: LinkPort) -> bytes:
         return self._flooding.digest_for(port)
@@ -341,7 +361,7 @@ class Switch:
         else:
             frame = arrival.frame[: HEADER_BYTES + header.length]
             sought = self.unicast.miss(header, frame, neighbour, now.mono_s)
-            if sought is not None and self.places.serves_stale:
+            if sought is not None and self.resolver.cache.serves_stale:
                 self.relocations.ask_neighbour(sought, neighbour, now.mono_s)
             self.relocations.frame_came(Name(header.destination), neighbour, now.mono_s)
 
@@ -498,10 +518,10 @@ class Switch:
         """Take from the new switch of a node that was attached here where it is, and tell whom it hears."""
         place = self._evidence.from_relay(statement, now)
         if place.right in HEARS and self.planter.reader_moved(place):
-            self.places.unwatch(place.name)
-        self.inquirer.answer_relocation(place, now.mono_s)
-        if place.right is not Right.READ and self._is_news(place):
-            self.inquirer.learn(place, statement.wire, now.mono_s)
+            self.resolver.unwatch(place.name)
+        self._locations.acknowledge_relocation(place, now.mono_s)
+        if place.right is not Right.READ and self._locations.is_newer(place):
+            self._locations.receive(place, statement.wire, now.mono_s)
 
     def _redirected(self, statement: Statement, now: Instant) -> None:
         """Take from a neighbour, to whom our frames for a node went, where that node is now."""
@@ -509,10 +529,10 @@ class Switch:
             place = self._evidence.from_relay(statement, now)
         else:
             place = self.inquirer.verify_answer(statement, now)
-        if self._is_news(place):
-            is_known = self.places.get(place.name, place.advertiser) is not None
+        if self._locations.is_newer(place):
+            is_known = self._locations.get(place.name, place.advertiser) is not None
             has_moved = is_known or self.planter.trees.get(place.name, place.advertiser) is not None
-            self.inquirer.learn(place, statement.wire, now.mono_s)
+            self._locations.receive(place, statement.wire, now.mono_s)
             if has_moved:
                 self.relocations.moved(place, statement.wire, now.mono_s)
 
@@ -522,15 +542,8 @@ class Switch:
         if not neighbour.role.is_switch or statement.signer != neighbour.name:
             raise StatementError(DropReason.UNKNOWN_SENDER, "a question that a neighbouring switch did not ask")
         statement.verify(neighbour.key)
-        for known in self.inquirer.known_of(query.name, now.mono_s):
+        for known in self._locations.proofs_of(query.name, now.mono_s):
             self._outbox.say(neighbour, Kind.REDIRECT, known)
-
-    def _is_news(self, place: Place) -> bool:
-        """Return whether a place is newer than what is known of the advertiser, here or elsewhere."""
-        attachment = self.attached.get(place.name, place.advertiser)
-        known = self.places.get(place.name, place.advertiser)
-        newest = max(-1 if attachment is None else attachment.claim.sequence, -1 if known is None else known.sequence)
-        return place.sequence > newest
 
     # -- trees
 

@@ -68,6 +68,7 @@ class Planter:
 
     def __init__(
         self,
+        *,
         identity: Identity,
         policy: Policy,
         table: Table,
@@ -139,7 +140,7 @@ class Planter:
             if place.sequence >= tree.version:
                 self._place_at(tree, place.switch, place.domain, place.sequence, place.claim)
                 tree.allowed = allowed
-            branch = Branch(reader.expires_s, self._outbox.mtu_of(at[0]), reader.claim.wire)
+            branch = Branch(expires_s=reader.expires_s, mtu=self._outbox.mtu_of(at[0]), evidence=reader.claim.wire)
             if not self._put_branch(tree, at, branch):
                 self.drops[DropReason.QUOTA] += 1
                 continue
@@ -217,9 +218,13 @@ class Planter:
             self._place_at(tree, join.switch, join.domain, join.version, join.proof)
             tree.allowed = join.allowed
         branch = Branch(
-            now_s + min(join.lease_s, JOIN_LEASE_S), join.mtu, join.evidence, join.mtu, join.sequence,
-            join.sender_session,
-        )  # fmt: skip
+            expires_s=now_s + min(join.lease_s, JOIN_LEASE_S),
+            mtu=join.mtu,
+            evidence=join.evidence,
+            said_mtu=join.mtu,
+            sequence=join.sequence,
+            session=join.sender_session,
+        )
         branch.fit(self._outbox.mtu_of(neighbour.port))
         if join.backup_for != ZERO:
             branch.backup_for = join.backup_for
@@ -325,7 +330,13 @@ class Planter:
     def _tree(self, topic: Name, publisher: Name, allowed: frozenset[Name]) -> Tree:
         tree = self.trees.get(topic, publisher)
         if tree is None:
-            tree = Tree(topic, publisher, self._identity.name, self._policy.own, allowed)
+            tree = Tree(
+                topic=topic,
+                publisher=publisher,
+                switch=self._identity.name,
+                domain=self._policy.own,
+                allowed=allowed,
+            )
             self.trees.put(tree)
         return tree
 

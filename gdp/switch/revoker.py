@@ -13,6 +13,7 @@ reader within ``GRACE_S``, the branches that rested on it. A revoked neighbour i
 
 from __future__ import annotations
 
+import heapq
 from typing import Final
 
 from gdp.control.greeter import Greeter
@@ -25,10 +26,9 @@ from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.switch.attached import Attached
 from gdp.switch.evidence import Evidence
-from gdp.switch.handed_in import HandedIn
 from gdp.switch.held import AttachedClaim, Held, JoinedBranch, KnownPlace
+from gdp.switch.name_resolver import NameResolver
 from gdp.switch.outbox import Outbox
-from gdp.switch.places import Places
 from gdp.switch.planter import Planter
 from gdp.switch.unicast import Unicast
 from gdp.trust.audit import Action
@@ -40,23 +40,24 @@ from gdp.trust.verifier import ClaimVerifier
 __all__ = ["Revoker"]
 
 GRACE_S: Final = 0.5
+_FIRST_S: Final = (0.3, 1.0, 3.0)  # from the first time that the RIB is sent a revocation to the next ones
+_AGAIN_S: Final = 60.0
+_TICK_S: Final = 0.1
+_PER_TICK: Final = 4
 
 
 class Revoker:
-    """Takes, applies and spreads revocations at one switch.
-
-    Attributes:
-        handed_in: those of owners that the operator handed in, for the RIB.
-    """
+    """Takes, applies and spreads revocations at one switch."""
 
     def __init__(
         self,
+        *,
         verifier: ClaimVerifier,
         greeter: Greeter,
         attached: Attached,
         planter: Planter,
         unicast: Unicast,
-        places: Places,
+        resolver: NameResolver,
         evidence: Evidence,
         held: Held,
         sync: RevocationSync,
@@ -68,12 +69,13 @@ class Revoker:
         self._attached = attached
         self._planter = planter
         self._unicast = unicast
-        self._places = places
+        self._resolver = resolver
         self._evidence = evidence
         self._held = held
         self._sync = sync
         self._outbox = outbox
-        self.handed_in = HandedIn()
+        self._handed_in = _HandedIn()
+        self._sent_to: Name | None = None  # the RIB that revocations of the operator went to
 
     def take(self, statement: Statement, neighbour: Neighbour, now: Instant) -> list[Name]:
         """Take a revocation from a neighbour; return the topics that lost all readers here.
@@ -114,19 +116,26 @@ class Revoker:
         revocation = self._revoked.take(statement, OPERATOR, now, self._held.has_issuer)
         issued = revocation or Revocation.read(statement)
         if not self._revoked.is_root(issued.issuer.owner_key):
-            self.handed_in.add(statement.fingerprint, statement.wire, now.mono_s)
+            self._handed_in.add(statement.fingerprint, statement.wire, now.mono_s)
         return [] if revocation is None else self._spread(revocation, statement, None, now)
 
-    def due_for_rib(self, now_s: float) -> list[bytes]:
-        """Return what the RIB is to be told now of what the operator handed in; what has run out is forgotten."""
+    def due_for_rib(self, rib: Name, now_s: float) -> list[bytes]:
+        """Return the revocations of the operator that are due at this RIB; those that have run out are removed."""
+        if rib != self._sent_to:
+            self._sent_to = rib
+            self._handed_in.say_again(now_s)
         wires = []
-        for fingerprint, wire in self.handed_in.due(now_s):
+        for fingerprint, wire in self._handed_in.due(now_s):
             revocation = Revocation.read(parse(wire))
             if self._revoked.has(revocation.fingerprint, revocation.issuer.owner_key):
                 wires.append(wire)
             else:
-                self.handed_in.remove(fingerprint)
+                self._handed_in.remove(fingerprint)
         return wires
+
+    def next_due_for_rib(self) -> float | None:
+        """Return the monotonic second at which the next revocation is due at the RIB, or None."""
+        return self._handed_in.next_due()
 
     def _spread(
         self, revocation: Revocation, statement: Statement, giver: Neighbour | None, now: Instant
@@ -165,9 +174,9 @@ class Revoker:
         return [holder.name] if is_last else []
 
     def _close_place(self, holder: KnownPlace, now: Instant) -> None:
-        place = self._places.get(holder.name, holder.advertiser)
+        place = self._resolver.cache.get(holder.name, holder.advertiser)
         if place is not None and not self._evidence.still_holds(place, now):
-            self._places.remove(place.name, place.advertiser, now.mono_s)
+            self._resolver.receive_removal(place.name, place.advertiser, now.mono_s)
             self._planter.publisher_gone(place.name, place.advertiser)
             self._unicast.forget(place.name)
 
@@ -188,3 +197,50 @@ class Revoker:
         except StatementError:
             return False
         return True
+
+
+class _HandedIn:
+    """Revocations of owners that the operator handed in, by fingerprint, and when each is due at the RIB.
+
+    A RIB keeps one only while a name that it concerns is stored or watched there, and acknowledges none. So each is
+    sent four times at first, then once every ``_AGAIN_S``: a user of the name who comes later receives it.
+    """
+
+    def __init__(self) -> None:
+        self._wires: dict[bytes, bytes] = {}
+        self._due: list[tuple[float, int, bytes]] = []  # when, how often it was said, fingerprint
+        self._tick_at_s = float("-inf")
+
+    def add(self, fingerprint: bytes, wire: bytes, now_s: float) -> None:
+        """Send a statement from now on."""
+        if fingerprint not in self._wires:
+            heapq.heappush(self._due, (now_s, 0, fingerprint))
+        self._wires[fingerprint] = wire
+
+    def remove(self, fingerprint: bytes) -> None:
+        """Stop sending a statement: it has run out."""
+        self._wires.pop(fingerprint, None)
+
+    def say_again(self, now_s: float) -> None:
+        """Send every statement again: there is another RIB."""
+        self._due = [(now_s, 0, fingerprint) for fingerprint in self._wires]
+
+    def due(self, now_s: float) -> list[tuple[bytes, bytes]]:
+        """Return the few statements to send now, each with its fingerprint."""
+        if now_s < self._tick_at_s:
+            return []
+        said: list[tuple[bytes, bytes]] = []
+        while self._due and self._due[0][0] <= now_s and len(said) < _PER_TICK:
+            _, times, fingerprint = heapq.heappop(self._due)
+            wire = self._wires.get(fingerprint)
+            if wire is not None:
+                said.append((fingerprint, wire))
+                pause_s = _FIRST_S[times] if times < len(_FIRST_S) else _AGAIN_S
+                heapq.heappush(self._due, (now_s + pause_s, times + 1, fingerprint))
+        if said:
+            self._tick_at_s = now_s + _TICK_S
+        return said
+
+    def next_due(self) -> float | None:
+        """Return the monotonic second of the next statement, or None."""
+        return max(self._due[0][0], self._tick_at_s) if self._due else None

@@ -24,7 +24,7 @@ _Key = tuple[Name, Name]  # topic and publisher
 _HEAP_SLACK: Final = 1_024
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Branch:
     """One neighbour below that wants a copy."""
 
@@ -47,7 +47,7 @@ class Branch:
         self.mtu = min(self.said_mtu, link_mtu)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Tree:
     """One topic from one publisher, as it passes this switch."""
 

@@ -16,16 +16,13 @@ from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
 from gdp.errors import DropReason
 from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_AT, SOURCE_AT, Header
-from gdp.limits import QUESTIONS_BURST, QUESTIONS_PER_S, SWITCH_QUESTIONS_BURST, SWITCH_QUESTIONS_PER_S
-from gdp.message.token_bucket import Paces
 from gdp.names import Name
 from gdp.switch.attached import Attached
+from gdp.switch.name_resolver import NameResolver
 from gdp.switch.outbox import Outbox
-from gdp.switch.parked import Parked
 from gdp.switch.paths import Paths, Way
-from gdp.switch.places import Place, Places
+from gdp.switch.places import Place
 from gdp.switch.table import NOWHERE, Hop, ProtectedHop, Table
-from gdp.trust.right import Right
 
 __all__ = ["Unicast"]
 
@@ -33,9 +30,6 @@ NODE_LEASE_S: Final = 30.0  # an entry for a switch or a RIB, which the link sta
 STALE_S: Final = 5.0  # an entry for a place whose lease has ended, while no RIB answers
 NEGATIVE_S: Final = 0.5
 _REFRESH_AT_ONCE: Final = 4_096  # ways; about 50 ms
-_FROM_NODE: Final = b"n"  # begins an owner
-_FROM_SWITCH: Final = b"s"
-_TAKES_FRAMES: Final = (Right.ATTACH, Right.SERVE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,14 +51,14 @@ class Unicast:
 
     def __init__(
         self,
+        *,
         me: Name,
         own_domain: Name,
         transit: frozenset[Name],
         table: Table,
         paths: Paths,
-        places: Places,
+        resolver: NameResolver,
         attached: Attached,
-        parked: Parked,
         outbox: Outbox,
     ) -> None:
         self._me = me
@@ -72,24 +66,18 @@ class Unicast:
         self._transit = transit
         self._table = table
         self._paths = paths
-        self._places = places
+        self._resolver = resolver
         self._attached = attached
-        self._parked = parked
         self._outbox = outbox
         self._installed: dict[bytes, _Installed] = {}
         self._stale = deque[bytes]()  # keys of ways to be computed anew
         self._keys_of: dict[Name, set[bytes]] = {}  # of what is installed, by destination
-        self._paces = {
-            _FROM_NODE: Paces(QUESTIONS_PER_S, QUESTIONS_BURST),
-            _FROM_SWITCH: Paces(SWITCH_QUESTIONS_PER_S, SWITCH_QUESTIONS_BURST),
-        }
         self.drops: Counter[DropReason] = Counter()
 
     def miss(self, header: Header, frame: bytes, neighbour: Neighbour, now_s: float) -> Name | None:
         """Take a neighbour's frame that has no entry in the table; return the name whose place it waits for, if any."""
         destination, source = Name(header.destination), Name(header.source)
-        kind = _FROM_SWITCH if neighbour.role.is_switch else _FROM_NODE
-        return self._find(destination, source, frame, kind + neighbour.name, now_s)
+        return self._find(destination, source, frame, self._resolver.owner_of(neighbour), now_s)
 
     def send(self, frames: list[bytes], destination: Name, source: Name, now_s: float) -> None:
         """Send frames of our own to a name, by the way that others' frames go."""
@@ -102,7 +90,7 @@ class Unicast:
 
     def release(self, name: Name, now_s: float) -> None:
         """Look again at what waited for a name."""
-        for frame, until_s, owner in self._parked.release(name):
+        for frame, until_s, owner in self._resolver.release_frames(name):
             source = Name(frame[SOURCE_AT:HEADER_BYTES])
             self._find(Name(frame[DESTINATION_AT:SOURCE_AT]), source, frame, owner, now_s, until_s)
 
@@ -164,10 +152,8 @@ class Unicast:
         waits_for = self._resolve(destination, source, owner, now_s)
         if waits_for is None:
             self._forward(destination, source, frame)
-        elif self._places.is_asked(waits_for):
-            self._parked.park(waits_for, frame, now_s, until_s, owner=owner)
         else:
-            self.drops[DropReason.PARKED_FULL] += 1  # too many questions are open, or its neighbour asks too much
+            self._resolver.buffer_frame(waits_for, frame, now_s, owner, until_s)
         return waits_for
 
     def _forward(self, destination: Name, source: Name, frame: bytes) -> None:
@@ -216,36 +202,29 @@ class Unicast:
         return self._resolve_by_rib(destination, source, owner, now_s)
 
     def _resolve_by_rib(self, destination: Name, source: Name, owner: bytes, now_s: float) -> Name | None:
-        places = self._places.of(destination, now_s)
-        takers = [place for place in places if place.right in _TAKES_FRAMES]
-        if not places and (node := self._places.of_node(destination, now_s)) is not None:
-            takers = [node]
-        if takers:
-            takers = [place for place in takers if place.switch != self._me]
-            if not takers:  # it has left, and nobody has said where to
-                self._ask(destination, owner, now_s)
-                return destination
-        else:
-            if not places and not self._places.is_nowhere(destination, now_s):
-                self._ask(destination, owner, now_s)
-                return destination
-            self._install_nowhere(destination, source, DropReason.NO_READER if places else DropReason.NO_ROUTE, now_s)
+        found = self._resolver.resolve(destination, now_s, owner)
+        if found is None:
+            return destination
+        if found.reason is not None:
+            self._install_nowhere(destination, source, found.reason, now_s)
             return None
-        self._places.use(destination, now_s)
-        if all(place.domain == self._own_domain for place in takers) and self._is_of_own_domain(source, now_s):
-            best = self._nearest(takers, frozenset({self._own_domain}))
+        places = found.locations
+        if all(place.domain == self._own_domain for place in places) and self._is_of_own_domain(source, now_s):
+            best = self._nearest(places, frozenset({self._own_domain}))
             if best is not None:
                 self._install_place(destination, b"", best, source, now_s)
                 return None
-        transit = self._source_transit(source, now_s)
-        if transit is None:
-            if self._places.is_nowhere(source, now_s):
-                self._install_nowhere(destination, source, DropReason.NO_ROUTE, now_s)
+        transit = self._transit
+        if self._attached.at(source) is None and not self._paths.is_switch(source) and not self._paths.is_rib(source):
+            origin = self._resolver.resolve_source(source, now_s, owner)
+            if origin is None:
+                return source
+            if origin.reason is not None:
+                self._install_nowhere(destination, source, origin.reason, now_s)
                 return None
-            self._ask(source, owner, now_s)
-            return source
-        best = self._nearest(takers, transit & self._transit)
-        reasons = [self._why(place.switch, place.domain) for place in takers] if best is None else []
+            transit = origin.locations[0].transit | {origin.locations[0].domain}
+        best = self._nearest(places, transit & self._transit)
+        reasons = [self._why(place.switch, place.domain) for place in places] if best is None else []
         self._install_place(destination, source, best, source, now_s, max(reasons, default=DropReason.NO_ROUTE))
         return None
 
@@ -253,26 +232,11 @@ class Unicast:
         """Return the reason to give where there is no way to a switch."""
         return DropReason.THROUGH_LEAF if self._paths.leads_through_leaf(switch, domain) else DropReason.NO_ROUTE
 
-    def _ask(self, name: Name, owner: bytes, now_s: float) -> None:
-        """Have a name asked for, within the pace of the neighbour at whose expense that is."""
-        pace = self._paces.get(owner[:1])
-        if pace is None or self._places.is_asked(name) or pace.take(owner, now_s):
-            self._places.ask_now(name, now_s, owner)
-
     def _is_of_own_domain(self, source: Name, now_s: float) -> bool:
         if self._attached.at(source) is not None or self._paths.domain_of(source) == self._own_domain:
             return True
-        places = self._places.of(source, now_s)
+        places = self._resolver.cache.of(source, now_s)
         return bool(places) and all(place.domain == self._own_domain for place in places)
-
-    def _source_transit(self, source: Name, now_s: float) -> frozenset[Name] | None:
-        """Return the domains that the source's domain lets its traffic pass; None: to be asked for."""
-        if self._attached.at(source) is not None or self._paths.is_switch(source) or self._paths.is_rib(source):
-            return self._transit
-        places = self._places.of(source, now_s)
-        if places:
-            self._places.use(source, now_s)
-        return places[0].transit | {places[0].domain} if places else None
 
     def _nearest(self, takers: list[Place], allowed: frozenset[Name]) -> tuple[Place, Way] | None:
         ways = [

@@ -62,10 +62,10 @@ SPEAKERS: Final = {
 _STRANGERS: Final = ("stranger", "stranger, recorded")
 _PER_S: Final = 20.0  # what a grant pays, here
 _GRANTS: Final[tuple[tuple[str, float], ...]] = (
-    ("gdp.switch.unicast.QUESTIONS_PER_S", _PER_S),
-    ("gdp.switch.unicast.QUESTIONS_BURST", _PER_S),
-    ("gdp.switch.unicast.SWITCH_QUESTIONS_PER_S", _PER_S),
-    ("gdp.switch.unicast.SWITCH_QUESTIONS_BURST", _PER_S),
+    ("gdp.switch.name_resolver.QUESTIONS_PER_S", _PER_S),
+    ("gdp.switch.name_resolver.QUESTIONS_BURST", _PER_S),
+    ("gdp.switch.name_resolver.SWITCH_QUESTIONS_PER_S", _PER_S),
+    ("gdp.switch.name_resolver.SWITCH_QUESTIONS_BURST", _PER_S),
     ("gdp.switch.machine.JOINS_PER_S", _PER_S),
     ("gdp.switch.machine.JOINS_BURST", _PER_S),
     ("gdp.switch.machine.CLAIMS_PER_S", _PER_S),

@@ -502,7 +502,7 @@ class Domain:
             },
             "places": {
                 (each.name, each.advertiser, each.switch)
-                for switch in switches.values() for each in switch.places.all()
+                for switch in switches.values() for each in switch.resolver.cache.all()
             },
             "routes": {
                 (*key, route.switch)

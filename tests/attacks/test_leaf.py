@@ -18,7 +18,6 @@ from gdp.names import Name
 from gdp.simulation.memory import Cable
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.simulation.world import World
-from gdp.switch.waiting import switch_waits
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
 from tests.journeys.flows import Flow, Tap, flowing
@@ -141,7 +140,7 @@ def test_l03_where_the_only_way_leads_through_a_leaf_frames_stop_and_it_is_said(
     assert first_to(world, "left", "right") is None
     assert not arrives(flow, LISTENER)
     assert tap.count(Kind.DATA) == 0
-    waits = {label: {wait.reason for wait in switch_waits(world.switches[label], (), world.network.now.mono_s)}
+    waits = {label: {wait.reason for wait in world.switches[label].waits((), world.network.now.mono_s)}
              for label in world.switches}  # fmt: skip
     assert {label for label, reasons in waits.items() if WaitReason.THROUGH_LEAF in reasons} == {
         "left", "middle", "right",
@@ -186,7 +185,7 @@ def test_l05_a_leaf_is_no_border_and_no_neighbour_of_another_domain() -> None:
     right, leaf = world.switches["right"], world.identities["leaf"]
     assert right.greeter.neighbour(1, leaf.name) is None
     assert right.drops()[DropReason.THROUGH_LEAF] > 0
-    waits = switch_waits(right, (), world.network.now.mono_s)
+    waits = right.waits((), world.network.now.mono_s)
     assert [wait.refused for wait in waits if wait.reason is WaitReason.STRANGER] == [DropReason.THROUGH_LEAF]
     border = replace(
         state_of(world, "leaf"), scope=Scope.BORDER, members=(world.switches["left"].name,),

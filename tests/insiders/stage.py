@@ -157,7 +157,9 @@ class Stage:
         names, watches = self.rib_limits
         for host in world.ribs.values():
             settings = host.rib._settings
-            host.rib._settings = RibSettings(settings.upper, settings.peers, names_per_sender=names, watches=watches)
+            host.rib._settings = RibSettings(
+                upper=settings.upper, peers=settings.peers, names_per_sender=names, watches=watches
+            )
             host.rib._watches._maximum = host.rib._holders._maximum = watches
         world.settle(8.0)
         source, sink = GOOD

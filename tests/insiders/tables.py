@@ -10,13 +10,13 @@ from gdp.client.private_streams import STREAMS_MAX
 from gdp.client.readers import READERS_MAX
 from gdp.limits import JOIN_MESSAGES_MAX, PARKED_FRAMES_MAX, REPLAY_WINDOW_MESSAGES
 from gdp.rib.replication import QUEUE_MAX
-from gdp.switch.places import QUESTIONS_MAX, USES_MAX
+from gdp.switch.name_queries import QUERIES_MAX, USED_NAMES_MAX
 
 __all__ = ["GENERAL_MAX", "LIMITS", "sizes"]
 
 GENERAL_MAX: Final = 4_096  # what remembers peers, sessions or old statements keeps no more than this
 LIMITS: Final[Mapping[str, int]] = {
-    "Places._questions": QUESTIONS_MAX + USES_MAX,
+    "NameQueries._queries": QUERIES_MAX + USED_NAMES_MAX,
     "Parked._by_name": PARKED_FRAMES_MAX,
     "Readers._by_name": READERS_MAX,
     "PrivateStreams._streams": STREAMS_MAX,

@@ -144,7 +144,7 @@ class Books:
         self.network.run(3)
         self.flow.collect()
         world = self.world
-        parked = sum(len(switch.parked) for switch in world.switches.values())
+        parked = sum(switch.resolver.pending_frames for switch in world.switches.values())
         ends = {"delivered": len(self.flow.got[B]), "parked": parked, **self.ledger.taken}
         assert self.ledger.taken["flying"] == parked == 0
         assert self._attempts == sum(ends.values()) + sum(self.reasons().values()), (ends, self.reasons())

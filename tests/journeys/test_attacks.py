@@ -23,7 +23,7 @@ from gdp.limits import CONTROL_JOIN_BYTES, CONTROL_PATIENCE_S, HOPS_MAX
 from gdp.names import ZERO, Name
 from gdp.simulation.world import World
 from gdp.switch.machine import Switch
-from gdp.switch.places import QUESTIONS_MAX
+from gdp.switch.name_queries import QUERIES_MAX
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 
 Injector = Callable[[bytes], None]
@@ -158,7 +158,7 @@ def test_for_strangers_nothing_is_looked_for() -> None:
     ]
     found = attack(flow, frames, ("nuc1",))
     assert found == {DropReason.UNKNOWN_SENDER: 1_000}
-    assert len(flow.world.switches["nuc1"].parked) == 0
+    assert flow.world.switches["nuc1"].resolver.pending_frames == 0
     flow.outlive()
 
 
@@ -168,14 +168,14 @@ def test_a_neighbour_that_looks_for_everything_is_bounded() -> None:
     nuc1 = world.switches["nuc1"]
     port = next(i for i, p in nuc1.greeter.ports.items() if world.members[ROBOT].name in p.neighbours)
     mac = mac_of(world, "nuc1", port)
-    for number in range(2 * QUESTIONS_MAX):
+    for number in range(2 * QUERIES_MAX):
         header = Header(Kind.DATA, Flag.LAST, HOPS_MAX, 1, 0, 1, 0, 1, 9, number.to_bytes(32, "big"), b"e" * 32)
         world.network._nodes["nuc1"].machine.receive([Arrival(port, mac, encode(header))], world.network.now)
-    assert len(nuc1.places._questions) <= QUESTIONS_MAX + 8
+    assert nuc1.resolver.open_queries <= QUERIES_MAX + 8
     assert nuc1.drops()[DropReason.PARKED_FULL] > 0
     world.network.touch("nuc1")
     world.network.run(6)
-    assert len(nuc1.parked) == 0
+    assert nuc1.resolver.pending_frames == 0
     still_flows(flow)
     flow.outlive()
 

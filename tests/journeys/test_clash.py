@@ -14,7 +14,6 @@ from gdp.simulation.memory import Cable
 from gdp.simulation.world import World
 from gdp.switch.machine import Switch
 from gdp.switch.table import Table
-from gdp.switch.waiting import switch_waits
 from gdp.trust.right import Right
 from tests.journeys.flows import ROBOT, SERVER, advertise, flowing, ring
 
@@ -154,7 +153,7 @@ def test_the_older_of_two_switches_keeps_its_place_and_both_are_told(at: str) ->
     older = world.switches["nuc2"]
     twin = add_twin_switch(world, "nuc2", at)
     assert world.network.run(
-        5, lambda: twin.is_displaced or WaitReason.IN_USE in {w.reason for w in switch_waits(twin, (), 0.0)}
+        5, lambda: twin.is_displaced or WaitReason.IN_USE in {w.reason for w in twin.waits((), 0.0)}
     )
     assert world.network.run(5, lambda: older.greeter.clashes > 0)
     there.outlive()

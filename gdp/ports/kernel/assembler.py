@@ -73,15 +73,19 @@ class Assembler:
         self._labels[name] = len(self._steps)
 
     def move(self, to: Reg, value: Reg | int) -> None:
+        """Set ``to`` to a value."""
         self._compute(_MOVE, to, value)
 
     def add(self, to: Reg, value: Reg | int) -> None:
+        """Add a value to ``to``, modulo 2**64."""
         self._compute(_ADD, to, value)
 
     def subtract(self, to: Reg, value: Reg | int) -> None:
+        """Subtract a value from ``to``, modulo 2**64."""
         self._compute(_SUBTRACT, to, value)
 
     def shift_left(self, to: Reg, bits: int) -> None:
+        """Shift ``to`` left by ``bits``."""
         self._compute(_SHIFT_LEFT, to, bits)
 
     def from_big_endian(self, to: Reg, bits: int) -> None:
@@ -104,6 +108,7 @@ class Assembler:
         self._steps += [_Step(_WIDE, to, _MAP, value=descriptor), _Step(0)]
 
     def jump(self, label: str) -> None:
+        """Jump to a label further on."""
         self._steps.append(_Step(_JUMP, label=label))
 
     def jump_if(self, left: Reg, condition: str, right: Reg | int, label: str) -> None:

@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from gdp.errors import LocalError
 from gdp.ports.kernel.loaded import PROGRAM
-from gdp.ports.kernel.netlink import CLSACT_EGRESS, CLSACT_INGRESS, Questions
 from gdp.ports.kernel.syscall import BpfError, attached, create_link, name_of
+from gdp.ports.netlink import CLSACT_EGRESS, CLSACT_INGRESS, Questions
 
 if TYPE_CHECKING:
     from pyroute2 import IPRoute
@@ -72,6 +72,7 @@ class LinkAttachment:
         self._link = create_link(program, ifindex, _TCX_INGRESS)
 
     def close(self) -> None:
+        """Close the link, which detaches the program."""
         os.close(self._link)
 
 
@@ -107,6 +108,7 @@ class FilterAttachment:
             ask.tc("add-filter", "bpf", ifindex, **place)
 
     def close(self) -> None:
+        """Remove our filter, and the qdisc if we made it; the device may be gone."""
         try:
             with _asking(self._ifindex) as ask:
                 for each in _filters(ask, self._ifindex, CLSACT_INGRESS):

@@ -14,8 +14,8 @@ import struct
 from collections.abc import Iterable
 from typing import Final
 
-from gdp.ports.kernel.netlink import CLSACT_EGRESS, ROOT, LinkAttribute, Questions, listen, nested
 from gdp.ports.kernel.syscall import BpfError, attached
+from gdp.ports.netlink import CLSACT_EGRESS, ROOT, TRAFFIC_GROUP, LinkAttribute, Questions, listen, nested
 
 __all__ = ["QueueWatch", "Refusals", "has_free_peer"]
 
@@ -71,9 +71,10 @@ class QueueWatch:
     """Becomes readable when queues or filters of this namespace's devices change."""
 
     def __init__(self) -> None:
-        self._socket = listen()
+        self._socket = listen(TRAFFIC_GROUP)
 
     def fileno(self) -> int:
+        """Return the descriptor to wait on; it is readable when there is news."""
         return self._socket.fileno()
 
     def drain(self) -> None:
@@ -87,6 +88,7 @@ class QueueWatch:
                 continue
 
     def close(self) -> None:
+        """Close the socket."""
         self._socket.close()
 
 

@@ -87,6 +87,7 @@ class Loaded:
 
     @property
     def is_leased(self) -> bool:
+        """Return whether the program forwards only while its lease is renewed."""
         return self._lease is not None
 
     @property

@@ -92,6 +92,7 @@ class Mirror:
         return len(self._waiting) + len(self._unfit)
 
     def put(self, items: Mapping[bytes, Hops]) -> None:
+        """Write entries of the table to the kernel's maps; what does not fit stays in Python alone."""
         keys: list[bytes] = []
         kernel_keys: list[bytes] = []
         values: list[bytes] = []
@@ -128,6 +129,7 @@ class Mirror:
             self._leave_group(each)
 
     def remove(self, keys: Sequence[bytes]) -> None:
+        """Remove entries from the kernel's maps; keys that are not there are ignored."""
         gone: list[bytes] = []
         for key in keys:
             if key in self._counter_of:

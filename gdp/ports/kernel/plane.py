@@ -21,8 +21,8 @@ from gdp.ports.kernel.attach import Attachment, FilterAttachment, LinkAttachment
 from gdp.ports.kernel.device import QueueWatch, Refusals, has_free_peer
 from gdp.ports.kernel.loaded import Loaded
 from gdp.ports.kernel.mirror import EntryCounts, Mirror
-from gdp.ports.kernel.netlink import Questions
 from gdp.ports.kernel.shapes import ENTRIES_DEFAULT, PortFlag
+from gdp.ports.netlink import Questions
 from gdp.ports.plane import Arrival, Counters, Port
 from gdp.ports.raw import RawPlane
 from gdp.switch.table import Table
@@ -106,6 +106,7 @@ class KernelPlane(RawPlane):
         return self._mirror.counts(most)
 
     def poll(self, timeout_s: float | None) -> list[Arrival]:
+        """Renew the lease of the program and read its counts when due, then as ``Plane.poll``."""
         if self._loaded.is_leased:
             timeout_s = _UPKEEP_S if timeout_s is None else min(timeout_s, _UPKEEP_S)
         if time.monotonic() >= self._next_upkeep_s:
@@ -113,6 +114,7 @@ class KernelPlane(RawPlane):
         return super().poll(timeout_s)
 
     def close(self) -> None:
+        """Detach the programs and close every socket and map."""
         if self._table is not None:
             self._table.observe(None)
         super().close()
@@ -121,6 +123,7 @@ class KernelPlane(RawPlane):
         self._loaded.close()
 
     def remove_port(self, index: int) -> None:
+        """Detach the program from a port and close it, as ``Plane.remove_port``."""
         self._look_at_devices()  # while what the port's device refused can still be asked
         super().remove_port(index)
 

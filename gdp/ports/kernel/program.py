@@ -74,7 +74,7 @@ _GROUP: Final = _INDEX - 8
 _IFINDEX: Final = _GROUP - 8
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Descriptors:
     """The maps that the program reads, by file descriptor; without ``lease`` it forwards for as long as it is there."""
 

@@ -171,7 +171,7 @@ def test_late_joiners_get_as_many_messages_as_the_depth_is_now(before: int, afte
 def sizes(world: World) -> list[int]:
     """Return how much the tables of all nodes hold, names aside that are the world's own."""
     switches = [
-        (len(switch.attached), len(switch.places), len(switch.planter.trees), len(switch.table.entries))
+        (len(switch.attached), len(switch.resolver.cache), len(switch.planter.trees), len(switch.table.entries))
         for switch in world.switches.values()
     ]
     ribs = [(host.rib.names, host.rib.watching) for host in world.ribs.values()]

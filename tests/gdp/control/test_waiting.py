@@ -14,7 +14,6 @@ from gdp.crypto.statements import parse
 from gdp.effects import Arrival
 from gdp.errors import DropReason, StatementError
 from gdp.limits import HELLO_S, WAIT_REPORT_S
-from gdp.switch.waiting import switch_waits
 from gdp.trust.right import Right
 from tests.gdp.control.members import CLOUD, ELSEWHERE, POLICY, Nonces, at, greeter, node, statement_of
 from tests.journeys.flows import ROBOT, ring
@@ -100,13 +99,13 @@ def test_a_world_at_work_waits_for_nothing_and_without_ribs_says_so() -> None:
     world = ring()
     now_s = world.network.now.mono_s
     robot, nuc1 = world.members[ROBOT].attachment, world.switches["nuc1"]
-    assert attachment_waits(robot, now_s) == switch_waits(nuc1, (), now_s) == []
+    assert attachment_waits(robot, now_s) == nuc1.waits((), now_s) == []
     for lead in [each for each in world.leads if each.endswith("/rib")]:
         world.network.set_link(world.leads[lead], up=False)
     robot = world.restart_member(ROBOT).attachment
     world.network.run(3)
     assert NO_RIB in attachment_waits(robot, world.network.now.mono_s)
-    assert NO_RIB in switch_waits(nuc1, range(9), world.network.now.mono_s)
+    assert NO_RIB in nuc1.waits(range(9), world.network.now.mono_s)
 
 
 def test_a_refused_advertisement_is_named_with_the_reason() -> None:

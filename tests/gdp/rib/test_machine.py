@@ -56,7 +56,8 @@ START = at(0.0)
 
 def rib(upper: Name | None = None, **settings: object) -> Rib:
     policy = Policy(SCHOOL.root, [CLOUD.root])
-    return Rib(RIB, policy, MemoryStore(), replace(RibSettings(() if upper is None else (upper,)), **settings))  # type: ignore[arg-type]
+    of_node = RibSettings(upper=() if upper is None else (upper,))
+    return Rib(RIB, policy, MemoryStore(), replace(of_node, **settings))  # type: ignore[arg-type]
 
 
 def relay(statement: bytes, by: Identity = SWITCH) -> bytes:

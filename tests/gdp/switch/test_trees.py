@@ -9,8 +9,13 @@ NEAR, FAR = (0, b"\x02nearr"), (1, b"\x02farrr")
 
 
 def tree(topic: str = "topic", publisher: str = "robot") -> Tree:
-    made = Tree(name(topic), name(publisher), name("switch"), HOME, frozenset({HOME}))
-    made.branches = {FAR: Branch(9.0, 1_400, b"far claim"), NEAR: Branch(5.0, 1_500, b"near claim")}
+    made = Tree(
+        topic=name(topic), publisher=name(publisher), switch=name("switch"), domain=HOME, allowed=frozenset({HOME})
+    )
+    made.branches = {
+        FAR: Branch(expires_s=9.0, mtu=1_400, evidence=b"far claim"),
+        NEAR: Branch(expires_s=5.0, mtu=1_500, evidence=b"near claim"),
+    }
     made.renew_at_s = 7.0
     return made
 
@@ -53,7 +58,7 @@ def test_trees_of_one_topic_are_found_by_it() -> None:
 
 
 def test_a_branch_is_as_narrow_as_its_link_or_the_way_behind_it() -> None:
-    branch = Branch(9.0, 1_400, b"claim", said_mtu=1_400)
+    branch = Branch(expires_s=9.0, mtu=1_400, evidence=b"claim", said_mtu=1_400)
     seen = []
     for link_mtu in (9_000, 1_000, 1_500):
         branch.fit(link_mtu)
@@ -68,7 +73,7 @@ MACS = {0: b"\x02own00", 1: b"\x02own01", 2: b"\x02own02"}
 def with_backup() -> Tree:
     """Return a tree with a backup that protects the branch FAR."""
     made = tree()
-    made.branches[OTHER] = Branch(20.0, 900, b"its claim", backup_for=name("below"))
+    made.branches[OTHER] = Branch(expires_s=20.0, mtu=900, evidence=b"its claim", backup_for=name("below"))
     made.protection = {FAR: OTHER}
     return made
 

@@ -27,7 +27,7 @@ def test_a_name_that_nobody_has_is_answered_and_then_dropped_by_the_data_plane()
     world = ring()
     robot, nuc1 = world.members[ROBOT].name, world.switches["nuc1"]
     send(world, ABSENT)
-    assert len(nuc1.parked) == 0
+    assert nuc1.resolver.pending_frames == 0
     world.network.run(0.1)
     send(world, ABSENT)
     world.network.run(0.01)
@@ -40,7 +40,7 @@ def test_a_frame_waits_while_its_destination_is_asked_for() -> None:
     world = ring()
     send(world, ABSENT)
     world.network.run(0.0005)
-    assert len(world.switches["nuc1"].parked) == 1
+    assert world.switches["nuc1"].resolver.pending_frames == 1
 
 
 def test_who_attaches_where_it_was_missed_is_reached_at_once() -> None:
@@ -63,7 +63,7 @@ def test_who_is_found_is_reached_though_it_was_missed_a_moment_ago() -> None:
     server = world.members[SERVER].name
     nuc1.unicast._install_nowhere(server, robot, DropReason.NO_ROUTE, world.network.now.mono_s)
     assert nuc1.table.entries[server + robot] == NOWHERE
-    nuc1.places.want(server, world.network.now.mono_s, watch=False)
+    nuc1.resolver.resolve(server, world.network.now.mono_s)
     world.network.touch("nuc1")
     world.network.run(1.0)
     send(world, server)

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 import pytest
 
 from gdp.errors import LocalError
-from gdp.ports.kernel import netlink
-from gdp.ports.kernel.netlink import CLSACT_EGRESS, LinkAttribute, Questions
+from gdp.ports import netlink
+from gdp.ports.netlink import CLSACT_EGRESS, LinkAttribute, Questions
 
 ERROR, DONE, NEW_LINK = 2, 3, 16
 QUEUE = LinkAttribute.QDISC

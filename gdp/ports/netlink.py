@@ -1,8 +1,13 @@
-"""Questions to the kernel about devices, their queues and filters: netlink by hand, as in ``gdp/ports/link.py``.
+"""Netlink sockets: requests to the kernel about devices, queues and filters, and the parser of its messages.
 
-Place: I/O; one socket for all questions, in the namespace it was opened in, whatever namespace asks later.
+I/O; every socket stays in the namespace that it was opened in. The parser is written by hand, because a switch on a
+small machine should not carry a netlink library.
 Source: rtnetlink(7), netlink(7); ``struct nlmsghdr``, ``struct nlmsgerr``, ``struct ifinfomsg`` and ``struct tcmsg`` in
-host byte order. A dump's end may carry an error, as an error message does.
+host byte order. The end of a dump may carry an error, as an error message does::
+
+    nlmsghdr   length (4)  type (2)  flags (2)  sequence (4)  port id (4)
+    ifinfomsg  family (1)  pad (1)  type (2)  index (4, signed)  flags (4)  change (4)
+    attribute  length (2)  type (2)  value, padded to 4 bytes
 """
 
 from __future__ import annotations
@@ -17,32 +22,53 @@ from typing import Final, NamedTuple
 
 from gdp.errors import LocalError
 
-__all__ = ["CLSACT_EGRESS", "CLSACT_INGRESS", "ROOT", "LinkAttribute", "Questions", "listen", "nested"]
+__all__ = [
+    "CLSACT_EGRESS",
+    "CLSACT_INGRESS",
+    "LINK_GROUP",
+    "READ_BYTES",
+    "ROOT",
+    "RTM_DELLINK",
+    "RTM_NEWLINK",
+    "TRAFFIC_GROUP",
+    "DeviceInfo",
+    "LinkAttribute",
+    "Message",
+    "Questions",
+    "listen",
+    "messages",
+    "nested",
+]
 
 CLSACT_INGRESS: Final = 0xFFFFFFF2  # TC_H_MAKE(TC_H_CLSACT, TC_H_MIN_INGRESS)
 CLSACT_EGRESS: Final = 0xFFFFFFF3
 ROOT: Final = 0xFFFFFFFF
+LINK_GROUP: Final = 1  # RTMGRP_LINK: devices that change
+TRAFFIC_GROUP: Final = 8  # RTMGRP_TC: queues and filters that change
+READ_BYTES: Final = 1 << 16
+RTM_NEWLINK, RTM_DELLINK = 16, 17
 
 _HEADER: Final = struct.Struct("=IHHII")
 _INFO: Final = struct.Struct("=BxHiII")
 _TRAFFIC: Final = struct.Struct("=BxxxiIII")
 _ATTRIBUTE: Final = struct.Struct("=HH")
 _NUMBER: Final = struct.Struct("=i")
-_RTMGRP_TC: Final = 8
 _NLMSG_ERROR, _NLMSG_DONE = 2, 3
-_RTM_NEWLINK, _RTM_GETLINK = 16, 18
+_RTM_GETLINK: Final = 18
 _RTM_NEWQDISC, _RTM_GETQDISC = 36, 38
 _RTM_NEWTFILTER, _RTM_GETTFILTER = 44, 46
 _NLM_F_REQUEST, _NLM_F_DUMP = 0x1, 0x300
 _NESTED: Final = 0x8000  # NLA_F_NESTED
 _TCA_KIND, _TCA_OPTIONS, _TCA_BPF_NAME = 1, 2, 7
-_READ_BYTES: Final = 1 << 16
 _FOREVER_S: Final = 5.0  # the kernel answers at once; this only keeps a bug from hanging a node
 
 
 class LinkAttribute(IntEnum):
     """Attributes of a device, as far as they are used."""
 
+    ADDRESS = 1
+    IFNAME = 3
+    MTU = 4
     LINK = 5  # the other end of a pair, by its ifindex there
     QDISC = 6
     LINKINFO = 18
@@ -52,10 +78,27 @@ class LinkAttribute(IntEnum):
     TARGET_NETNSID = 46
 
 
-class _Message(NamedTuple):
+class Message(NamedTuple):
+    """One netlink message: its type, sequence number and the bytes after its header."""
+
     kind: int
     sequence: int
     body: bytes
+
+
+class DeviceInfo(NamedTuple):
+    """The body of a message about a device: address family, ifindex, ``IFF_`` flags, attributes by type."""
+
+    family: int
+    ifindex: int
+    flags: int
+    attributes: dict[int, bytes]
+
+    @classmethod
+    def from_body(cls, body: bytes) -> DeviceInfo:
+        """Return what a message of type ``RTM_NEWLINK`` or ``RTM_DELLINK`` says."""
+        family, _, ifindex, flags, _ = _INFO.unpack_from(body)
+        return cls(family, ifindex, flags, nested(body[_INFO.size :]))
 
 
 class _RefusedError(LocalError):
@@ -87,7 +130,24 @@ class Questions:
         self._has_leftovers = False
 
     def close(self) -> None:
+        """Close the socket."""
         self._socket.close()
+
+    def links(self) -> list[Message]:
+        """Return a message about each device of the namespace."""
+        return self._ask(_RTM_GETLINK, _INFO.pack(socket.AF_UNSPEC, 0, 0, 0, 0), _NLM_F_DUMP)
+
+    def link_named(self, ifname: str) -> list[Message]:
+        """Return the message about the device of this name; none where there is no such device."""
+        name = ifname.encode() + b"\0"
+        body = _INFO.pack(socket.AF_UNSPEC, 0, 0, 0, 0)
+        body += _ATTRIBUTE.pack(_ATTRIBUTE.size + len(name), LinkAttribute.IFNAME) + name + bytes(-len(name) % 4)
+        try:
+            return self._ask(_RTM_GETLINK, body, 0)
+        except _RefusedError as error:
+            if error.number in (errno.ENODEV, errno.ERANGE, errno.EINVAL):  # the last two: no device can have the name
+                return []
+            raise
 
     def link(self, ifindex: int, namespace: int | None = None) -> dict[int, bytes]:
         """Return the attributes of one device; none where there is no such device.
@@ -105,12 +165,13 @@ class Questions:
             if error.number == errno.ENODEV:
                 return {}
             raise
-        return next((nested(answer[_INFO.size :]) for kind, answer in answers if kind == _RTM_NEWLINK), {})
+        found = (DeviceInfo.from_body(each.body).attributes for each in answers if each.kind == RTM_NEWLINK)
+        return next(found, {})
 
     def queues(self) -> list[tuple[int, int, dict[int, bytes]]]:
         """Return ifindex, parent and attributes of every queueing discipline of the namespace."""
         found: list[tuple[int, int, dict[int, bytes]]] = []
-        for kind, answer in self._ask(_RTM_GETQDISC, _TRAFFIC.pack(socket.AF_UNSPEC, 0, 0, 0, 0), _NLM_F_DUMP):
+        for kind, _, answer in self._ask(_RTM_GETQDISC, _TRAFFIC.pack(socket.AF_UNSPEC, 0, 0, 0, 0), _NLM_F_DUMP):
             if kind == _RTM_NEWQDISC:
                 _, ifindex, _, parent, _ = _TRAFFIC.unpack_from(answer)
                 found.append((ifindex, parent, nested(answer[_TRAFFIC.size :])))
@@ -123,9 +184,9 @@ class Questions:
         """
         question = _TRAFFIC.pack(socket.AF_UNSPEC, ifindex, 0, parent, 0)
         answers = self._ask(_RTM_GETTFILTER, question, _NLM_F_DUMP)
-        return [_program_name(nested(body[_TRAFFIC.size :])) for kind, body in answers if kind == _RTM_NEWTFILTER]
+        return [_program_name(nested(body[_TRAFFIC.size :])) for kind, _, body in answers if kind == _RTM_NEWTFILTER]
 
-    def _ask(self, kind: int, body: bytes, flags: int) -> list[tuple[int, bytes]]:
+    def _ask(self, kind: int, body: bytes, flags: int) -> list[Message]:
         if self._has_leftovers:
             self._forget()
         self._sequence += 1
@@ -139,10 +200,10 @@ class Questions:
         self._has_leftovers = False
         return answers
 
-    def _answers(self, *, is_dump: bool) -> list[tuple[int, bytes]]:
-        answers: list[tuple[int, bytes]] = []
+    def _answers(self, *, is_dump: bool) -> list[Message]:
+        answers: list[Message] = []
         while True:
-            for message in _messages(self._socket.recv(_READ_BYTES)):
+            for message in messages(self._socket.recv(READ_BYTES)):
                 if message.sequence != self._sequence & 0xFFFFFFFF:
                     continue
                 if message.kind in (_NLMSG_DONE, _NLMSG_ERROR):
@@ -150,7 +211,7 @@ class Questions:
                     if number:
                         raise _RefusedError(-number)
                     return answers
-                answers.append((message.kind, message.body))
+                answers.append(message)
             if answers and not is_dump:
                 return answers
 
@@ -159,13 +220,22 @@ class Questions:
         self._socket.setblocking(False)
         try:
             while True:
-                self._socket.recv(_READ_BYTES)
+                self._socket.recv(READ_BYTES)
         except BlockingIOError:
             self._has_leftovers = False
         except OSError as error:
             raise LocalError(f"netlink question: {error}") from error
         finally:
             self._socket.settimeout(_FOREVER_S)
+
+
+def messages(data: bytes) -> Iterator[Message]:
+    """Yield the messages of one datagram from the kernel."""
+    at = 0
+    while at + _HEADER.size <= len(data):
+        length, kind, _, sequence, _ = _HEADER.unpack_from(data, at)
+        yield Message(kind, sequence, data[at + _HEADER.size : at + length])
+        at += max(length, _HEADER.size) + 3 & ~3
 
 
 def nested(body: bytes) -> dict[int, bytes]:
@@ -179,13 +249,13 @@ def nested(body: bytes) -> dict[int, bytes]:
     return found
 
 
-def listen() -> socket.socket:
-    """Return a socket that hears of queues and filters that change; never blocking.
+def listen(groups: int) -> socket.socket:
+    """Return a non-blocking socket that receives news of these groups: ``LINK_GROUP``, ``TRAFFIC_GROUP``.
 
     Raises:
-        LocalError: none is to be had.
+        LocalError: the kernel opens no such socket.
     """
-    opened = _open(_RTMGRP_TC)
+    opened = _open(groups)
     opened.setblocking(False)
     return opened
 
@@ -207,11 +277,3 @@ def _open(groups: int) -> socket.socket:
         opened.close()
         raise LocalError(f"netlink socket: {error}") from error
     return opened
-
-
-def _messages(data: bytes) -> Iterator[_Message]:
-    at = 0
-    while at + _HEADER.size <= len(data):
-        length, kind, _, sequence, _ = _HEADER.unpack_from(data, at)
-        yield _Message(kind, sequence, data[at + _HEADER.size : at + length])
-        at += max(length, _HEADER.size) + 3 & ~3

@@ -1,0 +1,195 @@
+"""Queries for names: which names a switch asks its RIB for, and when each is due again.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
+
+A query is repeated until it is answered. A name that attached readers want, or that frames are sent to, is watched: its
+query is sent again before the watch ends, so that a RIB that restarted learns of the watch. Queries for new names pass
+the query window (``query_window.py``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from gdp.limits import CLAIM_LEASE_S, PARKED_S
+from gdp.names import Name
+from gdp.switch.query_window import QueryWindow
+
+__all__ = ["BATCH_MAX", "QUERIES_MAX", "RETRY_S", "TRIES_MAX", "USED_NAMES_MAX", "NameQueries"]
+
+RETRY_S: Final = 0.25
+TRIES_MAX: Final = 8
+QUERIES_MAX: Final = 4_096  # open at once, watches of readers not counted; each costs a signature at every try
+BATCH_MAX: Final = 64  # queries in one call, some 10 ms: a switch has other work
+USED_NAMES_MAX: Final = 8_192  # names watched because frames are sent to them
+_SCAN_S: Final = 0.01  # between two scans for queries that are due again
+_NEVER_S: Final = float("inf")
+
+
+@dataclass(slots=True)
+class _Query:
+    due_s: float  # ``_NEVER_S`` while it waits for the window
+    since_s: float
+    owner: bytes = b""  # the neighbour whose share it uses
+    tries: int = 0
+    is_watch: bool = False  # an attached reader needs all advertisers of the name
+    used_until_s: float = 0.0  # frames are sent to the name
+    is_answered: bool = False
+
+
+class NameQueries:
+    """The queries of one switch, by name.
+
+    Args:
+        watch_s: seconds for which the RIB keeps a reader's watch; it is renewed after a quarter of them. A name that
+            frames are sent to is watched for twice as long after the last use.
+    """
+
+    def __init__(self, watch_s: float = CLAIM_LEASE_S) -> None:
+        self.watch_s = watch_s
+        self._watch_again_s = watch_s / 4
+        self._use_watch_s = 2 * watch_s
+        self._use_again_s = watch_s / 2
+        self._queries: dict[Name, _Query] = {}
+        self._window = QueryWindow()
+        self._watches = 0
+        self._due_s = _NEVER_S  # no query is due before
+
+    def __len__(self) -> int:
+        return len(self._queries)
+
+    def __contains__(self, name: Name) -> bool:
+        return name in self._queries
+
+    def request(self, name: Name, now_s: float, owner: bytes = b"") -> None:
+        """Query a name unless a query is open; one that was answered is sent again at once.
+
+        Nothing happens where ``QUERIES_MAX`` are open: ``name in queries`` stays False.
+
+        Args:
+            owner: the neighbour whose share of the window the query uses; empty: this switch.
+        """
+        query = self._queries.get(name)
+        if query is None:
+            if len(self._queries) - self._watches < QUERIES_MAX:
+                self._queries[name] = _Query(_NEVER_S, now_s, owner)
+                self._window.put(owner, name)
+        elif query.is_answered:
+            query.is_answered, query.tries, query.due_s = False, 0, now_s
+            self._due_s = min(self._due_s, now_s)
+
+    def watch(self, name: Name, now_s: float) -> None:
+        """Query a name at once and watch it for attached readers, who proved their right: no bound applies."""
+        query = self._queries.get(name)
+        if query is None:
+            query = self._queries[name] = _Query(_NEVER_S, now_s)
+        if not query.is_watch:
+            self._window.cancel(query.owner, name)
+            query.is_watch = True
+            query.due_s = now_s
+            self._due_s = min(self._due_s, now_s)
+            self._watches += 1
+
+    def unwatch(self, name: Name) -> None:
+        """End the watch of a name for attached readers."""
+        query = self._queries.get(name)
+        if query is None:
+            return
+        if query.is_watch:
+            query.is_watch = False
+            self._watches -= 1
+        if query.used_until_s == 0.0:
+            self._remove(name)
+
+    def use(self, name: Name, now_s: float) -> None:
+        """Watch a name that frames are sent to, so that the switch learns where it moves.
+
+        Above ``USED_NAMES_MAX`` the switch learns of moves by redirects alone.
+        """
+        query = self._queries.get(name)
+        if query is None:
+            if len(self._queries) - self._watches >= USED_NAMES_MAX:
+                return
+            query = self._queries[name] = _Query(now_s, now_s)
+            self._due_s = min(self._due_s, now_s)
+        query.used_until_s = now_s + self._use_watch_s
+
+    def receive_answer(self, name: Name, now_s: float) -> None:
+        """Close the query for a name, or schedule the renewal of its watch."""
+        query = self._queries.get(name)
+        if query is None:
+            return
+        if not query.is_watch and query.used_until_s <= now_s:
+            self._remove(name)
+            return
+        self._window.answered(name)
+        if not query.is_answered:  # a later update renews no watch
+            query.is_answered = True
+            query.due_s = now_s + self._renewal_s(query)
+
+    def repeat_all(self, now_s: float) -> None:
+        """Send every open query and every watch again at once: there is a new RIB."""
+        for query in self._queries.values():
+            query.tries = 0
+            if query.due_s != _NEVER_S:
+                query.due_s = now_s
+        self._due_s = min(self._due_s, now_s)
+
+    def poll_due(self, now_s: float) -> tuple[list[tuple[Name, float]], list[Name]]:
+        """Return at most ``BATCH_MAX`` queries to send now, as (name, seconds to watch it), and the failed names."""
+        queries: list[tuple[Name, float]] = []
+        failed: list[Name] = []
+        if now_s >= self._due_s:
+            self._poll_repeated(now_s, queries, failed)
+        while len(queries) < BATCH_MAX and self._window.is_ready:
+            name = self._window.pop()
+            query = self._queries[name]
+            if now_s >= query.since_s + PARKED_S:  # the frame that needs it has expired
+                self._remove(name)
+                failed.append(name)
+                continue
+            self._window.sent(name)
+            queries.append((name, self._sent(query, now_s)))
+            self._due_s = min(self._due_s, query.due_s)
+        return queries, failed
+
+    def next_due(self) -> float | None:
+        """Return a monotonic second that is no later than the next query, or None."""
+        if self._window.is_ready:
+            return float("-inf")
+        return self._due_s if self._queries and self._due_s != _NEVER_S else None
+
+    def _poll_repeated(self, now_s: float, queries: list[tuple[Name, float]], failed: list[Name]) -> None:
+        """Add the queries and watches that were sent before and are due again."""
+        next_s = _NEVER_S
+        for name, query in list(self._queries.items()):
+            if query.due_s <= now_s:
+                is_needed = query.is_watch or query.used_until_s > now_s
+                if not is_needed and (query.is_answered or query.tries >= TRIES_MAX):
+                    self._remove(name)
+                    if not query.is_answered:
+                        failed.append(name)
+                    continue
+                if len(queries) >= BATCH_MAX:
+                    self._due_s = now_s
+                    return
+                queries.append((name, self._sent(query, now_s)))
+            next_s = min(next_s, query.due_s)
+        self._due_s = max(next_s, now_s + _SCAN_S)
+
+    def _sent(self, query: _Query, now_s: float) -> float:
+        """Record one try of a query; return for how many seconds the RIB shall watch its name."""
+        query.tries += 1
+        if query.is_answered:
+            query.due_s = now_s + self._renewal_s(query)
+        else:
+            query.due_s = now_s + RETRY_S * min(2 ** (query.tries // TRIES_MAX), 8)
+        return self.watch_s if query.is_watch else self._use_watch_s if query.used_until_s > now_s else 0.0
+
+    def _renewal_s(self, query: _Query) -> float:
+        return self._watch_again_s if query.is_watch else self._use_again_s
+
+    def _remove(self, name: Name) -> None:
+        self._window.cancel(self._queries.pop(name).owner, name)
+        self._window.answered(name)

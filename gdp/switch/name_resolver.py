@@ -1,0 +1,227 @@
+"""Name resolution at a switch: the cache of locations, the frames pending an answer, and the queries for the RIB.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). It works like the neighbour cache of RFC 4861, sections
+5.1 and 7.2.2: a miss makes one query and keeps the frame; the answer releases the frame, or its end drops it::
+
+    frame without an entry (machine.py)
+      -> Unicast.miss -> resolve: a location, or a negative entry -> table entry, and the frame goes on
+                      `-> resolve: unknown                        -> a query is open: buffer_frame
+    machine's timer   -> Inquirer.ask -> queries_to_send           -> query to the RIB, again until it is answered
+    RIB's answer      -> Inquirer.receive -> Locations.receive     -> receive_location -> Unicast.release: the frame
+                                          `-> receive_negative     -> the frame is dropped, counted
+    machine's timer   -> expire: leases, negative entries and pending frames end
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Final, NamedTuple
+
+from gdp.control.neighbour import Neighbour
+from gdp.errors import DropReason
+from gdp.limits import (
+    CLAIM_LEASE_S,
+    QUESTIONS_BURST,
+    QUESTIONS_PER_S,
+    SWITCH_QUESTIONS_BURST,
+    SWITCH_QUESTIONS_PER_S,
+)
+from gdp.message.token_bucket import Paces
+from gdp.names import Name
+from gdp.switch.name_queries import NameQueries
+from gdp.switch.parked import Parked
+from gdp.switch.places import Place, Places
+from gdp.trust.right import Right
+
+__all__ = ["NameResolver", "Resolution"]
+
+_FROM_NODE: Final = b"n"  # begins an owner
+_FROM_SWITCH: Final = b"s"
+_ACCEPTS_FRAMES: Final = (Right.ATTACH, Right.SERVE)
+
+
+class Resolution(NamedTuple):
+    """What is known of a name.
+
+    Attributes:
+        locations: where its advertisers are.
+        reason: why ``locations`` is empty; None where it is not.
+    """
+
+    locations: list[Place]
+    reason: DropReason | None = None
+
+
+class NameResolver:
+    """Resolves the names of one switch.
+
+    Args:
+        me: this switch.
+        lease_s: seconds for which the RIB keeps a watch; see ``NameQueries``.
+
+    Attributes:
+        cache: the locations that are known; others only read it.
+    """
+
+    def __init__(self, me: Name, lease_s: float = CLAIM_LEASE_S) -> None:
+        self._me = me
+        self.cache = Places(lease_s)
+        self._queries = NameQueries(lease_s)
+        self._pending = Parked()
+        self._rates = {
+            _FROM_NODE: Paces(QUESTIONS_PER_S, QUESTIONS_BURST),
+            _FROM_SWITCH: Paces(SWITCH_QUESTIONS_PER_S, SWITCH_QUESTIONS_BURST),
+        }
+        self._refused: Counter[DropReason] = Counter()
+
+    @property
+    def drops(self) -> Counter[DropReason]:
+        """Return how many frames were dropped instead of being released, by reason."""
+        return self._refused + self._pending.drops
+
+    @property
+    def pending_frames(self) -> int:
+        """Return how many frames wait for an answer."""
+        return len(self._pending)
+
+    @property
+    def open_queries(self) -> int:
+        """Return how many names are queried or watched."""
+        return len(self._queries)
+
+    @staticmethod
+    def owner_of(neighbour: Neighbour) -> bytes:
+        """Return the owner of the queries and pending frames that a neighbour causes."""
+        return (_FROM_SWITCH if neighbour.role.is_switch else _FROM_NODE) + neighbour.name
+
+    # -- resolve
+
+    def resolve(self, name: Name, now_s: float, owner: bytes = b"") -> Resolution | None:
+        """Return where frames to a name go, or None after the RIB was asked.
+
+        A name that resolves to another switch is watched from now on.
+
+        Args:
+            owner: as ``owner_of``, at whose rate the RIB is asked; empty: this switch itself, without a limit.
+        """
+        known = self.cache.of(name, now_s)
+        accepting = [place for place in known if place.right in _ACCEPTS_FRAMES]
+        if not known and (node := self.cache.of_node(name, now_s)) is not None:
+            accepting = [node]
+        elsewhere = [place for place in accepting if place.switch != self._me]
+        if elsewhere:
+            self._queries.use(name, now_s)
+            return Resolution(elsewhere)
+        if accepting or not (known or self.cache.is_nowhere(name, now_s)):  # it has left this switch, or is unknown
+            self._request(name, now_s, owner)
+            return None
+        return Resolution([], DropReason.NO_READER if known else DropReason.NO_ROUTE)
+
+    def resolve_source(self, name: Name, now_s: float, owner: bytes = b"") -> Resolution | None:
+        """Return where the source of frames is attached, whatever its rights, or None after the RIB was asked.
+
+        Args:
+            owner: as in ``resolve``.
+        """
+        known = self.cache.of(name, now_s)
+        if known:
+            self._queries.use(name, now_s)
+            return Resolution(known)
+        if self.cache.is_nowhere(name, now_s):
+            return Resolution([], DropReason.NO_ROUTE)
+        self._request(name, now_s, owner)
+        return None
+
+    def _request(self, name: Name, now_s: float, owner: bytes) -> None:
+        """Open a query within the rate of its owner."""
+        rate = self._rates.get(owner[:1])
+        if rate is None or name in self._queries or rate.take(owner, now_s):
+            self._queries.request(name, now_s, owner)
+
+    def watch(self, name: Name, now_s: float) -> None:
+        """Query a name and watch it for attached readers."""
+        self._queries.watch(name, now_s)
+
+    def unwatch(self, name: Name) -> None:
+        """End the watch of a name: it has no attached reader any more."""
+        self._queries.unwatch(name)
+
+    # -- pending frames
+
+    def buffer_frame(self, name: Name, frame: bytes, now_s: float, owner: bytes, until_s: float | None = None) -> None:
+        """Buffer a frame until its name is answered, or until ``until_s`` (default: for ``PARKED_S``).
+
+        Where no query for the name is open, too many are, or its owner exceeds its rate: the frame is dropped.
+        """
+        if name in self._queries:
+            self._pending.park(name, frame, now_s, until_s, owner=owner)
+        else:
+            self._refused[DropReason.PARKED_FULL] += 1
+
+    def release_frames(self, name: Name) -> list[tuple[bytes, float, bytes]]:
+        """Remove and return the frames that wait for a name, in order, each with its ``until_s`` and owner."""
+        return self._pending.release(name)
+
+    # -- receive an answer
+
+    def receive_location(self, place: Place, now_s: float, *, is_ours: bool = False, has_left: bool = False) -> None:
+        """Store a verified location.
+
+        Args:
+            is_ours: its advertiser is attached here. The RIB echoes a claim to the switch that relayed it; this echo
+                answers no query. The second time, it does.
+            has_left: its advertiser was attached here and is not any more. The RIB does not know that yet, so the
+                query stays open.
+        """
+        before = self.cache.put(place)
+        is_repeated = before is not None and before.claim == place.claim
+        if not has_left and (not is_ours or is_repeated):
+            self._queries.receive_answer(place.name, now_s)
+
+    def receive_removal(self, name: Name, advertiser: Name, now_s: float) -> None:
+        """Remove one advertiser of a name: it has withdrawn, or its proofs do not hold any more."""
+        self._queries.receive_answer(name, now_s)
+        self.cache.remove(name, advertiser)
+
+    def receive_negative(self, name: Name, now_s: float, *, keep: bool = False) -> None:
+        """Store that no node advertises a name, and drop the frames that wait for it.
+
+        Args:
+            keep: known locations count more than this answer, of a RIB that has just started.
+        """
+        self._queries.receive_answer(name, now_s)
+        if not (keep and self.cache.of(name, now_s)):
+            self.cache.nobody(name, now_s)
+            self._pending.refuse(name, DropReason.NO_ROUTE)
+
+    # -- time and the RIB
+
+    def queries_to_send(self, now_s: float) -> list[tuple[Name, float]]:
+        """Return the queries that are due, as (name, seconds to watch it); drop the frames of names that failed."""
+        queries, failed = self._queries.poll_due(now_s)
+        for name in failed:
+            self._pending.refuse(name, DropReason.NO_ROUTE)
+        return queries
+
+    def rib_changed(self, now_s: float, *, has_rib: bool) -> None:
+        """Send every query again at once; without a RIB, serve entries beyond their leases."""
+        self.cache.serve_stale(not has_rib, now_s)
+        self._queries.repeat_all(now_s)
+
+    def serve_stale(self, now_s: float, *, stale: bool) -> None:
+        """Begin, or end, to serve entries beyond their leases: the RIB does not answer, or does again."""
+        self.cache.serve_stale(stale, now_s)
+
+    def expire(self, now_s: float) -> list[Place]:
+        """Drop the frames that waited too long and the entries whose leases ended; return the places among them."""
+        self._pending.expire(now_s)
+        return self.cache.expire(now_s)
+
+    def next_expiry(self) -> float | None:
+        """Return a monotonic second that is no later than the next work of ``expire``, or None."""
+        times = (self._pending.next_expiry(), self.cache.next_expiry())
+        return min((time for time in times if time is not None), default=None)
+
+    def next_query(self) -> float | None:
+        """Return a monotonic second that is no later than the next query, or None."""
+        return self._queries.next_due()

@@ -1,0 +1,147 @@
+"""Queries for names: repeated until answered, renewed while watched, bounded, and fair to each owner."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from gdp.limits import CLAIM_LEASE_S, PARKED_S
+from gdp.names import Name
+from gdp.switch.name_queries import BATCH_MAX, QUERIES_MAX, RETRY_S, TRIES_MAX, NameQueries
+from gdp.switch.query_window import WINDOW
+from tests.gdp.switch.net import name
+
+TOPIC = name("topic")
+
+
+def polled(queries: NameQueries, now_s: float) -> list[tuple[Name, float]]:
+    return queries.poll_due(now_s)[0]
+
+
+def test_a_query_is_sent_at_once_and_again_until_it_fails() -> None:
+    queries, now_s, times = NameQueries(), 0.0, 0
+    failed: list[Name] = []
+    queries.request(TOPIC, now_s)
+    while not failed:
+        due, failed = queries.poll_due(now_s)
+        times += len(due)
+        now_s += RETRY_S
+    assert (times, failed) == (TRIES_MAX, [TOPIC])
+    assert queries.next_due() is None
+
+
+def test_two_requests_make_one_query() -> None:
+    queries = NameQueries()
+    queries.request(TOPIC, 0.0)
+    queries.request(TOPIC, 0.0)
+    assert polled(queries, 0.0) == [(TOPIC, 0.0)]
+    assert polled(queries, 0.0) == []
+
+
+def test_an_answer_closes_a_query() -> None:
+    queries = NameQueries()
+    queries.request(TOPIC, 0.0)
+    queries.receive_answer(TOPIC, 0.0)
+    assert (TOPIC in queries, queries.next_due()) == (False, None)
+
+
+def test_a_watch_goes_on_after_its_answer() -> None:
+    queries = NameQueries()
+    queries.watch(TOPIC, 0.0)
+    queries.receive_answer(TOPIC, 0.0)
+    assert polled(queries, 1.0) == []
+    assert polled(queries, CLAIM_LEASE_S / 4) == [(TOPIC, queries.watch_s)]
+
+
+def test_a_watch_is_sent_at_once_though_the_name_was_queried_before() -> None:
+    queries = NameQueries()
+    queries.request(TOPIC, 0.0)
+    assert polled(queries, 0.0) == [(TOPIC, 0.0)]
+    queries.watch(TOPIC, 0.1)
+    assert polled(queries, 0.1) == [(TOPIC, queries.watch_s)]
+
+
+def test_a_request_repeats_a_query_that_was_answered() -> None:
+    queries = NameQueries()
+    queries.watch(TOPIC, 0.0)
+    queries.receive_answer(TOPIC, 0.0)
+    queries.request(TOPIC, 1.0)
+    assert polled(queries, 1.0) == [(TOPIC, queries.watch_s)]
+
+
+def test_a_used_name_is_watched_for_a_while_and_then_queried_no_more() -> None:
+    queries = NameQueries()
+    queries.use(TOPIC, 0.0)
+    assert polled(queries, 0.0) == [(TOPIC, 2 * queries.watch_s)]
+    queries.receive_answer(TOPIC, 0.1)
+    assert TOPIC in queries
+    assert polled(queries, 3 * queries.watch_s) == []
+    assert TOPIC not in queries
+
+
+def test_a_new_rib_gets_every_query_at_once() -> None:
+    queries = NameQueries()
+    queries.watch(TOPIC, 0.0)
+    queries.receive_answer(TOPIC, 0.0)
+    queries.repeat_all(1.0)
+    assert polled(queries, 1.0) == [(TOPIC, queries.watch_s)]
+
+
+def test_a_name_without_a_watch_is_not_queried_again() -> None:
+    queries = NameQueries()
+    queries.watch(TOPIC, 0.0)
+    queries.unwatch(TOPIC)
+    assert (polled(queries, 1.0), queries.next_due()) == ([], None)
+
+
+def test_open_queries_are_bounded_and_watches_are_not_counted() -> None:
+    queries = NameQueries()
+    for number in range(QUERIES_MAX + 10):
+        queries.request(name(str(number)), 0.0)
+    queries.watch(TOPIC, 0.0)
+    assert TOPIC in queries
+    assert name(str(QUERIES_MAX - 1)) in queries
+    assert name(str(QUERIES_MAX + 9)) not in queries
+
+
+def test_new_names_fill_a_window_and_each_answer_admits_another_name() -> None:
+    queries = NameQueries()
+    for number in range(2 * WINDOW):
+        queries.request(name(str(number)), 0.0)
+    first = [each for _ in range(10) for each, _ in polled(queries, 0.0)]
+    assert len(first) == WINDOW
+    assert max(len(polled(queries, RETRY_S)), len(polled(queries, RETRY_S))) == BATCH_MAX  # the same ones again
+    queries.receive_answer(first[0], RETRY_S)
+    assert [each for each, _ in polled(queries, RETRY_S)] == [name(str(WINDOW))]
+
+
+def test_an_owner_of_many_queries_delays_no_other_owner() -> None:
+    queries = NameQueries()
+    for number in range(2 * WINDOW):
+        queries.request(name(str(number)), 0.0, owner=b"greedy")
+    queries.request(TOPIC, 0.0, owner=b"modest")
+    assert (TOPIC, 0.0) in polled(queries, 0.0)
+
+
+def test_a_name_that_waits_too_long_for_the_window_fails_without_a_query() -> None:
+    queries = NameQueries()
+    for number in range(WINDOW + 1):
+        queries.request(name(str(number)), 0.0)
+    first = [each for _ in range(10) for each, _ in polled(queries, 0.0)]
+    late = name(str(WINDOW))
+    assert late not in first
+    queries.receive_answer(first[0], PARKED_S)
+    failed = [each for _ in range(10) for each in queries.poll_due(PARKED_S)[1]]
+    assert failed == [late]
+    assert late not in queries
+
+
+def test_a_watch_is_renewed_in_time_however_often_the_rib_sends_updates() -> None:
+    queries = NameQueries()
+    queries.watch(TOPIC, 0.0)
+    sent_s = []
+    for now_s in range(60):
+        sent_s += [now_s] if polled(queries, now_s) else []
+        queries.receive_answer(TOPIC, now_s)
+    assert sent_s[0] == 0
+    assert all(b - a <= CLAIM_LEASE_S / 4 for a, b in pairwise(sent_s))
+    assert len(sent_s) >= 60 / (CLAIM_LEASE_S / 4)

@@ -1,0 +1,166 @@
+"""Name resolution at a switch: one miss from the query to the frame, and everything that can end it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from gdp.errors import DropReason
+from gdp.limits import CLAIM_LEASE_S, NEGATIVE_LEASE_S, PARKED_S, QUESTIONS_BURST
+from gdp.names import Name
+from gdp.switch.name_queries import QUERIES_MAX, RETRY_S, TRIES_MAX
+from gdp.switch.name_resolver import NameResolver
+from gdp.switch.places import Place
+from gdp.trust.right import Right
+from tests.gdp.switch.net import HOME, name
+
+ME, FAR, SERVER, TOPIC = name("me"), name("far"), name("server"), name("topic")
+NEIGHBOUR = b"n" + name("neighbour")
+
+
+def location(of: Name = SERVER, right: Right = Right.ATTACH, switch: Name = FAR, expires_s: float = 30.0) -> Place:
+    return Place(
+        name=of,
+        advertiser=name("robot"),
+        right=right,
+        switch=switch,
+        domain=HOME,
+        transit=frozenset(),
+        claim=b"claim",
+        expires_s=expires_s,
+    )
+
+
+def missed() -> NameResolver:
+    """Return a resolver with one frame that waits for ``SERVER``, whose query was sent."""
+    resolver = NameResolver(ME)
+    assert resolver.resolve(SERVER, 0.0, NEIGHBOUR) is None
+    resolver.buffer_frame(SERVER, b"frame", 0.0, NEIGHBOUR)
+    assert resolver.queries_to_send(0.0) == [(SERVER, 0.0)]
+    return resolver
+
+
+def test_a_location_answers_the_query_and_releases_the_frame() -> None:
+    resolver = missed()
+    resolver.receive_location(location(), 0.1)
+    assert resolver.resolve(SERVER, 0.1, NEIGHBOUR) == ([location()], None)
+    assert resolver.release_frames(SERVER) == [(b"frame", PARKED_S, NEIGHBOUR)]
+    assert (resolver.pending_frames, resolver.drops.total()) == (0, 0)
+
+
+def test_a_negative_answer_drops_the_frame_and_stands_for_a_moment() -> None:
+    resolver = missed()
+    resolver.receive_negative(SERVER, 0.1)
+    assert resolver.drops == {DropReason.NO_ROUTE: 1}
+    assert resolver.resolve(SERVER, 0.2) == ([], DropReason.NO_ROUTE)
+    assert resolver.resolve(SERVER, 0.1 + NEGATIVE_LEASE_S) is None
+
+
+def test_a_rib_that_has_just_started_does_not_remove_known_locations() -> None:
+    resolver = NameResolver(ME)
+    resolver.receive_location(location(), 0.0)
+    resolver.receive_negative(SERVER, 0.1, keep=True)
+    assert resolver.resolve(SERVER, 0.1) == ([location()], None)
+
+
+def test_a_rib_that_has_just_started_may_deny_an_unknown_name() -> None:
+    resolver = missed()
+    resolver.receive_negative(SERVER, 0.1, keep=True)
+    assert resolver.drops == {DropReason.NO_ROUTE: 1}
+
+
+def test_a_query_without_an_answer_drops_the_frame_when_it_fails() -> None:
+    resolver = missed()
+    for tries in range(1, TRIES_MAX + 4):
+        resolver.queries_to_send(tries * RETRY_S)
+    assert (resolver.open_queries, resolver.pending_frames) == (0, 0)
+    assert resolver.drops == {DropReason.NO_ROUTE: 1}
+
+
+def test_a_frame_expires_while_its_query_is_open() -> None:
+    resolver = missed()
+    assert resolver.next_expiry() == PARKED_S
+    resolver.expire(PARKED_S)
+    assert resolver.drops == {DropReason.PARKED_EXPIRED: 1}
+    assert resolver.open_queries == 1
+
+
+def test_a_frame_that_has_no_query_is_counted() -> None:
+    resolver = NameResolver(ME)
+    for number in range(QUERIES_MAX):
+        resolver.resolve(name(str(number)), 0.0)
+    resolver.resolve(SERVER, 0.0)
+    resolver.buffer_frame(SERVER, b"frame", 0.0, NEIGHBOUR)
+    assert (resolver.pending_frames, resolver.drops) == (0, {DropReason.PARKED_FULL: 1})
+
+
+def test_a_neighbour_above_its_rate_opens_no_query() -> None:
+    resolver = NameResolver(ME)
+    for number in range(int(QUESTIONS_BURST) + 10):
+        resolver.resolve(name(str(number)), 0.0, NEIGHBOUR)
+    assert resolver.open_queries == QUESTIONS_BURST
+    resolver.resolve(SERVER, 0.0, b"n" + name("other"))
+    assert resolver.open_queries == QUESTIONS_BURST + 1
+
+
+def test_a_name_that_only_publishes_has_no_reader() -> None:
+    resolver = NameResolver(ME)
+    resolver.receive_location(location(TOPIC, Right.PUBLISH), 0.0)
+    assert resolver.resolve(TOPIC, 0.0) == ([], DropReason.NO_READER)
+
+
+def test_a_node_is_found_by_any_name_that_it_advertises() -> None:
+    resolver = NameResolver(ME)
+    resolver.receive_location(location(TOPIC, Right.PUBLISH), 0.0)
+    assert resolver.resolve(name("robot"), 0.0) == ([location(TOPIC, Right.PUBLISH)], None)
+
+
+def test_a_node_that_has_left_this_switch_is_queried_again() -> None:
+    resolver = NameResolver(ME)
+    resolver.receive_location(location(switch=ME), 0.0, is_ours=True, has_left=True)
+    assert resolver.resolve(SERVER, 0.0) is None
+    assert resolver.queries_to_send(0.0) == [(SERVER, 0.0)]
+
+
+def test_a_source_is_located_whatever_its_right() -> None:
+    resolver = NameResolver(ME)
+    assert resolver.resolve_source(TOPIC, 0.0) is None
+    resolver.receive_location(location(TOPIC, Right.PUBLISH), 0.0)
+    assert resolver.resolve_source(TOPIC, 0.0) == ([location(TOPIC, Right.PUBLISH)], None)
+
+
+def test_a_location_that_is_used_is_watched() -> None:
+    resolver = NameResolver(ME)
+    resolver.receive_location(location(), 0.0)
+    resolver.resolve(SERVER, 0.0)
+    assert resolver.queries_to_send(0.0) == [(SERVER, 2 * CLAIM_LEASE_S)]
+
+
+def test_a_location_outlives_its_lease_only_while_no_rib_answers() -> None:
+    resolver = NameResolver(ME)
+    resolver.receive_location(replace(location(expires_s=1.0), stale_until_s=9.0), 0.0)
+    resolver.serve_stale(0.5, stale=True)
+    assert resolver.expire(2.0) == []
+    resolver.receive_removal(SERVER, name("robot"), 2.0)
+    assert resolver.resolve(SERVER, 2.0) is None
+
+
+def test_a_new_rib_gets_every_watch_at_once() -> None:
+    resolver = NameResolver(ME)
+    resolver.watch(TOPIC, 0.0)
+    assert resolver.queries_to_send(0.0) == [(TOPIC, CLAIM_LEASE_S)]
+    resolver.receive_location(location(TOPIC, Right.PUBLISH), 0.0)
+    assert resolver.queries_to_send(1.0) == []
+    resolver.rib_changed(1.0, has_rib=True)
+    assert resolver.queries_to_send(1.0) == [(TOPIC, CLAIM_LEASE_S)]
+
+
+def test_the_echo_of_a_relayed_claim_answers_no_query_until_it_is_repeated() -> None:
+    resolver = NameResolver(ME)
+    watch = [(TOPIC, CLAIM_LEASE_S)]
+    resolver.watch(TOPIC, 0.0)
+    assert resolver.queries_to_send(0.0) == watch
+    resolver.receive_location(location(TOPIC), 0.01, is_ours=True)
+    assert resolver.queries_to_send(RETRY_S) == watch
+    resolver.receive_location(location(TOPIC), RETRY_S + 0.01, is_ours=True)
+    assert resolver.queries_to_send(2 * RETRY_S + 0.1) == []
+    assert resolver.queries_to_send(CLAIM_LEASE_S / 4 + 1) == watch
