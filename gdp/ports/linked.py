@@ -137,6 +137,10 @@ class LinkedPlane(ABC):
         self._counters.handed_up += len(arrivals)
         return arrivals
 
+    def fileno(self) -> int:
+        """Return a descriptor that can be read while ``poll`` has something to do, for another event loop."""
+        return self._epoll.fileno()
+
     def watch(self, source: HasFileno, ready: Callable[[], None], *, rank: int = 0) -> None:
         fd = source.fileno()
         self._epoll.register(fd, select.EPOLLIN)
