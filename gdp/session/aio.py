@@ -73,6 +73,11 @@ class AsyncPublisher:
         """Return how many messages some reader did not get, as far as it is known here."""
         return self._publisher.losses.total
 
+    @property
+    def resent(self) -> int:
+        """Return how many parts were sent again because a reader lacked them."""
+        return self._publisher.repairs
+
     async def put(self, payload: bytes, timeout_s: float | None = None) -> None:
         """Publish a message; a reliable publisher waits while its window is full.
 

@@ -9,7 +9,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from types import TracebackType
 from typing import Final, Literal, Protocol
@@ -91,6 +91,11 @@ class Publisher:
     def lost(self) -> int:
         """Return how many messages some reader did not get, as far as it is known here."""
         return self._publisher.losses.total
+
+    @property
+    def resent(self) -> int:
+        """Return how many parts were sent again because a reader lacked them."""
+        return self._publisher.repairs
 
     def put(self, payload: bytes, timeout_s: float | None = None) -> None:
         """Publish a message.
@@ -210,7 +215,7 @@ class Subscription:
 
     def _wait(self, deadline_s: float | None, timeout_s: float | None) -> Message:
         while True:
-            if not self._driver.wait(self._is_ready, deadline_s):
+            if not self._driver.wait(self.is_ready, deadline_s):
                 label = self._session.core.label(self._topic)
                 hint = self._session.why_not(self.name, f"{self.publishers} publisher(s) are there")
                 raise SessionTimeoutError(f"{label}: no message within {timeout_s:g} s{hint}")
@@ -221,7 +226,15 @@ class Subscription:
                     label = self._session.core.label(self._topic)
                     raise ClosedError(f"the subscription to {label} is closed; subscribe again") from None
 
-    def _is_ready(self) -> bool:
+    def poll(self) -> Message | None:
+        """Return the next message if one has arrived, else None; never waits."""
+        try:
+            return self._messages.popleft()
+        except IndexError:
+            return None
+
+    def is_ready(self) -> bool:
+        """Return whether ``receive`` would return, or raise, at once."""
         return bool(self._messages) or self._is_closed
 
     def __iter__(self) -> Iterator[Message]:
@@ -401,6 +414,25 @@ class Session:
         subscription = Subscription(self, topic, self.driver.run(lambda: self.core.subscribe(topic, queue)))
         self._opened.append(subscription)
         return subscription
+
+    def receive_any(
+        self, subscriptions: Collection[Subscription], timeout_s: float | None = None
+    ) -> tuple[Subscription, Message]:
+        """Return the next message of several subscriptions, and whose it is, for one thread that reads many names.
+
+        Raises:
+            SessionTimeoutError: no message came in time.
+            ClosedError: the session is closed.
+        """
+        deadline_s = _deadline_s(timeout_s)
+        while self.driver.wait(lambda: any(map(Subscription.is_ready, subscriptions)), deadline_s):
+            for each in subscriptions:
+                message = each.poll()
+                if message is not None:
+                    return each, message
+            if not any(each in self._opened for each in subscriptions):
+                raise ClosedError("every subscription is closed; subscribe again")
+        raise SessionTimeoutError(f"no message on {len(subscriptions)} subscription(s) within {timeout_s:g} s")
 
     def serve(
         self,
