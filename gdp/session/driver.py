@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-_GRACE_S: Final = 0.005  # after the last leader left, before the background thread leads
+_GRACE_S: Final = 0.02  # after the last leader left, before the background thread leads
 _QUEUED_MAX: Final = 1_024  # messages handed to the leader; who has more waits until it took them
 _COPY_MAX_BYTES: Final = 65_536  # a larger message is handed over only when the leader takes it at once
 _SMALL_BYTES: Final = 1_024  # such a message leaves with one send
