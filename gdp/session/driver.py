@@ -44,6 +44,9 @@ _SMALL_BYTES: Final = 1_024  # such a message leaves with one send
 class Driver(Protocol):
     """What a session needs of its driver."""
 
+    def now_s(self) -> float:
+        """Return the present monotonic second."""
+
     def run(self, command: Callable[[], T]) -> T:
         """Run a command on the node and return what it returns; it must not block."""
 
@@ -111,6 +114,10 @@ class ThreadDriver:
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._background, name="gdp-session", daemon=True)
         self._thread.start()
+
+    def now_s(self) -> float:
+        """Return the present monotonic second."""
+        return time.monotonic()
 
     def run(self, command: Callable[[], T]) -> T:
         """Run a command on the node and return what it returns.

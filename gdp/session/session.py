@@ -126,7 +126,7 @@ class Publisher:
         Raises:
             SessionTimeoutError: they did not come in time; the text says why, where that is known.
         """
-        if not self._driver.wait(lambda: self._publisher.readers >= count, _deadline_s(timeout_s)):
+        if not self._driver.wait(lambda: self._publisher.readers >= count, _deadline_s(self._driver, timeout_s)):
             raise SessionTimeoutError(
                 f"{self._label}: {self.readers} of {count} reader(s) within {timeout_s:g} s"
                 f"{self._session.why_not(self.name, 'start a program that subscribes to it')}"
@@ -138,7 +138,7 @@ class Publisher:
         Raises:
             SessionTimeoutError: they did not in time.
         """
-        if not self._driver.wait(self._publisher.is_acknowledged, _deadline_s(timeout_s)):
+        if not self._driver.wait(self._publisher.is_acknowledged, _deadline_s(self._driver, timeout_s)):
             raise SessionTimeoutError(f"{self._label}: not every reader has confirmed within {timeout_s:g} s")
 
     def close(self) -> None:
@@ -160,7 +160,9 @@ class Publisher:
 
     def _wait_for_room(self, timeout_s: float | None) -> None:
         publisher = self._publisher
-        if not self._driver.wait(lambda: publisher.has_room() or not publisher.is_wanted, _deadline_s(timeout_s)):
+        if not self._driver.wait(
+            lambda: publisher.has_room() or not publisher.is_wanted, _deadline_s(self._driver, timeout_s)
+        ):
             raise SessionTimeoutError(
                 f"{self._label}: no room for {timeout_s:g} s, since a reader confirms too slowly; publish less, or with"
                 " reliable=False"
@@ -211,7 +213,7 @@ class Subscription:
         try:
             return self._messages.popleft()
         except IndexError:
-            return self._wait(_deadline_s(timeout_s), timeout_s)
+            return self._wait(_deadline_s(self._driver, timeout_s), timeout_s)
 
     def _wait(self, deadline_s: float | None, timeout_s: float | None) -> Message:
         while True:
@@ -300,9 +302,9 @@ class Server:
             return
         self._session.forget(self)
         self._driver.run(self._core.leave)
-        self._driver.wait(lambda: self._core.is_idle, time.monotonic() + linger_s)
+        self._driver.wait(lambda: self._core.is_idle, self._driver.now_s() + linger_s)
         self._is_closed = True
-        self._driver.run(lambda: self._session.core.close_server(self._core, time.monotonic()))
+        self._driver.run(lambda: self._session.core.close_server(self._core, self._driver.now_s()))
 
     def serve_forever(self) -> None:
         """Wait until the server or the session is closed, for a program that does nothing else."""
@@ -424,7 +426,7 @@ class Session:
             SessionTimeoutError: no message came in time.
             ClosedError: the session is closed.
         """
-        deadline_s = _deadline_s(timeout_s)
+        deadline_s = _deadline_s(self.driver, timeout_s)
         while self.driver.wait(lambda: any(map(Subscription.is_ready, subscriptions)), deadline_s):
             for each in subscriptions:
                 message = each.poll()
@@ -490,7 +492,7 @@ class Session:
         if len(call.payload) > PAYLOAD_MAX_BYTES:
             raise LocalError(f"the request has {len(call.payload)} bytes; at most {PAYLOAD_MAX_BYTES} can be sent")
         topic = self.core.resolve(name, Right.CALL)
-        self.driver.run(lambda: self.core.call(topic, call, time.monotonic()))
+        self.driver.run(lambda: self.core.call(topic, call, self.driver.now_s()))
         self.driver.wait(lambda: call.is_done, None)
         if call.response is None:
             raise call.error or ClosedError("the session was closed during the call")
@@ -514,7 +516,7 @@ class Session:
             return
         self._is_closed = True
         try:
-            self._finish(time.monotonic() + linger_s)
+            self._finish(self.driver.now_s() + linger_s)
         except ClosedError as error:
             log.warning("the session ended without a goodbye reason=%s", error)
         finally:
@@ -533,7 +535,7 @@ class Session:
         Raises:
             AttachError: none did in time; the text says what the node waits for.
         """
-        if not self.driver.wait(lambda: self.is_attached, time.monotonic() + timeout_s):
+        if not self.driver.wait(lambda: self.is_attached, self.driver.now_s() + timeout_s):
             raise AttachError(f"not attached within {timeout_s:g} s: {self._node.waiting_for()}")
 
     def why_not(self, name: Name, otherwise: str) -> str:
@@ -552,14 +554,14 @@ class Session:
         publishers = [each for each in self._opened if isinstance(each, Publisher)]
         for each in list(self._opened):
             if isinstance(each, Server):
-                each.close(max(deadline_s - time.monotonic(), 0.0))
+                each.close(max(deadline_s - self.driver.now_s(), 0.0))
         for publisher in publishers:
             if publisher.readers:
                 self.driver.wait(publisher._publisher.is_acknowledged, deadline_s)
         for opened in list(self._opened):
             opened.close()
-        self.driver.run(lambda: self.core.close(time.monotonic()))
-        self.driver.wait(lambda: False, time.monotonic() + GOODBYE_S)
+        self.driver.run(lambda: self.core.close(self.driver.now_s()))
+        self.driver.wait(lambda: False, self.driver.now_s() + GOODBYE_S)
 
 
 def open_session(
@@ -644,5 +646,5 @@ def is_urgent(priority: Priority) -> bool:
     return priority == "urgent"
 
 
-def _deadline_s(timeout_s: float | None) -> float | None:
-    return None if timeout_s is None else time.monotonic() + timeout_s
+def _deadline_s(driver: Driver, timeout_s: float | None) -> float | None:
+    return None if timeout_s is None else driver.now_s() + timeout_s
