@@ -65,8 +65,11 @@ class Inbox:
         del now_s
         delivered = message.delivered
         stamp_ns, payload = read_message(delivered.message)
+        publisher = delivered.publisher
+        if not isinstance(publisher, Name):
+            publisher = Name(publisher)
         messages = self.messages
-        messages.append(Message(payload, Name(delivered.publisher), delivered.sequence, delivered.hops, stamp_ns))
+        messages.append(Message(payload, publisher, delivered.sequence, delivered.hops, stamp_ns))
         self._bytes += len(payload)
         if len(messages) > self._limit or self._bytes > QUEUE_MAX_BYTES:
             self._drop_oldest()

@@ -163,7 +163,8 @@ class ThreadDriver:
                 self._send(len(message))
             finally:
                 self._lock.release()
-            self._after_release()
+            if self._commands or self._followers:
+                self._after_release()
         elif len(message) > _COPY_MAX_BYTES or len(self._commands) >= _QUEUED_MAX:
             self.run(partial(publisher.publish, message))
         else:
@@ -176,15 +177,15 @@ class ThreadDriver:
         Raises:
             ClosedError: the session is or was closed meanwhile.
         """
-        while not is_ready():
-            self._check()
-            if deadline_s is not None and time.monotonic() >= deadline_s:
-                return False
+        while True:
             if self._lock.acquire(blocking=False):
-                self._lead(is_ready, deadline_s)
-            else:
-                self._follow(is_ready, deadline_s)
-        return True
+                if self._lead(is_ready, deadline_s):
+                    return True
+            elif self._follow(is_ready, deadline_s):
+                return True
+            if deadline_s is not None and time.monotonic() >= deadline_s:
+                return is_ready()
+            self._check()
 
     def close(self) -> None:
         """End the background work; threads that wait get ``ClosedError``."""
@@ -203,15 +204,16 @@ class ThreadDriver:
 
     # leading
 
-    def _lead(self, is_ready: Callable[[], bool], deadline_s: float | None) -> None:
-        """Work as the leader until ready; the lock is taken, and is given back here."""
+    def _lead(self, is_ready: Callable[[], bool], deadline_s: float | None) -> bool:
+        """Work as the leader until ready; the lock is taken, and is given back here. Return whether it is ready."""
         self._is_led = True
         self._leads += 1
         try:
-            while not self._is_closed and not is_ready():
-                if deadline_s is not None and time.monotonic() >= deadline_s:
-                    break
+            while not is_ready():
+                if self._is_closed or (deadline_s is not None and time.monotonic() >= deadline_s):
+                    return False
                 self._step(deadline_s)
+            return True
         except Exception as error:
             self._error = error
             raise
@@ -220,7 +222,8 @@ class ThreadDriver:
             self._lock.release()
             if self._is_parked:
                 self._unparked.set()
-            self._after_release()
+            if self._commands or self._followers:
+                self._after_release()
 
     def _step(self, deadline_s: float | None) -> None:
         core = self._core
@@ -254,16 +257,17 @@ class ThreadDriver:
 
     # not leading
 
-    def _follow(self, is_ready: Callable[[], bool], deadline_s: float | None) -> None:
-        """Wait until the leader says that the condition came true, or that nobody leads."""
+    def _follow(self, is_ready: Callable[[], bool], deadline_s: float | None) -> bool:
+        """Wait until the leader says that the condition came true, or that nobody leads; return whether it is true."""
         follower = _Follower(is_ready)
         self._followers.append(follower)
         try:
-            if not self._is_led:
+            if not (self._is_led or self._is_closed):
                 self._wake.set()  # the background thread makes place
             if is_ready() or not self._lock.locked():  # it may have changed before the leader knew of us
-                return
+                return is_ready()
             follower.event.wait(None if deadline_s is None else max(deadline_s - time.monotonic(), 0.0))
+            return is_ready()
         finally:
             self._followers.remove(follower)
 
