@@ -19,11 +19,11 @@ from gdp.stores.keyring import CARD, ROOT_CERTIFICATE
 from gdp.testbed.namespaces import Namespaces
 from gdp.testbed.processes import Process, end_all
 from gdp.testbed.runs import Run, Runs
-from gdp.testbed.topology import Attachment, DomainPlan, Topology
+from gdp.testbed.topology import DomainPlan, Topology
 from gdp.trust.right import Right
 from tests.pages import ROOT
 
-__all__ = ["PATIENCE_S", "SessionLab", "session_lab"]
+__all__ = ["EXAMPLES", "PATIENCE_S", "SessionLab", "lines_of", "session_lab"]
 
 PATIENCE_S: Final = 30.0
 _MACHINE: Final = "lab"
@@ -37,13 +37,14 @@ class SessionLab:
         self.folder = run.directory
         self._run = run
         self._undo = undo
-        labels = tuple(rights)
-        attachments = (Attachment(_MACHINE, "rib", "rib0"), *(Attachment(_MACHINE, "proxy", f"{x}0") for x in labels))
-        topology = Topology((), (DomainPlan(_MACHINE, (_MACHINE,)),), attachments)
-        self._spaces = Namespaces(topology, run)
+        self._spaces = Namespaces(Topology((), (DomainPlan(_MACHINE, (_MACHINE,)),), ()), run)
+        if rights:
+            self._make_nodes(rights)
+
+    def _make_nodes(self, rights: Rights) -> None:
         make_domain(self.folder / "domain", _MACHINE)
         make_owner(self.folder / "owner")
-        attach = ["rib0", *(f"{label}0" for label in labels)]
+        attach = ["rib0", *(f"{label}0" for label in rights)]
         self._start_node(Role.SWITCH, {"attach": attach, "data_plane": "raw"})
         self._start_node(Role.RIB, {"iface": "rib0"})
         for label, names in rights.items():
@@ -57,9 +58,14 @@ class SessionLab:
 
     def start(self, *argv: str) -> subprocess.Popen[str]:
         """Start Python with these arguments on the machine; it ends with the lab."""
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+        return self.start_command([sys.executable, *argv])
+
+    def start_command(self, argv: Sequence[str]) -> subprocess.Popen[str]:
+        """Start a command on the machine; it ends with the lab."""
+        path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", "PATH": path}
         process = subprocess.Popen(
-            self._spaces.command(_MACHINE, [sys.executable, *argv]),
+            self._spaces.command(_MACHINE, argv),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -77,10 +83,6 @@ class SessionLab:
         out, errors = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0, f"exit {process.returncode}: {out}{errors}"
         return out
-
-    def run(self, code: str, *arguments: str) -> str:
-        """Run a program to its end and return what it has printed."""
-        return self.output(self.start("-c", code, *arguments))
 
     def _start_node(self, role: Role, content: Mapping[str, object]) -> None:
         identity = self.folder / role.value
@@ -104,7 +106,7 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 @contextmanager
 def session_lab(rights: Rights) -> Iterator[SessionLab]:
-    """Run a lab whose nodes have these rights; end it on leaving."""
+    """Run a lab whose nodes have these rights, without any only an empty machine; end it on leaving."""
     run = Runs().start()
     with ExitStack() as undo:
         undo.callback(run.end)
