@@ -252,7 +252,8 @@ class ThreadDriver:
     def _send(self, size_bytes: int) -> None:
         self._member.flush(time.monotonic())
         is_more = self._runtime.send()
-        while is_more and size_bytes > _SMALL_BYTES:
+        while is_more and size_bytes > _SMALL_BYTES:  # what is confirmed meanwhile makes room for more
+            self._step(0.0)  # that second has passed: it does not wait
             is_more = self._runtime.send()
 
     # not leading
