@@ -22,6 +22,7 @@ needs_ros2 = pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy is not
         ["forwarding.py", "--quick", "--no-save"],
         ["scale.py", "--quick", "--no-save"],
         ["messages.py", "--quick", "--mtu", "9000", "--offloads", "off"],
+        ["library.py", "--rounds", "1", "--count", "5"],
         ["overlap.py", "--rounds", "1", "--count", "5"],
         ["priority.py", "--quick", "--no-save"],
         ["bundles.py", "--quick", "--no-save"],

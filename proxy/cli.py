@@ -8,6 +8,7 @@ from __future__ import annotations
 import typer
 
 from gdp.cli.node import AwaitIface, Check, Config, Json, Verbose, failing_clearly, set_up_logging
+from gdp.cli.version import Version
 from gdp.nodes.awaiting import await_device
 from proxy.config import ProxyConfig
 from proxy.schema_cli import Schema
@@ -25,12 +26,13 @@ def proxy(
     json: Json = False,
     verbose: Verbose = False,
     schema: Schema = False,
+    version: Version = False,
 ) -> None:
     """Carry what the configuration names between ROS and the overlay, until Ctrl-C; SIGHUP reads it again.
 
     With a ros section it takes part in that graph; without one it records what it imports.
     """
-    del schema  # it ends the command by itself
+    del schema, version  # they end the command by themselves
     set_up_logging(verbose=verbose)
     with failing_clearly():
         settings = ProxyConfig.load(config)
@@ -57,7 +59,7 @@ def proxy(
 
 def main() -> None:
     """Run the command."""
-    app()
+    app(prog_name="gdp-proxy")
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from typing import Annotated
 import typer
 
 from gdp.cli.node import Json, emit, failing_clearly
+from gdp.cli.version import Version
 from gdp.crypto.keys import PublicKey
 from gdp.errors import LocalError, StatementError
 from gdp.limits import CHAIN_MAX
@@ -47,8 +48,10 @@ def delegate_what_is_needed(
     days: Days = DELEGATION_DAYS,
     renew: Renew = False,
     json: Json = False,
+    version: Version = False,
 ) -> None:
     """Let each proxy publish, read, serve or call what its rules say; what it may already is left as it is."""
+    del version  # it ends the command by itself
     with failing_clearly():
         key = load_owner(owner).public
         configs = [ProxyConfig.load(file) for file in files]
@@ -71,7 +74,7 @@ def delegate_what_is_needed(
 
 def main() -> None:
     """Run the command."""
-    app()
+    app(prog_name="gdp-delegate")
 
 
 def _refuse_other_owners(owner: Path, key: PublicKey, files: Sequence[Path], configs: Sequence[ProxyConfig]) -> None:

@@ -1,76 +1,11 @@
-"""The delegations that this node holds, each verified, with the secrets in them.
+"""The delegations of a proxy: the store that all nodes have (``gdp/nodes/delegation_store.py``).
 
-Place: shell; it reads files.
+Layer: I/O; it reads files.
 """
 
 from __future__ import annotations
 
-import logging
-import time
-from collections.abc import Iterator
-from pathlib import Path
+from gdp.nodes.delegation_store import DelegationStore as Held
+from gdp.nodes.delegation_store import open_delegation
 
-from gdp.client.member import Topic
-from gdp.crypto.identity import Identity
-from gdp.errors import GdpError, LocalError
-from gdp.metadata import Metadata
-from gdp.names import Name
-from gdp.stores.keyring import load_delegations
-from gdp.trust.delegation import Delegation
-from gdp.trust.right import Right
-
-__all__ = ["Held"]
-
-log = logging.getLogger(__name__)
-
-
-class Held:
-    """What may be done with which name.
-
-    Args:
-        directory: of delegation files; one that does not hold is told and left out.
-
-    Raises:
-        LocalError: a file is malformed, or readable for others.
-    """
-
-    def __init__(self, directory: Path, identity: Identity) -> None:
-        self.directory = directory
-        self._topics: dict[Name, Topic] = {}
-        for delegation in load_delegations(directory):
-            try:
-                self._topics[delegation.name] = open_delegation(delegation, identity)
-            except GdpError as error:
-                meant = delegation.metadata["name"] if delegation.metadata else delegation.name.short
-                log.warning("delegation left out of=%s reason=%s", meant, error)
-
-    def __iter__(self) -> Iterator[Topic]:
-        return iter(self._topics.values())
-
-    def get(self, name: Name) -> Topic | None:
-        """Return what is held of a name, whatever the rights."""
-        return self._topics.get(name)
-
-    def find(self, name: Name, right: Right) -> Topic | None:
-        """Return what is held of a name if it gives this right."""
-        topic = self._topics.get(name)
-        return topic if topic is not None and right in topic.delegation.rights else None
-
-    def described(self, right: Right) -> Iterator[tuple[Metadata, Name]]:
-        """Yield the names held with this right whose giver said what they mean."""
-        for topic in self._topics.values():
-            if right in topic.delegation.rights and topic.delegation.metadata is not None:
-                yield topic.delegation.metadata, topic.name
-
-
-def open_delegation(delegation: Delegation, identity: Identity) -> Topic:
-    """Return a delegation verified, with its secrets.
-
-    Raises:
-        GdpError: it does not hold now, or has no secret.
-    """
-    delegation.verify(identity, time.time())
-    secrets = {epoch: grant.secret for epoch, grant in delegation.open(identity).items()}
-    if not secrets:
-        raise LocalError("the delegation holds no secret of any epoch")
-    return Topic(delegation, secrets)
+__all__ = ["Held", "open_delegation"]

@@ -16,6 +16,7 @@ from typing import Annotated, Final
 import typer
 
 from gdp.cli.node import Check, Config, Json, Verbose, emit, emit_wait, failing_clearly, set_up_logging
+from gdp.cli.version import Version
 from gdp.errors import LocalError
 from proxy.checking import check_proxy
 from proxy.config import ProxyConfig
@@ -54,6 +55,7 @@ def replay(
     check: Check = False,
     json: Json = False,
     verbose: Verbose = False,
+    version: Version = False,
 ) -> None:
     """Replay a recording's exposed topics onto the overlay with the recorded timing.
 
@@ -61,6 +63,7 @@ def replay(
     too large, or the overlay refused a topic; or the recording takes more memory or time than it may. Best effort is
     sent, and confirmed by nobody.
     """
+    del version  # it ends the command by itself
     set_up_logging(verbose=verbose)
     limits = BagLimits(None if memory is None else memory << 20, cpu)
     with failing_clearly(), _failing_decoder():
@@ -180,7 +183,7 @@ def _topic_fields(replay: Replay) -> list[dict[str, object]]:
 
 def main() -> None:
     """Run the command."""
-    app()
+    app(prog_name="gdp-replay")
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ import typer
 from fog.host.bundle import TICKET_FILE
 from fog.host.host import Host
 from gdp.cli.node import Verbose, emit, failing_clearly, set_up_logging
+from gdp.cli.version import Version
 
 __all__ = ["main"]
 
@@ -32,12 +33,19 @@ AwaitGo = Annotated[bool, typer.Option("--await-go", hidden=True)]
 
 
 @app.command(epilog="Example: fog-machine --home /var/lib/fog/machine")
-def machine(home: Home, json: Json = False, verbose: Verbose = False, await_go: AwaitGo = False) -> None:
+def machine(
+    home: Home,
+    json: Json = False,
+    verbose: Verbose = False,
+    await_go: AwaitGo = False,
+    version: Version = False,
+) -> None:
     """Be a machine of a cluster: enrol if there is a ticket, run the programs of boot.json until SIGTERM.
     SIGUSR1 drains it first.
 
     Its folder's status.json tells how they are, logs/ what they say.
     """
+    del version  # it ends the command by itself
     set_up_logging(verbose=verbose)
     with failing_clearly():
         host = Host(home.resolve())
@@ -58,7 +66,7 @@ def machine(home: Home, json: Json = False, verbose: Verbose = False, await_go: 
 
 def main() -> None:
     """Run the command."""
-    app()
+    app(prog_name="fog-machine")
 
 
 if __name__ == "__main__":

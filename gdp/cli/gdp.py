@@ -13,6 +13,7 @@ import typer
 from gdp.cli import audit, cert, control, delegate, domain, key, keygen
 from gdp.cli.lab import lab
 from gdp.cli.name import name
+from gdp.cli.version import Version
 from gdp.errors import GdpError
 
 __all__ = ["app", "main"]
@@ -24,6 +25,13 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+
+
+@app.callback()
+def _gdp(version: Version = False) -> None:
+    del version  # it ends the command by itself
+
+
 app.command("name", no_args_is_help=True)(name)
 app.command("lab", no_args_is_help=True)(lab)
 for command in (control.reload, control.status, control.drain):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import typer
 
 from gdp.cli.node import AwaitIface, Check, Config, Json, Verbose, emit, emit_wait, failing_clearly, set_up_logging
+from gdp.cli.version import Version
 from gdp.crypto.certificates import Role
 from gdp.names import Name
 from gdp.nodes.awaiting import await_device
@@ -27,8 +28,10 @@ def rib(
     check: Check = False,
     json: Json = False,
     verbose: Verbose = False,
+    version: Version = False,
 ) -> None:
     """Answer who advertises a name, and where, for one trust domain, until Ctrl-C."""
+    del version  # it ends the command by itself
     set_up_logging(verbose=verbose)
     with failing_clearly():
         settings = RibConfig.load(config)
@@ -53,7 +56,7 @@ def _report(event: str, text: str, name: Name, *, json: bool) -> None:
 
 def main() -> None:
     """Run the command."""
-    app()
+    app(prog_name="gdp-rib")
 
 
 if __name__ == "__main__":

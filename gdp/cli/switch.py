@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from gdp.cli.node import Check, Config, Json, Verbose, emit, emit_wait, failing_clearly, set_up_logging
+from gdp.cli.version import Version
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import LocalError
@@ -32,11 +33,13 @@ def switch(
     check: Check = False,
     json: Json = False,
     verbose: Verbose = False,
+    version: Version = False,
 ) -> None:
     """Switch frames by 256-bit names between layer-2 ports, until Ctrl-C.
 
     With the identity of a leaf it serves the nodes attached to it, and passes nothing on between its neighbours.
     """
+    del version  # it ends the command by itself
     set_up_logging(verbose=verbose)
     with failing_clearly():
         settings = SwitchConfig.load(config).with_ifaces(iface or [])
@@ -78,7 +81,7 @@ def _report_ready(identity: Identity, plane: str, reason: str, *, json: bool) ->
 
 def main() -> None:
     """Run the command."""
-    app()
+    app(prog_name="gdp-switch")
 
 
 if __name__ == "__main__":

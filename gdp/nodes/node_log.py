@@ -93,6 +93,10 @@ class NodeLog:
             if self._on_wait is not None:
                 self._on_wait(wait.reason.value, text)
 
+    def waiting_for(self, now_s: float) -> list[str]:
+        """Return what the node waits for now, each as a sentence; empty when it waits for nothing."""
+        return [self._text(wait) for wait in self._waits(now_s)]
+
     def metrics(self) -> Mapping[str, int]:
         """Return for each reason whether the node waits for it, 1 or 0."""
         lasting = {wait.reason for wait in self._wait_log.lasting}

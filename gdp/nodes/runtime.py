@@ -177,6 +177,11 @@ class Runtime:
         if self.has_drained or time.monotonic() >= self._drain_until_s:
             self.stop()
 
+    def next_due_s(self) -> float | None:
+        """Return the monotonic second at which a step has something to do without frames, or None."""
+        times = [self._machine.next_timeout(), *(look.due_s for look in self._looks)]
+        return min((time for time in times if time is not None), default=None)
+
     def _wait(self, timeout_s: float | None) -> list[Arrival]:
         """Wait for frames; where they follow each other closely, look again for a moment before going to sleep."""
         begun_s = time.monotonic()

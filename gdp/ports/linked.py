@@ -141,6 +141,10 @@ class LinkedPlane(ABC):
         self._counters.handed_up += len(arrivals)
         return arrivals
 
+    def fileno(self) -> int:
+        """Return a descriptor that can be read while ``poll`` has something to do, for another event loop."""
+        return self._epoll.fileno()
+
     def watch(self, source: HasFileno, ready: Callable[[], None], *, rank: int = 0) -> None:
         """Call ``ready`` from within ``poll`` whenever ``source`` can be read; a lower ``rank`` comes first."""
         fd = source.fileno()

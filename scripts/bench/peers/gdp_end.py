@@ -1,26 +1,29 @@
-"""What runs of ours at A and B: a member of the overlay without ROS.
+"""What runs of ours at A and B: a session of the library, or a member of the overlay without it.
 
 Place: process of its own, started by ``gdp_net.py``. Each message is written in the topic's encoding, encrypted,
 signed, verified, put in order and reported on, and read back from the encoding: all that a proxy does but for ROS.
 
-Each encoding has a topic of its own, ``/ping/json`` for one; answers come back on ``/pong``.
+Each encoding has a topic of its own, ``/ping/json`` for one; answers come back on ``/pong``. ``bench/library.py`` runs
+the same with the internal path in place of the library, to measure what that costs.
 """
 
 from __future__ import annotations
 
 import os
 import secrets
+import signal
 import time
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
-from typing import Final, get_args
+from typing import Final, Protocol, get_args
 
+import gdp
 from gdp.client.member import Member, Topic
 from gdp.client.publisher import Publisher
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError
-from gdp.names import Name
 from gdp.nodes.allocator import settle_memory
 from gdp.nodes.config import RibConfig
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
@@ -44,58 +47,128 @@ def ping_topic(encoding: str) -> str:
     return f"/ping/{encoding}"
 
 
-class GdpEnd:
-    """A member on its plane."""
+class Endpoint(Protocol):
+    """One side: publishes some topics and reads others."""
+
+    def advertise(self, topic: str) -> Callable[[bytes], None]:
+        """Publish a topic, reliably; return what sends a message."""
+
+    def subscribe(self, topic: str) -> None:
+        """Read a topic."""
+
+    def wait_for_readers(self, deadline_s: float) -> None:
+        """Wait until each published topic is read; raises ``TimeoutError``."""
+
+    def receive(self, deadline_s: float) -> tuple[str, bytes] | None:
+        """Return the next message with its topic; None when the monotonic second passed."""
+
+    def resent(self, topic: str) -> int:
+        """Return how many parts of a published topic were sent again."""
+
+
+class LibraryEndpoint:
+    """A session of the library."""
+
+    def __init__(self, config: Path, spin_s: float) -> None:
+        self.session = gdp.open(config, spin_us=round(spin_s * 1e6), timeout_s=PATIENCE_S)
+        self._publishers: dict[str, gdp.Publisher] = {}
+        self._subscriptions: dict[str, gdp.Subscription] = {}
+
+    def advertise(self, topic: str) -> Callable[[bytes], None]:
+        """Publish a topic, reliably; return what sends a message."""
+        publisher = self._publishers[topic] = self.session.publisher(topic, reliable=True)
+        return publisher.put
+
+    def subscribe(self, topic: str) -> None:
+        """Read a topic."""
+        self._subscriptions[topic] = self.session.subscribe(topic)
+
+    def wait_for_readers(self, deadline_s: float) -> None:
+        """Wait until each published topic is read; raises ``TimeoutError``."""
+        for publisher in self._publishers.values():
+            publisher.wait_for_readers(timeout_s=max(deadline_s - time.monotonic(), 0.0))
+
+    def receive(self, deadline_s: float) -> tuple[str, bytes] | None:
+        """Return the next message with its topic; None when the monotonic second passed."""
+        try:
+            if len(self._subscriptions) == 1:
+                ((topic, subscription),) = self._subscriptions.items()
+                return topic, subscription.receive(deadline_s - time.monotonic()).payload
+            source, message = self.session.receive_any(self._subscriptions.values(), deadline_s - time.monotonic())
+        except gdp.SessionTimeoutError:
+            return None
+        return next(topic for topic, each in self._subscriptions.items() if each is source), message.payload
+
+    def resent(self, topic: str) -> int:
+        """Return how many parts of a published topic were sent again."""
+        return self._publishers[topic].resent
+
+
+class InternalEndpoint:
+    """A member on its plane, as the library has one inside."""
 
     def __init__(self, config: Path, spin_s: float) -> None:
         settings = RibConfig.load(config)  # identity, domain and iface are all that an end needs
         identity, policy = load_member(settings.identity, settings.domain, Role.PROXY)
-        self.member = Member(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes))
-        self.runtime = Runtime(self.member, RawPlane([settings.iface]), spin_s=spin_s)
+        self._member = Member(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes))
+        self._runtime = Runtime(self._member, RawPlane([settings.iface]), spin_s=spin_s)
+        self._publishers: dict[str, Publisher] = {}
         self._topics: dict[str, Topic] = {}
-        self._arrived = deque[tuple[Name, bytes]]()
+        self._labels: dict[bytes, str] = {}
+        self._arrived = deque[tuple[str, bytes]]()
         for each in load_delegations(settings.identity / "delegations"):
             if each.metadata is None:
                 raise LocalError("a delegation without metadata")
             grants = {epoch: grant.secret for epoch, grant in each.open(identity).items()}
             self._topics[str(each.metadata["name"])] = Topic(each, grants)
 
-    def advertise(self, topic: str) -> Publisher:
-        """Publish a topic, reliably."""
-        return self.member.advertise(self._topics[topic], b"bench", reliable=True)
+    def advertise(self, topic: str) -> Callable[[bytes], None]:
+        """Publish a topic, reliably; return what sends a message."""
+        publisher = self._publishers[topic] = self._member.advertise(self._topics[topic], b"bench", reliable=True)
 
-    def subscribe(self, topic: str) -> Name:
-        """Read a topic; return its name."""
-        self.member.subscribe(self._topics[topic])
-        return self._topics[topic].name
+        def send(message: bytes) -> None:
+            publisher.publish(message)
+            self._member.flush(time.monotonic())
+            self._runtime.send()
 
-    def publish(self, publisher: Publisher, message: bytes) -> None:
-        """Publish, and hand the frames to the device."""
-        publisher.publish(message)
-        self.member.flush(time.monotonic())
-        self.runtime.send()
+        return send
 
-    def receive(self, deadline_s: float) -> tuple[Name, bytes] | None:
+    def subscribe(self, topic: str) -> None:
+        """Read a topic."""
+        self._member.subscribe(self._topics[topic])
+        self._labels[self._topics[topic].name] = topic
+
+    def wait_for_readers(self, deadline_s: float) -> None:
+        """Wait until each published topic is read; raises ``TimeoutError``."""
+        if not self._runtime.run(lambda: all(each.readers for each in self._publishers.values()), deadline_s):
+            raise TimeoutError("no reader: the overlay did not come up")
+
+    def receive(self, deadline_s: float) -> tuple[str, bytes] | None:
         """Return the next message with its topic; None when the monotonic second passed."""
         while not self._arrived:
-            if time.monotonic() >= deadline_s or self.runtime.is_stopped:
+            if time.monotonic() >= deadline_s:
                 return None
-            self.runtime.step(deadline_s)
-            self._arrived.extend((each.topic, each.delivered.message) for each in self.member.take_messages())
+            self._runtime.step(deadline_s)
+            for each in self._member.take_messages():
+                self._arrived.append((self._labels[each.topic], each.delivered.message))
         return self._arrived.popleft()
+
+    def resent(self, topic: str) -> int:
+        """Return how many parts of a published topic were sent again."""
+        return self._publishers[topic].repairs
 
 
 class GdpWay:
     """A's side of one encoding."""
 
-    def __init__(self, end: GdpEnd, publisher: Publisher, serializer: Serializer) -> None:
+    def __init__(self, end: Endpoint, send: Callable[[bytes], None], serializer: Serializer) -> None:
         self._end = end
-        self._publisher = publisher
+        self._send = send
         self._serializer = serializer
 
     def send(self, message: bytes) -> None:
-        """Let a message go."""
-        self._end.publish(self._publisher, self._serializer.encode(message))
+        """Send a message."""
+        self._send(self._serializer.encode(message))
 
     def wait(self, deadline_s: float) -> bytes | None:
         """Return the next answer; None when the monotonic second passed."""
@@ -110,29 +183,30 @@ def _serializer(encoding: Encoding) -> Serializer:
     return Serializer(Channel("/bench", IMAGE, 2, definition=definition, definition_format="msg"), encoding)
 
 
-def _ping(end: GdpEnd, encodings: list[Encoding], settings: EndSettings) -> None:
-    publishers = {encoding: end.advertise(ping_topic(encoding)) for encoding in encodings}
+def _ping(end: Endpoint, encodings: list[Encoding], settings: EndSettings) -> None:
+    senders = {encoding: end.advertise(ping_topic(encoding)) for encoding in encodings}
     end.subscribe(PONG)
     settle_memory()
-    patience_s = time.monotonic() + PATIENCE_S
-    if not end.runtime.run(lambda: all(each.readers for each in publishers.values()), patience_s):
-        raise TimeoutError("nobody reads: the overlay did not come up")
+    end.wait_for_readers(time.monotonic() + PATIENCE_S)
     pids = {"sender": [os.getpid()], **settings.pids}
-    for encoding, publisher in publishers.items():
-        sizes = exchange(GdpWay(end, publisher, _serializer(encoding)), settings.load, pids)
-        say(series=encoding, sizes=sizes, resent=publisher.repairs)
+    for encoding, send in senders.items():
+        sizes = exchange(GdpWay(end, send, _serializer(encoding)), settings.load, pids)
+        say(series=encoding, sizes=sizes, resent=end.resent(ping_topic(encoding)))
 
 
-def _pong(end: GdpEnd, encodings: list[Encoding]) -> None:
-    publisher = end.advertise(PONG)
-    serializers = {end.subscribe(ping_topic(encoding)): _serializer(encoding) for encoding in encodings}
-    with end.runtime.signals():
-        say(event="ready")
-        while not end.runtime.is_stopped:
-            arrived = end.receive(time.monotonic() + _FOREVER_S)
-            if arrived is not None:
-                topic, body = arrived
-                end.publish(publisher, answer_to(serializers[topic].decode(body)))
+def _pong(end: Endpoint, encodings: list[Encoding]) -> None:
+    send = end.advertise(PONG)
+    serializers = {ping_topic(encoding): _serializer(encoding) for encoding in encodings}
+    for topic in serializers:
+        end.subscribe(topic)
+    settle_memory()
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # the bench ends it so; there is nothing to give back
+    say(event="ready")
+    while True:
+        arrived = end.receive(time.monotonic() + _FOREVER_S)
+        if arrived is not None:
+            topic, body = arrived
+            send(answer_to(serializers[topic].decode(body)))
 
 
 def main() -> None:
@@ -140,7 +214,10 @@ def main() -> None:
     settings = EndSettings.from_argument()
     wanted = settings.own["encodings"].split()
     encodings: list[Encoding] = [each for each in get_args(Encoding) if each in wanted]
-    end = GdpEnd(Path(settings.own["config"]), float(settings.own["spin_s"]))
+    config, spin_s = Path(settings.own["config"]), float(settings.own["spin_s"])
+    end: Endpoint = (
+        LibraryEndpoint(config, spin_s) if settings.own["path"] == "library" else InternalEndpoint(config, spin_s)
+    )
     if settings.role == "ping":
         _ping(end, encodings, settings)
     else:

@@ -34,10 +34,12 @@ class GdpNet:
         plane: as ``gdp-switch --data-plane``.
         encodings: measured one after the other, by the same processes.
         spin_s: how long ends look for frames before they sleep.
+        path: what the ends are: ``library`` or ``internal``.
     """
 
-    def __init__(self, plane: str, encodings: tuple[str, ...], spin_s: float) -> None:
-        self.name = f"gdp-{plane}"
+    def __init__(self, plane: str, encodings: tuple[str, ...], spin_s: float, path: str = "library") -> None:
+        self.name = f"gdp-{plane}" if path == "library" else f"gdp-{plane}-{path}"
+        self._path = path
         self.labels = tuple(f"{self.name} {encoding}" for encoding in encodings)
         self._plane = plane
         self._encodings = encodings
@@ -77,6 +79,7 @@ class GdpNet:
             "config": str(_admit_end(files, node, self._encodings)),
             "encodings": " ".join(self._encodings),
             "spin_s": str(self._spin_s),
+            "path": self._path,
         }
         return start_end(chain, _MODULE, node, load, own, pids)
 

@@ -1,0 +1,28 @@
+"""Send 30 images a second, or show how they arrive: ``camera.py send robot/proxy``, ``camera.py show server/proxy``."""
+
+import asyncio
+import os
+import sys
+import time
+
+import gdp
+
+
+async def main(role: str, node: str, count: int = 30) -> None:
+    """Send or show ``count`` images of 640 x 480 pixels."""
+    async with gdp.open_async(node) as session:
+        if role == "send":
+            camera = session.publisher("camera", reliable=False)  # a late image is worth nothing
+            await camera.wait_for_readers()
+            for _ in range(count):
+                await camera.put(os.urandom(640 * 480))
+                await asyncio.sleep(1 / 30)
+        else:
+            async for image in session.subscribe("camera", queue=2):  # a slow program sees the newest two
+                late_ms = 1e3 * (time.time() - image.stamp)
+                print(f"image {image.number}: {len(image.payload)} bytes, {late_ms:.1f} ms", flush=True)
+                if image.number >= count:
+                    break
+
+
+asyncio.run(main(*sys.argv[1:3]))

@@ -1,0 +1,254 @@
+"""One name called by a session: which servers get a request, and which response counts.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). ``gdp/service/dispatch.py`` decides; this file connects
+it with the member's streams. A call that begins while no server is there waits for one, as long as its time allows.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+from gdp.client.member import Member, Message, Topic
+from gdp.client.publisher import Publisher
+from gdp.errors import LocalError
+from gdp.names import Name
+from gdp.service.dispatch import Ask, Dispatch, Effect, Failure
+from gdp.service.replication import Replication
+from gdp.session.errors import CallError, CallTimeoutError, NoServerError, SessionError
+from gdp.session.messages import Response
+from gdp.session.wire import LEAVING, PATIENCE_MAX_MS, SERVING, RequestFrame, StopFrame, read_response
+
+__all__ = ["Call", "ClientCore"]
+
+_FOLLOW_S: Final = 0.05  # between two looks at which servers are there, while calls are under way
+_GONE: Final = "the server has gone"
+
+
+@dataclass(slots=True, eq=False)
+class Call:
+    """One call.
+
+    Attributes:
+        timeout_s: how long it may take; None: as long as it takes.
+        response: the first response, once there is one.
+        error: why there is none, once it has failed.
+    """
+
+    payload: bytes
+    timeout_s: float | None
+    replication: Replication
+    deadline_s: float | None = None
+    response: Response | None = None
+    error: SessionError | None = None
+
+    @property
+    def is_done(self) -> bool:
+        """Return whether it has ended."""
+        return self.response is not None or self.error is not None
+
+
+class ClientCore:
+    """One called name.
+
+    Args:
+        label: what errors call the name.
+        start: number of the first call, random in 64 bits.
+
+    Raises:
+        LocalError: no delegation, or the name is in use in this session.
+    """
+
+    def __init__(
+        self, member: Member, topic: Topic, label: str, *, start: int, is_global: bool = True, urgent: bool = False
+    ) -> None:
+        self._member = member
+        self._name = topic.name
+        self._label = label
+        self._start = start
+        self._publisher: Publisher = member.call(topic, SERVING, is_global=is_global, urgent=urgent)
+        self._dispatches: dict[Replication, Dispatch[Response]] = {}
+        self._servers: dict[Name, int] = {}  # and in which life
+        self._leaving: set[Name] = set()
+        self._unasked: list[Call] = []  # calls that wait for a server
+        self._for_all: deque[tuple[Dispatch[Response], Effect]] = deque()  # wait for room on the common stream
+        self._follow_at_s = 0.0
+
+    @property
+    def servers(self) -> list[Name]:
+        """Return the servers that are there."""
+        return list(self._servers)
+
+    @property
+    def is_idle(self) -> bool:
+        """Return whether no call is under way."""
+        return not self._unasked and not any(len(each) for each in self._dispatches.values())
+
+    def begin(self, call: Call, now_s: float) -> None:
+        """Begin a call; it ends later, by ``response`` or ``error``."""
+        call.deadline_s = None if call.timeout_s is None else now_s + call.timeout_s
+        self._follow(now_s)
+        if self._servers:
+            self._dispatch(call, now_s)
+        else:
+            self._unasked.append(call)
+        self._send_out(now_s)
+
+    def receive(self, message: Message, now_s: float) -> None:
+        """Take a server's response.
+
+        Raises:
+            RemoteError: MALFORMED or BAD_VERSION.
+        """
+        if not message.private:
+            return  # servers say nothing on the stream that all clients hear but what they are
+        server = Name(message.delivered.publisher)
+        frame = read_response(message.delivered.message)
+        if server not in self._servers:
+            self._follow(now_s)
+        dispatches = list(self._dispatches.values())
+        found = next((each for each in dispatches if frame.call in each), dispatches[0] if dispatches else None)
+        if found is None:
+            return  # of a life of this session that has ended
+        if frame.is_failure:
+            found.refused(frame.call, server, frame.reason, now_s)
+        else:
+            found.answered(frame.call, server, Response(frame.payload, server), now_s)
+        self._send_out(now_s)
+
+    def timeout(self, now_s: float) -> None:
+        """Do what is due."""
+        if now_s >= self._follow_at_s:
+            self._follow(now_s)
+        for call in [each for each in self._unasked if each.deadline_s is not None and now_s >= each.deadline_s]:
+            self._unasked.remove(call)
+            call.error = NoServerError(
+                f"{self._label}: no server within {call.timeout_s:g} s; start one that serves this name, or allow more"
+                " time with timeout_s"
+            )
+        for dispatch in self._dispatches.values():
+            dispatch.timeout(now_s)
+        self._send_out(now_s)
+
+    def next_timeout(self) -> float | None:
+        """Return the monotonic second of the next timer, or None."""
+        times = [dispatch.next_timeout() for dispatch in self._dispatches.values()]
+        times += [call.deadline_s for call in self._unasked]
+        if not self.is_idle or self._for_all:
+            times.append(self._follow_at_s)
+        return min((time for time in times if time is not None), default=None)
+
+    def close(self) -> None:
+        """Call the name no more; calls under way fail."""
+        error = CallError(f"{self._label}: the session was closed during the call")
+        for call in self._unasked:
+            call.error = error
+        self._unasked.clear()
+        for dispatch in self._dispatches.values():
+            dispatch.fail_all("the session was closed during the call")
+        self._member.withdraw(self._name)
+
+    def _follow(self, now_s: float) -> None:
+        """Learn which servers came and went."""
+        self._follow_at_s = now_s + _FOLLOW_S
+        member = self._member
+        peers = set(member.peers(self._name) or member.heard(self._name))  # one that lags is better than none
+        heard = {feed.publisher: feed for feed in member.feeds_of(self._name) if feed.publisher in peers}
+        for name, incarnation in list(self._servers.items()):
+            if name not in heard or heard[name].incarnation != incarnation:
+                del self._servers[name]
+                self._leaving.discard(name)
+                for dispatch in self._dispatches.values():
+                    dispatch.gone(name, now_s, _GONE)
+        for name, feed in heard.items():
+            is_new = name not in self._servers
+            self._servers[name] = feed.incarnation
+            if is_new:
+                for dispatch in self._dispatches.values():
+                    dispatch.came(name, now_s)
+            if feed.description == LEAVING and name not in self._leaving:
+                self._leaving.add(name)
+                for dispatch in self._dispatches.values():
+                    dispatch.leaves(name)
+        if self._servers and self._unasked:
+            waiting, self._unasked = self._unasked, []
+            for call in waiting:
+                self._dispatch(call, now_s)
+
+    def _dispatch(self, call: Call, now_s: float) -> None:
+        dispatch = self._dispatch_of(call.replication, now_s)
+        left_s = None if call.deadline_s is None else max(call.deadline_s - now_s, 0.0)
+        patience_ms = 0 if left_s is None else min(max(int(left_s * 1e3), 1), PATIENCE_MAX_MS)
+
+        def write(number: int) -> bytes:
+            return RequestFrame(number, patience_ms, call.payload).to_wire()
+
+        def responded(response: Response) -> None:
+            call.response = response
+
+        def failed(failure: Failure, reason: str) -> None:
+            call.error = self._error_of(call, failure, reason)
+
+        try:
+            dispatch.begin(now_s, write, left_s, responded, failed)
+        except LocalError as error:
+            call.error = CallError(f"{self._label}: {error}; wait for calls to end before you begin more")
+
+    def _dispatch_of(self, replication: Replication, now_s: float) -> Dispatch[Response]:
+        known = self._dispatches.get(replication)
+        if known is not None:
+            return known
+        start = (self._start + (len(self._dispatches) << 48)) % (1 << 64)  # so that no two give the same numbers
+        dispatch = self._dispatches[replication] = Dispatch(replication, start=start)
+        for name in self._servers:
+            dispatch.came(name, now_s)
+            if name in self._leaving:
+                dispatch.leaves(name)
+        return dispatch
+
+    def _send_out(self, now_s: float) -> None:
+        """Send what was decided; what all servers get waits for room on the stream that they all hear."""
+        for dispatch in self._dispatches.values():
+            while effects := dispatch.take():
+                for effect in effects:
+                    servers = effect.servers if isinstance(effect, Ask) else effect.server and (effect.server,)
+                    if servers is None:
+                        self._for_all.append((dispatch, effect))
+                    for server in servers or ():
+                        self._send_to(dispatch, server, effect, now_s)
+        while self._for_all and self._publisher.has_room():
+            dispatch, effect = self._for_all.popleft()
+            if isinstance(effect, Ask) and effect.call not in dispatch:
+                continue  # it has ended meanwhile
+            try:
+                self._publisher.publish(_wire_of(effect))
+            except LocalError as error:
+                self._not_sent(dispatch, effect, dispatch.servers, str(error), now_s)
+
+    def _send_to(self, dispatch: Dispatch[Response], server: Name, effect: Effect, now_s: float) -> None:
+        try:
+            self._member.ask(self._name, server, _wire_of(effect))
+        except LocalError as error:
+            self._not_sent(dispatch, effect, [server], str(error), now_s)
+
+    def _not_sent(
+        self, dispatch: Dispatch[Response], effect: Effect, servers: list[Name], reason: str, now_s: float
+    ) -> None:
+        if isinstance(effect, Ask):
+            for server in servers:
+                dispatch.refused(effect.call, server, reason, now_s)
+
+    def _error_of(self, call: Call, failure: Failure, reason: str) -> SessionError:
+        if failure is Failure.TIMED_OUT:
+            return CallTimeoutError(
+                f"{self._label}: no response within {call.timeout_s:g} s from {len(self._servers)} server(s); the"
+                " request may have been executed"
+            )
+        if failure is Failure.NO_SERVER:
+            return NoServerError(f"{self._label}: {reason or 'no server is left'}; call again when a server is back")
+        return CallError(f"{self._label}: every server refused: {reason}")
+
+
+def _wire_of(effect: Effect) -> bytes:
+    return effect.request if isinstance(effect, Ask) else StopFrame(effect.calls).to_wire()

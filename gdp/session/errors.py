@@ -1,0 +1,51 @@
+"""Errors of sessions: each says what is wrong, where, and what to do.
+
+Sans-I/O.
+"""
+
+from __future__ import annotations
+
+from gdp.errors import LocalError
+
+__all__ = [
+    "AttachError",
+    "CallError",
+    "CallTimeoutError",
+    "ClosedError",
+    "DelegationError",
+    "NoServerError",
+    "SessionError",
+    "SessionTimeoutError",
+]
+
+
+class SessionError(LocalError):
+    """Root of the errors of sessions."""
+
+
+class SessionTimeoutError(SessionError, TimeoutError):
+    """Something did not happen within the time that the caller allowed; trying again may help."""
+
+
+class AttachError(SessionTimeoutError):
+    """No switch accepted the node in time; the text says what the node waits for."""
+
+
+class DelegationError(SessionError):
+    """The node holds no delegation, or several, for what a name and a right ask."""
+
+
+class ClosedError(SessionError):
+    """The session, publisher, subscription or server was closed."""
+
+
+class CallError(SessionError):
+    """Every server that was asked refused a request; the text is the last server's reason."""
+
+
+class NoServerError(CallError, SessionTimeoutError):
+    """No server of the name was there."""
+
+
+class CallTimeoutError(CallError, SessionTimeoutError):
+    """No server responded in time; the request may have been executed."""

@@ -1,0 +1,144 @@
+"""Driver of a session for asyncio: the event loop of the program drives the node, without a thread.
+
+Layer: I/O. The loop watches the plane's epoll descriptor and one timer; each step is short and does not wait.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable
+from typing import Final
+
+from gdp.client.publisher import Publisher
+from gdp.nodes.runtime import Runtime
+from gdp.ports.linked import LinkedPlane
+from gdp.session.core import SessionCore
+from gdp.session.errors import ClosedError
+
+__all__ = ["LoopDriver"]
+
+log = logging.getLogger(__name__)
+
+_STEPS_MAX: Final = 8  # before the program's other tasks have their turn
+
+
+class LoopDriver:
+    """Drives a core from the running event loop; only that loop's thread may use it."""
+
+    def __init__(self, core: SessionCore, runtime: Runtime, plane: LinkedPlane) -> None:
+        self._core = core
+        self._member = core.member
+        self._runtime = runtime
+        self._plane = plane
+        self._loop = asyncio.get_running_loop()
+        self._waiters: dict[asyncio.Future[None], Callable[[], bool]] = {}
+        self._timer: asyncio.TimerHandle | None = None
+        self._is_scheduled = False
+        self._is_closed = False
+        self._error: Exception | None = None
+        self._loop.add_reader(plane.fileno(), self._work)
+        self.schedule()
+
+    def publish(self, publisher: Publisher, message: bytes) -> None:
+        """Publish a message now.
+
+        Raises:
+            LocalError: it is above the limits.
+            ClosedError: the session is closed.
+        """
+        self.check()
+        publisher.publish(message)
+        self._member.flush(time.monotonic())
+        self._runtime.send()
+        self.schedule()
+
+    async def wait(self, is_ready: Callable[[], bool], deadline_s: float | None) -> bool:
+        """Wait until ``is_ready``, or a monotonic second; return whether it came true.
+
+        Raises:
+            ClosedError: the session is or was closed meanwhile.
+        """
+        if is_ready():
+            return True
+        self.check()
+        future = self._loop.create_future()
+        self._waiters[future] = is_ready
+        try:
+            left_s = None if deadline_s is None else max(deadline_s - time.monotonic(), 0.0)
+            await asyncio.wait_for(future, left_s)
+        except asyncio.TimeoutError:
+            self.check()
+            return is_ready()
+        finally:
+            self._waiters.pop(future, None)
+        self.check()
+        return True
+
+    def schedule(self) -> None:
+        """Take a step soon: something was asked of the node."""
+        if not self._is_scheduled and not self._is_closed:
+            self._is_scheduled = True
+            self._loop.call_soon(self._scheduled)
+
+    def check(self) -> None:
+        """Return if the session works.
+
+        Raises:
+            ClosedError: it is closed, or has failed.
+        """
+        if self._error is not None:
+            raise ClosedError(f"the session has failed: {self._error!r}; open a new one") from self._error
+        if self._is_closed:
+            raise ClosedError("the session is closed; open a new one")
+
+    def close(self) -> None:
+        """End the work; tasks that wait get ``ClosedError``."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        self._loop.remove_reader(self._plane.fileno())
+        if self._timer is not None:
+            self._timer.cancel()
+        self._wake_all()
+
+    def _scheduled(self) -> None:
+        self._is_scheduled = False
+        if not self._is_closed:
+            self._work()
+
+    def _work(self) -> None:
+        """Take steps while there is something to do, then set the timer."""
+        try:
+            for _ in range(_STEPS_MAX):
+                now_s = time.monotonic()
+                self._runtime.step(now_s)  # that second has come: it does not wait
+                self._core.handle(time.monotonic())
+                if not self._runtime.send():
+                    break
+            else:
+                self.schedule()
+            self._set_timer()
+        except Exception as error:
+            log.exception("the session's node failed")
+            self._error = error
+            self.close()
+            return
+        for future, is_ready in list(self._waiters.items()):
+            if not future.done() and is_ready():
+                future.set_result(None)
+
+    def _set_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        times = [self._runtime.next_due_s(), self._core.next_timeout()]
+        due_s = min((each for each in times if each is not None), default=None)
+        if due_s is not None:
+            delay_s = max(due_s - time.monotonic(), 0.0)
+            self._timer = self._loop.call_later(delay_s, self._work)
+
+    def _wake_all(self) -> None:
+        for future in list(self._waiters):
+            if not future.done():
+                future.set_result(None)

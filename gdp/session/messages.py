@@ -1,0 +1,90 @@
+"""What a session gives to a program: messages, requests, responses, and the names that its node may use.
+
+Sans-I/O.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, TypeAlias, Union
+
+from gdp.metadata import Metadata
+from gdp.names import Name
+from gdp.trust.right import Right
+
+__all__ = ["DelegatedName", "Message", "NameLike", "Request", "Response", "describe"]
+
+NameLike: TypeAlias = Union[str, Name, Metadata]  # noqa: UP007 (typing.get_type_hints on 3.10)
+"""A name: the ``name`` of its metadata, 64 hex digits, a ``Name``, or the metadata."""
+
+
+class Message(NamedTuple):
+    """A published message as a subscriber gets it.
+
+    Attributes:
+        payload: what was published.
+        publisher: name of the node that published it, proven by its signature.
+        number: which message of the publisher's present life it is, from 1; a gap is a message that was lost.
+        hops: links between switches that it crossed.
+        stamp_ns: when it was published, by the publisher's clock, in nanoseconds since 1970.
+    """
+
+    payload: bytes
+    publisher: Name
+    number: int
+    hops: int
+    stamp_ns: int
+
+    @property
+    def stamp(self) -> float:
+        """Return when it was published, by the publisher's clock, in seconds since 1970."""
+        return self.stamp_ns / 1e9
+
+
+class Request(NamedTuple):
+    """A request as a server's handler gets it.
+
+    Attributes:
+        payload: what the client sent.
+        client: name of the client's node, proven by its signature.
+    """
+
+    payload: bytes
+    client: Name
+
+
+class Response(NamedTuple):
+    """The response to a call.
+
+    Attributes:
+        payload: what the server's handler returned.
+        server: name of the server's node, proven by its signature.
+    """
+
+    payload: bytes
+    server: Name
+
+
+class DelegatedName(NamedTuple):
+    """A name that the node holds a delegation for.
+
+    Attributes:
+        name: the 256-bit name.
+        rights: what the node may do with it.
+        metadata: what the name stands for, if its owner added it.
+    """
+
+    name: Name
+    rights: frozenset[Right]
+    metadata: Metadata | None
+
+    @property
+    def label(self) -> str:
+        """Return the ``name`` of the metadata, or the first and last digits of the name."""
+        return self.name.short if self.metadata is None else str(self.metadata.get("name", self.name.short))
+
+
+def describe(names: Sequence[DelegatedName]) -> str:
+    """Return names with their rights as one line for an error."""
+    each = (f"{name.label} ({', '.join(sorted(right.value for right in name.rights))})" for name in names)
+    return ", ".join(each) or "none"

@@ -1,0 +1,126 @@
+"""The node under a session: a member of the overlay on one device, with its credentials and its log.
+
+Layer: I/O.
+"""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Final
+
+from gdp.client.member import Member
+from gdp.client.waiting import attachment_waits
+from gdp.control.settings import NodeSettings
+from gdp.crypto.certificates import Role
+from gdp.crypto.identity import Identity
+from gdp.names import Name
+from gdp.nodes.credentials import Credentials
+from gdp.nodes.delegation_store import DelegationStore
+from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
+from gdp.nodes.node_log import LOOK_S, NodeLog
+from gdp.nodes.revocation_upkeep import load_revocations
+from gdp.nodes.runtime import Runtime
+from gdp.nodes.single_instance import run_alone
+from gdp.nodes.uplink import open_uplink
+from gdp.ports.raw import RawPlane
+from gdp.session.core import SessionCore
+from gdp.session.errors import SessionError
+from gdp.session.settings import SessionConfig
+
+__all__ = ["SessionNode", "open_node"]
+
+_open_names: Final = set[Name]()  # identities in use by this process: record locks do not see its own
+_open_lock: Final = threading.Lock()
+
+
+@dataclass(slots=True)
+class SessionNode:
+    """What a driver runs; ``close`` gives everything back."""
+
+    config: SessionConfig
+    identity: Identity
+    member: Member
+    runtime: Runtime
+    plane: RawPlane
+    node_log: NodeLog
+    core: SessionCore
+    _stack: ExitStack
+
+    def waiting_for(self) -> str:
+        """Return what keeps the node from being attached, as a sentence."""
+        texts = self.node_log.waiting_for(time.monotonic())
+        return "; ".join(texts) or "the switch has not answered yet"
+
+    def refused(self, name: Name) -> str:
+        """Return why the overlay refused an advertisement of this node; empty where it did not."""
+        claims = (each for each in self.member.attachment.claims if each.subject.name == name)
+        return next((each.refused.label for each in claims if each.refused is not None), "")
+
+    def reload(self) -> None:
+        """Read the delegations again.
+
+        Raises:
+            LocalError: a file is malformed, or readable for others.
+        """
+        self.core.renew(DelegationStore(self.config.delegation_directory, self.identity))
+
+    def close(self) -> None:
+        """Close the device and give the identity free."""
+        self._stack.close()
+
+
+def open_node(config: SessionConfig) -> SessionNode:
+    """Open everything that a session needs.
+
+    Raises:
+        LocalError: keys, delegations or the device are not as the settings say, or this node already runs.
+    """
+    identity, policy = load_member(config.identity, config.domain, Role.PROXY)
+    settings = NodeSettings(incarnation(), wall_clock_ms(), fresh_bytes, lease_s=config.lease_s)
+    member = Member(identity, policy, settings)
+    directory = config.delegation_directory
+    topics = DelegationStore(directory, identity)
+    core = SessionCore(member, topics, lambda: secrets.randbits(64), str(directory))
+    with ExitStack() as stack:
+        stack.callback(_own(identity.name))
+        stack.enter_context(run_alone("node", identity.name))
+        revocations = load_revocations(config.state, policy.revoked, stack)
+        plane = stack.enter_context(open_uplink(config.iface))
+        runtime = Runtime(member, plane, spin_s=config.spin_us / 1e6)
+        labels = {topic.name: core.label(topic) for topic in topics}
+        node_log = NodeLog(
+            member.attachment.greeter,
+            policy,
+            plane,
+            member.boundary,
+            lambda now_s: attachment_waits(member.attachment, now_s),
+            rival=lambda: member.attachment.rival_at,
+            local_name=lambda name: labels.get(name, name.short),
+        )
+        runtime.every(LOOK_S, node_log.look)
+        runtime.every(LOOK_S, Credentials(config.identity, config.domain, identity, policy).look)
+        revocations.start(runtime)
+        return SessionNode(config, identity, member, runtime, plane, node_log, core, stack.pop_all())
+
+
+def _own(name: Name) -> Callable[[], None]:
+    """Note that this process uses an identity; return what undoes that.
+
+    Raises:
+        SessionError: another session of this process uses it.
+    """
+    with _open_lock:
+        if name in _open_names:
+            raise SessionError(f"node {name.short} has a session in this process already; close it, or use that one")
+        _open_names.add(name)
+
+    def give_free() -> None:
+        with _open_lock:
+            _open_names.discard(name)
+
+    return give_free

@@ -1,0 +1,650 @@
+"""Sessions for programs with threads: publish, subscribe, serve and call.
+
+Layer: I/O, by its driver. Any thread may use a session and what it opens; ``aio.py`` has the same for asyncio.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import partial
+from types import TracebackType
+from typing import Final, Literal, Protocol
+
+from gdp.client.member import Topic
+from gdp.client.publisher import Publisher as MemberPublisher
+from gdp.errors import LocalError
+from gdp.names import Name
+from gdp.service.replication import Replication
+from gdp.session.client_core import Call
+from gdp.session.core import QUEUE_MESSAGES, Inbox, SessionCore, replication_of
+from gdp.session.driver import Driver, ThreadDriver
+from gdp.session.errors import AttachError, ClosedError, SessionTimeoutError
+from gdp.session.messages import DelegatedName, Message, NameLike, Request, Response
+from gdp.session.node import SessionNode, open_node
+from gdp.session.server_core import ServerCore
+from gdp.session.settings import settings_of
+from gdp.session.wire import PAYLOAD_MAX_BYTES, message_to_wire
+from gdp.trust.right import Right
+
+__all__ = ["Publisher", "Server", "Session", "Subscription", "open_session"]
+
+log = logging.getLogger(__name__)
+
+ATTACH_TIMEOUT_S: Final = 10.0
+CALL_TIMEOUT_S: Final = 10.0
+LINGER_S: Final = 1.0
+GOODBYE_S: Final = 0.2  # how long a node that leaves goes on, so that its goodbye is sent
+Priority = Literal["normal", "urgent"]
+
+
+class Node(Protocol):
+    """What a session needs of its node."""
+
+    @property
+    def core(self) -> SessionCore:
+        """The core."""
+
+    def waiting_for(self) -> str:
+        """Return what keeps the node from being attached."""
+
+    def refused(self, name: Name) -> str:
+        """Return why the overlay refused an advertisement; empty where it did not."""
+
+    def reload(self) -> None:
+        """Read the delegations again."""
+
+    def close(self) -> None:
+        """Close the device."""
+
+
+class Publisher:
+    """Publishes one name; made by ``Session.publisher``."""
+
+    def __init__(self, session: Session, topic: Topic, publisher: MemberPublisher, *, reliable: bool) -> None:
+        self._session = session
+        self._driver = session.driver
+        self._topic = topic
+        self._publisher = publisher
+        self._is_reliable = reliable
+        self._is_closed = False
+
+    @property
+    def name(self) -> Name:
+        """Return the 256-bit name."""
+        return self._topic.name
+
+    @property
+    def readers(self) -> int:
+        """Return how many readers are there."""
+        return self._publisher.readers
+
+    @property
+    def confirmed(self) -> int:
+        """Return how many messages every reader has confirmed; without ``reliable``, how many were sent."""
+        return self._publisher.acknowledged
+
+    @property
+    def lost(self) -> int:
+        """Return how many messages some reader did not get, as far as it is known here."""
+        return self._publisher.losses.total
+
+    @property
+    def resent(self) -> int:
+        """Return how many parts were sent again because a reader lacked them."""
+        return self._publisher.repairs
+
+    def put(self, payload: bytes, timeout_s: float | None = None) -> None:
+        """Publish a message.
+
+        A reliable publisher waits while its window is full, so no reader loses a message to a fast publisher. What is
+        published while nobody reads is lost, unless the publisher is ``latched``; see ``wait_for_readers``.
+
+        Args:
+            payload: at most ``MESSAGE_MAX_BYTES`` less 14.
+            timeout_s: longest wait for room; None: as long as it takes.
+
+        Raises:
+            SessionTimeoutError: the window stayed full.
+            LocalError: the payload is too large, or no bytes.
+            ClosedError: the publisher or the session is closed.
+        """
+        if self._is_closed:
+            raise ClosedError(f"the publisher of {self._label} is closed; open a new one with session.publisher()")
+        if len(payload) > PAYLOAD_MAX_BYTES:
+            raise LocalError(f"{self._label}: {len(payload)} bytes; at most {PAYLOAD_MAX_BYTES} fit into one message")
+        if self._is_reliable and not self._publisher.has_room():
+            self._wait_for_room(timeout_s)
+        self._driver.publish(self._publisher, message_to_wire(time.time_ns(), payload))
+
+    def wait_for_readers(self, count: int = 1, timeout_s: float | None = None) -> None:
+        """Wait until so many readers are there.
+
+        Raises:
+            SessionTimeoutError: they did not come in time; the text says why, where that is known.
+        """
+        if not self._driver.wait(lambda: self._publisher.readers >= count, _deadline_s(self._driver, timeout_s)):
+            raise SessionTimeoutError(
+                f"{self._label}: {self.readers} of {count} reader(s) within {timeout_s:g} s"
+                f"{self._session.why_not(self.name, 'start a program that subscribes to it')}"
+            )
+
+    def flush(self, timeout_s: float | None = None) -> None:
+        """Wait until every reader has confirmed every message; of a publisher without ``reliable``, until it is sent.
+
+        Raises:
+            SessionTimeoutError: they did not in time.
+        """
+        if not self._driver.wait(self._publisher.is_acknowledged, _deadline_s(self._driver, timeout_s)):
+            raise SessionTimeoutError(f"{self._label}: not every reader has confirmed within {timeout_s:g} s")
+
+    def close(self) -> None:
+        """Publish no more; what readers lack is lost, so ``flush`` first. Idempotent."""
+        if not self._is_closed:
+            self._is_closed = True
+            self._session.forget(self)
+            self._driver.run(partial(self._session.core.member.withdraw, self.name))
+
+    def __enter__(self) -> Publisher:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    @property
+    def _label(self) -> str:
+        return self._session.core.label(self._topic)
+
+    def _wait_for_room(self, timeout_s: float | None) -> None:
+        publisher = self._publisher
+        if not self._driver.wait(
+            lambda: publisher.has_room() or not publisher.is_wanted, _deadline_s(self._driver, timeout_s)
+        ):
+            raise SessionTimeoutError(
+                f"{self._label}: no room for {timeout_s:g} s, since a reader confirms too slowly; publish less, or with"
+                " reliable=False"
+            )
+
+
+class Subscription:
+    """The messages of one name, an iterator that waits for the next; made by ``Session.subscribe``."""
+
+    def __init__(self, session: Session, topic: Topic, inbox: Inbox) -> None:
+        self._session = session
+        self._driver = session.driver
+        self._topic = topic
+        self._inbox = inbox
+        self._messages = inbox.messages
+        self._is_closed = False
+
+    @property
+    def name(self) -> Name:
+        """Return the 256-bit name."""
+        return self._topic.name
+
+    @property
+    def publishers(self) -> int:
+        """Return how many publishers are there."""
+        return len(self._session.core.member.feeds_of(self.name))
+
+    @property
+    def lost(self) -> int:
+        """Return how many messages were lost on their way to this node."""
+        return self._session.core.member.losses_of(self.name).total
+
+    @property
+    def dropped(self) -> int:
+        """Return how many messages were dropped here because the program took too few."""
+        return self._inbox.dropped
+
+    def receive(self, timeout_s: float | None = None) -> Message:
+        """Return the next message; from one publisher they come in order.
+
+        Args:
+            timeout_s: longest wait; None: as long as it takes.
+
+        Raises:
+            SessionTimeoutError: no message came in time.
+            ClosedError: the subscription or the session is closed.
+        """
+        try:
+            return self._messages.popleft()
+        except IndexError:
+            return self._wait(_deadline_s(self._driver, timeout_s), timeout_s)
+
+    def _wait(self, deadline_s: float | None, timeout_s: float | None) -> Message:
+        while True:
+            if not self._driver.wait(self.is_ready, deadline_s):
+                label = self._session.core.label(self._topic)
+                hint = self._session.why_not(self.name, f"{self.publishers} publisher(s) are there")
+                raise SessionTimeoutError(f"{label}: no message within {timeout_s:g} s{hint}")
+            try:
+                return self._messages.popleft()
+            except IndexError:  # another thread took it, or the subscription was closed
+                if self._is_closed:
+                    label = self._session.core.label(self._topic)
+                    raise ClosedError(f"the subscription to {label} is closed; subscribe again") from None
+
+    def poll(self) -> Message | None:
+        """Return the next message if one has arrived, else None; never waits."""
+        try:
+            return self._messages.popleft()
+        except IndexError:
+            return None
+
+    def is_ready(self) -> bool:
+        """Return whether ``receive`` would return, or raise, at once."""
+        return bool(self._messages) or self._is_closed
+
+    def __iter__(self) -> Iterator[Message]:
+        return self
+
+    def __next__(self) -> Message:
+        """Return the next message; the iteration ends when the subscription or the session is closed."""
+        try:
+            return self.receive()
+        except ClosedError:
+            raise StopIteration from None
+
+    def close(self) -> None:
+        """Subscribe no more; idempotent."""
+        if not self._is_closed:
+            self._is_closed = True
+            self._session.forget(self)
+            self._driver.run(partial(self._session.core.unsubscribe, self._inbox))
+
+    def __enter__(self) -> Subscription:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+
+class Server:
+    """Serves one name with a handler; made by ``Session.serve``."""
+
+    def __init__(
+        self, session: Session, topic: Topic, server: ServerCore, handler: Callable[[Request], bytes], workers: int
+    ) -> None:
+        self._session = session
+        self._driver = session.driver
+        self._topic = topic
+        self._core = server
+        self._handler = handler
+        self._is_closed = False
+        self._threads = [
+            threading.Thread(target=self._work, name=f"gdp-serve-{topic.name.short}-{number}", daemon=True)
+            for number in range(workers)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def name(self) -> Name:
+        """Return the 256-bit name."""
+        return self._topic.name
+
+    @property
+    def clients(self) -> int:
+        """Return how many clients are there."""
+        return self._core.clients
+
+    def close(self, linger_s: float = LINGER_S) -> None:
+        """Serve no more: tell clients to ask other servers, finish what is under way, then withdraw. Idempotent.
+
+        Args:
+            linger_s: longest time for what is under way; the rest fails.
+        """
+        if self._is_closed:
+            return
+        self._session.forget(self)
+        self._driver.run(self._core.leave)
+        self._driver.wait(lambda: self._core.is_idle, self._driver.now_s() + linger_s)
+        self._is_closed = True
+        self._driver.run(lambda: self._session.core.close_server(self._core, self._driver.now_s()))
+
+    def serve_forever(self) -> None:
+        """Wait until the server or the session is closed, for a program that does nothing else."""
+        try:
+            self._driver.wait(lambda: self._is_closed, None)
+        except ClosedError:
+            return
+
+    def __enter__(self) -> Server:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def _work(self) -> None:
+        """Handle requests one after the other, as one of the workers."""
+        turns = self._core.turns
+        try:
+            while not self._is_closed:
+                self._driver.wait(lambda: bool(turns) or self._is_closed, None)
+                try:
+                    turn = turns.popleft()
+                except IndexError:
+                    continue  # another worker has it
+                outcome = outcome_of(self._handler, Request(turn.request, turn.asked.client))
+                self._driver.run(partial(self._core.finish, turn.number, outcome))
+        except ClosedError:
+            return
+
+
+class Session:
+    """A node of the overlay in this process; made by ``gdp.open``.
+
+    Use it as a context manager, or call ``close``: then readers get what was published, and the overlay learns at once
+    that the node has left.
+    """
+
+    def __init__(self, node: Node, driver: Driver) -> None:
+        self.core = node.core
+        self.driver = driver
+        self._node = node
+        self._opened: list[Publisher | Subscription | Server] = []
+        self._is_closed = False
+
+    @property
+    def name(self) -> Name:
+        """Return the node's own name."""
+        return self.core.member.name
+
+    @property
+    def delegations(self) -> list[DelegatedName]:
+        """Return the names that this node may use, and how."""
+        return self.core.delegations
+
+    @property
+    def is_attached(self) -> bool:
+        """Return whether a switch has accepted the node and what it advertises."""
+        return self.core.member.attachment.is_attached
+
+    def publisher(
+        self,
+        name: NameLike,
+        *,
+        reliable: bool = True,
+        priority: Priority = "normal",
+        latched: int = 0,
+        is_global: bool = True,
+        description: bytes = b"",
+    ) -> Publisher:
+        """Publish a name from now on.
+
+        Args:
+            name: ``name`` of its metadata, such as ``"camera"``; 64 hex digits; a ``Name``; or the ``Metadata``.
+            reliable: whether readers get every message, in order; else what is lost on the way stays lost.
+            priority: ``"urgent"`` messages go before others wherever they queue.
+            latched: how many of the last messages late readers get.
+            is_global: whether the name can be found from other domains.
+            description: what readers must know to understand the messages; travels sealed.
+
+        Raises:
+            DelegationError: the node may not publish it.
+            LocalError: the session publishes it already, or an option is out of bounds.
+        """
+        topic = self.core.resolve(name, Right.PUBLISH)
+        urgent = is_urgent(priority)
+        made = self.driver.run(
+            lambda: self.core.advertise(
+                topic, reliable=reliable, urgent=urgent, latched=latched, is_global=is_global, description=description
+            )
+        )
+        publisher = Publisher(self, topic, made, reliable=reliable)
+        self._opened.append(publisher)
+        return publisher
+
+    def subscribe(self, name: NameLike, *, queue: int = QUEUE_MESSAGES) -> Subscription:
+        """Subscribe to a name; iterate what this returns.
+
+        Args:
+            name: as for ``publisher``.
+            queue: most messages that wait for the program; beyond it, and beyond 64 MiB, the oldest one is dropped.
+
+        Raises:
+            DelegationError: the node may not read it.
+            LocalError: the session subscribes to it already.
+        """
+        if queue < 1:
+            raise LocalError(f"queue is at least 1, not {queue}")
+        topic = self.core.resolve(name, Right.READ)
+        subscription = Subscription(self, topic, self.driver.run(lambda: self.core.subscribe(topic, queue)))
+        self._opened.append(subscription)
+        return subscription
+
+    def receive_any(
+        self, subscriptions: Collection[Subscription], timeout_s: float | None = None
+    ) -> tuple[Subscription, Message]:
+        """Return the next message of several subscriptions, and whose it is, for one thread that reads many names.
+
+        Raises:
+            SessionTimeoutError: no message came in time.
+            ClosedError: the session is closed.
+        """
+        deadline_s = _deadline_s(self.driver, timeout_s)
+        while self.driver.wait(lambda: any(map(Subscription.is_ready, subscriptions)), deadline_s):
+            for each in subscriptions:
+                message = each.poll()
+                if message is not None:
+                    return each, message
+            if not any(each in self._opened for each in subscriptions):
+                raise ClosedError("every subscription is closed; subscribe again")
+        raise SessionTimeoutError(f"no message on {len(subscriptions)} subscription(s) within {timeout_s:g} s")
+
+    def serve(
+        self,
+        name: NameLike,
+        handler: Callable[[Request], bytes],
+        *,
+        workers: int = 1,
+        priority: Priority = "normal",
+        is_global: bool = True,
+    ) -> Server:
+        """Serve a name: ``handler`` gets each request and returns the response.
+
+        Args:
+            name: as for ``publisher``.
+            handler: called in a worker thread. Where it raises, the client gets the error's text, and may ask another
+                server.
+            workers: threads, so how many requests are handled at one time.
+
+        Raises:
+            DelegationError: the node may not serve it.
+            LocalError: the session serves, calls or reads it already.
+        """
+        if workers < 1:
+            raise LocalError(f"workers is at least 1, not {workers}")
+        topic = self.core.resolve(name, Right.SERVE)
+        urgent = is_urgent(priority)
+        core = self.driver.run(lambda: self.core.serve(topic, at_once=workers, is_global=is_global, urgent=urgent))
+        server = Server(self, topic, core, handler, workers)
+        self._opened.append(server)
+        return server
+
+    def call(
+        self,
+        name: NameLike,
+        request: bytes,
+        *,
+        timeout_s: float | None = CALL_TIMEOUT_S,
+        replication: str | int | Replication = "all",
+    ) -> Response:
+        """Send a request to the servers of a name and return the first response.
+
+        Args:
+            name: as for ``publisher``.
+            timeout_s: longest wait, for a server to come and for its response; None: as long as it takes.
+            replication: ``"all"`` servers get the request; ``"hedged"``: one, and a second one where the first is slow;
+                a number: so many, the fastest ones; or a ``Replication``.
+
+        Raises:
+            NoServerError: no server is there.
+            CallTimeoutError: none responded in time.
+            CallError: every server refused, or its handler raised.
+            DelegationError: the node may not call it.
+        """
+        call = Call(bytes(request), timeout_s, replication_of(replication))
+        if len(call.payload) > PAYLOAD_MAX_BYTES:
+            raise LocalError(f"the request has {len(call.payload)} bytes; at most {PAYLOAD_MAX_BYTES} can be sent")
+        topic = self.core.resolve(name, Right.CALL)
+        self.driver.run(lambda: self.core.call(topic, call, self.driver.now_s()))
+        self.driver.wait(lambda: call.is_done, None)
+        if call.response is None:
+            raise call.error or ClosedError("the session was closed during the call")
+        return call.response
+
+    def reload(self) -> None:
+        """Read the delegations again: renewed ones and new names take effect without a message lost.
+
+        Raises:
+            LocalError: a file is malformed, or readable for others.
+        """
+        self.driver.run(self._node.reload)
+
+    def close(self, linger_s: float = LINGER_S) -> None:
+        """Close everything that was opened, and leave the overlay. Idempotent.
+
+        Args:
+            linger_s: longest wait for readers to confirm what was published, and for requests under way.
+        """
+        if self._is_closed:
+            return
+        self._is_closed = True
+        try:
+            self._finish(self.driver.now_s() + linger_s)
+        except ClosedError as error:
+            log.warning("the session ended without a goodbye reason=%s", error)
+        finally:
+            self.driver.close()
+            self._node.close()
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close(0.0 if error is not None else LINGER_S)
+
+    def wait_until_attached(self, timeout_s: float = ATTACH_TIMEOUT_S) -> None:
+        """Wait until a switch has accepted the node.
+
+        Raises:
+            AttachError: none did in time; the text says what the node waits for.
+        """
+        if not self.driver.wait(lambda: self.is_attached, self.driver.now_s() + timeout_s):
+            raise AttachError(f"not attached within {timeout_s:g} s: {self._node.waiting_for()}")
+
+    def why_not(self, name: Name, otherwise: str) -> str:
+        """Return the end of an error's sentence: why nothing crosses on a name, as far as it is known here."""
+        if not self.is_attached:
+            return f"; the node is not attached: {self._node.waiting_for()}"
+        refused = self._node.refused(name)
+        return f"; the advertisement was refused: {refused}" if refused else f"; {otherwise}"
+
+    def forget(self, opened: Publisher | Subscription | Server) -> None:
+        """Close this one no more: it has been closed by itself."""
+        if opened in self._opened:
+            self._opened.remove(opened)
+
+    def _finish(self, deadline_s: float) -> None:
+        publishers = [each for each in self._opened if isinstance(each, Publisher)]
+        for each in list(self._opened):
+            if isinstance(each, Server):
+                each.close(max(deadline_s - self.driver.now_s(), 0.0))
+        for publisher in publishers:
+            if publisher.readers:
+                self.driver.wait(publisher._publisher.is_acknowledged, deadline_s)
+        for opened in list(self._opened):
+            opened.close()
+        self.driver.run(lambda: self.core.close(self.driver.now_s()))
+        self.driver.wait(lambda: False, self.driver.now_s() + GOODBYE_S)
+
+
+def open_session(
+    node: str | os.PathLike[str],
+    *,
+    iface: str | None = None,
+    root: str | os.PathLike[str] | None = None,
+    trusts: Sequence[str | os.PathLike[str]] | None = None,
+    delegations: str | os.PathLike[str] | None = None,
+    state: str | os.PathLike[str] | None = None,
+    lease_s: float | None = None,
+    spin_us: int | None = None,
+    timeout_s: float = ATTACH_TIMEOUT_S,
+) -> Session:
+    """Open a session: attach this process to the overlay as a node.
+
+    Args:
+        node: the node's directory, as ``gdp keygen node`` and ``gdp cert issue`` made it, or a configuration file: a
+            ``proxy.yaml``, of which a session uses ``identity``, ``domain``, ``iface``, ``delegations`` and ``state``.
+            Beside a directory ``robot/proxy`` it reads ``robot/proxy.yaml`` where there is one.
+        iface: device towards the switch. Default: the configuration's; else the directory's name and a 0 (``proxy0``),
+            as ``attach`` of the switch makes it.
+        root: certificate of the node's trust domain. Default: the configuration's; else ``root.crt`` of the directory.
+        trusts: root certificates of other domains that are trusted.
+        delegations: directory of the node's delegations. Default: the configuration's; else ``delegations`` in the
+            node's directory.
+        state: directory that keeps revocations across restarts.
+        lease_s: lease of what the node advertises.
+        spin_us: microseconds to poll for more frames before sleeping, where most waits were shorter. 0: never.
+        timeout_s: longest wait until a switch has accepted the node.
+
+    Raises:
+        LocalError: keys, delegations or the device are not as the options say, or this node already runs.
+        ConfigError: the configuration file is wrong.
+        AttachError: no switch accepted the node in time.
+    """
+    config = settings_of(
+        node,
+        iface=iface,
+        root=root,
+        trusts=trusts,
+        delegations=delegations,
+        state=state,
+        lease_s=lease_s,
+        spin_us=spin_us,
+    )
+    made: SessionNode = open_node(config)
+    session = Session(made, ThreadDriver(made.core, made.runtime))
+    try:
+        session.wait_until_attached(timeout_s)
+    except BaseException:
+        session.close(0.0)
+        raise
+    return session
+
+
+def outcome_of(handler: Callable[[Request], bytes], request: Request) -> bytes | str:
+    """Return a handler's response, or as text why there is none."""
+    try:
+        response = handler(request)
+    except Exception as error:  # the program's own
+        log.exception("a handler failed client=%s", request.client.short)
+        return f"{type(error).__name__}: {error}"
+    return checked_response(response)
+
+
+def checked_response(response: object) -> bytes | str:
+    """Return a response as bytes, or as text that it is none."""
+    if isinstance(response, bytes | bytearray | memoryview):
+        return bytes(response)
+    return f"the handler returned {type(response).__name__}, not bytes"
+
+
+def is_urgent(priority: Priority) -> bool:
+    """Return whether a priority is ``urgent``.
+
+    Raises:
+        LocalError: it is neither ``normal`` nor ``urgent``.
+    """
+    if priority not in ("normal", "urgent"):
+        raise LocalError(f"priority is 'normal' or 'urgent', not {priority!r}")
+    return priority == "urgent"
+
+
+def _deadline_s(driver: Driver, timeout_s: float | None) -> float | None:
+    return None if timeout_s is None else driver.now_s() + timeout_s

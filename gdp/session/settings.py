@@ -1,0 +1,118 @@
+"""Settings of a session: from a node's directory or a configuration file, and the options of ``gdp.open``.
+
+Layer: I/O; loading reads files and changes nothing. A directory is one that ``gdp keygen node`` made. What an option
+does not say comes from the file of the same name (``robot/proxy.yaml`` for ``robot/proxy``) where there is one. Else it
+comes from the directory: ``root.crt``, ``delegations/``, and its own name for the device (``proxy0`` for ``proxy``).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import orjson
+from pydantic import Field, ValidationError
+
+from gdp.errors import LocalError
+from gdp.limits import CLAIM_LEASE_S
+from gdp.nodes.config import LeaseSeconds
+from gdp.nodes.schema import Directory, Domain, Ifname, Section, load
+from gdp.nodes.spin import SPIN_MAX_US, SPIN_US
+from gdp.stores.keyring import DELEGATIONS, NODE_CERTIFICATE, ROOT_CERTIFICATE
+
+__all__ = ["SessionConfig", "settings_of"]
+
+_SUFFIXES: Final = (".yaml", ".yml")
+
+
+class SessionConfig(Section):
+    """``session.yaml``, or a ``proxy.yaml`` whose rules and graphs a session does not use."""
+
+    identity: Directory
+    domain: Domain
+    iface: Ifname
+    delegations: Directory | None = None
+    state: Directory | None = None
+    lease_s: LeaseSeconds = CLAIM_LEASE_S
+    spin_us: int = Field(default=SPIN_US, ge=0, le=SPIN_MAX_US)
+    # keys of proxy.yaml alone
+    ros: object = None
+    expose: object = None
+    imports: object = Field(default=None, alias="import")
+    record: object = None
+    metrics: object = None
+    sandbox: object = None
+
+    @property
+    def delegation_directory(self) -> Path:
+        """Return where the delegations are."""
+        return self.identity / DELEGATIONS if self.delegations is None else self.delegations
+
+
+def settings_of(
+    node: str | os.PathLike[str],
+    *,
+    iface: str | None = None,
+    root: str | os.PathLike[str] | None = None,
+    trusts: Sequence[str | os.PathLike[str]] | None = None,
+    delegations: str | os.PathLike[str] | None = None,
+    state: str | os.PathLike[str] | None = None,
+    lease_s: float | None = None,
+    spin_us: int | None = None,
+) -> SessionConfig:
+    """Return the settings of a session; see ``gdp.open`` for the options.
+
+    Raises:
+        LocalError: there is no such node, or an option is out of bounds.
+        ConfigError: the configuration file is wrong.
+    """
+    path = Path(node).expanduser()
+    values: dict[str, object] = {}
+    if path.is_dir():
+        if not (path / NODE_CERTIFICATE).is_file():
+            raise LocalError(
+                f"{path}: no node has its keys and membership here; make them with"
+                f" 'gdp keygen node {path} --role proxy' and 'gdp cert issue'"
+            )
+        beside = next((file for suffix in _SUFFIXES if (file := path.with_name(path.name + suffix)).is_file()), None)
+        config = None if beside is None else load(SessionConfig, beside)
+        if config is not None and config.identity.resolve() == path.resolve():
+            values = _values(config)
+        else:
+            values = {"identity": path, "iface": f"{path.name}0", "domain": {"root": path / ROOT_CERTIFICATE}}
+    elif path.is_file():
+        values = _values(load(SessionConfig, path))
+    else:
+        raise LocalError(f"{path}: no such directory or file; give a node's directory, or its configuration file")
+    options = {"iface": iface, "delegations": delegations, "state": state, "lease_s": lease_s, "spin_us": spin_us}
+    values |= {key: value for key, value in options.items() if value is not None}
+    values["domain"] = _domain(values["domain"], root, trusts)
+    try:
+        return SessionConfig.model_validate_json(orjson.dumps(values, default=os.fspath), strict=True)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise LocalError(f"{path}: {key}: {first['msg'].removeprefix('Value error, ')}") from error
+
+
+def _values(config: SessionConfig) -> dict[str, object]:
+    keys = ("identity", "iface", "delegations", "state", "lease_s", "spin_us")
+    domain = {
+        "root": config.domain.root,
+        "trusts": list(config.domain.trusts),
+        "transit": None if config.domain.transit is None else list(config.domain.transit),
+    }
+    return {**{key: getattr(config, key) for key in keys}, "domain": domain}
+
+
+def _domain(
+    found: object, root: str | os.PathLike[str] | None, trusts: Sequence[str | os.PathLike[str]] | None
+) -> dict[str, object]:
+    domain: dict[str, object] = dict(found) if isinstance(found, dict) else {}
+    if root is not None:
+        domain["root"] = Path(root)
+    if trusts is not None:
+        domain["trusts"] = [Path(each) for each in trusts]
+    return domain

@@ -1,0 +1,55 @@
+"""The examples of the library with a real switch, a RIB and real keys."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+
+from gdp.trust.right import Right
+from netns_tests.session_lab import EXAMPLES, lines_of, session_lab
+
+if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
+    pytest.skip("nsenter or setpriv is not installed (util-linux)", allow_module_level=True)
+
+pytestmark = pytest.mark.netns
+
+
+def test_a_subscriber_prints_what_the_example_publishes() -> None:
+    with session_lab({"robot": {"greeting": [Right.PUBLISH]}, "server": {"greeting": [Right.READ]}}) as lab:
+        subscriber = lab.start(str(EXAMPLES / "publish_subscribe.py"), "subscribe", "server")
+        lab.output(lab.start(str(EXAMPLES / "publish_subscribe.py"), "publish", "robot"))
+        said = lab.output(subscriber).splitlines()
+    assert [line.split(" from ")[0] for line in said] == [f"{number + 1} hello {number}" for number in range(10)]
+
+
+def test_a_client_gets_responses_while_one_of_two_replicas_is_killed() -> None:
+    rights = {
+        "edge": {"reverse": [Right.SERVE]},
+        "cloud": {"reverse": [Right.SERVE]},
+        "robot": {"reverse": [Right.CALL]},
+    }
+    with session_lab(rights) as lab:
+        servers = [lab.start(str(EXAMPLES / "request_response.py"), "serve", label) for label in ("edge", "cloud")]
+        assert [lines_of(server, 1) for server in servers] == [["serving"], ["serving"]]
+        before = lab.output(lab.start(str(EXAMPLES / "request_response.py"), "call", "robot")).splitlines()
+        servers[0].kill()
+        after = lab.output(lab.start(str(EXAMPLES / "request_response.py"), "call", "robot")).splitlines()
+    words = ["tobor", "rosnes", "rennalp"]
+    assert [line.split()[0] for line in before] == words
+    assert [line.split()[0] for line in after] == words
+
+
+def test_the_camera_example_shows_images_of_full_size() -> None:
+    with session_lab({"robot": {"camera": [Right.PUBLISH]}, "server": {"camera": [Right.READ]}}) as lab:
+        viewer = lab.start(str(EXAMPLES / "camera.py"), "show", "server")
+        sender = lab.start(str(EXAMPLES / "camera.py"), "send", "robot")
+        first = lines_of(viewer, 3)
+        lab.output(sender)
+    assert all("307200 bytes" in line for line in first), first
+
+
+@pytest.mark.parametrize("name", ["publish_subscribe.py", "request_response.py", "camera.py"])
+def test_an_example_is_shorter_than_thirty_lines(name: str) -> None:
+    code = (EXAMPLES / name).read_text().splitlines()
+    assert len(code) < 30

@@ -1,0 +1,41 @@
+"""The tutorial of the library, followed word by word."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+
+from netns_tests.session_lab import lines_of, session_lab
+from tests.pages import ROOT, blocks
+
+if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
+    pytest.skip("nsenter or setpriv is not installed (util-linux)", allow_module_level=True)
+
+pytestmark = pytest.mark.netns
+
+_PAGE = ROOT / "docs/tutorials/library.md"
+
+
+def test_the_tutorial_of_the_library_does_what_it_says() -> None:
+    shown = blocks(_PAGE)
+    make, delegate, nodes = (block.text for block in shown if block.language == "bash")
+    subscribe, publish, serve, call, subscribe_async = (block.text for block in shown if block.language == "python")
+    with session_lab({}) as lab:
+        for block in shown:
+            if block.language == "yaml":
+                (lab.folder / block.title).write_text(block.text)
+        for script in (make, delegate):
+            lab.output(lab.start_command(["bash", "-e", "-c", script]))
+        for line in nodes.splitlines():
+            node = lab.start_command([*line.removesuffix(" &").split(), "--json"])
+            assert '"ready"' in lines_of(node, 1)[0]
+        for program in (subscribe, subscribe_async):
+            reader = lab.start("-c", program)
+            lab.output(lab.start("-c", publish))
+            assert "b'hello'" in lines_of(reader, 1)[0]
+            reader.terminate()
+            reader.wait()
+        lab.start("-c", serve)
+        lab.start("-c", serve.replace('"edge"', '"server"'))
+        assert lab.output(lab.start("-c", call)).startswith("b'tobor' from ")
