@@ -60,7 +60,7 @@ class _Setting:
 
 
 _SETTINGS: Final = {
-    "servers wait, nobody contends": _Setting("light", False, ("", "1.3")),
+    "servers wait, no contention": _Setting("light", False, ("", "1.3")),
     "servers wait, contended": _Setting("light", True, ("1.31", "1.96 (2.1 in the abstract)")),
     "servers compute, contended": _Setting("segment", True),
 }
@@ -69,7 +69,7 @@ _SETTING: Final = (
     "A robot calls a service that segments frames of 640 x 480 bytes. *Contended*: a second client of the same service,"
     f" next to the replica m1, alternates: for {ON_S:g} s it asks m1 again and again, then it rests for {OFF_S:g}"
     " s. The"
-    " node serves one request after the other. *One server* is m1; *two replicas* are m1 and m2, where nobody else"
+    " node serves one request after the other. *One server* is m1; *two replicas* are m1 and m2, and no other client"
     " asks."
     " Both cases take turns, request by request, with the same frames.",
     "*Servers wait*: they segment every fourth row and column and wait for the rest of their time, as if a processor of"
