@@ -121,7 +121,7 @@ def page(cases: Sequence[Case]) -> str:
         "# Availability, by replaying preemptions",
         "",
         f"Made by `python scripts/experiments/availability.py` from {seen.source}. These are machines of 64 CPUs in a "
-        f"time of shortage: without any to be had for {taken} of the time, and taken after "
+        f"time of shortage. None was available for {taken} of the time, and they were preempted after "
         f"{duration_text(round(seen.uptime_s))} on average. Read the figures as the worst that was recorded, and "
         "compare them with each other.",
         "",
@@ -141,8 +141,8 @@ def page(cases: Sequence[Case]) -> str:
         "six days are few, and the intervals say so.",
         "",
         "## What follows",
-        "- A second and a third replica in the same region help less than independence says, because zones run out of "
-        f"machines together: pairs of zones have machines at the same time {low:g} to {high:g} times as often as "
+        "- A second and a third replica in the same region help less than independence says. The zones run out of "
+        f"machines together. Pairs of zones have machines at the same time {low:g} to {high:g} times as often as "
         "independent ones. Asked the other way round (neither has any) the ratio is 1.02 to 1.1, which says little. "
         "That state is the normal one here, and no ratio can exceed one over its share.",
         "- One replica that moves does as well as three that stay, and further ones that move add next to nothing. "
