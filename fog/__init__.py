@@ -1,6 +1,6 @@
 """Replicated ROS services on machines in the cloud: launch descriptions, providers, the supervisor, prices.
 
-A launch file's words are loaded when first asked for: ``from fog import FogCluster, SpotMachine`` (docs/launch.md).
+``from fog import FogCluster, SpotMachine`` loads a name when it is first used (docs/reference/launch-files.md).
 """
 
 from __future__ import annotations

@@ -71,9 +71,9 @@ class SiteConfig(Section):
         default=None, description="A name of that switch's `attach`: from there it is seen which replicas serve."
     )
     provider: ProviderName = Field(default="local", description="Where machines come from.")
-    aws: AwsConfig = Field(default=AwsConfig(), description="Of provider `aws`; see docs/providers.md.")
+    aws: AwsConfig = Field(default=AwsConfig(), description="Of provider `aws`; see docs/reference/providers.md.")
     skypilot: SkyPilotConfig = Field(
-        default=SkyPilotConfig(), description="Of provider `skypilot`; see docs/providers.md."
+        default=SkyPilotConfig(), description="Of provider `skypilot`; see docs/reference/providers.md."
     )
     machine_iface: Ifname | None = Field(
         default=None, description="A machine's device towards the overlay. Default: of `local` eth0, else the tunnel's."

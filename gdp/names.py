@@ -1,7 +1,8 @@
 """A 256-bit name: what it is made of, and how it is written.
 
 Place: ground floor; pure.
-Source: DESIGN section 2: ``name = SHA-256("gdp-name-1" || SHA-256(canonical metadata) || owner public key)``.
+Source: docs/explanation/design.md, section 2:
+``name = SHA-256("gdp-name-1" || SHA-256(canonical metadata) || owner public key)``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the README promises about two machines, done by its own commands in two namespaces that a cable joins."""
+"""Two machines set up by the commands of the README, or of the tutorial, in two namespaces that a cable joins."""
 
 from __future__ import annotations
 
@@ -10,21 +10,24 @@ from netns_tests.cable import Terminals, cable
 from netns_tests.spaces import Space
 from proxy.recordings.compare import compare
 from tests.machines import Machines
-from tests.pages import ROOT, Block, blocks_between
+from tests.pages import ROOT, Block, blocks, blocks_between
 
 pytestmark = pytest.mark.netns
 
+README = blocks_between(ROOT / "README.md", "Two machines of your own")
+TUTORIAL = blocks(ROOT / "docs/tutorials/two-machines.md")
 _TOPIC = "/camera/image"
 
 
-def test_a_recording_goes_from_one_machine_to_the_other_by_the_commands_of_the_readme(
-    space: Space, tmp_path: Path
+@pytest.mark.parametrize("page", [README, TUTORIAL], ids=["readme", "tutorial"])
+def test_a_recording_goes_from_one_machine_to_the_other_by_the_commands_of_a_page(
+    page: list[Block], space: Space, tmp_path: Path
 ) -> None:
     machines = Machines(tmp_path)
     with cable(space) as into_server:
         terminals = Terminals(machines, into_server)
         try:
-            printed = _follow(machines, terminals, blocks_between(ROOT / "README.md", "Two machines of your own"))
+            printed = _follow(machines, terminals, page)
             said = terminals.end()
         finally:
             terminals.close()

@@ -16,7 +16,7 @@ from gdp.stores.rollover import begin_rollover, finish_rollover, trust_successor
 from netns_tests.cable import Terminals, cable
 from netns_tests.spaces import Space
 from tests.machines import Machines
-from tests.pages import ROOT, blocks_between
+from tests.pages import ROOT, blocks
 
 pytestmark = pytest.mark.netns
 
@@ -74,8 +74,8 @@ def test_no_message_is_lost_while_memberships_and_the_root_are_replaced(space: S
 
 
 def _stand_up(machines: Machines, terminals: Terminals) -> None:
-    """Do what the README says, but for the replay."""
-    for block in blocks_between(ROOT / "README.md", "Two machines of your own"):
+    """Do what the tutorial says, but for the replay."""
+    for block in blocks(ROOT / "docs/tutorials/two-machines.md"):
         if block.language == "yaml":
             machines.write(block)
             if "proxy" not in block.title:

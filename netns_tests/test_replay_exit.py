@@ -1,4 +1,4 @@
-"""What gdp-replay says of messages that nobody confirmed, on the two machines of the README."""
+"""What gdp-replay says of messages that nobody confirmed, on the two machines of the tutorial."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from netns_tests.cable import Terminals, cable
 from netns_tests.spaces import Space
 from tests.machines import Machines
-from tests.pages import ROOT, blocks_between
+from tests.pages import ROOT, blocks
 
 pytestmark = pytest.mark.netns
 
@@ -40,9 +40,9 @@ def test_gdp_replay_exits_1_for_a_reliable_topic_without_a_reader_and_0_once_it_
 
 
 def _stand_up(machines: Machines, terminals: Terminals) -> tuple[str, Path]:
-    """Do what the README says, but for the recorder, which is returned, and the replay."""
+    """Do what the tutorial says, but for the recorder, which is returned, and the replay."""
     recorder = ("", Path())
-    for block in blocks_between(ROOT / "README.md", "Two machines of your own"):
+    for block in blocks(ROOT / "docs/tutorials/two-machines.md"):
         if block.language == "yaml":
             machines.write(block)
         elif block.title:

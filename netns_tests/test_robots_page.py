@@ -26,7 +26,7 @@ if shutil.which("nsenter") is None:
 
 pytestmark = pytest.mark.netns
 
-PAGE = ROOT / "docs/robots.md"
+PAGE = ROOT / "docs/tutorials/robots.md"
 _RUN_ON = ("gdp-switch ", "gdp-rib ", "gdp-proxy ", "roscore")
 _ROS2 = ", with ros2"
 _ROBOT = """

@@ -17,7 +17,7 @@ JsonSchema: TypeAlias = "dict[str, object]"
 
 DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
 
-_SHARED: Final = {  # keys that every node's file has; docs/configuration.md says more about them
+_SHARED: Final = {  # keys that every node's file has; docs/reference/configuration.md says more about them
     ("Domain", "root"): "Root certificate of the node's own trust domain.",
     ("Domain", "trusts"): "Root certificates of other domains whose members are believed.",
     ("Domain", "transit"): "Labels of the domains through which traffic may pass. `null`: every trusted one.",

@@ -10,12 +10,12 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 _ALONE = ("README.md", "CHANGELOG.md", "SECURITY.md", "docs/model/README.md", "gdp/frame/spec.md")
+KINDS = ("tutorials", "how-to", "reference", "explanation")
 PAGES = (
     *(ROOT / path for path in _ALONE),
     *sorted((ROOT / "docs").glob("*.md")),
-    *sorted((ROOT / "docs/explanation").glob("*.md")),
-    *sorted((ROOT / "docs/how-to").glob("*.md")),
-    *sorted((ROOT / "docs/tutorials").glob("*.md")),
+    *(page for kind in KINDS for page in sorted((ROOT / "docs" / kind).glob("*.md"))),
+    *(page for shown in ("benchmarks", "experiments") for page in sorted((ROOT / "docs" / shown).glob("*.md"))),
 )
 
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)

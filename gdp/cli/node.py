@@ -38,7 +38,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 _OURS: Final = ("gdp", "proxy", "fog")
 WRONG: Final = 2  # exit code of a wrong configuration
 
-Config = Annotated[Path, typer.Option("--config", help="The YAML file; see docs/configuration.md.")]
+Config = Annotated[Path, typer.Option("--config", help="The YAML file; see docs/reference/configuration.md.")]
 Check = Annotated[bool, typer.Option("--check", help="Validate the configuration and end.")]
 AwaitIface = Annotated[
     float,

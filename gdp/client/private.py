@@ -1,7 +1,8 @@
 """A private stream: what a server answers to one client, or a client asks one server; by unicast, reliable, in order.
 
 Place: pure; time comes in as ``now_s`` (monotonic seconds).
-Source: DESIGN section 6 ("answers return by unicast"). It is an ordinary stream, but for three things:
+Source: docs/explanation/design.md, section 6
+("answers return by unicast"). It is an ordinary stream, but for three things:
 
 - its frames are addressed to the reader, so any switch finds their way;
 - a name that both ends derive from who they are, in this life, stands for the topic in keys and notes, and the header's

@@ -1,7 +1,8 @@
 """Sealing a message into frames, and opening its parts one by one.
 
 Place: pure; no clock, no memory of messages (that is ``gdp/message``).
-Source: DESIGN section 4; XAES-256-GCM (C2SP), NIST SP 800-38D (GCM), RFC 5869 (HKDF), FIPS 186-5 (ECDSA). To the byte:
+Source: docs/explanation/design.md, section 4;
+XAES-256-GCM (C2SP), NIST SP 800-38D (GCM), RFC 5869 (HKDF), FIPS 186-5 (ECDSA). To the byte:
 ``frame/spec.md``.
 
 ::

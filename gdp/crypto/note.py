@@ -1,7 +1,8 @@
 """A short sealed note from one member of a topic to another, such as a reader's report; not signed.
 
 Place: pure.
-Source: DESIGN section 4; AES-256-GCM-SIV (RFC 8452), HKDF (RFC 5869), X25519 (RFC 7748). Layout: ``header | topic (32)
+Source: docs/explanation/design.md, section 4;
+AES-256-GCM-SIV (RFC 8452), HKDF (RFC 5869), X25519 (RFC 7748). Layout: ``header | topic (32)
 | ciphertext | tag``; the nonce is number || 0; additional data is the header without hops left, the topic, and the
 incarnation of the one it is for.
 

@@ -1,7 +1,7 @@
 """A name together with what proves it: the digest of its metadata and its owner's key.
 
 Place: pure. Holding one means that the hash came out, so nobody need check it again.
-Source: DESIGN section 2.
+Source: docs/explanation/design.md, section 2.
 """
 
 from __future__ import annotations

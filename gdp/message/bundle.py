@@ -1,6 +1,7 @@
 """Several small messages of one topic under one seal and one signature.
 
-Place: pure. Source: DESIGN section 4: natural batching, never an added delay: what goes together is what waits together
+Place: pure. Source: docs/explanation/design.md, section 4:
+natural batching, never an added delay: what goes together is what waits together
 when frames are asked for.
 
 Wire form, big-endian: for each message ``length (4) | message``; at least one message, nothing behind the last.

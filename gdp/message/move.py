@@ -1,6 +1,6 @@
 """Messages that had to be split anew, and so got new numbers: the links had become too narrow for their frames.
 
-Place: pure. Source: DESIGN section 4: what must be split anew gets a new number.
+Place: pure. Source: docs/explanation/design.md, section 4: what must be split anew gets a new number.
 
 All that a publisher keeps moves together, in order; the number between the old ones and the new ones stays unused, so
 that every number is either an old or a new one::

@@ -1,6 +1,6 @@
 """The configuration of a switch and of a RIB: every key, its bounds and its default.
 
-Place: shell; loading reads files and changes nothing. ``docs/configuration.md`` explains the keys to people.
+Place: shell; loading reads files and changes nothing. ``docs/reference/configuration.md`` explains the keys to people.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """What a data plane is to the node that runs it: ports, frames handed up, frames to send.
 
 Place: I/O floor; the Protocol and its nouns, no system call.
-Source: DESIGN section 7. A plane forwards by itself whatever the table decides; a node sees only what was handed up.
+Source: docs/explanation/design.md, section 7.
+A plane forwards by itself whatever the table decides; a node sees only what was handed up.
 A plane without a table (a proxy's, a RIB's) hands everything up.
 """
 

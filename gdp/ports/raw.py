@@ -1,7 +1,8 @@
 """The data plane on AF_PACKET sockets: batches in, a decision each, batches out.
 
 Place: I/O; no Scapy, and the struct codec's offsets only.
-Source: DESIGN section 7. What is ordinary is decided here, in one pass over the batch; whatever is not goes to
+Source: docs/explanation/design.md, section 7.
+What is ordinary is decided here, in one pass over the batch; whatever is not goes to
 ``gdp.switch.forwarder.decide``, and fixtures hold the two together. Neighbouring frames of a batch that go the same way
 leave in one call, a *run*; each lane of a port has its own socket, and the first one goes first. Of hellos, and of all
 that strangers say, a port takes so many frames a second; the others are left to the kernel, which drops them when the

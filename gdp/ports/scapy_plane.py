@@ -1,7 +1,8 @@
 """The data plane by Scapy: sniff, dissect, decide, build, send. The reference, for learning and for tests.
 
 Place: I/O; the only plane that imports Scapy, and imported only when chosen.
-Source: DESIGN section 7. It decides by the very ``decide`` that the others are tested against, and leaves the bytes of
+Source: docs/explanation/design.md, section 7.
+It decides by the very ``decide`` that the others are tested against, and leaves the bytes of
 a frame alone but for addresses and hops left, because Scapy builds anew only what was changed.
 """
 

@@ -1,7 +1,8 @@
 """The calls of one service that are under way: who waits for which answer, and until when.
 
 Place: pure; time comes in as ``now_s`` (monotonic seconds).
-Source: DESIGN section 6: the first answer wins. A call ends once: by its first answer, by its time running out, or
+Source: docs/explanation/design.md, section 6:
+the first answer wins. A call ends once: by its first answer, by its time running out, or
 with all others; whatever comes for it later finds nobody.
 """
 

@@ -1,7 +1,7 @@
 """The forwarding decision, in the plainest words: every data plane must decide as this does.
 
 Place: pure; the reference that the planes are tested against, and what they call for any frame out of the ordinary.
-Source: DESIGN sections 3 and 7. In this order:
+Source: docs/explanation/design.md, sections 3 and 7. In this order:
 
 1. shorter than an Ethernet and a GDP header: drop, truncated; another EtherType or version: drop;
 2. a kind from 0x80 on is for the neighbour itself: hand up;

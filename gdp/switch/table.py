@@ -1,7 +1,8 @@
 """The forwarding table: where a frame goes, and until when that is known.
 
 Place: pure; a data plane reads ``entries`` directly for every frame, the switch's machine alone writes.
-Source: DESIGN sections 6 and 7. A key is a destination (32 bytes) or destination and source (64 bytes, the order in
+Source: docs/explanation/design.md, sections 6 and 7.
+A key is a destination (32 bytes) or destination and source (64 bytes, the order in
 which they stand in a frame), the longer one looked up first. A value is the tuple of hops that each get a copy; the
 empty tuple is a negative entry: known to lead nowhere. A hop may name an alternate, computed ahead (RFC 5286), which a
 data plane takes by itself while the first port is down.

@@ -1,7 +1,8 @@
 """AdCert: an owner, or who has it from the owner, lets a node do something with a name.
 
 Place: pure.
-Source: FogROS G, section on advertisements; DESIGN section 5. A chain leads from the owner's key to the node that acts:
+Source: FogROS G, section on advertisements; docs/explanation/design.md, section 5.
+A chain leads from the owner's key to the node that acts:
 each link is signed by the key that the link before it names, may only narrow the rights, and needs its permission.
 
 ::

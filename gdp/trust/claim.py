@@ -1,7 +1,8 @@
 """A claim: what a node says it does with a name, with all that proves that it may.
 
 Place: pure.
-Source: DESIGN section 5. The node signs it, its switch relays it to a RIB, RIBs relay it up the tiers and down in
+Source: docs/explanation/design.md, section 5.
+The node signs it, its switch relays it to a RIB, RIBs relay it up the tiers and down in
 answers; each verifies it anew from the bytes and believes no relay.
 
 ::
@@ -43,7 +44,7 @@ class Claim:
         chain: the delegations from the owner; empty links where the node owns the name.
         rtcert: which switch may attract the traffic.
         sequence: a newer claim of the same node on the same name has a higher one.
-        incarnation: of the node's present run; readers open nothing else (DESIGN section 4).
+        incarnation: of the node's present run; readers open nothing else (docs/explanation/design.md, section 4).
         lease_s: how long it holds unless refreshed, within the bounds of ``limits``.
         is_global: whether it climbs to the tier above.
         wire: the bytes that were verified, to be relayed as they are.

@@ -1,7 +1,8 @@
 """What this domain's policy says: which domains it trusts, and through which its traffic may pass.
 
 Place: pure.
-Source: DESIGN section 5. Tiers are for finding names; trust is not inherited along them: a domain trusts the roots that
+Source: docs/explanation/design.md, section 5.
+Tiers are for finding names; trust is not inherited along them: a domain trusts the roots that
 its own operator put there, and no others.
 """
 

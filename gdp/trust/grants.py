@@ -1,7 +1,8 @@
 """Grants: how the secret of a topic's epoch reaches a node, and only that node.
 
 Place: pure, but for the randomness that sealing draws.
-Source: DESIGN section 4. HPKE (RFC 9180) to the node's key, signed by the owner. The owner keeps one master secret::
+Source: docs/explanation/design.md, section 4.
+HPKE (RFC 9180) to the node's key, signed by the owner. The owner keeps one master secret::
 
     secret(name, epoch) = HKDF-SHA256(master, salt "", info "gdp-topic-secret-1" || name || epoch (2)), 32 bytes
     HPKE info           = "gdp-grant-1" || name || epoch (2) || the node's name

@@ -1,7 +1,7 @@
 """RtCert: a node lets one switch attract traffic for it.
 
 Place: pure.
-Source: FogROS G, section on advertisements; DESIGN section 5.
+Source: FogROS G, section on advertisements; docs/explanation/design.md, section 5.
 """
 
 from __future__ import annotations

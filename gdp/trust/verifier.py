@@ -1,7 +1,8 @@
 """Believing a claim: every proof that it carries, in the order that costs a stranger most and us least.
 
 Place: pure; remembers what it verified, within bounds.
-Source: DESIGN section 5. First what is free (form, hash, lease), then who speaks (membership, signature), and only for
+Source: docs/explanation/design.md, section 5.
+First what is free (form, hash, lease), then who speaks (membership, signature), and only for
 a proved member the rest. A new claim costs two signature checks; a refreshed one costs one, since certificates seen
 before are remembered by digest. Time and revocation are asked every time.
 """

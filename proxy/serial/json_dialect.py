@@ -1,7 +1,8 @@
 """How the leaves of a message look in JSON; readable first, exact always.
 
 Place: pure.
-Source: rosbridge for base64; RFC 7493 (I-JSON) 2.2 for integers beyond 2^53; ``docs/serialisation.md`` for the rest.
+Source: rosbridge for base64; RFC 7493 (I-JSON) 2.2 for integers beyond 2^53.
+The rest: ``docs/reference/serialisation.md``.
 """
 
 from __future__ import annotations

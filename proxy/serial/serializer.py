@@ -1,7 +1,8 @@
 """One channel's messages in one encoding: bytes as ROS writes them to a body for the overlay, and back.
 
 Place: pure. What is compiled for a channel is compiled once.
-Source: DESIGN section 8; OMG CDR encapsulation (RTPS 2.2, section 10): two bytes of scheme, two of options.
+Source: docs/explanation/design.md, section 8;
+OMG CDR encapsulation (RTPS 2.2, section 10): two bytes of scheme, two of options.
 """
 
 from __future__ import annotations

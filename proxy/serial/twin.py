@@ -1,7 +1,7 @@
 """A topic's messages in the other ROS: how it would describe them, and the bytes there for the bytes here.
 
 Place: pure. A message is read with the one definition and written with the other; no type is known beforehand.
-What may differ is in ``match``; the table for people is in ``docs/serialisation.md``.
+What may differ is in ``match``; the table for people is in ``docs/reference/serialisation.md``.
 """
 
 from __future__ import annotations

@@ -34,8 +34,8 @@ RECOVERIES: Final = ("34s", "5min", "20min")
 BLOCK_S, RESAMPLES, MOST_REPLICAS = 6 * 3600.0, 2000, 3
 WAYS: Final = {
     "stays": "each replica has a zone of its own and waits for it",
-    "moves": "a replica that is taken is replaced in any of the zones that has room",
-    "elsewhere": "there is always room somewhere: down for the recovery only",
+    "moves": "a replica that is taken is replaced in any of the zones that has capacity",
+    "elsewhere": "there is always capacity somewhere: down for the recovery only",
 }
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
@@ -121,7 +121,7 @@ def page(cases: Sequence[Case]) -> str:
         "# Availability, by replaying preemptions",
         "",
         f"Made by `python scripts/experiments/availability.py` from {seen.source}. These are machines of 64 CPUs in a "
-        f"time of shortage: without any to be had for {taken} of the time, and taken after "
+        f"time of shortage. None was available for {taken} of the time, and they were preempted after "
         f"{duration_text(round(seen.uptime_s))} on average. Read the figures as the worst that was recorded, and "
         "compare them with each other.",
         "",
@@ -141,15 +141,15 @@ def page(cases: Sequence[Case]) -> str:
         "six days are few, and the intervals say so.",
         "",
         "## What follows",
-        "- A second and a third replica in the same region help less than independence says, because zones run out of "
-        f"machines together: pairs of zones have machines at the same time {low:g} to {high:g} times as often as "
-        "independent ones. Asked the other way round (neither has any) the ratio is 1.02 to 1.1, which says little: "
-        "that state is the normal one here, and no ratio can exceed one over its share.",
-        "- One replica that moves does as well as three that stay, and further ones that move add next to nothing: "
-        "what is left is the time in which the whole region has none. Other regions, other types of machine or one "
-        "on-demand machine help against that; with one on-demand machine all these shares are zero, since the traces "
+        "- A second and a third replica in the same region help less than independence says. The zones run out of "
+        f"machines together. Pairs of zones have machines at the same time {low:g} to {high:g} times as often as "
+        "independent ones. Asked the other way round (neither has any) the ratio is 1.02 to 1.1, which says little. "
+        "That state is the normal one here, and no ratio can exceed one over its share.",
+        "- One replica that moves does as well as three that stay, and further ones that move add next to nothing. "
+        "What is left is the time in which the whole region has none. Other regions, other types of machine or one "
+        "on-demand machine help against that. With one on-demand machine all these shares are zero, since the traces "
         "record nothing that takes it.",
-        "- Where room is found elsewhere, the recovery time decides.",
+        "- Where capacity is found elsewhere, the recovery time decides.",
     ]
     return "\n".join(lines) + "\n"
 

@@ -236,7 +236,8 @@ def _notes(counts: Mapping[str, int], timeout_s: float, planner: str) -> list[st
         " weighs more here than in the paper (last figure of each).",
         f"Computed trials: {told or 'none in this run'}, timeout {timeout_s:g} s. Of fewer than a hundred trials"
         " the p99 is"
-        " the slowest one. What nobody solved counts with its timeout, as failed. The replicas share two cores"
+        " the slowest one. A problem without a solution counts with its timeout, as failed."
+        " The replicas share two cores"
         " with each"
         " other, the robot and the overlay, and the planner calls back into Python for each check: gains of computed"
         " trials are less than those of two machines.",

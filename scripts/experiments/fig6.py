@@ -60,33 +60,33 @@ class _Setting:
 
 
 _SETTINGS: Final = {
-    "servers wait, nobody contends": _Setting("light", False, ("", "1.3")),
+    "servers wait, no contention": _Setting("light", False, ("", "1.3")),
     "servers wait, contended": _Setting("light", True, ("1.31", "1.96 (2.1 in the abstract)")),
     "servers compute, contended": _Setting("segment", True),
 }
 _QUICK: Final = "servers wait, contended"
 _SETTING: Final = (
     "A robot calls a service that segments frames of 640 x 480 bytes. *Contended*: a second client of the same service,"
-    f" next to the replica m1, alternates: for {ON_S:g} s it asks m1 again and again, then it rests for {OFF_S:g}"
+    f" next to the replica m1, alternates. For {ON_S:g} s it asks m1 again and again, then it rests for {OFF_S:g}"
     " s. The"
-    " node serves one request after the other. *One server* is m1; *two replicas* are m1 and m2, where nobody else"
+    " node serves one request after the other. *One server* is m1; *two replicas* are m1 and m2, and no other client"
     " asks."
     " Both cases take turns, request by request, with the same frames.",
     "*Servers wait*: they segment every fourth row and column and wait for the rest of their time, as if a processor of"
     f" their own worked. The time is drawn for each request and replica: log-normal, mean {1e3 * _MEAN_S:g} ms, sigma"
-    f" {_SIGMA:g}. That sigma is chosen so that by arithmetic alone the p99 of the lesser of two is 1.3 times lower,"
-    " which is the paper's gain without a fault. So the first case is a calibration; the gains under contention are"
+    f" {_SIGMA:g}. With that sigma, by arithmetic alone, the p99 of the lesser of two is 1.3 times lower."
+    " That is the paper's gain without a fault. So the first case is a calibration; the gains under contention are"
     " results. *Servers compute*: the whole segmentation runs on the machine's own cores.",
 )
 _NOTES: Final = (
     "The segmentation is a stand-in: smoothing at seven scales, thresholds and connected components, about 60 ms of"
-    " one core; how many regions it finds is checked against the scene that was drawn. The paper ran a neural"
+    " one core. How many regions it finds is checked against the scene that was drawn. The paper ran a neural"
     " network.",
     "The service type is rcl_interfaces/srv/SetParameters, whose integer array carries the frame (307,200 bytes): the"
     " installed packages have no service that takes an image.",
     "The paper has 300 requests, as the cases in which the servers wait.",
-    "While the second client is busy and the servers compute, three processes want a core at once: with two cores the"
-    " robot's request to the second replica pays for a part of it, which two machines would not.",
+    "While the second client is busy and the servers compute, three processes want a core at once. With two cores the"
+    " robot's request to the second replica pays for a part of it. Two machines would not share that cost.",
 )
 
 

@@ -42,23 +42,23 @@ _PATIENCE_S: Final = 10.0
 _LINKS: Final = {"m2": ("round trip +100 ms", DELAY_S / 2), "m3": ("each way +100 ms", DELAY_S)}
 _NEAR: Final = "m1"
 _SETTING: Final = (
-    "A robot calls a service that counts objects in frames of 640 x 480 bytes; the link of one of its two servers is"
+    "A robot calls a service that counts objects in frames of 640 x 480 bytes. The link of one of its two servers is"
     " slowed down, the other one's is not. *One server*: requests go to the two servers in turn, as where a load"
-    " balancer or an anycast address picks the server, so half of them meet the slow link. *Two replicas*: each"
+    " balancer or an anycast address picks the server. So half of them meet the slow link. *Two replicas*: each"
     " request goes to both, and the first answer wins. All cases take turns, request by request, with the same"
     " frames.",
-    "Which requests of its single server met the slow link in the paper is not known here; with all of them on the slow"
+    "Which requests of its single server met the slow link in the paper is not known here. With all of them on the slow"
     " link mean and p99 would gain alike, which they do not in the paper. Both readings of a link with 100 ms more"
     " are measured: in the round trip, and each way.",
 )
 _NOTES: Final = (
     "The paper has 300 requests, as each case here.",
     "The paper ran a neural network (YOLOv8) on machines of 16 cores. Here a server looks at every fourth row and"
-    f" column, and waits until {1e3 * _TAKES_S:g} ms have passed; its answers are checked against the scene that was"
+    f" column, and waits until {1e3 * _TAKES_S:g} ms have passed. Its answers are checked against the scene that was"
     " drawn. `--compute` runs a real detector instead: correlation with a disc by FFT, about 15 ms of one core.",
     "The service type is rcl_interfaces/srv/SetParameters, whose integer array carries the frame (307,200 bytes): the"
     " installed packages have no service that takes an image.",
-    "Robot and servers are namespaces of one machine and share its cores, so two replicas cost each other time that two"
+    "Robot and servers are namespaces of one machine and share its cores. So two replicas cost each other time that two"
     " machines would not.",
 )
 

@@ -35,19 +35,19 @@ _QUICK_STEADY_S: Final = 1.0
 _LANES: Final = 1_000  # the camera does not wait for answers
 _PATIENCE_S: Final = 10.0
 _SETTING: Final = (
-    "A robot's camera sees an AprilTag; ten times a second a frame of 640 x 480 bytes goes to a service that finds"
+    "A robot's camera sees an AprilTag. Ten times a second a frame of 640 x 480 bytes goes to a service that finds"
     " the tag's pose, whether or not earlier answers are there. The service has replicas. One is killed (SIGKILL to"
-    f" its node and its proxy at once), started again {_DOWN_S:g} s later, and when it answers again, the next one is"
-    " killed: there is always one that serves, and never for long the same one.",
+    f" its node and its proxy at once), started again {_DOWN_S:g} s later. When it answers again, the next one is"
+    " killed. There is always one that serves, and never for long the same one.",
     "A request fails when its answer does not come within 10 s, or when the pose is more than 5 mm or 0.03 rad off. How"
     " many answers reach each call is counted by ROS 2's service introspection in the robot's node.",
 )
 _NOTES: Final = (
-    "Frames are drawn for a known pose (nine rays a pixel, no lens distortion) and are not photographs; the detector"
+    "Frames are drawn for a known pose (nine rays a pixel, no lens distortion) and are not photographs. The detector"
     " is pupil-apriltags, family 36h11. The service type is rcl_interfaces/srv/SetParameters, whose integer array"
     " carries the frame: the installed packages have no service that takes an image.",
-    "The paper's robot and spot machines were apart; here all share the cores of one machine, so a machine that starts"
-    " (Python, rclpy, keys) takes time from those that serve, which is most of what the timeline shows.",
+    "The paper's robot and spot machines were apart. Here all share the cores of one machine. So a machine that starts"
+    " (Python, rclpy, keys) takes time from those that serve. That is most of what the timeline shows.",
 )
 
 

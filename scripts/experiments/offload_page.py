@@ -172,17 +172,17 @@ def _notes(tasks: Document, slower: Mapping[str, float]) -> list[str]:
     ratios = ", ".join(f"{name} {each:.2f}" for name, each in slower.items())
     notes = [f"{name}: {COMPUTES[name]}." for name in PAPER if name in tasks]
     notes += [
-        "The data are recorded ones: RGB-D frames 2 to 5 of the five in slambook2 for vSLAM (the paper: TUM fr2/loop),"
-        " three of them cropped to 516 x 386 with an armchair's mask for grasps, OMPL.app's meshes of Home. Answers are"
-        " checked: motion within 0.1 m and 0.1 rad of the recorded poses, a path from start to goal, a grasp on the"
-        " object.",
-        "*Robot only* is the same computation in a control group that gets as much less of a core as the paper's robot"
+        "The data are recorded ones: RGB-D frames 2 to 5 of the five in slambook2 for vSLAM (the paper: TUM fr2/loop)."
+        " Three of them are cropped to 516 x 386 with an armchair's mask for grasps. The meshes are OMPL.app's Home."
+        " Answers are checked: motion within 0.1 m and 0.1 rad of the recorded poses, a path from start to goal, a"
+        " grasp on the object.",
+        "*Robot only* is the same computation in a control group that gets less of a core, as the paper's robot"
         f" was slower than its server (robot only over total less network: {ratios}). So the ratio is the paper's,"
         " not a"
         " result; the times are measured. Where the paper's robot was the faster one (vSLAM) ours has a whole core, as"
         " the server has.",
-        "The paper used five NUCs. Here all machines are network namespaces of one, which shares its cores among"
-        " robot, proxies and server; links are veth pairs, without the time of a cable, and the switches forward in the"
+        "The paper used five NUCs. Here all machines are network namespaces of one. It shares its cores among"
+        " robot, proxies and server. Links are veth pairs, without the time of a cable, and the switches forward in the"
         " kernel.",
         "Of Cyclone DDS there is no wheel for rclpy: its nodes serialise by rclpy and carry by this project's endpoint"
         " `dds`, without the overlay.",

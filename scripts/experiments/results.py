@@ -32,7 +32,7 @@ _GAINS: Final[Mapping[str, Mapping[str, tuple[str, str, str, str]]]] = {
         "Twistycool, computed": ("MPT TwistyCool", "up to 1.22", "1.42", "computed; both replicas on one machine"),
     },
     "fig6": {
-        "servers wait, nobody contends": ("SAM, no fault", "", "1.3", "waits; spread chosen to give 1.3"),
+        "servers wait, no contention": ("SAM, no fault", "", "1.3", "waits; spread chosen to give 1.3"),
         "servers wait, contended": ("SAM, second client", "1.31", "1.96", "waits; second client on and off"),
         "servers compute, contended": ("SAM, second client", "1.31", "1.96", "computed; all on one machine"),
     },
@@ -94,7 +94,7 @@ def page_of(rows: Sequence[Row], machines: Sequence[str]) -> str:
     cells = [(r.figure, r.what, r.paper, r.here, r.spread, r.trials, r.conditions) for r in rows]
     table = "\n".join("| " + " | ".join(line) + " |" for line in [head, ("---",) * len(head), *cells])
     return "\n\n".join([
-        "# The papers' figures beside ours",
+        "# The published figures next to ours",
         "G is FogROS G, FT is FogROS2-FT. One command measures everything and writes this page and"
         " [results.json](results.json); `--collect` only writes the page again.",
         "```bash\nsudo .venv/bin/python scripts/experiments/papers.py\n```",
@@ -102,7 +102,7 @@ def page_of(rows: Sequence[Row], machines: Sequence[str]) -> str:
         "Gains are the time of one server divided by that of two replicas. Their spread is the 95 % interval of a"
         f" bootstrap ({_RESAMPLES:,} resamples). Each experiment's own page has all latencies and its conditions"
         " ([index](README.md)).",
-        "What differs from the papers, in short:",
+        "What differs from the published settings, in short:",
         "\n".join(f"- {note}" for note in _NOTES),
         "Measured on these machines. Load is that of other work; above the number of cores it takes time from what is"
         " measured:",
@@ -111,13 +111,13 @@ def page_of(rows: Sequence[Row], machines: Sequence[str]) -> str:
 
 
 _NOTES: Final = (
-    "One machine of two cores holds robot, switches and servers, as network namespaces. The papers had five NUCs"
+    "One machine of two cores holds robot, switches and servers, as network namespaces. The authors had five NUCs"
     " (G), and"
     " AWS machines of 4 to 64 cores in two regions (FT). Absolute times are not comparable; ratios and added times"
     " are.",
     "No neural network runs here. Stand-ins: visual odometry for ORB-SLAM2, geometric ranking for Dex-Net's GQ-CNN,"
     " classical segmentation and detection for SAM and YOLOv8. Their answers are checked against known truth. Motion"
-    " planning is OMPL with FCL on the papers' problems, on one thread, where the papers used MPT on many cores.",
+    " planning is OMPL with FCL on the published problems, on one thread. The authors used MPT on many cores.",
     "Servers that wait compute nothing, so two of them do not take each other's processor time. The number of trials is"
     " then the paper's. Where servers compute there are fewer trials, and two replicas share the cores.",
     "Long waits are divided by the number given; the network's time is not.",

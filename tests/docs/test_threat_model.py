@@ -86,6 +86,6 @@ def test_every_attacker_of_the_tables_is_introduced() -> None:
 
 
 def test_every_source_is_cited_and_every_citation_has_a_source() -> None:
-    (part,) = (part for part in re.split(r"^## ", PAGE.read_text(), flags=re.M) if part.startswith("Beside others"))
+    (part,) = (part for part in re.split(r"^## ", PAGE.read_text(), flags=re.M) if part.startswith("Compared with"))
     table, _, sources = part.partition("Sources:")
     assert {*re.findall(r"\[(\d+)\]", table)} == {*re.findall(r"^(\d+)\. .*<https://\S+>$", sources, re.M)}

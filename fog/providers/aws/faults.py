@@ -27,7 +27,7 @@ _TRY_AGAIN: Final = {
     "ThrottlingException": "too many requests",
 }
 _WHAT_TO_DO: Final = {
-    "UnauthorizedOperation": "the credentials lack the permission; docs/providers.md lists what they need",
+    "UnauthorizedOperation": "the credentials lack the permission; docs/reference/providers.md lists what they need",
     "AuthFailure": "the credentials are not valid, or the region is not enabled for the account",
     "InvalidClientTokenId": "the credentials are not valid",
     "OptInRequired": "the account is not subscribed to this",

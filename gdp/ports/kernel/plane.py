@@ -1,7 +1,8 @@
 """The data plane whose decision is a program in the kernel; what that is unsure of comes up to the raw plane's code.
 
 Place: I/O; the raw plane beneath, with the same table, so that nothing is lost that the kernel cannot take.
-Source: DESIGN section 7. A frame that the kernel takes wakes nobody; one that comes up costs what it costs the raw
+Source: docs/explanation/design.md, section 7.
+A frame that the kernel takes wakes nobody; one that comes up costs what it costs the raw
 plane::
 
     device -> program -> redirected | dropped and counted

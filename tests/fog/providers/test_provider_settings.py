@@ -1,4 +1,4 @@
-"""What docs/providers.md shows can be read, and its tables name the keys that there are."""
+"""What docs/reference/providers.md shows can be read, and its tables name the keys that there are."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fog.providers.skypilot.config import SkyPilotConfig
 from gdp.nodes.schema import Section
 from tests.pages import ROOT, blocks
 
-PAGE = ROOT / "docs/providers.md"
+PAGE = ROOT / "docs/reference/providers.md"
 
 
 def _shown(provider: str) -> object:
