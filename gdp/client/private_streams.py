@@ -9,10 +9,11 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Final
 
+from gdp.client.identities import WriterIdentity
+from gdp.client.key_epochs import Secrets
 from gdp.client.pasts import Pasts
 from gdp.client.private import IDLE_S, Life, Party, PrivateStream, private_name
 from gdp.client.publisher import Publisher
-from gdp.client.source import Secrets, Source
 from gdp.errors import DropReason, LocalError
 from gdp.message.loss import LossReason
 from gdp.names import Name
@@ -34,7 +35,7 @@ class PrivateStreams:
     def __init__(
         self,
         service: Name,
-        writer: Source,
+        writer: WriterIdentity,
         secrets: Secrets,
         pasts: Pasts,
         published: Callable[[Publisher], None],

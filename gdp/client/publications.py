@@ -9,13 +9,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 
 from gdp.client.agenda import Agenda
+from gdp.client.identities import WriterIdentity
+from gdp.client.key_epochs import Secrets
 from gdp.client.pasts import Pasts
 from gdp.client.path_mtu import PathMtu
 from gdp.client.private import Life, Party
 from gdp.client.private_streams import PrivateStreams
 from gdp.client.publisher import Publisher
 from gdp.client.readers import TOPICS, Patience
-from gdp.client.source import Secrets, Source
 from gdp.client.turns import Turns
 from gdp.control.join import Join
 from gdp.crypto.note import topic_of
@@ -35,7 +36,7 @@ class Publications:
         heard: returns another party of a service, if that is heard now.
     """
 
-    def __init__(self, source: Source, heard: Callable[[Name, bytes], Party | None]) -> None:
+    def __init__(self, source: WriterIdentity, heard: Callable[[Name, bytes], Party | None]) -> None:
         self._source = source
         self._heard = heard
         self._publishers: dict[Name, Publisher] = {}
