@@ -274,8 +274,8 @@ class SendWindow:
     def _budget_now(self) -> int:
         """Return how many bytes may be cached: fewer where the oldest is cached for suspended readers alone."""
         oldest, readers = self._cache.oldest, self._readers
-        is_spare = len(self._cache.messages) > self._cache.depth and oldest is not None
-        is_spare = is_spare and oldest < readers.least_active()
+        is_spare = len(self._cache.messages) > self._cache.depth
+        is_spare = is_spare and oldest is not None and oldest < readers.least_active()
         return self._budget_bytes if readers.suspended and is_spare else 2 * self._budget_bytes
 
     def _request_repairs(self, reader: bytes, report: Report, now_s: float) -> bool:
