@@ -152,6 +152,7 @@ class Feed:
 
     @idle_s.setter
     def idle_s(self, idle_s: float) -> None:
+        """Set the longest time between two reports."""
         self._schedule.idle_s = idle_s
 
     @property

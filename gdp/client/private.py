@@ -68,11 +68,11 @@ class PrivateStream(Publisher):
 
     def __init__(
         self,
+        *,
         service: Name,
         writer: WriterIdentity,
         party: Party,
         secrets: Secrets,
-        *,
         mtu: int | None,
         urgent: bool,
         past: Past,
@@ -83,8 +83,16 @@ class PrivateStream(Publisher):
         self._touched_s = now_s
         name = private_name(service, Life(writer.name, writer.incarnation), self.reader)
         source = replace(writer, incarnation=private_incarnation(name))
-        address = self.reader.name
-        super().__init__(name, source, secrets, b"", reliable=True, urgent=urgent, past=past, address=address)
+        super().__init__(
+            topic=name,
+            source=source,
+            secrets=secrets,
+            description=b"",
+            reliable=True,
+            urgent=urgent,
+            past=past,
+            address=self.reader.name,
+        )
         self.tree_stands(MTU_MIN_BYTES if mtu is None else mtu)
 
     def touch(self, now_s: float) -> None:

@@ -34,12 +34,12 @@ class PrivateStreams:
 
     def __init__(
         self,
+        *,
         service: Name,
         writer: WriterIdentity,
         secrets: Secrets,
         pasts: Pasts,
         published: Callable[[Publisher], None],
-        *,
         urgent: bool,
     ) -> None:
         self._service = service
@@ -95,9 +95,15 @@ class PrivateStreams:
             self._make_room()
             past = self._pasts.of(self._name_of(reader))
             stream = self._streams[reader.name] = PrivateStream(
-                self._service, self._writer, party, self._secrets,
-                mtu=mtu, urgent=self._urgent, past=past, now_s=now_s,
-            )  # fmt: skip
+                service=self._service,
+                writer=self._writer,
+                party=party,
+                secrets=self._secrets,
+                mtu=mtu,
+                urgent=self._urgent,
+                past=past,
+                now_s=now_s,
+            )
             stream.published = self._published
         stream.touch(now_s)
         return stream

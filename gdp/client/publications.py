@@ -82,16 +82,30 @@ class Publications:
     ) -> Publisher:
         """Publish a name from now on, above all numbers that were used for it before."""
         publisher = Publisher(
-            name, self._source, secrets, description,
-            reliable=reliable, depth=depth, urgent=urgent, past=self._pasts.of(name), patience=patience,
-        )  # fmt: skip
+            topic=name,
+            source=self._source,
+            secrets=secrets,
+            description=description,
+            reliable=reliable,
+            depth=depth,
+            urgent=urgent,
+            past=self._pasts.of(name),
+            patience=patience,
+        )
         publisher.published = self.turns.add
         self._publishers[name] = publisher
         return publisher
 
     def begin_private(self, name: Name, secrets: Secrets, *, urgent: bool) -> None:
         """Have private streams on a published name from now on."""
-        self._private[name] = PrivateStreams(name, self._source, secrets, self._pasts, self.turns.add, urgent=urgent)
+        self._private[name] = PrivateStreams(
+            service=name,
+            writer=self._source,
+            secrets=secrets,
+            pasts=self._pasts,
+            published=self.turns.add,
+            urgent=urgent,
+        )
 
     def end(self, name: Name) -> bool:
         """Say nothing on a name any more; return whether it was published."""

@@ -60,11 +60,11 @@ class Publisher:
 
     def __init__(
         self,
+        *,
         topic: Name,
         source: WriterIdentity,
         secrets: Secrets,
         description: bytes,
-        *,
         reliable: bool,
         depth: int = 0,
         urgent: bool = False,
@@ -108,6 +108,7 @@ class Publisher:
 
     @bundle_bytes.setter
     def bundle_bytes(self, size: int) -> None:
+        """Set the largest bundle in bytes."""
         self._queue.bundle_bytes = size
 
     @property

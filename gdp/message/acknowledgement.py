@@ -19,7 +19,7 @@ __all__ = ["ReaderPosition", "ReaderPositions"]
 _BEYOND_ALL: Final = 1 << 64  # above every message number
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class ReaderPosition:
     """How much one reader has acknowledged.
 
@@ -58,7 +58,9 @@ class ReaderPositions:
     def add(self, reader: bytes, acked_at: int, next_number: int, now_s: float) -> None:
         """Add an active reader, or restart one."""
         self.suspended.pop(reader, None)
-        self.active[reader] = ReaderPosition(acked_at, next_number, now_s, acked_at, now_s)
+        self.active[reader] = ReaderPosition(
+            acked_at=acked_at, next_number=next_number, last_progress_s=now_s, mark_at=acked_at, mark_s=now_s
+        )
 
     def remove(self, reader: bytes) -> bool:
         """Remove a reader; return whether there was one."""

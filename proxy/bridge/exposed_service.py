@@ -252,11 +252,14 @@ class ExposedService:
     def _keep(self, number: int) -> KeptServer:
         rule, what = self._wish.rule, self._wish.local
         return KeptServer(
-            self._seat, self, rule.state_node, number,
+            seat=self._seat,
+            owner=self,
+            node=rule.state_node,
+            number=number,
             give=lambda number, raw: self._seat.endpoint.call(self._servers[0], number, raw),
             tell=self._tell,
             complain=lambda reason: self._site.faults.tell(what, Fault.REFUSED, reason),
-        )  # fmt: skip
+        )
 
     def _tell(self, client: Name, word: FollowerWord | Refuse) -> None:
         if isinstance(word, Refuse):

@@ -36,7 +36,9 @@ def publisher_of(
     *, incarnation: int = 1, secrets: Secrets = SECRETS, reliable: bool = True, depth: int = 0
 ) -> Publisher:
     source = source_of(Name(b"p" * 32), incarnation, WRITER)
-    publisher = Publisher(TOPIC, source, secrets, b"what it is", reliable=reliable, depth=depth)
+    publisher = Publisher(
+        topic=TOPIC, source=source, secrets=secrets, description=b"what it is", reliable=reliable, depth=depth
+    )
     publisher.tree_stands(1500)
     return publisher
 
