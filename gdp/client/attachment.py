@@ -11,7 +11,7 @@ Place: pure. Whoever publishes, reads or serves builds on this; so does a RIB.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -23,6 +23,7 @@ from gdp.control.presence import Presence
 from gdp.control.revocation_sync import RevocationSync
 from gdp.control.settings import NodeSettings
 from gdp.control.verdict import Verdict
+from gdp.control.waiting import Wait, WaitReason, port_waits, stranger_waits
 from gdp.crypto.certificates import Role
 from gdp.crypto.fields import check_sequence
 from gdp.crypto.identity import Identity
@@ -41,7 +42,7 @@ from gdp.trust.revocations import hash_of
 from gdp.trust.right import HEARS, Right
 from gdp.trust.rtcert import RtCert
 
-__all__ = ["Attachment", "Claimed"]
+__all__ = ["Attachment", "Claimed", "attachment_waits"]
 
 _CLAIM_AGAIN_S: Final = 0.5  # until it is judged
 _OWN_FIRST_S: Final = 0.5  # that other claims wait for the node's own; without a RIB they are good on this switch only
@@ -396,3 +397,26 @@ class Attachment:
     def _next_sequence(self) -> int:
         self._sequence += 1
         return self._sequence
+
+
+def attachment_waits(attachment: Attachment, now_s: float) -> list[Wait]:
+    """Return what keeps a node from being attached with all it advertises; empty when nothing does."""
+    if attachment.switch is None:
+        ports = attachment.greeter.ports.values()
+        of_ports = [wait for port in ports for wait in port_waits(port, (Role.SWITCH, Role.LEAF))]
+        strangers = list(stranger_waits(attachment.greeter, now_s))
+        refusing = {wait.port for wait in strangers}
+        return [*strangers, *(w for w in of_ports if w.port not in refusing or w.reason is WaitReason.LINK_DOWN)]
+    return list(_claim_waits(attachment))
+
+
+def _claim_waits(attachment: Attachment) -> Iterator[Wait]:
+    claims = attachment.claims
+    if attachment.is_in_use:
+        yield Wait(WaitReason.IN_USE)
+        return
+    if any(not each.is_judged for each in claims):
+        yield Wait(WaitReason.NO_RIB)
+    for each in claims:
+        if each.refused is not None:
+            yield Wait(WaitReason.REFUSED, name=each.subject.name, refused=each.refused)

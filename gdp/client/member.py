@@ -15,13 +15,13 @@ from typing import Final
 
 from gdp.client.agenda import Agenda
 from gdp.client.attachment import Attachment
-from gdp.client.feed import Feed, FeedState, Reader
+from gdp.client.feed import Feed, FeedState
+from gdp.client.identities import ReaderIdentity, WriterIdentity
 from gdp.client.note_keys import NoteKeys
 from gdp.client.private import Life, Party
 from gdp.client.publications import Publications
 from gdp.client.publisher import Publisher
 from gdp.client.readers import CALLS, TOPICS
-from gdp.client.source import Source
 from gdp.client.subscription import Message, Subscription, Subscriptions, Topic
 from gdp.control.boundary import ErrorBoundary
 from gdp.control.join import Join
@@ -56,13 +56,15 @@ class Member:
         self._identity = identity
         self._verifier = ClaimVerifier(policy)
         notes = NoteKeys(ExchangeKey.from_random(settings.random_bytes(EXCHANGE_KEY_BYTES)))
-        source = Source(identity.name, settings.incarnation, identity.key, settings.random_bytes, notes)
+        source = WriterIdentity(identity.name, settings.incarnation, identity.key, settings.random_bytes, notes)
         self._publications = Publications(source, self._party_of)
         self._turns = self._publications.turns
         self._feeds_due = Agenda[Feed]()
         self._reporting: dict[Feed, None] = {}  # whose report may be due
         self._introduced = (-1, b"")  # since when, and how
-        reader = Reader(identity.name, settings.incarnation, notes, self._introduction)  # one, for all its feeds
+        reader = ReaderIdentity(
+            identity.name, settings.incarnation, notes, self._introduction
+        )  # one, for all its feeds
         self._subscriptions = Subscriptions(reader, self._verifier)
         self._messages: list[Message] = []
         self._under_way: tuple[Feed, Subscription] | None = None  # whose next part is expected

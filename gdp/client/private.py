@@ -13,20 +13,18 @@ Source: docs/explanation/design.md, section 6
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Final, NamedTuple
 
-from gdp.client.feed import Ended, Feed, FeedState, Reader
+from gdp.client.feed import Ended, Feed, FeedState
+from gdp.client.identities import ReaderIdentity, WriterIdentity
+from gdp.client.key_epochs import Secrets
 from gdp.client.pasts import Past
 from gdp.client.publisher import Publisher
-from gdp.client.source import Secrets, Source
-from gdp.crypto.envelope import Sealer, Signer
 from gdp.errors import DropReason
 from gdp.frame.codec import Header
-from gdp.frame.kinds import Kind
-from gdp.limits import FLIGHT_START_BYTES, MTU_MIN_BYTES, REPORT_IDLE_S
-from gdp.message.join import Joined, VerifiesDigest
+from gdp.limits import FLIGHT_START_BYTES, MTU_MIN_BYTES
+from gdp.message.join import VerifiesDigest
 from gdp.message.memory import Budget
 from gdp.names import Name
 
@@ -60,24 +58,6 @@ def private_incarnation(name: Name) -> int:
     return int.from_bytes(hashlib.sha256(b"gdp-private-incarnation-1" + name).digest()[:8], "big")
 
 
-class _PrivateSealer(Sealer):
-    """Seals under the key of a stream what is addressed to somebody."""
-
-    def __init__(
-        self,
-        secret: bytes,
-        epoch: int,
-        kind: int,
-        source: Source,
-        stream: Name,
-        destination: Name,
-        signer: Signer,
-        random_bytes: Callable[[int], bytes],
-    ) -> None:
-        super().__init__(secret, epoch, kind, source.name, source.incarnation, stream, signer, random_bytes)
-        self._fixed = (epoch, kind, source.incarnation, destination, source.name)
-
-
 class PrivateStream(Publisher):
     """The writer's end.
 
@@ -89,38 +69,37 @@ class PrivateStream(Publisher):
 
     def __init__(
         self,
+        *,
         service: Name,
-        writer: Source,
+        writer: WriterIdentity,
         party: Party,
         secrets: Secrets,
-        *,
         mtu: int | None,
         urgent: bool,
         past: Past,
         now_s: float,
     ) -> None:
         self.reader = party.life
-        name = private_name(service, Life(writer.name, writer.incarnation), self.reader)
-        source = replace(writer, incarnation=private_incarnation(name))
         self._exchange = party.exchange
         self._touched_s = now_s
-        super().__init__(name, source, secrets, b"", reliable=True, urgent=urgent, past=past)
+        name = private_name(service, Life(writer.name, writer.incarnation), self.reader)
+        source = replace(writer, incarnation=private_incarnation(name))
+        super().__init__(
+            topic=name,
+            source=source,
+            secrets=secrets,
+            description=b"",
+            reliable=True,
+            urgent=urgent,
+            past=past,
+            address=self.reader.name,
+        )
         self.tree_stands(MTU_MIN_BYTES if mtu is None else mtu)
 
     def touch(self, now_s: float) -> None:
-        """Note that there is something to say, or to hear; who was silent is a reader again, from now on."""
+        """Note that the stream is in use; a silent reader becomes active."""
         self._touched_s = now_s
-        name, incarnation = self.reader
-        if name in self._readers:
-            return
-        if not self._readers.resume(name, now_s):
-            self._readers.know(name, incarnation, 0, self._exchange)
-            self._readers.admit(name, incarnation, now_s).sequence = self._first_waiting()
-        self._readers[name].behind_s = None
-        if self._window.is_suspended(name):
-            self._window.resume(name, now_s)
-        else:
-            self._window.add_reader(name, self._next_number, now_s)
+        self.connect(*self.reader, self._exchange, now_s)
 
     def receive_report(self, header: Header, frame: bytes, now_s: float) -> bool:
         """Take the reader's report; a silent one is a reader again by that."""
@@ -131,13 +110,7 @@ class PrivateStream(Publisher):
 
     def is_idle(self, now_s: float) -> bool:
         """Return whether it may be forgotten."""
-        return not self._readers and now_s - self._touched_s >= IDLE_S
-
-    def _sealer(self, kind: Kind) -> Sealer:
-        source, secret = self._source, self._secrets[self._epoch]
-        return _PrivateSealer(
-            secret, self._epoch, kind, source, self.topic, self.reader.name, source.signer, source.random_bytes
-        )
+        return not self.readers and now_s - self._touched_s >= IDLE_S
 
 
 class PrivateFeed(Feed):
@@ -155,8 +128,9 @@ class PrivateFeed(Feed):
 
     def __init__(
         self,
+        *,
         name: Name,
-        reader: Reader,
+        reader: ReaderIdentity,
         public: Feed,
         verifier: VerifiesDigest,
         secrets: Secrets,
@@ -164,28 +138,24 @@ class PrivateFeed(Feed):
         now_s: float,
         ended: Ended,
     ) -> None:
-        writer, incarnation = public.publisher, private_incarnation(name)
-        super().__init__(name, reader, writer, incarnation, verifier, public.exchange, secrets, budget, now_s, ended)
-        self.state = FeedState.LIVE
         self._public = public
-        self._early_bytes = 0
-        self._is_reliable = True
-        self._expected = max(ended.number, 1)
-        self._sequence = max(ended.sequence, 1)
-        self._data.begin(self._expected, ())
-        self._report_at_s = now_s + REPORT_IDLE_S
+        super().__init__(
+            topic=name,
+            reader=reader,
+            publisher=public.publisher,
+            incarnation=private_incarnation(name),
+            writer=verifier,
+            exchange=public.exchange,
+            secrets=secrets,
+            budget=budget,
+            now_s=now_s,
+            ended=ended,
+            introduces=False,
+        )
 
     def receive(self, header: Header, frame: bytes, now_s: float) -> None:
-        """Take one DATA or STATUS frame of this writer; one that is refused is asked for again."""
-        if self._public.state is FeedState.NEW and self._early_bytes >= FLIGHT_START_BYTES:
-            self._data.drops[DropReason.MEMORY_FULL] += 1
+        """Process one DATA or STATUS frame of this writer; one that is refused is requested again."""
+        if self._public.state is FeedState.NEW and self.delivered_bytes >= FLIGHT_START_BYTES:
+            self.refuse(DropReason.MEMORY_FULL)
         else:
             super().receive(header, frame, now_s)
-
-    def _hand_out(self, joined: Joined) -> None:
-        if self._public.state is FeedState.NEW:
-            self._early_bytes += len(joined.message)
-        super()._hand_out(joined)
-
-    def _introduce(self, _epoch: int) -> list[bytes]:
-        return []  # the writer knows its reader's key by the claim

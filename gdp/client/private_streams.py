@@ -9,10 +9,11 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Final
 
+from gdp.client.identities import WriterIdentity
+from gdp.client.key_epochs import Secrets
 from gdp.client.pasts import Pasts
 from gdp.client.private import IDLE_S, Life, Party, PrivateStream, private_name
 from gdp.client.publisher import Publisher
-from gdp.client.source import Secrets, Source
 from gdp.errors import DropReason, LocalError
 from gdp.message.loss import LossReason
 from gdp.names import Name
@@ -33,12 +34,12 @@ class PrivateStreams:
 
     def __init__(
         self,
+        *,
         service: Name,
-        writer: Source,
+        writer: WriterIdentity,
         secrets: Secrets,
         pasts: Pasts,
         published: Callable[[Publisher], None],
-        *,
         urgent: bool,
     ) -> None:
         self._service = service
@@ -94,9 +95,15 @@ class PrivateStreams:
             self._make_room()
             past = self._pasts.of(self._name_of(reader))
             stream = self._streams[reader.name] = PrivateStream(
-                self._service, self._writer, party, self._secrets,
-                mtu=mtu, urgent=self._urgent, past=past, now_s=now_s,
-            )  # fmt: skip
+                service=self._service,
+                writer=self._writer,
+                party=party,
+                secrets=self._secrets,
+                mtu=mtu,
+                urgent=self._urgent,
+                past=past,
+                now_s=now_s,
+            )
             stream.published = self._published
         stream.touch(now_s)
         return stream

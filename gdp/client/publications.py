@@ -9,13 +9,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 
 from gdp.client.agenda import Agenda
+from gdp.client.identities import WriterIdentity
+from gdp.client.key_epochs import Secrets
 from gdp.client.pasts import Pasts
 from gdp.client.path_mtu import PathMtu
 from gdp.client.private import Life, Party
 from gdp.client.private_streams import PrivateStreams
 from gdp.client.publisher import Publisher
 from gdp.client.readers import TOPICS, Patience
-from gdp.client.source import Secrets, Source
 from gdp.client.turns import Turns
 from gdp.control.join import Join
 from gdp.crypto.note import topic_of
@@ -35,7 +36,7 @@ class Publications:
         heard: returns another party of a service, if that is heard now.
     """
 
-    def __init__(self, source: Source, heard: Callable[[Name, bytes], Party | None]) -> None:
+    def __init__(self, source: WriterIdentity, heard: Callable[[Name, bytes], Party | None]) -> None:
         self._source = source
         self._heard = heard
         self._publishers: dict[Name, Publisher] = {}
@@ -81,16 +82,30 @@ class Publications:
     ) -> Publisher:
         """Publish a name from now on, above all numbers that were used for it before."""
         publisher = Publisher(
-            name, self._source, secrets, description,
-            reliable=reliable, depth=depth, urgent=urgent, past=self._pasts.of(name), patience=patience,
-        )  # fmt: skip
+            topic=name,
+            source=self._source,
+            secrets=secrets,
+            description=description,
+            reliable=reliable,
+            depth=depth,
+            urgent=urgent,
+            past=self._pasts.of(name),
+            patience=patience,
+        )
         publisher.published = self.turns.add
         self._publishers[name] = publisher
         return publisher
 
     def begin_private(self, name: Name, secrets: Secrets, *, urgent: bool) -> None:
         """Have private streams on a published name from now on."""
-        self._private[name] = PrivateStreams(name, self._source, secrets, self._pasts, self.turns.add, urgent=urgent)
+        self._private[name] = PrivateStreams(
+            service=name,
+            writer=self._source,
+            secrets=secrets,
+            pasts=self._pasts,
+            published=self.turns.add,
+            urgent=urgent,
+        )
 
     def end(self, name: Name) -> bool:
         """Say nothing on a name any more; return whether it was published."""

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from gdp.client.source import Source
+from gdp.client.identities import WriterIdentity
 from gdp.crypto.envelope import seal_key
 from gdp.crypto.note import NoteNumbers, NoteOpener, note_key
 from gdp.errors import DropReason, EnvelopeError, FrameError, StatementError
@@ -54,7 +54,7 @@ CALLS: Final = Patience(CALL_LAG_S, CALL_QUIET_S, CALL_IDLE_S)  # other replicas
 class _Life:
     """What opens the notes of one life of a reader, and which of them were opened."""
 
-    def __init__(self, topic: Name, source: Source, incarnation: int, started: int, exchange: bytes) -> None:
+    def __init__(self, topic: Name, source: WriterIdentity, incarnation: int, started: int, exchange: bytes) -> None:
         self.started = started
         self._topic = topic
         self._source = source
@@ -108,7 +108,7 @@ class Reading:
 class Readers:
     """The readers of one publisher, by name."""
 
-    def __init__(self, topic: Name, source: Source, patience: Patience = TOPICS) -> None:
+    def __init__(self, topic: Name, source: WriterIdentity, patience: Patience = TOPICS) -> None:
         self._topic = topic
         self._source = source
         self._patience = patience

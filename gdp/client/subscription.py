@@ -14,9 +14,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-from gdp.client.feed import Delivered, Ended, Feed, FeedState, Reader
+from gdp.client.delivery import Delivered
+from gdp.client.feed import Ended, Feed, FeedState
+from gdp.client.identities import ReaderIdentity
+from gdp.client.key_epochs import Secrets
 from gdp.client.private import Life, PrivateFeed, private_incarnation, private_name
-from gdp.client.source import Secrets
 from gdp.control.query import Answer
 from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
@@ -134,7 +136,7 @@ class Subscriptions:
         reader: the member.
     """
 
-    def __init__(self, reader: Reader, verifier: ClaimVerifier) -> None:
+    def __init__(self, reader: ReaderIdentity, verifier: ClaimVerifier) -> None:
         self._reader = reader
         self._verifier = verifier
         self._budget = Budget()
@@ -247,9 +249,18 @@ class Subscriptions:
         else:
             subscription.forget_absent(party, LossReason.PUBLISHER_RESTARTED)
         feed = Feed(
-            topic.name, reader, party, claim.incarnation, claim.member.key, claim.exchange, topic.secrets, self._budget,
-            now_s, ended, restarted=life != claim.incarnation,
-        )  # fmt: skip
+            topic=topic.name,
+            reader=reader,
+            publisher=party,
+            incarnation=claim.incarnation,
+            writer=claim.member.key,
+            exchange=claim.exchange,
+            secrets=topic.secrets,
+            budget=self._budget,
+            now_s=now_s,
+            ended=ended,
+            restarted=life != claim.incarnation,
+        )
         feed.claim_sequence, feed.claim = claim.sequence, claim
         subscription.feeds[party] = feed
         if subscription.right is Right.SERVE:
@@ -266,7 +277,14 @@ class Subscriptions:
         if feed is None:
             public, ended = subscription.feeds[writer], self._ended.get(way.stream) or _NOWHERE
             feed = subscription.private[writer] = PrivateFeed(
-                way.stream, self._reader, public, way.verifier, subscription.topic.secrets, self._budget, now_s, ended
+                name=way.stream,
+                reader=self._reader,
+                public=public,
+                verifier=way.verifier,
+                secrets=subscription.topic.secrets,
+                budget=self._budget,
+                now_s=now_s,
+                ended=ended,
             )
         return feed
 

@@ -145,6 +145,7 @@ class Sealer:
     Args:
         random_bytes: the system's randomness, asked for each message and never ahead: what was drawn before a machine
             was copied is no longer random.
+        address: what the headers name as destination; None: ``destination``, which the key is bound to.
     """
 
     def __init__(
@@ -157,11 +158,13 @@ class Sealer:
         destination: bytes,
         signer: Signer,
         random_bytes: Callable[[int], bytes],
+        *,
+        address: bytes | None = None,
     ) -> None:
         self._keys = MessageKeys(seal_key(secret, kind, source, incarnation, destination))
         self._signer = signer
         self._random_bytes = random_bytes
-        self._fixed = (epoch, kind, incarnation, destination, source)
+        self._fixed = (epoch, kind, incarnation, destination if address is None else address, source)
         self._last_number = -1
 
     def seal(self, number: int, flags: int, message: bytes | Sealed, mtu: int) -> Sealed:

@@ -9,8 +9,8 @@ import contextlib
 import logging
 from collections.abc import Callable
 
+from gdp.client.attachment import attachment_waits
 from gdp.client.rib_host import RibHost
-from gdp.client.waiting import attachment_waits
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.names import Name

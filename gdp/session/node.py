@@ -13,8 +13,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Final
 
+from gdp.client.attachment import attachment_waits
 from gdp.client.member import Member
-from gdp.client.waiting import attachment_waits
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity

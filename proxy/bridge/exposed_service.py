@@ -1,7 +1,10 @@
-"""A local server on its way out: requests from far clients, asked here, answered to the one that asked.
+"""Local server exposed to remote clients: their requests are called here, and each gets its response.
 
-Place: shell; endpoint and member do the I/O, ``gdp/service/serving.py`` keeps order. A service and an action differ in
-their parts; and what nobody waits for any more is broken off by cancelling its goal, or by calling the rule's ``stop``.
+I/O: endpoint and member; ``gdp/service/serving.py`` keeps order. A service and an action differ in their parts.
+
+It joins ``callers.py`` (what requests mean), ``early.py`` (requests that wait for their description),
+``response_sender.py`` (what clients get), ``cancellation.py`` (what is stopped), ``client_liveness.py`` (who is there)
+and ``kept_server.py`` (a server that keeps state).
 """
 
 from __future__ import annotations
@@ -12,37 +15,35 @@ from typing import Final
 
 from gdp.client.member import Message, Topic
 from gdp.errors import LocalError, RemoteError
-from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.service.follower import Refuse
 from gdp.service.ordered import FollowerWord
 from gdp.service.serving import Asked, Serving
 from proxy.bridge.callers import Callers
+from proxy.bridge.cancellation import TRIGGER, Cancellation
+from proxy.bridge.client_liveness import ClientLiveness
 from proxy.bridge.early import Early
 from proxy.bridge.goal_calls import GoalCalls
 from proxy.bridge.goals import cancel_of, goal_of
 from proxy.bridge.kept_server import KeptServer
 from proxy.bridge.parts import CANCEL, GOAL, PROFILES, RESULT, Parts
+from proxy.bridge.response_sender import ResponseSender
 from proxy.bridge.rivals import mark_of, sign
 from proxy.bridge.seat import Seat
 from proxy.bridge.site import Site
 from proxy.bridge.wishes import Wish
 from proxy.endpoints.endpoint import Answered, Described, End, Event, Failed, Faulted, Heard
-from proxy.exchange import Answer, News, Outcome, Request, Stop, too_large
+from proxy.exchange import Answer, Request, Stop
 from proxy.faults import Fault
 from proxy.ordering import is_word, keeper_word, to_wire
 from proxy.rules.rule import CALL_MAX_S
 from proxy.serial.schema import DefinitionError
-from proxy.serial.serializer import Serializer
 
 __all__ = ["ExposedService"]
 
 _GRACE_S: Final = 0.5  # it is the client's side that ends a call; here it is only forgotten
 _CANCEL_S: Final = 5.0
-_AWAY_S: Final = 30.0  # a client that is not heard for so long does not wait any more
 _NOTICE_S: Final = 1.0  # a server that leaves still takes requests for so long: of clients that have not heard it yet
-_TRIGGER: Final = "std_srvs/srv/Trigger"
-_NO_FIELDS: Final = {1: b"", 2: b"\0\1\0\0\0"}  # a request of it; ROS 2 fills a message without fields with one byte
 
 
 class ExposedService:
@@ -62,25 +63,40 @@ class ExposedService:
         self._topic = topic
         self._serving: Serving[bytes] = Serving(random_start, wish.rule.at_once)
         self._goals = GoalCalls()
-        self._words = 0  # of ours to the local server; their numbers
+        self._cancels = 0  # requests of our own that cancel a goal; their numbers
         self._refuses_from_s: float | None = None
-        self._heard_s: dict[Name, float] = {}  # when clients were there last whose calls are under way
+        self._liveness = ClientLiveness()
         self._early = Early()
         endpoint, rule = seat.endpoint, wish.rule
         parts = Parts.of(rule.kind, wish.local, wish.type_name)
         self._exchange = replace(parts.known(endpoint, rule.encoding), is_ordered=rule.is_ordered)
         self._callers = Callers(self._exchange, endpoint.ros)
-        self._answers = [Serializer(each.response, rule.encoding) for each in self._exchange.services]
-        self._news = [Serializer(each, rule.encoding) for each in self._exchange.topics]
         self._mark = seat.advertise(self, sign(mark_of(wish.local), endpoint.ros))
         self._servers = [seat.dial(self, *part) for part in parts.services]
-        self._stopper = None if rule.stop is None else seat.dial(self, rule.stop, _TRIGGER)
+        self._stopper = None if rule.stop is None else seat.dial(self, rule.stop, TRIGGER)
         self._kept = None if not rule.is_ordered else self._keep(random_start)
         self._topics = [
             seat.subscribe(self, *part, profile) for part, profile in zip(parts.topics, PROFILES, strict=False)
         ]
         self._publisher = site.member.serve(
             topic, self._exchange.to_wire(), is_global=rule.is_global, urgent=rule.priority == "urgent"
+        )
+        self._responses = ResponseSender(
+            site=site,
+            wish=wish,
+            service=topic.name,
+            exchange=self._exchange,
+            serving=self._serving,
+            publisher=self._publisher,
+        )
+        self._cancellation = Cancellation(
+            endpoint=endpoint,
+            serving=self._serving,
+            goals=self._goals,
+            servers=self._servers,
+            stopper=self._stopper,
+            is_concurrent=rule.at_once is None,
+            cancel_goal=self._cancel_goal,
         )
 
     def receive(self, message: Message, now_s: float) -> None:
@@ -94,7 +110,8 @@ class ExposedService:
                 client = Name(message.delivered.publisher)
                 self._kept.heard(client, keeper_word(message.delivered.message), now_s)
             elif Stop.is_in(message.delivered.message):
-                self._stop(Name(message.delivered.publisher), Stop.from_wire(message.delivered.message), now_s)
+                client, stop = Name(message.delivered.publisher), Stop.from_wire(message.delivered.message)
+                self._cancellation.handle_stop(client, stop, now_s)
             else:
                 self._ask(message, now_s)
         except RemoteError as error:
@@ -113,12 +130,13 @@ class ExposedService:
             if asked is not None:
                 self._goals.end(asked)
             if asked is not None and isinstance(event, Answered):
-                self._answer(asked, event.raw)
+                self._responses.respond(asked, event.raw)
             elif asked is not None and isinstance(event, Failed):
-                self._fail(asked, Fault.REFUSED, event.reason)
+                self._responses.fail(asked, Fault.REFUSED, event.reason)
             self._give()
         elif isinstance(event, Heard):
-            self._publish(event)
+            at = self._topics.index(event.handle)
+            self._responses.publish_news(at, event.raw, event.stamp_ns)
         elif isinstance(event, Faulted):
             self._site.tell(self._wish.local, event, Fault.REFUSED)
         else:
@@ -140,11 +158,10 @@ class ExposedService:
         """Give up what its client no longer waits for."""
         for number, part, asked, is_given in self._serving.expired(now_s):
             if is_given:
-                self._seat.endpoint.drop(self._servers[part], number)
-                self._break_off()
+                self._cancellation.handle_timeout(part, number)
             if asked is not None:
                 self._goals.end(asked)
-                self._fail(asked, Fault.TIMED_OUT, "the server did not answer in time")
+                self._responses.fail(asked, Fault.TIMED_OUT, "the server did not answer in time")
         self._give()
 
     def next_timeout(self) -> float | None:
@@ -168,7 +185,7 @@ class ExposedService:
         """Serve nobody any more; calls under way fail."""
         for asked in self._serving.fail_all():
             self._goals.end(asked)
-            self._fail(asked, Fault.NO_SERVER, "the server is gone")
+            self._responses.fail(asked, Fault.NO_SERVER, "the server is gone")
         for _ in range(self._early.forget_all_but(())):
             self._drop_early("the server is gone before their client's description came")
         stopper = [] if self._stopper is None else [self._stopper]
@@ -193,31 +210,11 @@ class ExposedService:
             for message in self._early.take(client):
                 self.receive(message._replace(description=description), now_s)
         here = {self._site.member.name, *self._site.member.heard(self._topic.name)}
-        clients = self._serving.clients
-        self._heard_s = {each: now_s if each in here else self._heard_s.get(each, now_s) for each in clients}
-        for client, heard_s in self._heard_s.items():
-            if client not in here and (bytes(client) not in known or now_s - heard_s >= _AWAY_S):
-                self._let_go(client)
+        for client in self._liveness.update(self._serving.clients, present=here, known=known.keys(), now_s=now_s):
+            self._cancellation.handle_client_gone(client)
 
     def _drop_early(self, reason: str) -> None:
         self._site.faults.tell(self._wish.local, Fault.TOO_FAST, reason)
-
-    def _let_go(self, client: Name) -> None:
-        """Forget the calls of a client that left. Its goals go on: it may come back, and ask for their results."""
-        is_working = False
-        for number, part, asked, is_given in self._serving.gone(client):
-            if asked is not None:
-                self._goals.end(asked)
-            if is_given:
-                is_working = True
-                self._give_up(part, number)
-        if is_working:
-            self._break_off()
-
-    def _give_up(self, part: int, number: int) -> None:
-        """Await no more what the local server works on, unless the next one waits for that."""
-        if self._wish.rule.at_once is None:
-            self._seat.endpoint.drop(self._servers[part], number)
 
     def _ask(self, message: Message, now_s: float) -> None:
         delivered = message.delivered
@@ -227,10 +224,10 @@ class ExposedService:
         before = None if self._kept is not None else self._serving.answer_of(asked)
         if before is not None or asked in self._serving:
             if before:
-                self._send_wire(asked.client, before)
+                self._responses.send_wire(asked.client, before)
             return
         if self._kept is None and self._refuses_from_s is not None and now_s >= self._refuses_from_s:
-            self._send(asked, Answer.failed(asked.part, asked.call, "the server is leaving"))
+            self._responses.refuse(asked, "the server is leaving")
             return
         try:
             raw = self._callers.incoming(delivered.publisher, message.description, asked.part).decode(request.body)
@@ -239,11 +236,11 @@ class ExposedService:
             else:
                 self._begin(now_s, self._patience_s(request), asked, raw)
         except DefinitionError as error:
-            self._fail(asked, Fault.OTHER_TYPE, str(error))
+            self._responses.fail(asked, Fault.OTHER_TYPE, str(error))
         except LocalError as error:
-            self._fail(asked, Fault.TOO_FAST, str(error))
+            self._responses.fail(asked, Fault.TOO_FAST, str(error))
         except RemoteError as error:
-            self._fail(asked, Fault.MALFORMED, str(error))
+            self._responses.fail(asked, Fault.MALFORMED, str(error))
 
     def _patience_s(self, request: Request) -> float | None:
         """Return how long a call may take; None: as long as a goal does."""
@@ -255,25 +252,28 @@ class ExposedService:
     def _keep(self, number: int) -> KeptServer:
         rule, what = self._wish.rule, self._wish.local
         return KeptServer(
-            self._seat, self, rule.state_node, number,
+            seat=self._seat,
+            owner=self,
+            node=rule.state_node,
+            number=number,
             give=lambda number, raw: self._seat.endpoint.call(self._servers[0], number, raw),
             tell=self._tell,
             complain=lambda reason: self._site.faults.tell(what, Fault.REFUSED, reason),
-        )  # fmt: skip
+        )
 
     def _tell(self, client: Name, word: FollowerWord | Refuse) -> None:
         if isinstance(word, Refuse):
             self._site.faults.tell(self._wish.local, Fault.REFUSED, word.reason)
-            self._send_wire(client, Answer.failed(0, word.call, word.reason).to_wire())
+            self._responses.send_wire(client, Answer.failed(0, word.call, word.reason).to_wire())
         else:
-            self._send_wire(client, to_wire(word))
+            self._responses.send_wire(client, to_wire(word))
 
     def _take_in_order(self, kept: KeptServer, event: Answered | Failed, now_s: float) -> None:
         entry = kept.done(event, now_s)
         if entry is not None and isinstance(event, Answered):
-            self._answer(Asked(entry.client, 0, entry.call), event.raw)
+            self._responses.respond(Asked(entry.client, 0, entry.call), event.raw)
         elif entry is not None and isinstance(event, Failed):
-            self._fail(Asked(entry.client, 0, entry.call), Fault.REFUSED, event.reason)
+            self._responses.fail(Asked(entry.client, 0, entry.call), Fault.REFUSED, event.reason)
 
     def _begin(self, now_s: float, patience_s: float | None, asked: Asked, raw: bytes) -> None:
         """Take a request; what is about a goal waits until the local server knows whether it accepts that one."""
@@ -288,78 +288,10 @@ class ExposedService:
         for number, asked, raw in self._serving.take():
             self._seat.endpoint.call(self._servers[asked.part], number, raw)
 
-    def _stop(self, client: Name, stop: Stop, now_s: float) -> None:
-        """Learn that a client's calls have ended: what waits is left undone, what is worked on is broken off."""
-        is_working = False
-        for call in stop.calls:
-            asked = Asked(client, stop.part, call)
-            goal = self._goals.end(asked)
-            number = self._serving.stop(asked)
-            if number is not None and stop.part < len(self._servers):
-                is_working = True
-                self._give_up(stop.part, number)
-            if goal is not None and stop.part == RESULT and not self._goals.is_awaited(goal):
-                self._cancel(goal, now_s)
-        if is_working:
-            self._break_off()
-
-    def _cancel(self, goal: bytes, now_s: float) -> None:
-        self._words += 1
-        cancel = Asked(self._site.member.name, CANCEL, self._words)
+    def _cancel_goal(self, goal: bytes, now_s: float) -> None:
+        self._cancels += 1
+        cancel = Asked(self._site.member.name, CANCEL, self._cancels)
         try:
             self._begin(now_s, _CANCEL_S, cancel, cancel_of(goal))
         except LocalError as error:
             self._site.faults.tell(self._wish.local, Fault.TOO_FAST, str(error))
-
-    def _break_off(self) -> None:
-        """Let the local server know that nobody waits for what it works on, if the rule says how."""
-        if self._stopper is not None:
-            self._seat.endpoint.drop(self._stopper, self._words)  # what the last word came to is nobody's
-            self._words += 1
-            self._seat.endpoint.call(self._stopper, self._words, _NO_FIELDS[self._seat.endpoint.ros])
-
-    def _answer(self, asked: Asked, raw: bytes) -> None:
-        body = self._answers[asked.part].encode(raw)
-        if reason := too_large("an answer", len(raw), self._wish.rule.max_bytes, len(body)):
-            self._fail(asked, Fault.TOO_LARGE, reason)
-        else:
-            self._send(asked, Answer(asked.part, asked.call, Outcome.ANSWERED, body))
-
-    def _fail(self, asked: Asked, fault: Fault, reason: str) -> None:
-        self._site.faults.tell(self._wish.local, fault, reason)
-        self._send(asked, Answer.failed(asked.part, asked.call, reason))
-
-    def _send(self, asked: Asked, answer: Answer) -> None:
-        if asked.client == self._site.member.name:
-            return  # our own word that a goal is cancelled
-        wire = answer.to_wire()
-        self._serving.remember(asked, wire)
-        self._send_wire(asked.client, wire)
-
-    def _send_wire(self, client: Name, wire: bytes) -> None:
-        try:
-            self._site.member.answer(self._topic.name, client, wire)
-        except LocalError:
-            self._site.traffic.unread += 1  # the client is gone
-            return
-        self._site.traffic.sent(len(wire))
-
-    def _publish(self, event: Heard) -> None:
-        """Tell all clients what an action's topic says."""
-        at, what = self._topics.index(event.handle), self._wish.local
-        if not self._publisher.is_wanted:
-            self._site.traffic.unread += 1
-            self._publisher.skip(LossReason.NO_READER)
-            return
-        if not self._publisher.has_room():
-            self._site.faults.tell(what, Fault.TOO_FAST, "news come faster than clients confirm them")
-            self._publisher.skip(LossReason.WINDOW_OVERFLOW)
-            return
-        body = self._news[at].encode(event.raw)
-        if reason := too_large("news", len(event.raw), self._wish.rule.max_bytes, len(body)):
-            self._site.faults.tell(what, Fault.TOO_LARGE, reason)
-            self._publisher.skip(LossReason.TOO_LARGE)
-            return
-        wire = News(len(self._exchange.services) + at, event.stamp_ns, body).to_wire()
-        self._publisher.publish(wire)
-        self._site.traffic.sent(len(wire))

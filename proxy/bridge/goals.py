@@ -74,6 +74,10 @@ class Goals:
     """What the clients here know of an action's goals."""
 
     def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget every goal."""
         self._goals: dict[bytes, _Goal] = {}
         self._ours: OrderedDict[bytes, None] = OrderedDict()
         self._named: dict[Name, OrderedDict[bytes, None]] = {}  # by server

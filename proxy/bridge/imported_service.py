@@ -1,8 +1,10 @@
-"""Far servers on their way in: one virtual server here, whose requests go to them all or to some, under own numbers.
+"""Virtual server on this machine for the remote servers of one service or action.
 
-Place: shell; endpoint and member do the I/O, ``gdp/service/dispatch.py`` decides. The virtual server stands while a far
-one is heard, so that local clients see whether there is one. A call ends with the first answer, with a reason, or when
-its time is up; a later answer finds nobody, and servers that still work on it are told.
+I/O: endpoint and member; ``gdp/service/dispatch.py`` or ``gdp/service/keeper.py`` decide. The virtual server exists
+while a remote one is heard, so that local clients see whether there is one. A call ends with the first response, with a
+reason, or when its time is up; a later response is counted, and servers that still work on it are told to stop.
+
+It joins ``server_discovery.py`` (which servers there are) and ``request_sender.py`` (what is sent to which of them).
 """
 
 from __future__ import annotations
@@ -10,20 +12,20 @@ from __future__ import annotations
 import secrets
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Final
 
 from gdp.client.member import Message, Topic
-from gdp.errors import GdpError, LocalError, RemoteError
+from gdp.errors import LocalError, RemoteError
 from gdp.names import Name
-from gdp.service.dispatch import Ask, Dispatch, Failure
+from gdp.service.dispatch import Dispatch, Failure
 from gdp.service.keeper import Keeper
-from gdp.service.ordered import LIFE_BITS, Word
+from gdp.service.ordered import LIFE_BITS
 from gdp.service.replication import ALL, Mode
-from proxy.bridge.far_server import FarServer
 from proxy.bridge.goals import Goals, goal_of, says_yes
-from proxy.bridge.outgoing import Effect, ForAll, wire_of
 from proxy.bridge.parts import CANCEL, GOAL, PROFILES, RESULT, Parts
+from proxy.bridge.request_sender import RequestSender
 from proxy.bridge.seat import Seat
+from proxy.bridge.server_discovery import Response, ServerCalls, ServerDiscovery
 from proxy.bridge.site import Site
 from proxy.bridge.wishes import Wish
 from proxy.endpoints.endpoint import Asked, Event, Faulted
@@ -35,7 +37,6 @@ from proxy.serial.serializer import Serializer
 
 __all__ = ["ImportedService"]
 
-_GONE: Final = "the far server is gone"
 _FAULTS: Final = {
     Failure.TIMED_OUT: Fault.TIMED_OUT,
     Failure.NO_SERVER: Fault.NO_SERVER,
@@ -53,13 +54,6 @@ class _Waiting:
     call: int = 0
 
 
-class _Won(NamedTuple):
-    """An answer, and whose."""
-
-    server: Name
-    raw: bytes
-
-
 class ImportedService:
     """Lets local clients call one far service or action.
 
@@ -74,24 +68,21 @@ class ImportedService:
         self._topic = topic
         self._parts = Parts.of(wish.rule.kind, wish.local, wish.type_name)
         self._goals = Goals() if wish.rule.kind == "action" else None
-        self._keeper: Keeper[_Won] | None = None
+        self._keeper: Keeper[Response] | None = None
         self._outside: dict[Name, str] = {}  # servers that cannot be kept in order, as told
         if wish.rule.is_ordered:
             self._keeper = Keeper(life=lambda: secrets.randbits(LIFE_BITS))
-        self._calls: tuple[Dispatch[_Won] | Keeper[_Won], ...] = tuple(
+        self._calls: tuple[ServerCalls, ...] = tuple(
             self._keeper
             if self._keeper is not None
-            else Dispatch[_Won](
+            else Dispatch[Response](
                 ALL if self._goals is not None and part == CANCEL else wish.rule.spread,
                 start=random_start,
                 stops=self._goals is None or part == RESULT,  # a goal is every server's, until one has its result
             )
             for part in range(len(self._parts.services))
         )
-        self._about: dict[tuple[int, int], bytes] = {}  # part and call -> goal, while under way
-        self._for_all = ForAll()
         self._counted: tuple[int, ...] = (0, 0, 0)  # late, strange and hedged, as told
-        self._servers: dict[Name, FarServer] = {}
         self._requests: tuple[Serializer, ...] = ()
         self._no_answers: tuple[NoAnswer | None, ...] = ()  # None: the dialect has errors
         self._handles: list[int] = []
@@ -99,33 +90,48 @@ class ImportedService:
         self._publisher = site.member.call(
             topic, self._description(), is_global=wish.rule.is_global, urgent=wish.rule.priority == "urgent"
         )
+        self._sender = RequestSender(
+            site=site, service=topic.name, calls=self._calls, goals=self._goals, publisher=self._publisher
+        )
+        self._discovery = ServerDiscovery(
+            site=site,
+            seat=seat,
+            wish=wish,
+            service=topic.name,
+            parts=self._parts,
+            calls=self._calls,
+            goals=self._goals,
+            opened=self._open,
+            closed=self._shut,
+        )
 
     def receive(self, message: Message, now_s: float) -> None:
         """Take a far server's answer, or what its action's topics say."""
         self._site.traffic.received(len(message.delivered.message))
         try:
             if message.private and self._keeper is not None and is_word(message.delivered.message):
-                word = follower_word(message.delivered.message)
-                self._keeper.positioned(self._heard_of(message, now_s), word, now_s)
+                word, name = follower_word(message.delivered.message), Name(message.delivered.publisher)
+                self._discovery.find(name, now_s)
+                self._keeper.positioned(name, word, now_s)
             elif message.private:
-                self._take_answer(message, now_s)
+                self._receive_response(message, now_s)
             else:
-                self._take_news(message)
+                self._receive_news(message)
         except RemoteError as error:
             self._site.faults.tell(self._wish.local, Fault.MALFORMED, str(error))
-        self._send_out(now_s)
+        self._sender.flush(now_s)
 
     def take(self, event: Event, now_s: float) -> None:
         """Take a local client's request."""
         if isinstance(event, Asked):
             self._ask(event, now_s)
-            self._send_out(now_s)
+            self._sender.flush(now_s)
         elif isinstance(event, Faulted):
             self._site.tell(self._wish.local, event, Fault.REFUSED)
 
     def tick(self, now_s: float) -> None:
         """Open or close the virtual server as far ones come and go."""
-        self._follow(now_s)
+        self._discovery.update(now_s)
         self.timeout(now_s)
         self._count()
         if self._keeper is not None:
@@ -138,11 +144,11 @@ class ImportedService:
         """Do what is due, between looks at who is there."""
         for dispatch in self._calls:
             dispatch.timeout(now_s)
-        self._send_out(now_s)
+        self._sender.flush(now_s)
 
     def next_timeout(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        if self._for_all and self._publisher.has_room():
+        if self._sender.is_ready:
             return 0.0
         times = [dispatch.next_timeout() for dispatch in self._calls]
         return min((time for time in times if time is not None), default=None)
@@ -167,55 +173,6 @@ class ImportedService:
         traffic.hedged += now[2] - self._counted[2]
         self._counted = now
 
-    def _follow(self, now_s: float) -> None:
-        member = self._site.member
-        # Where nobody keeps up, to wait for who may do so again is better than to give up.
-        peers = set(member.peers(self._topic.name) or member.heard(self._topic.name))
-        feeds = self._site.member.feeds_of(self._topic.name) if peers else []
-        heard = {feed.publisher: feed for feed in feeds if feed.publisher in peers}
-        for name, server in list(self._servers.items()):
-            feed = heard.get(name)
-            if feed is not None and (feed.incarnation, feed.description) == (server.incarnation, server.description):
-                continue
-            same = server.said_anew(feed.description) if feed and feed.incarnation == server.incarnation else None
-            if same is not None:
-                self._servers[name] = same
-                self._mark(name, same, now_s)
-                continue
-            del self._servers[name]
-            if self._goals is not None:
-                self._goals.gone(name)
-            for dispatch in self._calls:
-                dispatch.gone(name, now_s, _GONE)
-        for name, feed in heard.items():
-            if name not in self._servers:
-                self._learn(name, feed.incarnation, feed.description, now_s)
-        if not self._servers and self._handles:
-            self._shut(_GONE)
-
-    def _learn(self, name: Name, incarnation: int, description: bytes, now_s: float) -> None:
-        """Make ready for a server's answers; the first one opens the virtual server here."""
-        endpoint = self._seat.endpoint
-        try:
-            server = FarServer.learn(incarnation, description, self._parts, endpoint, self._wish.rule.encoding)
-            if server.exchange is not None and server.exchange.is_ordered != (self._keeper is not None):
-                side = "the far side's" if self._keeper is not None else "this side's"
-                raise LocalError(f"'state: ordered' is missing in {side} rule")
-            if not self._handles and server.ours is not None:
-                self._open(server.ours)
-        except GdpError as error:
-            self._site.faults.tell(self._wish.local, Fault.OTHER_TYPE, str(error))
-            self._servers[name] = FarServer(incarnation, description)
-            return
-        self._servers[name] = server
-        self._mark(name, server, now_s)
-
-    def _mark(self, name: Name, server: FarServer, now_s: float) -> None:
-        for dispatch in self._calls:
-            dispatch.came(name, now_s)
-            if server.is_leaving:
-                dispatch.leaves(name)
-
     def _description(self) -> bytes:
         """Return how this machine knows the service; empty where it must learn that from the far side."""
         try:
@@ -237,8 +194,9 @@ class ImportedService:
     def _shut(self, reason: str) -> None:
         for dispatch in self._calls:
             dispatch.fail_all(reason)
-        self._for_all.clear()
-        self._goals = None if self._goals is None else Goals()
+        self._sender.clear()
+        if self._goals is not None:
+            self._goals.clear()
         for handle in [*self._handles, *self._topics]:
             self._seat.close(handle)
         self._handles, self._topics = [], []
@@ -271,7 +229,7 @@ class ImportedService:
         wire = Request(waiting.part, call, patience_ms, body).to_wire()
         waiting.call = call
         if self._goals is not None:
-            self._about[waiting.part, call] = waiting.goal
+            self._sender.note_goal(waiting.part, call, waiting.goal)
             if waiting.part == GOAL:
                 self._goals.sent(waiting.goal, wire)
             elif waiting.part == CANCEL:
@@ -286,65 +244,11 @@ class ImportedService:
             return () if not holders or len(holders) == len(servers) else tuple(servers)
         return tuple(holders or servers)
 
-    def _send_out(self, now_s: float) -> None:
-        """Send what was decided; what is for all servers waits for room on the stream that they all hear."""
-        for part, dispatch in enumerate(self._calls):
-            while effects := dispatch.take():
-                for effect in effects:
-                    whom = effect.servers if isinstance(effect, Ask) else effect.server and (effect.server,)
-                    if whom is None and not isinstance(effect, Word):
-                        self._for_all.add(part, effect)
-                    for server in whom or ():
-                        self._send_to(server, part, effect, now_s)
-        while self._for_all and self._publisher.has_room():
-            part, effect = self._for_all.take()
-            if isinstance(effect, Ask):
-                if effect.call not in self._calls[part]:
-                    continue  # of a log that is over
-                self._note_holders(part, effect.call, set(self._calls[part].servers))
-            try:
-                wire = wire_of(part, effect)
-                self._publisher.publish(wire)
-                self._site.traffic.sent(len(wire))
-            except LocalError as error:
-                self._not_sent(part, effect, self._calls[part].servers, str(error), now_s)
-
-    def _send_to(self, server: Name, part: int, effect: Effect, now_s: float) -> None:
-        again = None
-        if isinstance(effect, Ask) and self._goals is not None:
-            goal = self._about.get((part, effect.call), b"")
-            if part == RESULT and server not in self._goals.holders(goal):
-                again = self._goals.again(goal)  # a server that came later works on the goal as well
-            self._note_holders(part, effect.call, {server})
-        try:
-            for wire in (*([] if again is None else [again]), wire_of(part, effect)):
-                self._site.member.ask(self._topic.name, server, wire)
-                self._site.traffic.sent(len(wire))
-        except LocalError as error:
-            self._not_sent(part, effect, [server], str(error), now_s)
-
-    def _not_sent(self, part: int, effect: Effect, servers: list[Name], reason: str, now_s: float) -> None:
-        self._site.traffic.unread += 1
-        if isinstance(effect, Ask):
-            for server in servers:
-                self._calls[part].refused(effect.call, server, reason, now_s)
-
-    def _note_holders(self, part: int, call: int, servers: set[Name]) -> None:
-        if self._goals is not None and part != CANCEL:
-            self._goals.holds(self._about[part, call], servers)
-
-    def _heard_of(self, message: Message, now_s: float) -> Name:
-        """Return who sent this, which may have come just now."""
-        name = Name(message.delivered.publisher)
-        if name not in self._servers:
-            self._follow(now_s)
-        return name
-
-    def _take_answer(self, message: Message, now_s: float) -> None:
-        answer, name = Answer.from_wire(message.delivered.message), self._heard_of(message, now_s)
-        server = self._servers.get(name)
+    def _receive_response(self, message: Message, now_s: float) -> None:
+        answer, name = Answer.from_wire(message.delivered.message), Name(message.delivered.publisher)
+        server = self._discovery.find(name, now_s)
         if server is None or answer.part >= len(server.answers):
-            return  # of a server that is gone, or that cannot be understood here: that was told
+            return  # of a server that is gone, or that cannot be understood here: that was reported
         dispatch = self._calls[answer.part]
         if answer.outcome is Outcome.FAILED:
             dispatch.refused(answer.call, name, answer.reason, now_s)
@@ -356,19 +260,20 @@ class ImportedService:
             dispatch.refused(answer.call, name, str(error), now_s)
             return
         if self._goals is None or says_yes(answer.part, raw):
-            dispatch.answered(answer.call, name, _Won(name, raw), now_s)
+            dispatch.answered(answer.call, name, (name, raw), now_s)
         else:
-            dispatch.declined(answer.call, name, _Won(name, raw), now_s)
+            dispatch.declined(answer.call, name, (name, raw), now_s)
 
-    def _answered(self, waiting: _Waiting, won: _Won) -> None:
+    def _answered(self, waiting: _Waiting, response: Response) -> None:
+        server, raw = response
         self._forget(waiting)
-        self._seat.endpoint.answer(self._handles[waiting.part], waiting.ticket, won.raw)
-        if self._goals is None or not says_yes(waiting.part, won.raw):
+        self._seat.endpoint.answer(self._handles[waiting.part], waiting.ticket, raw)
+        if self._goals is None or not says_yes(waiting.part, raw):
             return
         if waiting.part == GOAL:
-            self._goals.accepted(waiting.goal, won.server)
+            self._goals.accepted(waiting.goal, server)
         elif waiting.part == RESULT:
-            self._tell_status(self._goals.ended(waiting.goal, won.server, won.raw))
+            self._tell_status(self._goals.ended(waiting.goal, server, raw))
 
     def _failed(self, waiting: _Waiting, failure: Failure, reason: str) -> None:
         self._forget(waiting)
@@ -384,13 +289,12 @@ class ImportedService:
         self._seat.endpoint.answer(self._handles[waiting.part], waiting.ticket, no_answer.to_raw(reason))
 
     def _forget(self, waiting: _Waiting) -> None:
-        self._about.pop((waiting.part, waiting.call), None)
-        if self._keeper is None:  # a log's entries go to all servers, whoever waits
-            self._for_all.end(waiting.part, waiting.call)
+        is_cancelled = self._keeper is None  # a log's entries go to all servers in any case
+        self._sender.forget(waiting.part, waiting.call, is_cancelled=is_cancelled)
 
-    def _take_news(self, message: Message) -> None:
+    def _receive_news(self, message: Message) -> None:
         news, name = News.from_wire(message.delivered.message), Name(message.delivered.publisher)
-        server = self._servers.get(name)
+        server = self._discovery.servers.get(name)
         at = news.part - len(self._parts.services)
         if server is None or self._goals is None or not 0 <= at < len(server.news) or not self._topics:
             return

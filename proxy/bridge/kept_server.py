@@ -39,11 +39,11 @@ class KeptServer:
 
     def __init__(
         self,
+        *,
         seat: Seat,
         owner: Owner,
         node: str | None,
         number: int,
-        *,
         give: Give,
         tell: Tell,
         complain: Callable[[str], None],

@@ -537,15 +537,15 @@ def _any_start(self: Feed, joined: Any, epoch: int, now_s: float) -> None:
             starts={self._reader.name: start._replace(incarnation=self._reader.incarnation)}
         ).to_wire()
         joined = replace(joined, message=wire)
-    _TAKE_STATUS(self, joined, epoch, now_s)
+    _HANDLE_STATUS(self, joined, epoch, now_s)
 
 
-_TAKE_STATUS: Final = Feed._take_status
+_HANDLE_STATUS: Final = Feed._handle_status
 
 
 CONTROLS: Final[dict[str, tuple[tuple[object, str, Any], ...]]] = {
     "window": ((ReplayWindow, "is_finished", _always(False)),),
-    "start": ((Feed, "_take_status", _any_start),),
+    "start": ((Feed, "_handle_status", _any_start),),
     "claims": ((Claims, "_check_fresh", _always(None)),),
 }
 

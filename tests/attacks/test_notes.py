@@ -40,13 +40,13 @@ def live(pipe: Pipe, label: bytes, incarnation: int = 7) -> End:
 
 
 def notes_of(pipe: Pipe, label: bytes, *, secrets: dict[int, bytes] | None = None, victim: Name | None = None) -> Notes:
-    source = pipe.publisher._source
+    source = pipe.source
     return Notes(reader_of(label), source, TOPIC, SECRETS if secrets is None else secrets, as_name=victim)
 
 
 def by_the_secret_alone(pipe: Pipe, end: End, number: int, report: Report) -> bytes:
     """Return the note that proved a reader while the topic's secret was all that it took."""
-    source, reader = pipe.publisher._source, end.reader
+    source, reader = pipe.source, end.reader
     key = seal_key(SECRETS[1], Kind.REPORT, reader.name, reader.incarnation, source.name)
     to = source.name, TOPIC, source.incarnation
     made = NoteSealer(key, 1, Kind.REPORT, reader.name, reader.incarnation, *to, iter([number]))
@@ -166,14 +166,14 @@ def test_a33_no_note_is_accepted_that_is_forged_or_recorded_whatever_restarts() 
     present: dict[bytes, Notes] = {}
     names = {label: name_of(label) for label in (b"a", b"b", b"c")}
     for turn, (label, incarnation, epoch) in enumerate(lives()):
-        if max(pipe.publisher._secrets) != epoch:
+        if max(pipe.publisher._keys._secrets) != epoch:
             pipe.publisher.renew({epoch: secrets[epoch]}, pipe.now_s)
             pipe.now_s += EPOCH_GRACE_S
         if turn == 9:
             pipe.publisher = publisher_of(secrets={epoch: secrets[epoch]}, incarnation=2)
             present.clear()
         reader = reader_of(label, incarnation)
-        mine = present[label] = Notes(reader, pipe.publisher._source, TOPIC, secrets)
+        mine = present[label] = Notes(reader, pipe.source, TOPIC, secrets)
         said = mine.hello(epoch)
         pipe.tell(*said)
         assert pipe.publisher.is_read_by(reader.name), "the genuine life is heard at once"
@@ -184,7 +184,7 @@ def test_a33_no_note_is_accepted_that_is_forged_or_recorded_whatever_restarts() 
         before = snapshot(pipe)
         for other in present.keys() - {label}:
             for life in (incarnation, incarnation + 1):
-                forger = Notes(reader_of(other, life), pipe.publisher._source, TOPIC, secrets, as_name=names[label])
+                forger = Notes(reader_of(other, life), pipe.source, TOPIC, secrets, as_name=names[label])
                 pipe.tell(*forger.hello(epoch), *(forger.report(report, epoch) for report in LIES))
         pipe.tell(*recorded)
         assert snapshot(pipe) == before, f"turn {turn}"
@@ -208,19 +208,19 @@ def test_a56_a_reader_that_asks_for_everything_costs_a_bounded_share() -> None:
     window.add(1, frames, 20_000_000)
     now_s = 0.0
     while window.sent[0] < 2:  # all of it is under way
-        taken = len(window.take(now_s))
+        taken = len(window.frames_to_send(now_s))
         part = window.sent[1] if window.sent[0] < 2 else len(frames)
-        window.report(reader, Report(ReportFlag.NONE, 1, max(part - 1, 0), ()), now_s)
+        window.handle_report(reader, Report(ReportFlag.NONE, 1, max(part - 1, 0), ()), now_s)
         now_s += 0.01 if taken else 0.1
     everything = tuple(Missing(1, 0, 0xFFFF_FFFF) for _ in range(NACKS_PER_REPORT))
     greedy = Report(ReportFlag.NONE, 1, 0, everything)
     for _ in range(200):  # nothing is sent, as over a slow link: all that is looked at waits already
         now_s += 0.02
-        window.report(reader, greedy, now_s)
+        window.handle_report(reader, greedy, now_s)
     with lines_run(2_000_000):  # each of 2,000 reports in a tenth of a second looked at 8,192 parts: 80 million
         for _ in range(2_000):
             now_s += 0.000_05
-            window.report(reader, greedy, now_s)
+            window.handle_report(reader, greedy, now_s)
 
 
 @pytest.mark.parametrize("said", [(576, 9_000), tuple(range(8_999, 577, -7))])

@@ -9,8 +9,8 @@ from typing import Any, cast
 
 import pytest
 
+from gdp.client.delivery import Delivered
 from gdp.client.member import Member, Message, Topic
-from gdp.client.reading import Delivered
 from gdp.message.loss import Losses
 from gdp.names import Name
 from proxy.bridge.imported_topic import ImportedTopic

@@ -646,7 +646,7 @@ class Forge:
             self._number(rng), self._number(rng),
         )  # fmt: skip
         feed = rng.choice(feeds)
-        return [feed._note(feed._epoch).seal(report.to_wire())]
+        return [feed._sealer.seal(report)]
 
     def _status(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
         """Return what a publisher or a server says of its stream."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from math import ceil
 
-from gdp.client.feed import Delivered
+from gdp.client.delivery import Delivered
 from gdp.client.member import Member, Topic
 from gdp.client.publisher import Publisher
 from gdp.frame.codec import ETHER_BYTES, Header, decode

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from gdp.client.attachment import attachment_waits
 from gdp.client.member import Member
 from gdp.client.rib_host import RibHost
-from gdp.client.waiting import attachment_waits
 from gdp.control.waiting import WaitReason
 from gdp.errors import DropReason
 from gdp.limits import CLAIM_LEASE_S, DEAD_S

@@ -163,15 +163,15 @@ def test_what_a_client_may_ask_before_it_has_said_what_its_requests_are_is_bound
     world, client, (one,) = cluster(SERVERS[0])
     (public,) = one.member.feeds_of(one.service)
     public.state = FeedState.NEW  # as if its first status had been lost
-    public._report_at_s = float("inf")
+    public._schedule.due_s = float("inf")
     messages = 40
     for number in range(messages):
         ask(client, one, bytes([number]) * 20_000)
     world.network.run(2)
     (private,) = [feed for feed in one.member.feeds() if feed is not public]
-    assert len(private._out) * 20_000 <= FLIGHT_START_BYTES + 20_000
+    assert len(private._delivery) * 20_000 <= FLIGHT_START_BYTES + 20_000
     assert private.drops[DropReason.MEMORY_FULL] > 0
-    public._report_at_s = world.network.now.mono_s
+    public._schedule.due_s = world.network.now.mono_s
     public.state = FeedState.LIVE
     client.publish(b"?")
     assert work(world, one, until_s=5, have=messages + 1)

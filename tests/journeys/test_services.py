@@ -303,7 +303,7 @@ def test_a_private_stream_that_nobody_uses_is_forgotten_and_goes_on_above_its_nu
     assert len(streams) == 1
     world.network.run(1)
     (feed,) = [feed for feed in client.member.feeds() if feed not in client.member.feeds_of(client.service)]
-    feed._report_at_s = float("inf")  # it says nothing any more
+    feed._schedule.due_s = float("inf")  # it says nothing any more
     world.network.run(READER_LEASE_S + 1.5 * IDLE_S)
     assert len(streams) == 0
     server.answer(client.member.name, b"2")

@@ -123,7 +123,7 @@ class HostileProxy:
     def reports(self) -> _Frames:
         """Yield reports of a reader that lacks everything, under the key that it has agreed with the publisher."""
         feed = next(each for each in self._end.member.feeds_of(self._topic) if each.state is FeedState.LIVE)
-        note = feed._note(feed._epoch)
+        note = feed._sealer.sealer(feed._sealer.epoch)
         for number in count(1):
             missing = tuple(Missing(number + each, 0, 1 << 17) for each in range(NACKS_PER_REPORT))
             yield note.seal(Report(ReportFlag.NONE, number, 0, missing, number, 0).to_wire())

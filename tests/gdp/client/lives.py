@@ -6,9 +6,9 @@ import hashlib
 from functools import cache
 from os import urandom
 
-from gdp.client.feed import Reader
+from gdp.client.identities import ReaderIdentity, WriterIdentity
+from gdp.client.key_epochs import Secrets
 from gdp.client.note_keys import NoteKeys
-from gdp.client.source import Secrets, Source
 from gdp.crypto.envelope import Signer, seal_key
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
 from gdp.crypto.introduction import Introduction
@@ -38,22 +38,28 @@ def note_keys() -> NoteKeys:
     return NoteKeys(ExchangeKey.from_random(urandom(EXCHANGE_KEY_BYTES)))
 
 
-def source_of(name: Name, incarnation: int, signer: Signer) -> Source:
-    return Source(name, incarnation, signer, urandom, note_keys())
+def source_of(name: Name, incarnation: int, signer: Signer) -> WriterIdentity:
+    return WriterIdentity(name, incarnation, signer, urandom, note_keys())
 
 
-def reader_of(label: bytes, incarnation: int = 7, *, started: int | None = None) -> Reader:
+def reader_of(label: bytes, incarnation: int = 7, *, started: int | None = None) -> ReaderIdentity:
     """Return a life of a reader, by default one that began after those of lower incarnations."""
     notes, at = note_keys(), incarnation if started is None else started
     wire = Introduction.make(subject_of(label), key_of(label), incarnation, at, notes.public)
-    return Reader(name_of(label), incarnation, notes, lambda: wire)
+    return ReaderIdentity(name_of(label), incarnation, notes, lambda: wire)
 
 
 class Notes:
     """What one life of a reader can say to a publisher, under any name; by default its own, and the truth."""
 
     def __init__(
-        self, reader: Reader, publisher: Source, topic: Name, secrets: Secrets, *, as_name: Name | None = None
+        self,
+        reader: ReaderIdentity,
+        publisher: WriterIdentity,
+        topic: Name,
+        secrets: Secrets,
+        *,
+        as_name: Name | None = None,
     ) -> None:
         self._reader = reader
         self._publisher = publisher

@@ -9,8 +9,11 @@ from functools import partial
 from itertools import count
 from random import Random
 
-from gdp.client.feed import Delivered, Feed, Reader
-from gdp.client.publisher import Publisher, Secrets
+from gdp.client.delivery import Delivered
+from gdp.client.feed import Feed
+from gdp.client.identities import ReaderIdentity, WriterIdentity
+from gdp.client.key_epochs import Secrets
+from gdp.client.publisher import Publisher
 from gdp.crypto.keys import SigningKey
 from gdp.frame.codec import decode
 from gdp.frame.kinds import Kind
@@ -33,7 +36,9 @@ def publisher_of(
     *, incarnation: int = 1, secrets: Secrets = SECRETS, reliable: bool = True, depth: int = 0
 ) -> Publisher:
     source = source_of(Name(b"p" * 32), incarnation, WRITER)
-    publisher = Publisher(TOPIC, source, secrets, b"what it is", reliable=reliable, depth=depth)
+    publisher = Publisher(
+        topic=TOPIC, source=source, secrets=secrets, description=b"what it is", reliable=reliable, depth=depth
+    )
     publisher.tree_stands(1500)
     return publisher
 
@@ -42,7 +47,7 @@ def publisher_of(
 class End:
     """A reader at the end of the pipe."""
 
-    reader: Reader
+    reader: ReaderIdentity
     feed: Feed
     budget: Budget
     loss: float = 0.0
@@ -75,13 +80,26 @@ class Pipe:
         self._events: list[tuple[float, int, Callable[[], None]]] = []
         self._order = count()
 
+    @property
+    def source(self) -> WriterIdentity:
+        return self.publisher._keys._writer
+
     def join(self, name: bytes, *, incarnation: int = 7, loss: float = 0.0, secrets: Secrets = SECRETS) -> End:
         return self.attach(reader_of(name, incarnation), loss=loss, secrets=secrets)
 
-    def attach(self, reader: Reader, *, loss: float = 0.0, secrets: Secrets = SECRETS) -> End:
+    def attach(self, reader: ReaderIdentity, *, loss: float = 0.0, secrets: Secrets = SECRETS) -> End:
         budget = Budget()
-        publisher, exchange = Name(b"p" * 32), self.publisher._source.notes.public
-        feed = Feed(TOPIC, reader, publisher, self.incarnation, WRITER.public, exchange, secrets, budget, self.now_s)
+        feed = Feed(
+            topic=TOPIC,
+            reader=reader,
+            publisher=Name(b"p" * 32),
+            incarnation=self.incarnation,
+            writer=WRITER.public,
+            exchange=self.source.notes.public,
+            secrets=secrets,
+            budget=budget,
+            now_s=self.now_s,
+        )
         end = self.ends[reader.name] = End(reader, feed, budget, loss)
         return end
 

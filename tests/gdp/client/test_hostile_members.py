@@ -38,7 +38,7 @@ def give(pipe: Pipe, end: End, frames: list[bytes]) -> None:
 
 
 def notes_of(pipe: Pipe, label: bytes, reports: list[Report]) -> list[bytes]:
-    notes = Notes(reader_of(label), pipe.publisher._source, TOPIC, SECRETS)
+    notes = Notes(reader_of(label), pipe.source, TOPIC, SECRETS)
     return [notes.introduction(), *(notes.report(each) for each in reports)]
 
 
@@ -201,6 +201,6 @@ def test_what_an_outsider_sends_leaves_nothing_behind() -> None:
     assert end.budget.held_bytes == held
     assert end.feed.drops == {DropReason.BAD_TAG: 3 * 199}
     for at in range(50):
-        pipe.tell(*Notes(reader_of(bytes([at])), pipe.publisher._source, TOPIC, strange).hello())
+        pipe.tell(*Notes(reader_of(bytes([at])), pipe.source, TOPIC, strange).hello())
     assert pipe.publisher.readers == 1
     assert pipe.publisher.drops == {DropReason.BAD_TAG: 50, DropReason.UNKNOWN_SENDER: 50}

@@ -20,7 +20,14 @@ EXCHANGE = note_keys().public
 
 
 def streams_of(pasts: Pasts | None = None) -> PrivateStreams:
-    return PrivateStreams(SERVICE, SERVER, SECRETS, Pasts() if pasts is None else pasts, lambda _: None, urgent=False)
+    return PrivateStreams(
+        service=SERVICE,
+        writer=SERVER,
+        secrets=SECRETS,
+        pasts=Pasts() if pasts is None else pasts,
+        published=lambda _: None,
+        urgent=False,
+    )
 
 
 def client(number: int) -> Party:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gdp.client.attachment import Attachment
-from gdp.client.waiting import attachment_waits
+from gdp.client.attachment import Attachment, attachment_waits
 from gdp.control.settings import NodeSettings
 from gdp.control.strangers import STRANGERS_MAX, Strangers
 from gdp.control.waiting import Wait, WaitLog, WaitReason

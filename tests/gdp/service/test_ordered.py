@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.service.dispatch import Ask, Failure
-from gdp.service.entries import Entries
 from gdp.service.follower import Apply, Fetch, Follower, Load, Refuse, Say
 from gdp.service.keeper import Keeper
 from gdp.service.ordered import Follow, Keep, Position, State, Tell
+from gdp.service.replicated_log import ReplicatedLog
 
 KEEPERS = tuple(Name(bytes([number]) * 32) for number in (1, 2))
 SERVERS = tuple(Name(bytes([number]) * 32) for number in (11, 12, 13))
@@ -64,7 +64,7 @@ class World:
     def open(self, name: Name) -> None:
         self.cut(name)
         keeper = Keeper[bytes](
-            life=lambda: self.dice.getrandbits(32), entries=partial(Entries, state_every=8, entries_max=256)
+            life=lambda: self.dice.getrandbits(32), entries=partial(ReplicatedLog, state_every=8, entries_max=256)
         )
         self.clients[name] = Client(keeper)
         for server in self.replicas:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from gdp.client.delivery import Delivered
 from gdp.client.member import Message
-from gdp.client.reading import Delivered
 from gdp.names import Name
 from proxy.bridge.early import EARLY_MAX, Early
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from gdp.client.delivery import Delivered
 from gdp.client.member import Message
-from gdp.client.reading import Delivered
 from gdp.errors import LocalError
 from proxy.bridge.exposed_service import ExposedService
 from proxy.exchange import Exchange

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from gdp.client.delivery import Delivered
 from gdp.client.member import Message
-from gdp.client.reading import Delivered
 from proxy.bridge.imported_service import ImportedService
 from proxy.exchange import Answer, Outcome
 from proxy.qos import default

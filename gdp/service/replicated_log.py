@@ -1,6 +1,6 @@
-"""The entries of a log, and the state that stands for those that are forgotten.
+"""Replicated log of one service: its entries, and the state that stands for those that were removed.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Final
 
 from gdp.service.ordered import State
 
-__all__ = ["Entries"]
+__all__ = ["ReplicatedLog"]
 
 ENTRIES_MAX: Final = 65_536
 LOG_MAX_BYTES: Final = 64 << 20
@@ -18,7 +18,7 @@ STATE_EVERY: Final = 1_024  # entries after which another state is wanted
 STATE_EVERY_BYTES: Final = 4 << 20
 
 
-class Entries:
+class ReplicatedLog:
     """Requests in their order, from 1, without a gap; the oldest are forgotten when a state stands for them.
 
     Attributes:

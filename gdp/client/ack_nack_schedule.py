@@ -1,0 +1,88 @@
+"""Schedule of a reader's reports: when the next one is due.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
+"""
+
+from __future__ import annotations
+
+from gdp.frame.codec import Header
+from gdp.limits import (
+    REPORT_DELAY_S,
+    REPORT_EVERY_BYTES,
+    REPORT_EVERY_MAX_BYTES,
+    REPORT_GAP_S,
+    REPORT_IDLE_S,
+    REPORT_PAUSE_S,
+)
+from gdp.message.join import Joiner
+
+__all__ = ["AckNackSchedule"]
+
+
+class AckNackSchedule:
+    """When a report of one reader to one writer is due.
+
+    Args:
+        data: reassembles the writer's messages.
+        due_s: when the first report is due.
+
+    Attributes:
+        due_s: monotonic second of the next report.
+        idle_s: longest time between two reports.
+    """
+
+    def __init__(self, data: Joiner, due_s: float) -> None:
+        self._data = data
+        self.due_s = due_s
+        self.idle_s = REPORT_IDLE_S
+        self._unreported_bytes = 0
+        self._clean_bytes = 0  # reported since something was last missing
+
+    def count(self, size: int) -> None:
+        """Count received bytes that no report confirms yet."""
+        self._unreported_bytes += size
+
+    def handle_run(self, now_s: float) -> None:
+        """Reschedule after parts that came in order."""
+        self.due_s = min(self.due_s, now_s if self._is_owed() else now_s + REPORT_PAUSE_S)
+
+    def handle_part(self, header: Header, highest: int, expected: int, now_s: float) -> None:
+        """Reschedule after a new part.
+
+        Args:
+            highest: highest message number before it.
+            expected: message number that is delivered next.
+        """
+        number, data = header.number, self._data
+        if header.parts == 1 and number == highest + 1 == expected and self.due_s <= now_s + REPORT_DELAY_S:
+            if self._is_owed():
+                self.due_s = now_s
+            return  # a whole message in order changes nothing else
+        is_next = number == highest or (number == highest + 1 and (highest < expected or data.is_finished(highest)))
+        is_in_order = is_next and (data.is_finished(number) or header.part == data.progress(number) - 1)
+        if self._is_owed():
+            due_s = now_s
+        elif not is_in_order:
+            due_s = now_s + REPORT_GAP_S
+        else:
+            due_s = now_s + (REPORT_DELAY_S if data.is_finished(number) else REPORT_PAUSE_S)
+        self.due_s = min(self.due_s, due_s)
+
+    def start_report(self) -> None:
+        """Count all received bytes as reported."""
+        self._clean_bytes += self._unreported_bytes
+        self._unreported_bytes = 0
+
+    def handle_reported(self, now_s: float, *, is_missing: bool) -> None:
+        """Schedule the report after one that is sent now."""
+        if is_missing:
+            self._clean_bytes = 0
+        self.due_s = now_s + (REPORT_DELAY_S if is_missing else self.idle_s)
+
+    def _is_owed(self) -> bool:
+        """Return whether enough bytes came for a report; the longer nothing is missing, the more that takes.
+
+        A writer's congestion window has grown by what was reported since the last loss, and must never run dry.
+        """
+        every_bytes = max(REPORT_EVERY_BYTES, min(self._clean_bytes // 4, REPORT_EVERY_MAX_BYTES))
+        return self._unreported_bytes >= every_bytes

@@ -1,0 +1,137 @@
+"""Sealer of a reader's reports and introductions, under the key epochs of the topic.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
+
+Reports are sealed under the epoch of the newest verified message. A writer that is silent may have moved to another
+epoch, or have forgotten this reader: now and then reports are sealed under another epoch too, with an introduction.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from gdp.client.identities import ReaderIdentity
+from gdp.client.key_epochs import Secrets
+from gdp.crypto.envelope import seal_key
+from gdp.crypto.note import NoteSealer, note_key
+from gdp.frame.kinds import Kind
+from gdp.message.report import Report
+from gdp.names import Name
+
+__all__ = ["AckNackSealer"]
+
+_SILENT_S: Final = 3.0  # without a message or a status, until the writer is sent another introduction
+_TRIES: Final = 3  # under one epoch, before the next is tried
+
+
+class AckNackSealer:
+    """Seals what one reader sends to one writer.
+
+    Args:
+        exchange: the writer's X25519 key.
+        secrets: topic secrets by epoch.
+        introduces: introductions are sent; else the writer knows the reader's key otherwise.
+
+    Attributes:
+        epoch: under which reports are sealed.
+
+    Raises:
+        StatementError: MALFORMED, ``exchange`` is no key.
+    """
+
+    def __init__(
+        self,
+        *,
+        topic: Name,
+        reader: ReaderIdentity,
+        publisher: Name,
+        incarnation: int,
+        exchange: bytes,
+        secrets: Secrets,
+        introduces: bool,
+        now_s: float,
+    ) -> None:
+        self._topic = topic
+        self._reader = reader
+        self._publisher = publisher
+        self._incarnation = incarnation
+        self._introduces = introduces
+        self._secrets = secrets
+        self._shared = reader.notes.shared(exchange)
+        self._sealers: dict[int, NoteSealer] = {}
+        self._tried = 0
+        self._epoch_at = -1  # number of the message that says so
+        self._silent_s = now_s  # since when the writer is silent, or was last introduced to
+        self.epoch = max(secrets)
+
+    def handle_message(self, number: int, epoch: int, now_s: float) -> None:
+        """Note the epoch of a verified message."""
+        self._silent_s = now_s
+        if number >= self._epoch_at:
+            self.epoch, self._epoch_at = epoch, number
+
+    def handle_status(self, epoch: int, now_s: float, *, is_newest: bool) -> None:
+        """Note the epoch of a verified status."""
+        self._silent_s = now_s
+        if is_newest:
+            self.epoch = epoch
+
+    def renew(self, secrets: Secrets) -> None:
+        """Replace the topic's secrets."""
+        self._secrets = secrets
+        self._sealers.clear()
+        if self.epoch not in secrets:
+            self.epoch = max(secrets)
+
+    def seal(self, report: Report) -> bytes:
+        """Return the frame of a report."""
+        return self.sealer(self.epoch).seal(report.to_wire())
+
+    def seal_first(self, report: Report) -> list[bytes]:
+        """Return the frames of an introduction and a report to a writer that has not responded yet."""
+        self.epoch = self._epoch_to_try()
+        return [*self._introduction(self.epoch), self.seal(report)]
+
+    def seal_all(self, report: Report, now_s: float) -> list[bytes]:
+        """Return the frames of a report; to a silent writer also an introduction, in turn under every epoch."""
+        frames = [self.seal(report)]
+        if now_s - self._silent_s >= _SILENT_S:
+            self._silent_s = now_s
+            epoch = self._epoch_to_try()
+            frames += self._introduction(epoch)
+            if epoch != self.epoch:
+                frames.append(self.sealer(epoch).seal(report.to_wire()))
+        return frames
+
+    def sealer(self, epoch: int) -> NoteSealer:
+        """Return what seals reports under an epoch.
+
+        Raises:
+            KeyError: there is no secret of that epoch.
+        """
+        sealer = self._sealers.get(epoch)
+        if sealer is None:
+            reader = self._reader
+            ends = reader.name, reader.incarnation, self._publisher, self._incarnation
+            key = note_key(self._shared, self._secrets[epoch], Kind.REPORT, *ends, self._topic)
+            sealer = self._sealers[epoch] = self._note_sealer(key, epoch, Kind.REPORT)
+        return sealer
+
+    def _introduction(self, epoch: int) -> list[bytes]:
+        """Return the frames that prove whose reports these are, sealed under the secret of an epoch."""
+        if not self._introduces:
+            return []
+        reader = self._reader
+        key = seal_key(self._secrets[epoch], Kind.INTRODUCTION, reader.name, reader.incarnation, self._publisher)
+        return [self._note_sealer(key, epoch, Kind.INTRODUCTION).seal(reader.introduction())]
+
+    def _note_sealer(self, key: bytes, epoch: int, kind: Kind) -> NoteSealer:
+        reader, to = self._reader, (self._publisher, self._topic, self._incarnation)
+        return NoteSealer(key, epoch, kind, reader.name, reader.incarnation, *to, reader.note_numbers)
+
+    def _epoch_to_try(self) -> int:
+        """Return the newest epoch, and in turn the others, for the writer may not have the newest yet."""
+        epochs = sorted(self._secrets, reverse=True)
+        epoch = epochs[self._tried // _TRIES % len(epochs)]
+        self._tried += 1
+        return epoch

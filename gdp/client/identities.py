@@ -1,0 +1,49 @@
+"""Identities of a writer and of a reader in one incarnation of their process, with the keys of each.
+
+Sans-I/O.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import count
+
+from gdp.client.note_keys import NoteKeys
+from gdp.crypto.envelope import Signer
+from gdp.names import Name
+
+__all__ = ["ReaderIdentity", "WriterIdentity"]
+
+
+@dataclass(frozen=True, slots=True)
+class WriterIdentity:
+    """One incarnation of a writer.
+
+    Args:
+        random_bytes: the system's randomness, called for each message that is sealed.
+        notes: keys for the notes of readers.
+    """
+
+    name: Name
+    incarnation: int
+    signer: Signer
+    random_bytes: Callable[[int], bytes]
+    notes: NoteKeys
+
+
+@dataclass(frozen=True, slots=True)
+class ReaderIdentity:
+    """One incarnation of a reader; all its feeds share it, since they share its numbers for notes.
+
+    Args:
+        notes: keys for notes.
+        introduction: returns the wire form of the statement that proves whose keys they are.
+        note_numbers: numbers of the next notes.
+    """
+
+    name: Name
+    incarnation: int
+    notes: NoteKeys = field(compare=False)
+    introduction: Callable[[], bytes] = field(compare=False)
+    note_numbers: Iterator[int] = field(default_factory=lambda: count(1), compare=False)

@@ -1,0 +1,104 @@
+"""Key epochs of a topic as its writer uses them: the newest seals, the one before still opens notes for a while.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+from gdp.client.identities import WriterIdentity
+from gdp.crypto.envelope import Sealer
+from gdp.errors import DropReason, EnvelopeError, LocalError
+from gdp.frame.kinds import Kind
+from gdp.limits import EPOCH_GRACE_S
+from gdp.names import Name
+
+__all__ = ["KeyEpochs", "Secrets"]
+
+Secrets = Mapping[int, bytes]  # key epoch -> topic secret, 32 bytes
+
+_NEVER: Final = float("-inf")
+
+
+class KeyEpochs:
+    """The secrets of one topic, and the sealers under the newest of them.
+
+    Args:
+        topic: the name that the keys are derived from.
+        address: destination of the frames; None: the topic.
+
+    Attributes:
+        epoch: the newest.
+        data: seals messages.
+        status: seals statuses.
+
+    Raises:
+        LocalError: there is no secret.
+    """
+
+    def __init__(self, topic: Name, writer: WriterIdentity, secrets: Secrets, address: Name | None = None) -> None:
+        self._topic = topic
+        self._writer = writer
+        self._address = address
+        self._secrets = _checked(secrets)
+        self._former = (-1, b"", _NEVER)  # the epoch before, its secret, and until when readers use it
+        self._use(max(secrets))
+
+    @property
+    def secret(self) -> bytes:
+        """Return the secret of the newest epoch."""
+        return self._secrets[self.epoch]
+
+    def renew(self, secrets: Secrets, now_s: float) -> bool:
+        """Replace the secrets; return whether there is a new epoch, which seals from now on.
+
+        Raises:
+            LocalError: there is no secret.
+        """
+        former = self.epoch, self.secret, now_s + EPOCH_GRACE_S
+        self._secrets = _checked(secrets)
+        if max(secrets) == self.epoch:
+            return False
+        self._former = former
+        self._use(max(secrets))
+        return True
+
+    def secret_of(self, epoch: int, now_s: float) -> bytes:
+        """Return the secret under which notes of an epoch are accepted now.
+
+        Raises:
+            EnvelopeError: UNKNOWN_EPOCH.
+        """
+        if epoch == self.epoch:
+            return self.secret
+        former, secret, until_s = self._former
+        if epoch != former or now_s >= until_s:
+            raise EnvelopeError(DropReason.UNKNOWN_EPOCH, str(epoch))
+        return secret
+
+    def _use(self, epoch: int) -> None:
+        self.epoch = epoch
+        self.data = self._sealer(Kind.DATA)
+        self.status = self._sealer(Kind.STATUS)
+
+    def _sealer(self, kind: Kind) -> Sealer:
+        writer = self._writer
+        return Sealer(
+            secret=self.secret,
+            epoch=self.epoch,
+            kind=kind,
+            source=writer.name,
+            incarnation=writer.incarnation,
+            destination=self._topic,
+            signer=writer.signer,
+            random_bytes=writer.random_bytes,
+            address=self._address,
+        )
+
+
+def _checked(secrets: Secrets) -> Secrets:
+    if not secrets:
+        raise LocalError("a publisher needs a topic secret")
+    return secrets

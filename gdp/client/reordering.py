@@ -1,0 +1,91 @@
+"""Reordering buffer of one writer's messages: whole messages wait behind a gap.
+
+Sans-I/O.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Final
+
+from gdp.limits import REPLAY_WINDOW_MESSAGES
+from gdp.message.join import Joined
+from gdp.message.memory import Budget
+from gdp.message.move import Move
+from gdp.names import Name
+
+__all__ = ["ReorderingBuffer"]
+
+_OVERHEAD_BYTES: Final = 256  # what a waiting message costs in addition to its bytes
+
+
+class ReorderingBuffer:
+    """Messages by number, and the number that is delivered next.
+
+    Args:
+        budget: memory of all feeds; what waits is reserved there.
+
+    Attributes:
+        expected: the number that is delivered next.
+    """
+
+    def __init__(self, publisher: Name, budget: Budget) -> None:
+        self._publisher = publisher
+        self._budget = budget
+        self._waiting: dict[int, Joined] = {}
+        self.expected = 0
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def __contains__(self, number: int) -> bool:
+        return number in self._waiting
+
+    @property
+    def numbers(self) -> list[int]:
+        """Return the numbers that wait, lowest first."""
+        return sorted(self._waiting)
+
+    def put(self, joined: Joined) -> bool:
+        """Let a message wait; return False where the budget has no room for it."""
+        if not self._budget.reserve(self._publisher, len(joined.message) + _OVERHEAD_BYTES):
+            return False
+        self._waiting[joined.number] = joined
+        return True
+
+    def consecutive(self) -> Iterator[Joined]:
+        """Remove and yield the messages from ``expected`` on, up to the next gap."""
+        while self.expected in self._waiting:
+            joined = self._pop(self.expected)
+            self.expected += 1
+            yield joined
+
+    def skip_to(self, number: int) -> Iterator[Joined]:
+        """Move on to a number; remove and yield what waited before it."""
+        before = sorted(each for each in self._waiting if each < number)
+        self.expected = number
+        return iter([self._pop(each) for each in before])
+
+    def begin(self, number: int) -> None:
+        """Expect a first number; what waits too far from it is dropped."""
+        self.expected = number
+        for each in [each for each in self._waiting if not 0 <= each - number < REPLAY_WINDOW_MESSAGES]:
+            self._pop(each)
+
+    def renumber(self, move: Move) -> list[Joined]:
+        """Expect the new numbers of a renumbering; remove and return what waited, under its new numbers."""
+        self.expected = move.of(self.expected)
+        early = {number: self._pop(number) for number in list(self._waiting) if move.is_before(number)}
+        for number in [number for number in self._waiting if number < self.expected]:
+            self._pop(number)  # it was delivered under its old number
+        return [replace(joined, number=move.of(old)) for old, joined in early.items()]
+
+    def drain(self) -> list[Joined]:
+        """Remove and return what waits, in order."""
+        return [self._pop(number) for number in self.numbers]
+
+    def _pop(self, number: int) -> Joined:
+        joined = self._waiting.pop(number)
+        self._budget.release(self._publisher, len(joined.message) + _OVERHEAD_BYTES)
+        return joined

@@ -1,0 +1,247 @@
+"""Send queue of a writer: numbers, bundles and seals messages, and refragments them when the path MTU drops.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
+
+A message passes up to three stages::
+
+    deferred (latched, before the first reader) -> gathered (small, waits for its bundle) -> sealed (window or queue)
+
+A message is sealed once. Where the path has become too narrow for what is cached, that is refragmented, and all that is
+cached gets new numbers; statuses announce which (``gdp/message/move.py``). Each message has a sequence number under its
+seal, sent or not (``gdp/message/ledger.py``).
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from typing import Final
+
+from gdp.client.best_effort import Carried, Unsent
+from gdp.client.key_epochs import KeyEpochs
+from gdp.crypto.envelope import SIGNATURE_BYTES, Sealed, part_room
+from gdp.errors import DropReason
+from gdp.frame.kinds import Flag
+from gdp.limits import SEQUENCE_BYTES, WINDOW_BYTES
+from gdp.message.bundle import BUNDLE_BYTES, Gathered, pack
+from gdp.message.ledger import Ledger
+from gdp.message.loss import LossReason
+from gdp.message.move import MOVES_MAX, Move
+from gdp.message.window import SendWindow
+
+__all__ = ["SendQueue"]
+
+_BUNDLE: Final = int(Flag.BUNDLE)
+
+
+class SendQueue:
+    """The messages of one writer, from the call that publishes them to their frames.
+
+    Args:
+        keys: seals the frames.
+        window: caches the frames of a topic whose readers acknowledge.
+        next_number: number of the first message.
+        last_sequence: highest sequence number in use.
+
+    Attributes:
+        is_acknowledged: readers acknowledge what they get (reliable or latched topics).
+        depth: latched messages for late joiners.
+        flags: header flags of every frame.
+        mtu: smallest on the path, in bytes after the Ethernet header; None: unknown.
+        bundle_bytes: largest bundle; 0: each message has a seal of its own.
+        ledger: sequence numbers.
+        moves: the latest renumberings.
+        drops: messages dropped here, by reason.
+    """
+
+    def __init__(self, *, keys: KeyEpochs, window: SendWindow, next_number: int, last_sequence: int) -> None:
+        self._keys = keys
+        self._window = window
+        self.next_number = next_number
+        self.ledger = Ledger(last_sequence)
+        self.is_acknowledged = True
+        self.depth = 0
+        self.flags = 0
+        self.mtu: int | None = None
+        self.bundle_bytes = BUNDLE_BYTES
+        self.moves: deque[Move] = deque(maxlen=MOVES_MAX)
+        self.drops: Counter[DropReason] = Counter()
+        self._deferred = deque[tuple[int, bytes]]()  # (sequence number, message)
+        self._gathered = Gathered()
+        self._best_effort = Unsent()
+
+    @property
+    def is_empty(self) -> bool:
+        """Return whether nothing waits outside the window."""
+        return not (self._deferred or self._gathered or self._best_effort)
+
+    def has_room(self) -> bool:
+        """Return whether a message may be added without evicting an unacknowledged one."""
+        return self._window.has_room() and self._gathered.held_bytes < WINDOW_BYTES
+
+    @property
+    def oldest(self) -> int:
+        """Return the first message number that is cached, or will be."""
+        oldest = self._window.oldest
+        return self.next_number if oldest is None else oldest
+
+    @property
+    def first_waiting(self) -> int:
+        """Return the first sequence number that has no message number yet, or the next one."""
+        if self._deferred:
+            return self._deferred[0][0]
+        return self._gathered.first if self._gathered else self.ledger.last + 1
+
+    @property
+    def deferred(self) -> int:
+        """Return how many latched messages wait for the first reader."""
+        return len(self._deferred)
+
+    @property
+    def sent(self) -> tuple[int, int]:
+        """Return the message number and the part before which everything has been sent."""
+        if self.is_acknowledged:
+            return self._window.sent
+        unsent = self._best_effort.oldest
+        return (self.next_number if unsent is None else unsent.number), 0
+
+    @property
+    def sequences(self) -> tuple[int, int]:
+        """Return the sequence numbers of what is sent next, and of what is cached first."""
+        unsent, oldest = self._best_effort.oldest, self._window.oldest
+        if not self.is_acknowledged:
+            sent = self.first_waiting if unsent is None else unsent.sequence
+        else:
+            sent = self.ledger.begin_of(self._window.sent[0], self.first_waiting)
+        return sent, sent if oldest is None else self.ledger.begin_of(oldest, sent)
+
+    def defer(self, message: bytes) -> None:
+        """Queue a latched message for the first reader; the oldest above ``depth`` are dropped."""
+        self._deferred.append((self.ledger.next(), message))
+        self._drop_deferred(self.depth)
+
+    def add(self, message: bytes, *, gather_bytes: int) -> None:
+        """Queue a message; small ones wait to be bundled, up to ``gather_bytes`` of them.
+
+        Raises:
+            LocalError: above the limits.
+        """
+        self.seal_deferred()
+        if self.depth or not self._gathered.is_small(message, self._bundle_room()):
+            self.seal_gathered()
+            self._seal_message(message, self.ledger.last + 1)
+            self.ledger.next()
+            return
+        self._gathered.add(self.ledger.next(), message)
+        if self._gathered.held_bytes > gather_bytes:
+            self._seal_next()
+
+    def skip(self, reason: LossReason) -> None:
+        """Use up a sequence number for a message that nobody gets."""
+        self.seal_gathered()
+        sequence = self.ledger.next()
+        self.ledger.lose(sequence, sequence, reason)
+
+    def set_depth(self, depth: int) -> None:
+        """Change how many messages are latched; what is beyond that is dropped."""
+        self.seal_gathered()
+        self.depth = depth
+        self._window.set_history_depth(depth, self.next_number)
+        self.drops[DropReason.NO_READER] += self._drop_deferred(depth)
+
+    def seal_deferred(self) -> None:
+        """Seal what waited for the first reader."""
+        while self._deferred:
+            sequence, message = self._deferred.popleft()
+            self._seal_message(message, sequence)
+
+    def seal_gathered(self) -> None:
+        """Seal what waited to be bundled."""
+        while self._gathered:
+            self._seal_next()
+
+    def frames_to_send(self, now_s: float, limit: int) -> list[bytes]:
+        """Return about ``limit`` frames that may be sent now, at least one; the rest is sealed when it is polled."""
+        frames = self._best_effort.take(max(limit, 1))
+        frames += self._window.frames_to_send(now_s, max(limit - len(frames), 1))
+        while self._gathered and len(frames) < limit and not self._has_unsent():
+            self._seal_next()
+            left = limit - len(frames)
+            sends_window = self.is_acknowledged
+            frames += self._window.frames_to_send(now_s, left) if sends_window else self._best_effort.take(left)
+        return frames
+
+    def refragment_best_effort(self, mtu: int) -> bool:
+        """Seal unsent best-effort messages again if one is too large for the path; return whether any was."""
+        unsent = self._best_effort.take_back(mtu)
+        for body, carried in unsent:
+            self._seal_message(body, carried.sequence, carried.messages)
+        return bool(unsent)
+
+    def refragment(self, mtu: int) -> Move | None:
+        """Seal all that is cached again, under new numbers, if something is too large for the path.
+
+        Returns:
+            the renumbering, or None if everything fits.
+        """
+        cached = [(number, each) for number, each in self._window.cached() if isinstance(each, Sealed)]
+        if not any(each.largest > mtu for _, each in cached):
+            return None
+        first, end = cached[0][0], self.next_number
+        move = Move(first, end - first, end + 1)
+        is_bundle = self.ledger.is_bundle
+        sealed = [
+            (move.of(number), self._seal(move.of(number), each, mtu, is_bundle=is_bundle(number)))
+            for number, each in cached
+        ]
+        self.ledger.forget(first)
+        self.ledger.move(move)
+        self.next_number = move.of(end)
+        self.moves.append(move)
+        self._window.renumber(move, [(number, each, each.size_bytes) for number, each in sealed])
+        return move
+
+    def close(self) -> None:
+        """Drop what waits; nothing is sent any more."""
+        self.drops[DropReason.NO_READER] += len(self._gathered) + self._drop_deferred(0)
+        self._gathered, self._best_effort = Gathered(), Unsent()
+
+    def _has_unsent(self) -> bool:
+        return self._window.sent[0] < self.next_number if self.is_acknowledged else bool(self._best_effort)
+
+    def _bundle_room(self) -> int:
+        """Return the largest bundle in bytes: one frame on a best-effort topic, which loses all of it with one part."""
+        if self.is_acknowledged or self.mtu is None:
+            return self.bundle_bytes
+        return min(self.bundle_bytes, part_room(self.mtu) - SIGNATURE_BYTES - SEQUENCE_BYTES)
+
+    def _seal_next(self) -> None:
+        """Seal as much of what was gathered as fits into one bundle."""
+        first, together = self._gathered.first, self._gathered.take(self._bundle_room())
+        self._seal_message(together[0] if len(together) == 1 else pack(together), first, len(together))
+
+    def _seal_message(self, body: bytes, sequence: int, messages: int = 1) -> None:
+        """Number and seal a message, or a bundle of several; the oldest are dropped when too much waits."""
+        assert self.mtu is not None
+        number, ledger = self.next_number, self.ledger
+        frames = self._seal(number, sequence.to_bytes(SEQUENCE_BYTES, "big") + body, self.mtu, is_bundle=messages > 1)
+        self.next_number += 1
+        if not self.is_acknowledged:
+            for dropped in self._best_effort.add(frames, Carried(number, sequence, messages)):
+                self.drops[DropReason.MEMORY_FULL] += dropped.messages
+                ledger.lose(dropped.sequence, dropped.sequence + dropped.messages - 1, LossReason.QUEUE_OVERFLOW)
+            return
+        ledger.put(number, sequence, messages)
+        evicted = self._window.add(number, frames, frames.size_bytes)
+        self.drops[DropReason.MEMORY_FULL] += ledger.let_go(evicted, LossReason.WINDOW_OVERFLOW)
+        ledger.forget(self.oldest)
+
+    def _seal(self, number: int, body: bytes | Sealed, mtu: int, *, is_bundle: bool) -> Sealed:
+        return self._keys.data.seal(number, self.flags | _BUNDLE * is_bundle, body, mtu)
+
+    def _drop_deferred(self, keep: int) -> int:
+        """Drop the oldest deferred messages above ``keep``; return how many."""
+        dropped = max(len(self._deferred) - keep, 0)
+        for _ in range(dropped):
+            sequence, _ = self._deferred.popleft()
+            self.ledger.lose(sequence, sequence, LossReason.NO_READER)
+        return dropped

@@ -1,0 +1,140 @@
+"""Acknowledgement state of the readers of a reliable writer.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Positions count bytes of frames from the first message on.
+
+An active reader blocks the send window until it acknowledges; a suspended one does not. A reader is slow when it
+acknowledges nothing for ``READER_LEASE_S``, or lags behind another one for longer than the tolerated lag.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from gdp.limits import READER_LEASE_S
+from gdp.message.retransmission import RepairAllowance
+
+__all__ = ["ReaderPosition", "ReaderPositions"]
+
+_BEYOND_ALL: Final = 1 << 64  # above every message number
+
+
+@dataclass(slots=True, kw_only=True)
+class ReaderPosition:
+    """How much one reader has acknowledged.
+
+    Attributes:
+        acked_at: position before which it has everything.
+        next_number: message before which it has everything.
+        last_progress_s: when it last acknowledged something new, or had everything.
+        mark_at: what another reader had acknowledged at ``mark_s``; the mark advances when this reader has reached it.
+        allowance: repairs that may be examined for it.
+    """
+
+    acked_at: int
+    next_number: int
+    last_progress_s: float
+    mark_at: int
+    mark_s: float
+    allowance: RepairAllowance = field(default_factory=RepairAllowance)
+
+
+class ReaderPositions:
+    """The positions of all readers.
+
+    Args:
+        lag_s: how long a reader may lag behind another before it counts as slow.
+
+    Attributes:
+        active: readers that block the window, by name.
+        suspended: readers that do not, by name.
+    """
+
+    def __init__(self, lag_s: float) -> None:
+        self._lag_s = lag_s
+        self.active: dict[bytes, ReaderPosition] = {}
+        self.suspended: dict[bytes, ReaderPosition] = {}
+
+    def add(self, reader: bytes, acked_at: int, next_number: int, now_s: float) -> None:
+        """Add an active reader, or restart one."""
+        self.suspended.pop(reader, None)
+        self.active[reader] = ReaderPosition(
+            acked_at=acked_at, next_number=next_number, last_progress_s=now_s, mark_at=acked_at, mark_s=now_s
+        )
+
+    def remove(self, reader: bytes) -> bool:
+        """Remove a reader; return whether there was one."""
+        return bool(self.active.pop(reader, None) or self.suspended.pop(reader, None))
+
+    def suspend(self, reader: bytes) -> None:
+        """Suspend an active reader; others are left as they are."""
+        position = self.active.pop(reader, None)
+        if position is not None:
+            self.suspended[reader] = position
+
+    def resume(self, reader: bytes, now_s: float) -> None:
+        """Reactivate a suspended reader at its position.
+
+        Raises:
+            KeyError: it is not suspended.
+        """
+        position = self.active[reader] = self.suspended.pop(reader)
+        position.last_progress_s = position.mark_s = now_s
+        position.mark_at = position.acked_at
+
+    def all(self) -> list[ReaderPosition]:
+        """Return every position, active ones first."""
+        return [*self.active.values(), *self.suspended.values()]
+
+    def acked_at(self, otherwise: int) -> int:
+        """Return the position that every active reader has acknowledged; ``otherwise`` without one."""
+        return min((each.acked_at for each in self.active.values()), default=otherwise)
+
+    def least_active(self) -> int:
+        """Return the lowest message number that an active reader lacks."""
+        return min((each.next_number for each in self.active.values()), default=_BEYOND_ALL)
+
+    def least(self) -> int:
+        """Return the lowest message number that any reader lacks, suspended or not."""
+        least = self.least_active()
+        return min([least, *(each.next_number for each in self.suspended.values())]) if self.suspended else least
+
+    def acknowledge(self, position: ReaderPosition, acked_at: int, now_s: float) -> None:
+        """Advance an active reader, and the marks that other readers are measured against."""
+        if acked_at > position.acked_at:
+            position.acked_at = acked_at
+            position.last_progress_s = now_s
+        first_at = self._first_at()
+        for each in self.active.values():
+            if each.mark_at <= each.acked_at < first_at:
+                each.mark_at, each.mark_s = first_at, now_s
+
+    def reset_stall_timers(self, sent_at: int, now_s: float) -> None:
+        """Restart the timers of readers that have everything sent before ``sent_at``: they owe nothing."""
+        for each in self.active.values():
+            if each.acked_at >= sent_at:
+                each.last_progress_s = now_s
+
+    def slow(self, sent_at: int, now_s: float) -> list[bytes]:
+        """Return the active readers that have stalled, or lag behind another for longer than tolerated."""
+        first_at = self._first_at()
+        return [
+            name
+            for name, each in self.active.items()
+            if each.acked_at < sent_at
+            and (
+                now_s - each.last_progress_s > READER_LEASE_S
+                or (now_s - each.mark_s > self._lag_s and each.acked_at < each.mark_at <= first_at)
+            )
+        ]
+
+    def next_slow(self) -> float | None:
+        """Return the monotonic second at which a reader that lags behind another becomes slow, or None."""
+        first_at = self._first_at()
+        behind = (each.mark_s for each in self.active.values() if each.acked_at < each.mark_at <= first_at)
+        mark_s = min(behind, default=None)
+        return None if mark_s is None else mark_s + self._lag_s + 0.001
+
+    def _first_at(self) -> int:
+        """Return the position of the most advanced active reader."""
+        return max((each.acked_at for each in self.active.values()), default=0)

@@ -1,0 +1,106 @@
+"""Flow control of a reliable writer: congestion window, round-trip time, and the timer that asks silent readers.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
+Source: window growth and halving after RFC 5681, sections 3.1 and 3.2; round-trip estimate after RFC 6298, section 2,
+with Karn's rule. Positions count bytes of frames from the first message on.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from gdp.limits import FLIGHT_MAX_BYTES, FLIGHT_MIN_BYTES, FLIGHT_START_BYTES, PROBE_MAX_S, PROBE_MIN_S
+
+__all__ = ["FlowControl", "RoundTripEstimator"]
+
+_GROWTH_BYTES: Final = 16 << 10  # of the window in a round trip, above the threshold: these links are not narrow
+
+
+class RoundTripEstimator:
+    """Smoothed round-trip time of frames that were sent once.
+
+    Attributes:
+        rtt_s: smoothed estimate; None before the first sample.
+        deviation_s: smoothed mean deviation.
+    """
+
+    def __init__(self) -> None:
+        self.rtt_s: float | None = None
+        self.deviation_s = 0.0
+        self._sample: tuple[int, float] | None = None  # (position, when it was sent)
+
+    def handle_sent(self, sent_at: int, now_s: float) -> None:
+        """Start a sample at a position that was just sent, unless one is running."""
+        if self._sample is None:
+            self._sample = (sent_at, now_s)
+
+    def handle_acknowledged(self, acked_at: int, now_s: float) -> None:
+        """Finish the sample if its position is acknowledged."""
+        if self._sample is not None and acked_at >= self._sample[0]:
+            self._update(now_s - self._sample[1])
+            self._sample = None
+
+    def discard_sample(self) -> None:
+        """Discard the running sample: an acknowledgement of what was sent twice is ambiguous (Karn's rule)."""
+        self._sample = None
+
+    def _update(self, sample_s: float) -> None:
+        if self.rtt_s is None:
+            self.rtt_s, self.deviation_s = sample_s, sample_s / 2
+            return
+        self.deviation_s += (abs(sample_s - self.rtt_s) - self.deviation_s) / 4
+        self.rtt_s += (sample_s - self.rtt_s) / 8
+
+
+class FlowControl:
+    """How many bytes may be under way, and when silent readers are asked.
+
+    Attributes:
+        window_bytes: the congestion window.
+        round_trip: estimate of the round-trip time.
+    """
+
+    def __init__(self) -> None:
+        self.window_bytes = FLIGHT_START_BYTES
+        self.round_trip = RoundTripEstimator()
+        self._threshold_bytes = FLIGHT_MAX_BYTES
+        self._halved_s = float("-inf")
+        self._quiet_s = 0.0  # since when nothing was acknowledged
+        self._probe_s = PROBE_MIN_S
+
+    def handle_acknowledged(self, new_bytes: int, acked_at: int, now_s: float) -> None:
+        """Grow the window by an acknowledgement of ``new_bytes`` up to ``acked_at``, and restart the probe timer."""
+        if new_bytes <= 0:
+            return
+        self._quiet_s = now_s
+        if self.window_bytes < self._threshold_bytes:
+            self.window_bytes += new_bytes
+        else:
+            self.window_bytes += new_bytes * _GROWTH_BYTES // self.window_bytes
+        self.window_bytes = min(self.window_bytes, FLIGHT_MAX_BYTES)
+        trip = self.round_trip
+        trip.handle_acknowledged(acked_at, now_s)
+        self._probe_s = min(max(3 * (trip.rtt_s or 0.0) + 4 * trip.deviation_s, PROBE_MIN_S), PROBE_MAX_S)
+
+    def handle_loss(self, now_s: float) -> None:
+        """Halve the window, at most once in a round trip."""
+        if now_s - self._halved_s > (self.round_trip.rtt_s or PROBE_MIN_S):
+            self._threshold_bytes = max(self.window_bytes // 2, FLIGHT_MIN_BYTES)
+            self.window_bytes = self._threshold_bytes
+            self._halved_s = now_s
+
+    def restart_probe(self, now_s: float) -> None:
+        """Restart the probe timer: nothing is under way."""
+        self._quiet_s = now_s
+
+    def next_probe(self) -> float:
+        """Return the monotonic second at which readers are asked, if something is under way."""
+        return self._quiet_s + self._probe_s
+
+    def probe_due(self, now_s: float) -> bool:
+        """Return whether readers have been silent for too long; if so, the next interval doubles."""
+        if now_s < self.next_probe():
+            return False
+        self._quiet_s = now_s
+        self._probe_s = min(2 * self._probe_s, PROBE_MAX_S)
+        return True

@@ -1,0 +1,57 @@
+"""Snapshot requests of a replicated log: which replica is asked for its state, and until when.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from gdp.names import Name
+from gdp.service.ordered import Log, State
+from gdp.service.replicas import Replicas
+from gdp.service.replicated_log import ReplicatedLog
+
+__all__ = ["SnapshotRequests"]
+
+_TIMEOUT_S: Final = 10.0
+
+
+class SnapshotRequests:
+    """At most one request at a time."""
+
+    def __init__(self) -> None:
+        self._server: Name | None = None
+        self._until_s = 0.0
+
+    @property
+    def is_pending(self) -> bool:
+        """Return whether a replica is asked now."""
+        return self._server is not None
+
+    def request(self, replicas: Replicas, entries: ReplicatedLog, now_s: float) -> Name | None:
+        """Return the replica that is to be asked: the furthest that has a newer state; None: there is none."""
+        tellers = replicas.tellers()
+        server = max(tellers, key=lambda name: tellers[name], default=None)
+        if server is None or (entries.state is not None and tellers[server] <= entries.state.at):
+            return None
+        self._server = server
+        self._until_s = now_s + _TIMEOUT_S
+        return server
+
+    def handle_state(self, server: Name, state: State, log: Log, entries: ReplicatedLog) -> bool:
+        """Return whether a state is the one that was requested; if so, the request is over."""
+        if server != self._server or state.log != log or state.at > entries.last:
+            return False
+        self._server = None
+        return True
+
+    def cancel(self, server: Name) -> None:
+        """Drop the request to a replica that has gone."""
+        if self._server == server:
+            self._server = None
+
+    def timeout(self, now_s: float) -> None:
+        """Drop a request whose time has run out."""
+        if self._server is not None and now_s >= self._until_s:
+            self._server = None

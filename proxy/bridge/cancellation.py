@@ -1,0 +1,97 @@
+"""Cancellation of calls at one exposed service: what no client waits for any more is not worked on.
+
+I/O: the local endpoint is called.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from gdp.names import Name
+from gdp.service.serving import Asked, Serving
+from proxy.bridge.goal_calls import GoalCalls
+from proxy.bridge.parts import RESULT
+from proxy.endpoints.endpoint import Endpoint
+from proxy.exchange import Stop
+
+__all__ = ["TRIGGER", "Cancellation"]
+
+TRIGGER: Final = "std_srvs/srv/Trigger"
+
+_NO_FIELDS: Final = {1: b"", 2: b"\0\1\0\0\0"}  # a request of it; ROS 2 fills a message without fields with one byte
+
+
+class Cancellation:
+    """Stops calls; an action's by cancelling the goal, a service's by calling the rule's ``stop``.
+
+    Args:
+        servers: handles of the local server, by part.
+        stopper: handle of the rule's ``stop``; None: it has none.
+        is_concurrent: the local server works on several calls at once; else it finishes one before the next.
+        cancel_goal: asks the local server to cancel a goal, at a monotonic second.
+    """
+
+    def __init__(
+        self,
+        *,
+        endpoint: Endpoint,
+        serving: Serving[bytes],
+        goals: GoalCalls,
+        servers: Sequence[int],
+        stopper: int | None,
+        is_concurrent: bool,
+        cancel_goal: Callable[[bytes, float], None],
+    ) -> None:
+        self._endpoint = endpoint
+        self._serving = serving
+        self._goals = goals
+        self._servers = servers
+        self._stopper = stopper
+        self._is_concurrent = is_concurrent
+        self._cancel_goal = cancel_goal
+        self._stops = 0  # calls of the stopper; their numbers
+
+    def handle_stop(self, client: Name, stop: Stop, now_s: float) -> None:
+        """Process that a client's calls have ended: what waits is dropped, what is worked on is stopped."""
+        is_working = False
+        for call in stop.calls:
+            asked = Asked(client, stop.part, call)
+            goal = self._goals.end(asked)
+            number = self._serving.stop(asked)
+            if number is not None and stop.part < len(self._servers):
+                is_working = True
+                self._release(stop.part, number)
+            if goal is not None and stop.part == RESULT and not self._goals.is_awaited(goal):
+                self._cancel_goal(goal, now_s)
+        if is_working:
+            self._stop_work()
+
+    def handle_client_gone(self, client: Name) -> None:
+        """Drop the calls of a client that left. Its goals go on: it may come back, and ask for their results."""
+        is_working = False
+        for number, part, asked, is_given in self._serving.gone(client):
+            if asked is not None:
+                self._goals.end(asked)
+            if is_given:
+                is_working = True
+                self._release(part, number)
+        if is_working:
+            self._stop_work()
+
+    def handle_timeout(self, part: int, number: int) -> None:
+        """Stop a call whose time has run out."""
+        self._endpoint.drop(self._servers[part], number)
+        self._stop_work()
+
+    def _release(self, part: int, number: int) -> None:
+        """Await no more what the local server works on, unless the next one waits for that."""
+        if self._is_concurrent:
+            self._endpoint.drop(self._servers[part], number)
+
+    def _stop_work(self) -> None:
+        """Call the rule's ``stop``, if there is one."""
+        if self._stopper is not None:
+            self._endpoint.drop(self._stopper, self._stops)  # the response to the last one is not used
+            self._stops += 1
+            self._endpoint.call(self._stopper, self._stops, _NO_FIELDS[self._endpoint.ros])

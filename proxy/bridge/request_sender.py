@@ -1,0 +1,115 @@
+"""Sender of the requests of one imported service, to all remote servers or to some.
+
+I/O: the overlay's member and publisher send.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from gdp.client.publisher import Publisher
+from gdp.errors import LocalError
+from gdp.names import Name
+from gdp.service.dispatch import Ask
+from gdp.service.ordered import Word
+from proxy.bridge.goals import Goals
+from proxy.bridge.outgoing import Effect, ForAll, wire_of
+from proxy.bridge.parts import CANCEL, RESULT
+from proxy.bridge.server_discovery import ServerCalls
+from proxy.bridge.site import Site
+
+__all__ = ["RequestSender"]
+
+
+class RequestSender:
+    """Sends what the calls of each part decide; what is for all servers waits for room on their common stream.
+
+    Args:
+        service: name of the service.
+        goals: of an action.
+        publisher: the stream that all servers hear.
+    """
+
+    def __init__(
+        self, *, site: Site, service: Name, calls: Sequence[ServerCalls], goals: Goals | None, publisher: Publisher
+    ) -> None:
+        self._site = site
+        self._service = service
+        self._calls = calls
+        self._goals = goals
+        self._publisher = publisher
+        self._for_all = ForAll()
+        self._goal_of: dict[tuple[int, int], bytes] = {}  # part and call -> goal, while under way
+
+    @property
+    def is_ready(self) -> bool:
+        """Return whether something that waited can be sent now."""
+        return bool(self._for_all) and self._publisher.has_room()
+
+    def note_goal(self, part: int, call: int, goal: bytes) -> None:
+        """Note which goal a call is about."""
+        self._goal_of[part, call] = goal
+
+    def forget(self, part: int, call: int, *, is_cancelled: bool) -> None:
+        """Forget a call that has ended.
+
+        Args:
+            is_cancelled: its request is not sent any more.
+        """
+        self._goal_of.pop((part, call), None)
+        if is_cancelled:
+            self._for_all.end(part, call)
+
+    def clear(self) -> None:
+        """Drop what waits."""
+        self._for_all.clear()
+
+    def flush(self, now_s: float) -> None:
+        """Send what was decided, as far as there is room."""
+        for part, dispatch in enumerate(self._calls):
+            while effects := dispatch.take():
+                for effect in effects:
+                    whom = effect.servers if isinstance(effect, Ask) else effect.server and (effect.server,)
+                    if whom is None and not isinstance(effect, Word):
+                        self._for_all.add(part, effect)
+                    for server in whom or ():
+                        self._send_to(server, part, effect, now_s)
+        while self.is_ready:
+            self._send_to_all(*self._for_all.take(), now_s)
+
+    def _send_to_all(self, part: int, effect: Effect, now_s: float) -> None:
+        servers = self._calls[part].servers
+        if isinstance(effect, Ask):
+            if effect.call not in self._calls[part]:
+                return  # of a log that is over
+            self._note_holders(part, effect.call, set(servers))
+        try:
+            wire = wire_of(part, effect)
+            self._publisher.publish(wire)
+            self._site.traffic.sent(len(wire))
+        except LocalError as error:
+            self._refuse(part, effect, servers, str(error), now_s)
+
+    def _send_to(self, server: Name, part: int, effect: Effect, now_s: float) -> None:
+        again = None
+        if isinstance(effect, Ask) and self._goals is not None:
+            goal = self._goal_of.get((part, effect.call), b"")
+            if part == RESULT and server not in self._goals.holders(goal):
+                again = self._goals.again(goal)  # a server that came later works on the goal as well
+            self._note_holders(part, effect.call, {server})
+        try:
+            for wire in (*([] if again is None else [again]), wire_of(part, effect)):
+                self._site.member.ask(self._service, server, wire)
+                self._site.traffic.sent(len(wire))
+        except LocalError as error:
+            self._refuse(part, effect, [server], str(error), now_s)
+
+    def _refuse(self, part: int, effect: Effect, servers: list[Name], reason: str, now_s: float) -> None:
+        self._site.traffic.unread += 1
+        if isinstance(effect, Ask):
+            for server in servers:
+                self._calls[part].refused(effect.call, server, reason, now_s)
+
+    def _note_holders(self, part: int, call: int, servers: set[Name]) -> None:
+        if self._goals is not None and part != CANCEL:
+            self._goals.holds(self._goal_of[part, call], servers)
