@@ -7,4 +7,5 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 .venv/bin/ruff format --check --quiet --exclude "*.md" .
 .venv/bin/mypy
 .venv/bin/lint-imports
+scripts/lock.sh --check
 .venv/bin/python scripts/readability.py --check
