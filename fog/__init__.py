@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from gdp.extras import require_extra
+
 if TYPE_CHECKING:
     from fog.launch.description import DeclareLaunchArgument, LaunchConfiguration, LaunchDescription, Node
     from fog.launch.entity import FogCluster
@@ -21,6 +23,8 @@ __all__ = [
     "Node",
     "SpotMachine",
 ]
+
+require_extra("fog", ("numpy", "rich", "rosbags"), "fog")
 
 
 def __getattr__(name: str) -> object:

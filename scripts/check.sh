@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# What can be said about the source without running it: style, types, and that no room imports upwards.
+# Static checks: style, types, import rules, and readability figures that never get worse.
 set -euo pipefail
 
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -7,3 +7,5 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 .venv/bin/ruff format --check --quiet --exclude "*.md" .
 .venv/bin/mypy
 .venv/bin/lint-imports
+scripts/lock.sh --check
+.venv/bin/python scripts/readability.py --check

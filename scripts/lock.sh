@@ -3,11 +3,15 @@
 #
 #   scripts/lock.sh                        newest versions that pyproject.toml allows
 #   scripts/lock.sh --upgrade-package X    X alone; further arguments go to uv
+#   scripts/lock.sh --check                fails if pyproject.toml changed since the locks were written; needs no network
 #
 # Needs uv (pip install uv; UV may name it) and a package index. All locks agree on versions: they are parts of dev.lock.
 set -euo pipefail
 
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
+if [[ "${1-}" == --check ]]; then
+    exec python3 scripts/supply/lock_stamp.py --check
+fi
 uv=${UV:-uv}
 command -v "$uv" >/dev/null || { printf 'lock: uv is needed (pip install uv)\n' >&2; exit 2; }
 
@@ -20,6 +24,7 @@ compile() {
 
 [[ $# -gt 0 ]] || rm -f requirements/dev.lock
 compile dev.lock --all-extras "$@" pyproject.toml
-compile run.lock -c requirements/dev.lock pyproject.toml
-compile ros2.lock -c requirements/dev.lock --extra ros2 pyproject.toml
+compile run.lock -c requirements/dev.lock --extra proxy --extra fog --extra scapy pyproject.toml
+compile ros2.lock -c requirements/dev.lock --extra proxy --extra fog --extra scapy --extra ros2 pyproject.toml
 compile build.lock -c requirements/dev.lock requirements/build.in
+python3 scripts/supply/lock_stamp.py --write

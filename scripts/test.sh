@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Everything that must hold: style, types, floors, and all tests, those with real namespaces included.
+# Static checks and all tests, those with real namespaces included.
 #
 #   sudo scripts/test.sh
 #   scripts/test.sh -k certificate                 arguments go to pytest
@@ -16,8 +16,8 @@ if [[ $(id -u) -ne 0 ]]; then
     PYTEST_DEBUG_TEMPROOT=$(mktemp -d)
     export PYTEST_DEBUG_TEMPROOT
 fi
-beside=$(mktemp)
-trap 'rm -rf "$beside" ${PYTEST_DEBUG_TEMPROOT:+"$PYTEST_DEBUG_TEMPROOT"}' EXIT
+scratch=$(mktemp -d)
+trap 'rm -rf "$scratch" ${PYTEST_DEBUG_TEMPROOT:+"$PYTEST_DEBUG_TEMPROOT"}' EXIT
 
 # run <argument>...: pytest, as root of a user namespace where we are not root and that is allowed
 run() {
@@ -32,26 +32,30 @@ if [[ $# -gt 0 ]]; then
     run "$@"
     exit
 fi
-# Tests with namespaces mostly wait for processes, so two lanes run side by side, equally long. Timers of nodes that
-# share two cores with other tests may starve: what failed runs once more with nothing beside it, and is told.
+# Tests with namespaces mostly wait for processes, so two lanes of equal length run in parallel. A test that fails runs once
+# more alone, to tell an unsteady test from a broken one. Both fail the run, unless tests/quarantine.yaml lists the test.
 clusters=(netns_tests/test_{bench_replicas,experiments,fog,fog_demo,leaving,local_provider,replica_gateway}.py)
 declare -A lanes=(["clusters"]="tests ${clusters[*]}" ["spaces"]="netns_tests ${clusters[*]/#/--ignore=}")
+# lane <name> <report> <argument>...: runs the tests of a lane and writes a JUnit file
 # shellcheck disable=SC2086  # words
-lane() { run -o "cache_dir=.pytest_cache/$1" ${lanes[$1]} "${@:2}"; }
-lane clusters >"$beside" 2>&1 &
+lane() { run -o "cache_dir=.pytest_cache/$1" --junit-xml "$scratch/$1.$2.xml" ${lanes[$1]} "${@:3}"; }
+lane clusters first >"$scratch/clusters.log" 2>&1 &
 others=$!
 trap 'kill "$others" 2>/dev/null || true; exit 130' INT TERM
 failed=()
 declare -A ended=()
-lane spaces || { ended[spaces]=$?; failed+=(spaces); }
+lane spaces first || { ended[spaces]=$?; failed+=(spaces); }
 wait "$others" || { ended[clusters]=$?; failed+=(clusters); }
-cat "$beside"
+cat "$scratch/clusters.log"
+status=0
 for which in "${failed[@]}"; do
-    printf 'failed beside other tests, so once more alone: %s\n' "$which"
-    if [[ ${ended[$which]} -eq 1 ]]; then
-        lane "$which" --last-failed --last-failed-no-failures none
-    else
-        lane "$which"  # pytest itself did not come to its end
+    if [[ ${ended[$which]} -ne 1 ]]; then
+        printf 'pytest did not finish (exit status %d): %s\n' "${ended[$which]}" "$which"
+        status=1
+        continue
     fi
-    printf 'passed alone: unsteady, look at the failures above\n'
+    printf 'failed tests run once more alone: %s\n' "$which"
+    lane "$which" rerun --last-failed --last-failed-no-failures none || true  # rerun_check.py reads the outcome
+    .venv/bin/python scripts/rerun_check.py --first "$scratch/$which.first.xml" --rerun "$scratch/$which.rerun.xml" || status=1
 done
+exit "$status"

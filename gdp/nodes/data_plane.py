@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.extras import require_extra
 from gdp.ports.linked import LinkedPlane
 from gdp.ports.raw import RawPlane
 from gdp.switch.table import Table
@@ -46,9 +47,11 @@ def choose_plane(wanted: str, ifnames: Sequence[str], table: Table, entries_max:
         entries_max: most entries that the kernel is to hold.
 
     Raises:
+        MissingExtraError: Scapy is asked for and not installed.
         LocalError: a port cannot be opened, or what was asked for by name is refused, and why.
     """
     if wanted == "scapy":
+        require_extra("scapy", ("scapy",), "data plane scapy")
         from gdp.ports.scapy_plane import ScapyPlane
 
         return Chosen(ScapyPlane(ifnames, table), "scapy")

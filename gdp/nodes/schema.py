@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Final, TypeVar, get_args
+from typing import Annotated, ClassVar, Final, TypeVar, get_args
 
 import orjson
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, ValidationInfo
@@ -50,7 +50,14 @@ T = TypeVar("T")
 
 
 class Section(BaseModel):
-    """One mapping of a configuration file: immutable, and without a key that is not stated here."""
+    """One mapping of a configuration file: immutable, and without a key that is not stated here.
+
+    Attributes:
+        renamed: old keys of this mapping with their new names; an old key is an error that names the new one. A new
+            name may be a path such as ``limits.frames``.
+    """
+
+    renamed: ClassVar[Mapping[str, str]] = {}
 
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
@@ -183,8 +190,7 @@ def _translated(model: type[Section], source: YamlSource, details: list[ErrorDet
         if detail["type"] == "missing":
             yield source.error(key, "required, but not there")
         elif detail["type"] == "extra_forbidden":
-            known = ", ".join(_keys_of(_section_at(model, key[:-1])))
-            yield source.error(_shown(source, key), f"unknown key; expected one of {known}", at_key=True)
+            yield source.error(_shown(source, key), _unknown_key(_section_at(model, key[:-1]), key[-1]), at_key=True)
         elif message.startswith(_SHOULD_BE):
             wanted = message.removeprefix(_SHOULD_BE).removeprefix("a valid ")
             wrong_kind.setdefault(_shown(source, key), ([], detail["input"]))[0].append(_WORDS.get(wanted, wanted))
@@ -193,6 +199,14 @@ def _translated(model: type[Section], source: YamlSource, details: list[ErrorDet
     for key, (wanted_each, found) in wrong_kind.items():
         instead = f", not {found!r}" if isinstance(found, str | int | float | None) else ""
         yield source.error(key, f"expected {' or '.join(wanted_each)}{instead}")
+
+
+def _unknown_key(section: type[Section], key: str | int) -> str:
+    """Return the error for a key that the section does not have."""
+    new_name = section.renamed.get(str(key))
+    if new_name is not None:
+        return f"this key is now called {new_name}"
+    return f"unknown key; expected one of {', '.join(_keys_of(section))}"
 
 
 def _shown(source: YamlSource, key: KeyPath) -> KeyPath:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import audit
+import lock_stamp
 import pytest
 import release
 import sbom
@@ -107,9 +108,31 @@ def test_each_dependency_is_pinned_in_a_version_that_is_allowed(name: str, extra
     for pin in LOCKS[name]:
         versions.setdefault(pin.name, []).append(pin.version)
     for requirement in map(Requirement, wanted):
+        if requirement.name == project["name"]:
+            continue  # an extra that includes another extra of this project
         pinned = versions.get(canonicalize_name(requirement.name), [])
         assert pinned, requirement
         assert all(requirement.specifier.contains(each, prereleases=True) for each in pinned), requirement
+
+
+def test_each_lock_was_written_for_the_present_dependencies() -> None:
+    assert lock_stamp.outdated_locks(ROOT) == []
+
+
+def test_a_changed_dependency_makes_each_lock_outdated(tmp_path: Path) -> None:
+    shutil.copytree(ROOT / "requirements", tmp_path / "requirements")
+    text = (ROOT / "pyproject.toml").read_text()
+    (tmp_path / "pyproject.toml").write_text(text.replace('"typer>=', '"typer>=99.'))
+    assert lock_stamp.outdated_locks(tmp_path) == sorted(LOCKS)
+    lock_stamp.stamp_locks(tmp_path)
+    assert lock_stamp.outdated_locks(tmp_path) == []
+
+
+@needs_toml
+def test_a_switch_needs_no_ros_package_and_no_scapy() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    names = {canonicalize_name(Requirement(each).name) for each in project["dependencies"]}
+    assert not names & {"scapy", "rosbags", "numpy", "apsw", "lz4", "backports-zstd"}
 
 
 def test_setup_installs_by_hash_alone() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 
@@ -10,6 +11,7 @@ from gdp.errors import ConfigError
 from gdp.limits import DEAD_S, HELLO_S, RIB_NAMES_PER_SENDER
 from gdp.names import Name
 from gdp.nodes.config import PortConfig, RibConfig, SwitchConfig
+from gdp.nodes.schema import Section, load
 from gdp.nodes.yaml_source import ConfigFileError
 
 SWITCH = """\
@@ -149,3 +151,38 @@ def test_a_shortened_name_is_refused(place: Path) -> None:
     (place / "rib.yaml").write_text(f"{SWITCH}iface: rib\nupper: 75e…0fc\n")
     with pytest.raises(ConfigFileError, match=r"rib\.yaml:4:8: upper: a name is written as 64 hex digits"):
         RibConfig.load(place / "rib.yaml")
+
+
+class _Inner(Section):
+    renamed: ClassVar[dict[str, str]] = {"credit": "limits.frames"}
+
+    frames: int = 0
+
+
+class _Outer(Section):
+    renamed: ClassVar[dict[str, str]] = {"wait": "timeout_s"}
+
+    timeout_s: int = 0
+    inner: _Inner = _Inner()
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("wait: 1\n", "renamed.yaml:1:1: wait: this key is now called timeout_s"),
+        ("inner:\n  credit: 1\n", "renamed.yaml:2:3: inner.credit: this key is now called limits.frames"),
+    ],
+)
+def test_a_renamed_key_is_refused_with_its_new_name(tmp_path: Path, text: str, error: str) -> None:
+    path = tmp_path / "renamed.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as refused:
+        load(_Outer, path)
+    assert error in str(refused.value)
+
+
+def test_a_key_that_never_existed_is_still_refused_with_the_known_keys(tmp_path: Path) -> None:
+    path = tmp_path / "renamed.yaml"
+    path.write_text("speed: 1\n")
+    with pytest.raises(ConfigError, match="unknown key; expected one of timeout_s, inner"):
+        load(_Outer, path)

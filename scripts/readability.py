@@ -1,0 +1,368 @@
+#!/usr/bin/env python3
+"""Readability figures of the source, printed and compared with committed limits.
+
+    scripts/readability.py                   print the figures
+    scripts/readability.py --check           fail if a figure is worse than its limit in scripts/readability.json
+    scripts/readability.py --save            write the present figures as limits
+    scripts/readability.py --words           list each listed word as file:line:column: word
+    scripts/readability.py --names           list method names that many packages define
+    scripts/readability.py --docstrings      list public definitions without docstring
+    scripts/readability.py --json            print the figures as JSON
+
+``scripts/readability.json`` holds the limits, the goals, the listed words and the exceptions, each with its reason.
+Exit status: 0 all limits hold, 1 a figure is worse, 2 wrong usage.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import re
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import grimp
+import networkx
+from rich.console import Console
+from rich.table import Table
+
+ROOT = Path(__file__).resolve().parent.parent
+SETTINGS = ROOT / "scripts" / "readability.json"
+PRODUCT = ("gdp", "proxy", "fog")
+SCANNED = frozenset({".cff", ".in", ".lua", ".md", ".py", ".service", ".sh", ".toml", ".yaml", ".yml"})
+HIGHER_IS_BETTER = frozenset({"tests"})
+
+_TOKEN = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
+_CODE_SPAN = re.compile(r"`[^`]*`")
+_LIST_ITEM = re.compile(r"\s*(?:[-*+]|\d+\.)\s+")
+_SENTENCE_END = re.compile(r"(?<=[.!?])[\"')*_]*\s+(?=[\"'(*_`\[]*[A-Z0-9`])")
+_ABBREVIATION = re.compile(r"\b(?:e\.g|i\.e|etc|cf|vs)\.")
+
+
+class Place(NamedTuple):
+    """Position of a finding in a file; line and column count from 1."""
+
+    path: str
+    line: int
+    column: int
+    text: str
+
+    def __str__(self) -> str:
+        """Return ``path:line:column: text``."""
+        return f"{self.path}:{self.line}:{self.column}: {self.text}"
+
+
+class Settings(NamedTuple):
+    """Content of readability.json.
+
+    Attributes:
+        words: every form of a listed word, lower case.
+        allowed: patterns of text in which a listed word may stand.
+        protocol_names: method names that an interface prescribes.
+        limits: worst accepted value of each figure.
+        goals: value to reach for each figure.
+    """
+
+    words: frozenset[str]
+    allowed: tuple[re.Pattern[str], ...]
+    protocol_names: frozenset[str]
+    limits: dict[str, float]
+    goals: dict[str, float]
+
+    @classmethod
+    def from_file(cls, path: Path) -> Settings:
+        """Read the settings.
+
+        Raises:
+            OSError: the file cannot be read.
+            ValueError: it is not the expected JSON.
+        """
+        data = json.loads(path.read_text())
+        try:
+            return cls(
+                frozenset(form for forms in data["words"].values() for form in forms),
+                tuple(re.compile(each["pattern"]) for each in data["allowed"]),
+                frozenset(data["protocol_names"]),
+                data["limits"],
+                data["goals"],
+            )
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"{path}: wrong or missing key: {error}") from error
+
+
+def tracked_files(root: Path) -> list[Path]:
+    """Return the files that git tracks or would track, in order."""
+    command = ["git", "-C", str(root), "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    return [path for name in sorted(set(listed.split("\0"))) if name and (path := root / name).is_file()]
+
+
+def _blank(match: re.Match[str]) -> str:
+    return " " * len(match[0])
+
+
+def words_in(text: str, path: str, settings: Settings) -> Iterator[Place]:
+    """Yield each listed word of a text; identifiers are split at underscores and capitals.
+
+    Text of the changelog inside backticks quotes old names and is skipped.
+    """
+    if path == "CHANGELOG.md":
+        text = _CODE_SPAN.sub(_blank, text)
+    for number, line in enumerate(text.splitlines(), 1):
+        shown = line
+        for pattern in settings.allowed:
+            shown = pattern.sub(_blank, shown)
+        for match in _TOKEN.finditer(shown):
+            if match[0].lower() in settings.words:
+                yield Place(path, number, match.start() + 1, match[0])
+
+
+def listed_words(root: Path, files: Iterable[Path], settings: Settings) -> list[Place]:
+    """Return each listed word in the names and the content of source and documentation files."""
+    found: list[Place] = []
+    for file in files:
+        name = file.relative_to(root).as_posix()
+        if file.suffix not in SCANNED or name.startswith("tests/corpus/"):
+            continue
+        found += [Place(name, 0, 0, f"file name: {each.text}") for each in words_in(name, "", settings)]
+        found += words_in(file.read_text(encoding="utf-8", errors="replace"), name, settings)
+    return found
+
+
+def sentences(markdown: str) -> list[str]:
+    """Return the sentences of running text and lists; headings, tables, code blocks and images are left out."""
+    blocks: list[list[str]] = [[]]
+    fence = ""
+    for line in markdown.splitlines():
+        bare = line.strip()
+        if bare.startswith(("```", "~~~")):
+            fence = "" if fence and bare.startswith(fence) else fence or bare[:3]
+            blocks.append([])
+        elif fence or not bare or bare.startswith(("#", "|", "<", "![")) or re.fullmatch(r"[-=*_ ]+", bare):
+            blocks.append([])
+        elif item := _LIST_ITEM.match(line):
+            blocks.append([line[item.end() :].strip()])
+        else:
+            blocks[-1].append(bare)
+    found: list[str] = []
+    for block in blocks:
+        text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", " ".join(block))
+        text = _ABBREVIATION.sub(lambda match: match[0].replace(".", ""), _CODE_SPAN.sub("Code", text))
+        found += [each for each in _SENTENCE_END.split(text) if word_count(each)]
+    return found
+
+
+def word_count(sentence: str) -> int:
+    """Return the number of words, separated by blanks; signs alone do not count."""
+    return sum(any(sign.isalnum() for sign in word) for word in sentence.split())
+
+
+def sentence_lengths(root: Path) -> list[int]:
+    """Return the words of each sentence of README.md and docs, longest first."""
+    pages = [root / "README.md", *sorted((root / "docs").rglob("*.md"))]
+    return sorted((word_count(each) for page in pages for each in sentences(page.read_text())), reverse=True)
+
+
+Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+_FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
+
+
+def _decorators(node: Definition) -> set[str]:
+    return {ast.unparse(each).rpartition(".")[2] for each in node.decorator_list}
+
+
+def public_definitions(tree: ast.Module) -> Iterator[tuple[str, Definition]]:
+    """Yield public classes and functions of a module, and public methods of its public classes."""
+    for node in tree.body:
+        if not isinstance(node, (*_FUNCTIONS, ast.ClassDef)) or node.name.startswith("_"):
+            continue
+        yield node.name, node
+        if isinstance(node, ast.ClassDef):
+            for method in node.body:
+                if isinstance(method, _FUNCTIONS) and not method.name.startswith("_"):
+                    yield f"{node.name}.{method.name}", method
+
+
+def undocumented(trees: dict[str, ast.Module]) -> list[Place]:
+    """Return public definitions without docstring; overloads and setters share that of the first definition."""
+    return [
+        Place(path, node.lineno, node.col_offset + 1, name)
+        for path, tree in trees.items()
+        for name, node in public_definitions(tree)
+        if ast.get_docstring(node) is None and not _decorators(node) & {"overload", "override", "setter"}
+    ]
+
+
+def shared_names(trees: dict[str, ast.Module], excepted: frozenset[str]) -> list[tuple[int, str]]:
+    """Return public method names with the number of product packages that define them, most first."""
+    packages: dict[str, set[str]] = defaultdict(set)
+    for path, tree in trees.items():
+        if path.split("/", 1)[0] not in PRODUCT:
+            continue
+        for name, node in public_definitions(tree):
+            method = name.rpartition(".")[2]
+            is_noun = bool(_decorators(node) & {"property", "cached_property", "setter"})
+            if "." in name and not is_noun and method not in excepted:
+                packages[method].add(path.rpartition("/")[0])
+    return sorted(((len(places), name) for name, places in packages.items()), reverse=True)
+
+
+def import_circles() -> list[list[str]]:
+    """Return the groups of product modules that import each other, those imported late included."""
+    graph = grimp.build_graph(*PRODUCT, cache_dir=None)
+    arrows = networkx.DiGraph()
+    for module in graph.modules:
+        arrows.add_edges_from((module, other) for other in graph.find_modules_directly_imported_by(module))
+    return [sorted(group) for group in networkx.strongly_connected_components(arrows) if len(group) > 1]
+
+
+def broken_import_rules(root: Path) -> int:
+    """Return how many import rules of pyproject.toml are broken.
+
+    Raises:
+        RuntimeError: import-linter did not report.
+    """
+    tool = Path(sys.executable).parent / "lint-imports"
+    report = subprocess.run([tool, "--no-cache"], cwd=root, capture_output=True, text=True, check=False)
+    match = re.search(r"Contracts: \d+ kept, (\d+) broken", report.stdout)
+    if match is None:
+        raise RuntimeError(f"lint-imports did not report: {report.stdout[-500:]}{report.stderr[-500:]}")
+    return int(match[1])
+
+
+def _line_count(files: Iterable[Path], root: Path, folders: tuple[str, ...]) -> int:
+    chosen = (file for file in files if file.suffix in (".py", ".sh", ".lua"))
+    return sum(len(file.read_text().splitlines()) for file in chosen if file.relative_to(root).parts[0] in folders)
+
+
+def _test_count(files: Iterable[Path], root: Path) -> int:
+    return sum(
+        isinstance(node, _FUNCTIONS) and node.name.startswith("test_")
+        for file in files
+        if file.suffix == ".py" and file.relative_to(root).parts[0] in ("tests", "netns_tests")
+        for node in ast.walk(ast.parse(file.read_text()))
+    )
+
+
+class Report(NamedTuple):
+    """Figures by name, and the places behind them."""
+
+    figures: dict[str, float]
+    words: list[Place]
+    undocumented: list[Place]
+    names: list[tuple[int, str]]
+    circles: list[list[str]]
+
+
+def measure(root: Path, settings: Settings) -> Report:
+    """Measure every figure of the source at ``root``; takes some seconds."""
+    files = tracked_files(root)
+    parts = (*PRODUCT, "scripts")
+    trees = {
+        file.relative_to(root).as_posix(): ast.parse(file.read_text())
+        for file in files
+        if file.suffix == ".py" and file.relative_to(root).parts[0] in parts
+    }
+    words = listed_words(root, files, settings)
+    lengths = sentence_lengths(root)
+    longest = lengths[: max(1, len(lengths) // 10)]
+    bare = undocumented(trees)
+    names = shared_names(trees, settings.protocol_names)
+    circles = import_circles()
+    figures: dict[str, float] = {
+        "listed words": len(words),
+        "words a sentence": round(sum(lengths) / max(1, len(lengths)), 1),
+        "words a sentence, longest tenth": round(sum(longest) / max(1, len(longest)), 1),
+        "public definitions without docstring": len(bare),
+        "import circles": len(circles),
+        "broken import rules": broken_import_rules(root),
+        "packages that define one method name": names[0][0] if names else 0,
+        "product and script lines": _line_count(files, root, parts),
+        "tests": _test_count(files, root),
+    }
+    return Report(figures, words, bare, names, circles)
+
+
+def is_worse(figure: str, value: float, limit: float) -> bool:
+    """Return whether ``value`` breaks ``limit``."""
+    return value < limit if figure in HIGHER_IS_BETTER else value > limit
+
+
+def regressions(figures: dict[str, float], limits: dict[str, float]) -> list[str]:
+    """Return one line for each figure that is worse than its limit or has none."""
+    found: list[str] = []
+    for figure, value in figures.items():
+        if figure not in limits:
+            found.append(f"{figure}: no limit in {SETTINGS.name} (run scripts/readability.py --save)")
+        elif is_worse(figure, value, limits[figure]):
+            found.append(f"{figure}: {value:g}, limit {limits[figure]:g}")
+    return found
+
+
+def save_limits(path: Path, figures: dict[str, float]) -> None:
+    """Write the figures as limits; every other key of the file stays."""
+    data: dict[str, Any] = json.loads(path.read_text())
+    data["limits"] = figures
+    path.write_text(json.dumps(data, indent=2) + "\n")
+
+
+def _table(report: Report, settings: Settings) -> Table:
+    table = Table("figure", "goal", title="readability", title_justify="left")
+    table.add_column("now", justify="right")
+    table.add_column("limit", justify="right")
+    for figure, value in report.figures.items():
+        limit, goal = settings.limits.get(figure), settings.goals.get(figure)
+        style = "red" if limit is None or is_worse(figure, value, limit) else ""
+        shown = "" if goal is None else f"{'>=' if figure in HIGHER_IS_BETTER else '<='} {goal:g}"
+        table.add_row(figure, shown, f"{value:g}", "" if limit is None else f"{limit:g}", style=style)
+    return table
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; return its exit status."""
+    head, _, text = (__doc__ or "").partition("\n")
+    parser = argparse.ArgumentParser(
+        description=head, epilog=text, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--check", action="store_true", help="fail if a figure is worse than its limit")
+    parser.add_argument("--save", action="store_true", help="write the present figures as limits")
+    parser.add_argument("--words", action="store_true", help="list each place of a listed word")
+    parser.add_argument("--names", action="store_true", help="list method names that several packages define")
+    parser.add_argument("--docstrings", action="store_true", help="list public definitions without docstring")
+    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
+    options = parser.parse_args(argv)
+    console = Console(highlight=False, soft_wrap=True)
+    try:
+        settings = Settings.from_file(SETTINGS)
+    except (OSError, ValueError) as error:
+        parser.error(str(error))
+    report = measure(ROOT, settings)
+    if options.json:
+        print(json.dumps(report.figures, indent=2))
+    elif not options.words and not options.names and not options.docstrings:
+        console.print(_table(report, settings))
+        for circle in report.circles:
+            console.print("import circle:", ", ".join(circle), markup=False)
+    listed = (report.words if options.words else []) + (report.undocumented if options.docstrings else [])
+    for place in listed:
+        console.print(str(place), markup=False)
+    if options.names:
+        for count, name in report.names[:40]:
+            console.print(f"{count:3} {name}", markup=False)
+    if options.save:
+        save_limits(SETTINGS, report.figures)
+    elif options.check:
+        worse = regressions(report.figures, settings.limits)
+        for line in worse:
+            print(f"readability: worse: {line}", file=sys.stderr)
+        return 1 if worse else 0
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

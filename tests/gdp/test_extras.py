@@ -1,0 +1,62 @@
+"""Base installation: a switch runs without the packages of the extras; a missing extra is named."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from gdp.extras import MissingExtraError, require_extra
+from tests.pages import ROOT
+
+_BLOCKER = """
+import sys
+
+class Blocker:
+    blocked = {"apsw", "backports", "lz4", "numpy", "pybase64", "rosbags", "scapy"}
+
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in self.blocked:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+        return None
+
+sys.meta_path.insert(0, Blocker())
+"""
+
+_NETWORK = """
+from gdp.simulation.topology import ring5
+from gdp.simulation.world import World
+assert World(ring5()).settle()
+"""
+
+
+def run_without_extras(code: str) -> subprocess.CompletedProcess[str]:
+    """Run code in a new interpreter that finds no package of the extras."""
+    command = [sys.executable, "-c", _BLOCKER + code]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=120)
+
+
+@pytest.mark.parametrize("module", ["gdp.cli.switch", "gdp.cli.rib", "gdp.cli.gdp"])
+def test_a_command_of_gdp_shows_its_help_without_the_extras(module: str) -> None:
+    done = run_without_extras(f"sys.argv = ['x', '--help']\nimport {module}\n{module}.main()")
+    assert done.returncode == 0, done.stderr
+    assert "Usage" in done.stdout
+
+
+def test_switches_in_memory_forward_without_the_extras() -> None:
+    done = run_without_extras(_NETWORK)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_scapy_data_plane_names_its_extra_when_scapy_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gdp.extras.find_spec", lambda module: None)
+    with pytest.raises(MissingExtraError, match=r"needs scapy \(run: pip install 'gdp-ros\[scapy\]'\)"):
+        require_extra("scapy", ("scapy",), "data plane scapy")
+
+
+@pytest.mark.parametrize("package", ["proxy", "fog"])
+def test_a_package_names_its_extra_when_it_is_missing(package: str) -> None:
+    code = "import importlib.util\nimportlib.util.find_spec = lambda name: None\n"
+    done = run_without_extras(code + f"import {package}")
+    assert f"pip install 'gdp-ros[{package}]'" in done.stderr
