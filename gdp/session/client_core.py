@@ -72,7 +72,7 @@ class ClientCore:
         self._servers: dict[Name, int] = {}  # and in which life
         self._leaving: set[Name] = set()
         self._unasked: list[Call] = []  # calls that wait for a server
-        self._for_all: deque[tuple[Dispatch[Response], Effect]] = deque()  # wait for room on the common stream
+        self._for_all: deque[tuple[Dispatch[Response], Effect]] = deque()  # wait for the window of the common stream
         self._follow_at_s = 0.0
 
     @property
@@ -208,7 +208,7 @@ class ClientCore:
         return dispatch
 
     def _send_out(self, now_s: float) -> None:
-        """Send what was decided; what all servers get waits for room on the stream that they all hear."""
+        """Send what was decided; what all servers get waits for the window of their common stream."""
         for dispatch in self._dispatches.values():
             while effects := dispatch.take():
                 for effect in effects:

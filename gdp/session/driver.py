@@ -1,11 +1,11 @@
-"""Driver of a session for programs with threads: whoever waits drives the node.
+"""Driver of a session for programs with threads: the thread that waits drives the node.
 
 Layer: I/O. One thread at a time leads: it holds the lock, waits for frames, and lets the core distribute them.
 
     a thread that waits for a message   leads until it has one; so a message wakes one thread, not two
     further threads that wait           follow: the leader wakes them when their condition has come true
-    no thread waits                     the background thread leads, once nobody has for ``_GRACE_S``
-    a thread that publishes             does it itself if nobody leads; else it hands the message to the leader
+    no thread waits                     the background thread leads, once none has for ``_GRACE_S``
+    a thread that publishes             does it itself if no thread leads; else it hands the message to the leader
 
 Hand-over of commands is free of lost wake-ups: who finds the lock taken has queued its command before, and who gives
 the lock back looks at the queue afterwards (flat combining; Hendler et al., SPAA 2010).
@@ -68,19 +68,23 @@ class _Wake:
         self._is_set = False
 
     def fileno(self) -> int:
+        """Return the descriptor that the runtime watches."""
         return self._fd
 
     def set(self) -> None:
+        """End the leader's wait; any thread may."""
         if not self._is_set:  # one wake-up for many commands
             self._is_set = True
             os.eventfd_write(self._fd, 1)
 
     def clear(self) -> None:
+        """Allow the leader to wait again."""
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self._fd)
-        self._is_set = False  # last: whoever sees it set has queued a command that the leader looks at next
+        self._is_set = False  # last: a thread that sees it set has queued a command that the leader looks at next
 
     def close(self) -> None:
+        """Close the descriptor."""
         os.close(self._fd)
 
 
@@ -252,14 +256,14 @@ class ThreadDriver:
     def _send(self, size_bytes: int) -> None:
         self._member.flush(time.monotonic())
         is_more = self._runtime.send()
-        while is_more and size_bytes > _SMALL_BYTES:  # what is confirmed meanwhile makes room for more
+        while is_more and size_bytes > _SMALL_BYTES:  # what is confirmed meanwhile opens the window further
             self._step(0.0)  # that second has passed: it does not wait
             is_more = self._runtime.send()
 
     # not leading
 
     def _follow(self, is_ready: Callable[[], bool], deadline_s: float | None) -> bool:
-        """Wait until the leader says that the condition came true, or that nobody leads; return whether it is true."""
+        """Wait until the leader says that the condition came true, or that none leads; return whether it is true."""
         follower = _Follower(is_ready)
         self._followers.append(follower)
         try:
@@ -273,7 +277,7 @@ class ThreadDriver:
             self._followers.remove(follower)
 
     def _drain_or_wake(self) -> None:
-        """Have the queued commands run: here if nobody leads, else by the leader."""
+        """Have the queued commands run: here if no thread leads, else by the leader."""
         while self._commands:
             if not self._lock.acquire(blocking=False):
                 if not self._is_closed:

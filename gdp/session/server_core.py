@@ -95,7 +95,7 @@ class ServerCore:
         self._give()
 
     def leave(self) -> None:
-        """Take no new requests: clients are told to ask other servers; what is under way is finished."""
+        """Take no new requests: clients learn to ask other servers; what is under way is finished."""
         self._is_leaving = True
         self._publisher.describe(LEAVING)
 
@@ -108,7 +108,7 @@ class ServerCore:
         self._member.withdraw(self._name)
 
     def timeout(self, now_s: float) -> None:
-        """Give up requests that nobody waits for."""
+        """Give up requests that no client waits for."""
         for each in self._serving.expired(now_s):
             if each.asked is not None:
                 self._respond(each.asked, ResponseFrame.failed(each.asked.call, "the server did not respond in time"))

@@ -101,11 +101,11 @@ class Publisher:
         """Publish a message.
 
         A reliable publisher waits while its window is full, so no reader loses a message to a fast publisher. What is
-        published while nobody reads is lost, unless the publisher is ``latched``; see ``wait_for_readers``.
+        published without a reader is lost, unless the publisher is ``latched``; see ``wait_for_readers``.
 
         Args:
             payload: at most ``MESSAGE_MAX_BYTES`` less 14.
-            timeout_s: longest wait for room; None: as long as it takes.
+            timeout_s: longest wait while the window is full; None: as long as it takes.
 
         Raises:
             SessionTimeoutError: the window stayed full.
@@ -164,7 +164,7 @@ class Publisher:
             lambda: publisher.has_room() or not publisher.is_wanted, _deadline_s(self._driver, timeout_s)
         ):
             raise SessionTimeoutError(
-                f"{self._label}: no room for {timeout_s:g} s, since a reader confirms too slowly; publish less, or with"
+                f"{self._label}: the window was full for {timeout_s:g} s, since a reader confirms too slowly; publish less, or with"
                 " reliable=False"
             )
 
@@ -581,7 +581,7 @@ def open_session(
     Args:
         node: the node's directory, as ``gdp keygen node`` and ``gdp cert issue`` made it, or a configuration file: a
             ``proxy.yaml``, of which a session uses ``identity``, ``domain``, ``iface``, ``delegations`` and ``state``.
-            Beside a directory ``robot/proxy`` it reads ``robot/proxy.yaml`` where there is one.
+            For a directory ``robot/proxy`` it reads ``robot/proxy.yaml`` where there is one.
         iface: device towards the switch. Default: the configuration's; else the directory's name and a 0 (``proxy0``),
             as ``attach`` of the switch makes it.
         root: certificate of the node's trust domain. Default: the configuration's; else ``root.crt`` of the directory.

@@ -76,8 +76,8 @@ def settings_of(
                 f"{path}: no node has its keys and membership here; make them with"
                 f" 'gdp keygen node {path} --role proxy' and 'gdp cert issue'"
             )
-        beside = next((file for suffix in _SUFFIXES if (file := path.with_name(path.name + suffix)).is_file()), None)
-        config = None if beside is None else load(SessionConfig, beside)
+        sibling = next((file for suffix in _SUFFIXES if (file := path.with_name(path.name + suffix)).is_file()), None)
+        config = None if sibling is None else load(SessionConfig, sibling)
         if config is not None and config.identity.resolve() == path.resolve():
             values = _values(config)
         else:

@@ -119,9 +119,13 @@ def test_a_message_above_the_limit_is_refused(pair: Simulated) -> None:
 @pytest.mark.parametrize("form", ["camera", "/camera", "hex", "name", "metadata"])
 def test_a_name_is_found_by_each_of_its_forms(pair: Simulated, form: str) -> None:
     session = pair.sessions["robot"]
-    (held,) = session.delegations
-    forms = {"hex": held.name.to_text(), "name": held.name, "metadata": Metadata({"kind": "topic", "name": "/camera"})}
-    assert session.publisher(forms.get(form, form)).name == held.name
+    (known,) = session.delegations
+    forms = {
+        "hex": known.name.to_text(),
+        "name": known.name,
+        "metadata": Metadata({"kind": "topic", "name": "/camera"}),
+    }
+    assert session.publisher(forms.get(form, form)).name == known.name
 
 
 def test_a_name_without_a_delegation_is_refused_with_what_to_do(pair: Simulated) -> None:
