@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import KW_ONLY, asdict, dataclass, field
 from typing import Literal
 
 from fog.hardware import Hardware
@@ -77,6 +77,7 @@ class ClusterPlan:
     nodes: tuple[CloudNode, ...]
     machines: tuple[Wanted, ...]
     carried: tuple[Carried, ...] = ()
+    _: KW_ONLY
     idle_s: float | None = None
     budget_usd: float | None = None
     availability: float | None = None
@@ -107,9 +108,9 @@ class ClusterPlan:
                 tuple(nodes),
                 tuple(machines),
                 tuple(carried),
-                items["idle_s"],
-                items["budget_usd"],
-                items.get("availability"),
+                idle_s=items["idle_s"],
+                budget_usd=items["budget_usd"],
+                availability=items.get("availability"),
             )
         except json.JSONDecodeError as error:
             raise LocalError(f"line {error.lineno}: JSON is expected: {error.msg}") from error

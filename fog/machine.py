@@ -6,7 +6,7 @@ Place: pure.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from enum import Enum
 
 from fog.offer import Offer
@@ -56,6 +56,7 @@ class Program:
     argv: tuple[str, ...]
     ready: str = ""
     environment: Mapping[str, str] = field(default_factory=dict)
+    _: KW_ONLY
     restarts: bool = True
     is_users: bool = False
 
@@ -91,6 +92,7 @@ class Machine:
     spec: MachineSpec
     state: MachineState
     started_unix_s: float
+    _: KW_ONLY
     address: str = ""
     leaves_at_unix_s: float | None = None
     reason: str = ""

@@ -5,7 +5,7 @@ Place: pure.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 from fog.hardware import Hardware
 
@@ -27,5 +27,6 @@ class Offer:
     region: str
     type_name: str
     hardware: Hardware
+    _: KW_ONLY
     is_spot: bool
     usd_per_hour: float

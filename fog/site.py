@@ -205,7 +205,7 @@ class _Settings(TypedDict):
     enrolment_address: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Site:
     """A site as the commands and the supervisor use it.
 
@@ -329,7 +329,16 @@ def peek_site(file: Path | None, state: Path | None = None) -> Iterator[Site]:
         return
     with tempfile.TemporaryDirectory(prefix="gdp-fog-") as empty:
         authority = Authority(folder / "domain", folder / "owner")
-        site = Site("000000", Path(empty), None, authority, (), None, None, "")
+        site = Site(
+            id="000000",
+            state=Path(empty),
+            file=None,
+            authority=authority,
+            robots=(),
+            revocations=None,
+            watch=None,
+            uplink="",
+        )
         if config is not None:
             site = replace(site, file=file, **_settings(config))
         yield site

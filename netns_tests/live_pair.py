@@ -41,10 +41,10 @@ from gdp.trust.right import Right
 from netns_tests.lifetimes import LEASE_S, LEASES, Lifetime, noted
 from proxy.endpoints.endpoint import proxy_node_name
 from ring.plan import Credentials, rib_yaml, switch_yaml
-from tests.pages import ROOT
 from tests.proxy.endpoints.dds_peers import CYCLONE
 from tests.proxy.endpoints.ros1_net import need_ros1
 from tests.proxy.endpoints.ros2_net import DOMAIN, Peer
+from tests.script_packages import PYTHON_PATH
 
 __all__ = ["PATIENCE_S", "Crossing", "Pair", "Proxy", "pair_of", "until"]
 
@@ -65,7 +65,7 @@ _ENVIRONMENT: Final = {
     "CYCLONEDDS_URI": CYCLONE,
     "ROS_MASTER_URI": _MASTER,
     "ROS_HOSTNAME": "127.0.0.1",
-    "PYTHONPATH": str(ROOT),
+    "PYTHONPATH": PYTHON_PATH,
 }
 _TOPOLOGY: Final = Topology(
     links=(Link("a", "b"),),
@@ -274,7 +274,7 @@ class Pair:
         """Start a command of ours on a machine; return it when it has said that it is ready."""
         words = [*self.spaces.command(machine, []), *self._environment(graph)]
         if graph in self._hidden:
-            words.append(f"PYTHONPATH={self._hide(self._hidden[graph])}{os.pathsep}{ROOT}")
+            words.append(f"PYTHONPATH={self._hide(self._hidden[graph])}{os.pathsep}{PYTHON_PATH}")
         with log.open("ab") as errors:
             process = subprocess.Popen(
                 [*words, sys.executable, "-m", *argv],
@@ -343,7 +343,7 @@ class Pair:
         machine = "a" if graph == "a" else "b"
         words = [*self.spaces.command(machine, []), *self._environment(graph)]
         if graph == "one":
-            logs = {"ROS_LOG_DIR": str(self.folder / "ros"), "PYTHONPATH": f"{need_ros1()}{os.pathsep}{ROOT}"}
+            logs = {"ROS_LOG_DIR": str(self.folder / "ros"), "PYTHONPATH": f"{need_ros1()}{os.pathsep}{PYTHON_PATH}"}
             node: Peer = Ros1Node(name, words, {**_ENVIRONMENT, **logs})
         else:
             node = Peer(name, words, _ENVIRONMENT)

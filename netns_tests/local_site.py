@@ -42,7 +42,7 @@ def until(is_met: Callable[[], object], what: str) -> None:
 def spec(name: str, region: str = "local-a", hardware: Hardware | None = None) -> MachineSpec:
     """Return what to ask for."""
     has = hardware or Hardware(2, 4.0)
-    return MachineSpec("test", name, Offer("local", region, "local.small", has, True, 0.01))
+    return MachineSpec("test", name, Offer("local", region, "local.small", has, is_spot=True, usd_per_hour=0.01))
 
 
 def machine_of(provider: LocalProvider, machine: str) -> Machine:

@@ -22,6 +22,7 @@ from gdp.host.processes import Process
 from gdp.host.run_registry import Runs
 from netns_tests.live_pair import until
 from tests.pages import ROOT
+from tests.script_packages import PYTHON_PATH
 
 pytestmark = pytest.mark.netns
 
@@ -67,7 +68,7 @@ def test_a_killed_run_is_taken_down_by_the_next() -> None:
 
 @pytest.mark.skipif(not has_server(), reason="neither redis-server nor valkey-server is installed")
 def test_the_disk_and_the_servers_of_a_killed_run_are_gone_after_the_next_sweep() -> None:
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT), str(ROOT / "scripts" / "bench")))}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((PYTHON_PATH, str(ROOT / "scripts" / "bench")))}
     argv = [sys.executable, "-m", "netns_tests.store_child"]
     pipe = subprocess.PIPE
     with subprocess.Popen(argv, stdin=pipe, stdout=pipe, text=True, cwd=ROOT, env=environment) as child:

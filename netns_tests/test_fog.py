@@ -20,6 +20,7 @@ from fog.supervisor.record import Record
 from netns_tests.local_site import PATIENCE_S
 from netns_tests.spaces import Space
 from tests.pages import ROOT
+from tests.script_packages import PYTHON_PATH
 
 pytestmark = pytest.mark.netns
 pytest.importorskip("rclpy", reason="needs the extra ros2")
@@ -38,7 +39,7 @@ class Fog:
             "ROS_DOMAIN_ID": "171",
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
             "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
-            "PYTHONPATH": str(ROOT),
+            "PYTHONPATH": PYTHON_PATH,
         }
 
     def run(self, *words: str) -> str:

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from tests.pages import ROOT, Block
+from tests.script_packages import PYTHON_PATH
 
 _COPY = """#!{python}
 import subprocess, sys
@@ -34,7 +35,7 @@ class Machines:
         (programs / "scp").write_text(_COPY.format(python=sys.executable, folder=str(folder)))
         (programs / "scp").chmod(0o755)
         path = os.pathsep.join([str(programs), str(Path(sys.executable).parent), os.environ["PATH"]])
-        self.environment = {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT)}
+        self.environment = {**os.environ, "PATH": path, "PYTHONPATH": PYTHON_PATH}
 
     def home_of(self, block: Block) -> Path:
         """Return the folder that stands for the machine which a block is about."""

@@ -6,9 +6,10 @@ import os
 
 from tests.pages import ROOT
 
-__all__ = ["share_script_packages"]
+__all__ = ["PYTHON_PATH", "share_script_packages"]
 
 _VARIABLE = "PYTHONPATH"
+PYTHON_PATH = os.pathsep.join((str(ROOT), str(ROOT / "scripts")))  # of processes with a path of their own
 
 
 def share_script_packages() -> None:

@@ -43,10 +43,10 @@ def aws_prices() -> AwsPrices:
     band: dict[tuple[str, str], int] = {}
     for region, prices in items["regions"].items():
         for name, (usd, savings_percent, interruptions) in prices.items():
-            offers.append(Offer("aws", region, name, types[name], False, usd))
+            offers.append(Offer("aws", region, name, types[name], is_spot=False, usd_per_hour=usd))
             if savings_percent is not None:
                 spot = round(usd * (1 - savings_percent / 100), 5)
-                offers.append(Offer("aws", region, name, types[name], True, spot))
+                offers.append(Offer("aws", region, name, types[name], is_spot=True, usd_per_hour=spot))
                 band[region, name] = interruptions
     return AwsPrices(tuple(offers), tuple(items["sources"]), tuple(items["bands"]), band)
 

@@ -32,5 +32,5 @@ def local_offers(regions: Sequence[str] = LOCAL_REGIONS) -> Iterator[Offer]:
     for place, region in enumerate(regions):
         for name, has in _TYPES.items():
             usd = (has.cpus * _USD_PER_CPU + has.gpus * _USD_PER_GPU) * (1 + place * _DEARER)
-            yield Offer("local", region, name, has, False, round(usd, 4))
-            yield Offer("local", region, name, has, True, round(usd * _SPOT, 4))
+            yield Offer("local", region, name, has, is_spot=False, usd_per_hour=round(usd, 4))
+            yield Offer("local", region, name, has, is_spot=True, usd_per_hour=round(usd * _SPOT, 4))

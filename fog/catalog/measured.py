@@ -28,10 +28,10 @@ def measured() -> Measured:
         for each in items["pairs"]
     )
     return Measured(
-        items["source"],
-        items["uptime_s"],
-        items["back_s"],
-        items["taken_share"],
-        pairs,
-        items["all_free_together"],
+        source=items["source"],
+        uptime_s=items["uptime_s"],
+        back_s=items["back_s"],
+        taken_share=items["taken_share"],
+        pairs=pairs,
+        all_free_together=items["all_free_together"],
     )

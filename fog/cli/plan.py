@@ -82,15 +82,15 @@ def plan(
         wanted = Hardware.from_text(hardware)
         standing = _standing(have)
         question = Question(
-            target,
-            wanted,
-            None if uptime is None else _positive(uptime),
-            None if recovery is None else _positive(recovery),
-            ("spot", "on-demand") if mixed else ("spot",) if spot else ("on-demand",),
-            standing["spot"],
-            standing["on-demand"],
-            _latencies(latency),
-            Weights(usd_per_ms),
+            target=target,
+            hardware=wanted,
+            uptime_s=None if uptime is None else _positive(uptime),
+            recovery_s=None if recovery is None else _positive(recovery),
+            kinds=("spot", "on-demand") if mixed else ("spot",) if spot else ("on-demand",),
+            spot=standing["spot"],
+            on_demand=standing["on-demand"],
+            latency_ms=_latencies(latency),
+            weights=Weights(usd_per_ms),
         )
         result = answer(question, _offers(provider, region), measured())
         if as_json:

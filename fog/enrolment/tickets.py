@@ -63,7 +63,7 @@ class PlannedSeat:
     carried: tuple[Carried, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Kept:
     """A ticket as the launcher keeps it.
 
@@ -88,7 +88,7 @@ class Kept:
     is_reported: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class News:
     """Something that the supervisor is to act on, told again until it is ``taken``."""
 
@@ -171,16 +171,16 @@ class Tickets:
             return None
         token, cluster, machine, seats, expires_unix_s, until_unix_s, keys, answer, papers, is_reported = row
         return Kept(
-            token,
-            cluster,
-            machine,
-            _seats(seats),
-            expires_unix_s,
-            until_unix_s,
-            keys,
-            answer,
-            _papers(papers),
-            bool(is_reported),
+            token=token,
+            cluster=cluster,
+            machine=machine,
+            seats=_seats(seats),
+            expires_unix_s=expires_unix_s,
+            until_unix_s=until_unix_s,
+            keys=keys,
+            answer=answer,
+            papers=_papers(papers),
+            is_reported=bool(is_reported),
         )
 
     def use(self, identifier: bytes, keys: bytes) -> bool:
@@ -224,7 +224,14 @@ class Tickets:
                 "SELECT id, cluster, machine, report, detail, papers FROM news ORDER BY id"
             ).fetchall()
         return [
-            News(number, cluster, machine, Report(report), detail, _papers(papers))
+            News(
+                id=number,
+                cluster=cluster,
+                machine=machine,
+                report=Report(report),
+                detail=detail,
+                papers=_papers(papers),
+            )
             for number, cluster, machine, report, detail, papers in rows
         ]
 

@@ -36,6 +36,7 @@ class BoundedLog:
         self._file.write(data)
 
     def close(self) -> None:
+        """Close the file."""
         self._file.close()
 
 

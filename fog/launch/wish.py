@@ -21,7 +21,7 @@ __all__ = ["Wish"]
 _NAME: Final = "[a-z0-9][a-z0-9-]{0,31}"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Wish:
     """A cluster but for its nodes.
 
@@ -87,15 +87,15 @@ class Wish:
             )
         idle_s = seconds_from_text(idle) if isinstance(idle, str) else idle
         return cls(
-            name,
-            machines,
-            named,
-            defaults,
-            None if idle_s is None else _positive("idle", idle_s),
-            None if budget_usd is None else _positive("budget_usd", budget_usd),
-            keep,
-            notes,
-            availability,
+            name=name,
+            machines=machines,
+            carried=named,
+            defaults=defaults,
+            idle_s=None if idle_s is None else _positive("idle", idle_s),
+            budget_usd=None if budget_usd is None else _positive("budget_usd", budget_usd),
+            keep=keep,
+            notes=notes,
+            availability=availability,
         )
 
     def plan(self, nodes: Sequence[CloudNode], found: Sequence[Carried] = ()) -> ClusterPlan:
@@ -116,9 +116,9 @@ class Wish:
             tuple(nodes),
             self.machines,
             carries,
-            self.idle_s,
-            self.budget_usd,
-            self.availability,
+            idle_s=self.idle_s,
+            budget_usd=self.budget_usd,
+            availability=self.availability,
         )
 
     def carry(self, kind_name_type: Sequence[tuple[str, str, str]]) -> tuple[Carried, ...]:

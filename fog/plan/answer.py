@@ -22,7 +22,7 @@ from fog.plan.pool import ON_DEMAND_DOWN, PAPER_RECOVERY_S, PAPER_UPTIME_S, Pool
 __all__ = ["Answer", "Question", "answer", "assumptions"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Question:
     """What is asked.
 
@@ -45,7 +45,7 @@ class Question:
     weights: Weights = BY_BOTH
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
     """The answer.
 
@@ -97,16 +97,16 @@ def answer(question: Question, offers: Sequence[Offer], seen: Measured) -> Answe
     if p_system > question.target * (1 + 1e-9):
         assumed.append("the target is out of reach in so few regions, as far as those traces tell")
     return Answer(
-        question.spot + question.on_demand + len(choices),
-        down if "spot" in question.kinds else ON_DEMAND_DOWN,
-        p_system,
-        uptime_s,
-        recovery_s,
-        factor,
-        tuple(choices),
-        pool,
-        _pool(question, offers, chance_down(seen.uptime_s, recovery_s), factor),
-        tuple(assumed),
+        replicas=question.spot + question.on_demand + len(choices),
+        p_vm=down if "spot" in question.kinds else ON_DEMAND_DOWN,
+        p_system=p_system,
+        uptime_s=uptime_s,
+        recovery_s=recovery_s,
+        factor=factor,
+        choices=tuple(choices),
+        independent=pool,
+        as_recorded=_pool(question, offers, chance_down(seen.uptime_s, recovery_s), factor),
+        assumptions=tuple(assumed),
     )
 
 

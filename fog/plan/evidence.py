@@ -31,7 +31,7 @@ class Pair:
     outages_together: dict[int, float]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Measured:
     """The measurements.
 

@@ -21,10 +21,12 @@ class FogCommand(CommandExtension):  # type: ignore[misc]  # ros2cli has no type
     """Replicated services on machines in the cloud."""
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
+        """Add the arguments of ``ros2 fog`` to a parser."""
         self._parser = parser
         add_subparsers_on_demand(parser, cli_name, _VERB, "fog.verb", required=False)
 
     def main(self, *, parser: argparse.ArgumentParser, args: argparse.Namespace) -> int:  # noqa: ARG002  # their call
+        """Run a verb of ``ros2 fog``; return its exit code."""
         verb: VerbExtension | None = getattr(args, _VERB, None)
         if verb is None:
             self._parser.print_help()

@@ -16,7 +16,7 @@ from fog.supervisor.record import Ending, Record
 __all__ = ["Action", "Drain", "Launch", "Patience", "Release", "decide"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Patience:
     """How long what may last, in seconds.
 

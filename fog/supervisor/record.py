@@ -5,7 +5,7 @@ Place: pure; time comes in as ``now_s``, seconds since 1970: a journal outlives 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from enum import Enum
 
 from fog.cluster import Wanted
@@ -44,6 +44,7 @@ class Record:
     wanted: Wanted
     papers: Papers
     asked_unix_s: float
+    _: KW_ONLY
     id: str = ""
     state: MachineState = MachineState.BOOTING
     address: str = ""

@@ -12,6 +12,7 @@ import sys
 import pytest
 
 from tests.pages import ROOT
+from tests.script_packages import PYTHON_PATH
 
 PLANNING = """
 import json, pathlib, sys
@@ -109,7 +110,7 @@ def test_a_planner_finds_a_way_and_breaks_off_when_told() -> None:
         if importlib.util.find_spec(module) is None:
             pytest.skip(f"{module} is not installed: pip install 'gdp-ros[experiments]'")
     # In a process of its own: beside the libraries of ROS, that of OMPL has been seen to abort while it is loaded.
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'scripts/experiments'}:{ROOT / 'scripts/bench'}"}
+    environment = {**os.environ, "PYTHONPATH": f"{PYTHON_PATH}:{ROOT / 'scripts/experiments'}:{ROOT / 'scripts/bench'}"}
     done = subprocess.run(
         [sys.executable, "-c", PLANNING, str(MESHES)],
         env=environment, capture_output=True, text=True, timeout=200, check=False,

@@ -80,10 +80,10 @@ def machine_of(region: str, instance: InstanceTypeDef, request: SpotInstanceRequ
         _spec_of(region, instance, tags),
         state,
         instance["LaunchTime"].timestamp(),
-        instance.get("PublicIpAddress") or instance.get("PrivateIpAddress") or "",
-        leaves_at,
-        reason,
-        since,
+        address=instance.get("PublicIpAddress") or instance.get("PrivateIpAddress") or "",
+        leaves_at_unix_s=leaves_at,
+        reason=reason,
+        since_unix_s=since,
     )
 
 
@@ -94,7 +94,7 @@ def _spec_of(region: str, instance: InstanceTypeDef, tags: Mapping[str, str]) ->
     except ValueError as error:
         raise LocalError(f"aws: {region}/{instance['InstanceId']}: tag {_PRICE} is no number") from error
     is_spot = instance.get("InstanceLifecycle") == "spot"
-    offer = Offer("aws", region, instance["InstanceType"], hardware, is_spot, usd)
+    offer = Offer("aws", region, instance["InstanceType"], hardware, is_spot=is_spot, usd_per_hour=usd)
     return MachineSpec(tags[CLUSTER], tags.get(MACHINE, instance["InstanceId"]), offer)
 
 

@@ -110,11 +110,13 @@ class LocalProvider:
     # the Provider protocol
 
     def offers(self, hardware: Hardware, *, spot: bool) -> list[Offer]:
+        """Return the offers of this host's machines, cheapest first."""
         everything = local_offers(self._regions)
         fitting = [each for each in everything if each.is_spot == spot and hardware.fits(each.hardware)]
         return sorted(fitting, key=lambda each: each.usd_per_hour)
 
     def create(self, spec: MachineSpec, boot: Boot) -> str:
+        """Make a machine on this host and start its programs; return its id."""
         if not _NAME.fullmatch(spec.name):
             raise LocalError(f"machine {spec.name!r}: a name has letters, digits, '-' and '_'")
         with self._alone():
@@ -136,6 +138,7 @@ class LocalProvider:
         return run.id
 
     def describe(self, cluster: str) -> list[Machine]:
+        """Return the machines of a cluster as they are now."""
         now_unix_s = time.time()
         told = []
         for each in standing(self._runs, cluster):
@@ -150,15 +153,19 @@ class LocalProvider:
         return told
 
     def terminate(self, ids: Sequence[str]) -> None:
+        """End machines and remove all that they own."""
         self._end(ids)
 
     def drain(self, machine: str) -> None:
+        """Have a machine answer what it has begun, and end its programs."""
         self._tell(machine, signal.SIGUSR1)
 
     def replica_gateway(self, region: str) -> str:
+        """Return the group whose gateway one of the machines of a region is; empty: it has none."""
         return self._network.replica_gateway(region)
 
     def attach_uplink(self, machine: str) -> None:
+        """Give a machine the uplink of its group."""
         with self._alone():
             found = find(self._runs, machine)
             if not self.replica_gateway(found.file.spec.offer.region):
@@ -169,6 +176,7 @@ class LocalProvider:
             found.gateway_mark.touch()
 
     def detach_uplink(self, machine: str) -> None:
+        """Take the uplink from a machine."""
         with self._alone():
             for each in standing(self._runs):
                 if each.id == machine:
@@ -176,11 +184,13 @@ class LocalProvider:
                     each.gateway_mark.unlink(missing_ok=True)
 
     def log(self, machine: str, program: str, lines: int) -> str:
+        """Return the last lines of a program's log, or without a program of the machine's own."""
         if not _NAME.fullmatch(program or "machine"):
             raise LocalError(f"no program {program!r}")
         return last_lines(find(self._runs, machine).home / "logs" / f"{program or 'machine'}.log", lines)
 
     def shell(self, machine: str) -> list[str]:
+        """Return the command line of a shell inside a machine."""
         found = find(self._runs, machine)
         inside = ["env", f"--chdir={found.home}", f"FOG_MACHINE={found.file.spec.name}", "bash"]
         return ["nsenter", f"--net={found.space}", "--", *inside]

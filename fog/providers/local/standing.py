@@ -34,10 +34,12 @@ class Standing:
 
     @property
     def id(self) -> str:
+        """Return the id of the machine's run."""
         return self.record.run
 
     @property
     def directory(self) -> Path:
+        """Return the folder of the machine."""
         return Path(self.record.files[0])
 
     @property
@@ -47,6 +49,7 @@ class Standing:
 
     @property
     def space(self) -> Path:
+        """Return the file of the machine's network namespace."""
         return space_path(self.id, self.directory, self.file.spec.name)
 
     @property
@@ -86,10 +89,12 @@ class Standing:
 
     @property
     def cgroup(self) -> Cgroup:
+        """Return the control group of the machine's processes."""
         return Cgroup(f"gdp-{self.id}")
 
     @property
     def host(self) -> Process | None:
+        """Return the process that runs the machine's programs."""
         return next(iter(self.record.processes), None)
 
     @property
@@ -105,10 +110,10 @@ class Standing:
             self.file.spec,
             state,
             self.file.started_unix_s,
-            self.address,
-            read_notice(self.home),
-            reason,
-            self._since_unix_s(state),
+            address=self.address,
+            leaves_at_unix_s=read_notice(self.home),
+            reason=reason,
+            since_unix_s=self._since_unix_s(state),
             is_gateway=self.gateway_mark.exists(),
         )
 

@@ -73,7 +73,7 @@ class SkyPilotProvider:
                     cpus, memory_gib = each.cloud.get_vcpus_mem_from_instance_type(each.instance_type)
                     has = Hardware(int(cpus or 0), float(memory_gib or 0.0), hardware.gpu, hardware.gpus)
                     usd = float(each.get_cost(HOUR_S))
-                    lines.append(Offer(self.name, place, each.instance_type, has, spot, usd))
+                    lines.append(Offer(self.name, place, each.instance_type, has, is_spot=spot, usd_per_hour=usd))
         return sorted(lines, key=lambda each: each.usd_per_hour)
 
     def create(self, spec: MachineSpec, boot: Boot) -> str:

@@ -42,37 +42,56 @@ class Named(Protocol):
     """A value of an enumeration of SkyPilot's."""
 
     @property
-    def value(self) -> str: ...
+    def value(self) -> str:
+        """Return the word of the enumeration's member."""
 
 
 class Status(Protocol):
     """What is read of a ``StatusResponse``."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Return the cluster's name at SkyPilot."""
+
     @property
-    def status(self) -> Named: ...
+    def status(self) -> Named:
+        """Return the state of the cluster."""
+
     @property
-    def launched_at(self) -> int: ...
+    def launched_at(self) -> int:
+        """Return when the cluster was launched, in unix seconds."""
+
     @property
-    def labels(self) -> Mapping[str, str] | None: ...
+    def labels(self) -> Mapping[str, str] | None:
+        """Return the labels that the cluster was launched with."""
+
     @property
-    def init_kind(self) -> str | None: ...
+    def init_kind(self) -> str | None:
+        """Return what a cluster in INIT waits for."""
+
     @property
-    def init_status_reason(self) -> str | None: ...
+    def init_status_reason(self) -> str | None:
+        """Return why a cluster is in INIT."""
+
     @property
-    def handle(self) -> object: ...
+    def handle(self) -> object:
+        """Return SkyPilot's handle of the cluster's machines."""
 
 
 class Request(Protocol):
     """What is read of a ``RequestPayload``: something that the API server was asked and has not finished."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Return the kind of the request."""
+
     @property
-    def cluster_name(self) -> str | None: ...
+    def cluster_name(self) -> str | None:
+        """Return the cluster that the request is about."""
+
     @property
-    def created_at(self) -> float: ...
+    def created_at(self) -> float:
+        """Return when the request was made, in unix seconds."""
 
 
 def cluster_name(spec: MachineSpec) -> str:
@@ -119,7 +138,15 @@ def machine_of(status: Status, cluster: str) -> Machine | None:
         spec = _spec_of(cluster, labels)
     except (KeyError, ValueError) as error:
         raise LocalError(f"skypilot: {status.name}: its labels make no sense: {error!r}") from error
-    return Machine(status.name, spec, state, float(status.launched_at), str(address or ""), None, reason)
+    return Machine(
+        status.name,
+        spec,
+        state,
+        float(status.launched_at),
+        address=str(address or ""),
+        leaves_at_unix_s=None,
+        reason=reason,
+    )
 
 
 def being_made(requests: Sequence[Request], cluster: str, known: Sequence[str]) -> list[Machine]:
@@ -142,7 +169,9 @@ def _spec_of(cluster: str, labels: Mapping[str, str]) -> MachineSpec:
         bytes.fromhex(labels[key]).decode() for key in (_PLACE, _TYPE, _HARDWARE, _MACHINE)
     )
     usd = int(labels[_PRICE]) / _MILLIONTHS
-    offer = Offer("skypilot", place, type_name, Hardware.from_text(hardware), labels[_SPOT] == "1", usd)
+    offer = Offer(
+        "skypilot", place, type_name, Hardware.from_text(hardware), is_spot=labels[_SPOT] == "1", usd_per_hour=usd
+    )
     return MachineSpec(cluster, name, offer)
 
 

@@ -11,7 +11,9 @@ from gdp.errors import LocalError
 
 
 def offer(region: str, usd: float, cpus: int = 4, gpu: str = "", *, spot: bool = True) -> Offer:
-    return Offer("aws", region, f"type{cpus}{gpu}", Hardware(cpus, 16, gpu, 1 if gpu else 0), spot, usd)
+    return Offer(
+        "aws", region, f"type{cpus}{gpu}", Hardware(cpus, 16, gpu, 1 if gpu else 0), is_spot=spot, usd_per_hour=usd
+    )
 
 
 def regions(offers: list[Offer], wanted: list[Wanted], **more: object) -> list[str]:

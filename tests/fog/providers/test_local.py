@@ -23,7 +23,9 @@ from gdp.errors import LocalError
 from gdp.host.processes import Process
 from gdp.host.run_registry import Run
 
-SPEC = MachineSpec("c", "m1", Offer("local", "local-a", "local.small", Hardware(2, 4.0), True, 0.01))
+SPEC = MachineSpec(
+    "c", "m1", Offer("local", "local-a", "local.small", Hardware(2, 4.0), is_spot=True, usd_per_hour=0.01)
+)
 _MS = 1_000_000
 
 

@@ -20,7 +20,7 @@ REGIONS = ("east", "west", "south")
 
 def offer(region: str = "east", *, is_spot: bool = True, usd: float = 0.1) -> Offer:
     """Return an offer of two processors."""
-    return Offer("local", region, "small", Hardware(cpus=2, memory_gib=4), is_spot, usd)
+    return Offer("local", region, "small", Hardware(cpus=2, memory_gib=4), is_spot=is_spot, usd_per_hour=usd)
 
 
 OFFERS = [offer(region) for region in REGIONS]
