@@ -96,14 +96,8 @@ class AsyncPublisher:
             deadline_s = _deadline_s(timeout_s)
             if not await self._driver.wait(lambda: publisher.has_room() or not publisher.is_wanted, deadline_s):
                 raise SessionTimeoutError(
-<<<<<<< HEAD
-                    f"{label}: the window was full for {timeout_s:g} s, since a reader confirms too slowly; "
-                    "publish less, or with"
-                    " reliable=False"
-=======
                     f"{label}: the window was full for {timeout_s:g} s, since a reader confirms too slowly;"
                     " publish less, or with reliable=False"
->>>>>>> lib/lib
                 )
         self._driver.publish(publisher, message_to_wire(time.time_ns(), payload))
 

@@ -164,14 +164,8 @@ class Publisher:
             lambda: publisher.has_room() or not publisher.is_wanted, _deadline_s(self._driver, timeout_s)
         ):
             raise SessionTimeoutError(
-<<<<<<< HEAD
-                f"{self._label}: the window was full for {timeout_s:g} s, since a reader confirms too slowly; "
-                "publish less, or with"
-                " reliable=False"
-=======
                 f"{self._label}: the window was full for {timeout_s:g} s, since a reader confirms too slowly;"
                 " publish less, or with reliable=False"
->>>>>>> lib/lib
             )
 
 
