@@ -179,7 +179,7 @@ def _decorators(node: Definition) -> set[str]:
 def public_definitions(tree: ast.Module) -> Iterator[tuple[str, Definition]]:
     """Yield public classes and functions of a module, and public methods of its public classes."""
     for node in tree.body:
-        if not isinstance(node, (*_FUNCTIONS, ast.ClassDef)) or node.name.startswith("_"):
+        if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)) or node.name.startswith("_"):
             continue
         yield node.name, node
         if isinstance(node, ast.ClassDef):
@@ -215,7 +215,7 @@ def shared_names(trees: dict[str, ast.Module], excepted: frozenset[str]) -> list
 def import_circles() -> list[list[str]]:
     """Return the groups of product modules that import each other, those imported late included."""
     graph = grimp.build_graph(*PRODUCT, cache_dir=None)
-    arrows = networkx.DiGraph()
+    arrows: networkx.DiGraph[str] = networkx.DiGraph()
     for module in graph.modules:
         arrows.add_edges_from((module, other) for other in graph.find_modules_directly_imported_by(module))
     return [sorted(group) for group in networkx.strongly_connected_components(arrows) if len(group) > 1]

@@ -39,7 +39,8 @@ class Asked(NamedTuple):
     call: int
 
 
-class Turn(NamedTuple, Generic[R]):
+@dataclass(frozen=True, slots=True)
+class Turn(Generic[R]):  # Python 3.10 has no generic named tuple
     """A request whose turn it is, with the number under which it is under way here."""
 
     number: int
