@@ -18,12 +18,12 @@ from pathlib import Path
 
 from gdp.client.member import Member, Topic
 from gdp.control.settings import NodeSettings
+from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import incarnation, wall_clock_ms
 from gdp.nodes.runtime import Runtime
 from gdp.ports.raw import RawPlane
 from gdp.stores.keyring import DELEGATIONS, load_identity, load_root
 from gdp.trust.domain import Policy
-from proxy.held import Held
 
 GAP_S = 0.002  # between requests
 PATIENCE_S = 30.0
@@ -66,7 +66,7 @@ class Robot:
 def main(service: str, identity_at: str, root: str, device: str, role: str, *load: str) -> None:
     identity = load_identity(Path(identity_at), time.time())
     policy = Policy(load_root(Path(root)), [])
-    (topic,) = Held(Path(identity_at) / DELEGATIONS, identity)
+    (topic,) = DelegationStore(Path(identity_at) / DELEGATIONS, identity)
     assert topic.name.to_text() == service
     member = Member(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes))
     plane = RawPlane([device])

@@ -12,6 +12,7 @@ from rich.console import Console
 from gdp.cli.node import emit
 from gdp.crypto.certificates import Role
 from gdp.names import Name
+from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import load_member
 from gdp.trust.delegation import Delegation
 from proxy.config import ProxyConfig
@@ -19,7 +20,6 @@ from proxy.endpoints.endpoint import Graph
 from proxy.explain import explain
 from proxy.explain_table import table
 from proxy.finding import Finding
-from proxy.held import Held
 from proxy.looking import look
 from proxy.node import open_topics
 from proxy.rules.rule import Rule
@@ -34,7 +34,7 @@ def check_proxy(settings: ProxyConfig, *, json: bool) -> None:
         LocalError: without a live graph, a rule that has no delegation; with one, a graph that cannot be looked at.
     """
     identity, _ = load_member(settings.identity, settings.domain, Role.PROXY)
-    held = Held(settings.delegations, identity)
+    held = DelegationStore(settings.delegations, identity)
     delegations = {topic.name: topic.delegation for topic in held}
     if settings.ros:
         for at, (label, graph) in enumerate(look(settings.ros, identity.name.to_text(), "check")):

@@ -15,12 +15,12 @@ import typer
 
 from gdp.cli.node import emit, emit_wait
 from gdp.errors import LocalError
+from gdp.nodes.delegation_store import DelegationStore
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.site import Site
 from proxy.config import ProxyConfig
 from proxy.endpoints.endpoint import proxy_node_name
 from proxy.endpoints.live import open_endpoints
-from proxy.held import Held
 from proxy.node import GOODBYE_S, ProxyNode, run_node
 from proxy.tally import percentile
 
@@ -47,7 +47,7 @@ def carry(path: Path, settings: ProxyConfig, *, json: bool) -> None:
     with run_node(settings, emit_wait if json else None) as node:
         name = proxy_node_name(node.identity.name.to_text())
         with open_endpoints(settings.ros, name) as endpoints:
-            held = Held(settings.delegations, node.identity)
+            held = DelegationStore(settings.delegations, node.identity)
             look_s = 0.0 if all(end.alone for end in settings.ros) else _LOOK_S
             bridge = Bridge(Site(node.member, node.traffic, node.faults), settings, endpoints, held, look_s=look_s)
             node.drains = True
@@ -142,7 +142,7 @@ def _reload(path: Path, first: ProxyConfig, node: ProxyNode, bridge: Bridge) -> 
         GdpError: the old configuration stays in use.
     """
     settings = ProxyConfig.load(path)
-    held = Held(settings.delegations, node.identity)
+    held = DelegationStore(settings.delegations, node.identity)
     for key in ("identity", "domain", "iface", "ros", "metrics", "sandbox", "state", "control_socket"):
         if getattr(settings, key) != getattr(first, key):
             raise LocalError(f"{path}: {key} changed; restart the proxy to change it")

@@ -27,6 +27,7 @@ from gdp.nodes.control_socket import ControlHandlers
 from gdp.nodes.control_status import node_status
 from gdp.nodes.counts import count_list
 from gdp.nodes.credentials import Credentials, watched_folders
+from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.revocation_upkeep import load_revocations
@@ -38,7 +39,6 @@ from gdp.ports.plane import Plane
 from gdp.telemetry.sources import Sources
 from proxy.config import ProxyConfig, Record
 from proxy.faults import Faults
-from proxy.held import Held
 from proxy.traffic import Traffic
 
 __all__ = ["GOODBYE_S", "ProxyNode", "open_topics", "run_node"]
@@ -202,7 +202,7 @@ def _local_names(config: ProxyConfig) -> Callable[[Name], str]:
     return lambda name: names.get(name, name.short)
 
 
-def open_topics(config: ProxyConfig, held: Held) -> dict[Name, Topic]:
+def open_topics(config: ProxyConfig, held: DelegationStore) -> dict[Name, Topic]:
     """Return, for every rule, what this node may do with its name and the topic's secrets.
 
     Raises:

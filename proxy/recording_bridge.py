@@ -11,10 +11,10 @@ import time
 from collections.abc import Iterator
 
 from gdp.errors import GdpError
+from gdp.nodes.delegation_store import DelegationStore
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.site import Site
 from proxy.config import ProxyConfig
-from proxy.held import Held
 from proxy.node import ProxyNode, open_topics
 from proxy.recordings.endpoint import RecordingEndpoint, ReplayEndpoint
 from proxy.rules.recorded import RecordedRules
@@ -36,7 +36,7 @@ def open_recording_bridge(
     Raises:
         LocalError: a rule of ``settings`` without a delegation that holds, or a topic that cannot be published.
     """
-    held = Held(settings.delegations, node.identity)
+    held = DelegationStore(settings.delegations, node.identity)
     open_topics(settings, held)
     bridge = Bridge(Site(node.member, node.traffic, node.faults), rules, [endpoint], held)
     node.on_reload = lambda: _renew(node, settings, rules, bridge)
@@ -62,7 +62,7 @@ def work(node: ProxyNode, bridge: Bridge) -> None:
 def _renew(node: ProxyNode, settings: ProxyConfig, rules: RecordedRules, bridge: Bridge) -> None:
     """Read the delegations again: new epochs and longer validity take effect without a message lost."""
     try:
-        held = Held(settings.delegations, node.identity)
+        held = DelegationStore(settings.delegations, node.identity)
         topics = open_topics(settings, held)
     except GdpError as error:
         log.error("delegations not renewed reason=%s", error)

@@ -19,6 +19,7 @@ from gdp.crypto.certificates import Role
 from gdp.errors import GdpError
 from gdp.names import Name
 from gdp.nodes.credentials import Credentials
+from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S
 from gdp.nodes.runtime import Runtime
@@ -26,7 +27,6 @@ from gdp.nodes.schema import Domain
 from gdp.ports.raw import RawPlane
 from gdp.stores.keyring import DELEGATIONS, ROOT_CERTIFICATE
 from gdp.trust.right import Right
-from proxy.held import Held
 
 __all__ = ["Watch"]
 
@@ -91,12 +91,12 @@ class Watch:
         try:
             runtime = Runtime(member, plane)
             runtime.every(LOOK_S, Credentials(self._identity, domain, identity, policy).look)
-            called = self._call(member, Held(self._identity / DELEGATIONS, identity), [])
+            called = self._call(member, DelegationStore(self._identity / DELEGATIONS, identity), [])
             attached_s: float | None = None
             while not self._ended.is_set() and any(port.up for port in plane.ports.values()):
                 if self._again.is_set():
                     self._again.clear()
-                    called = self._call(member, Held(self._identity / DELEGATIONS, identity), called)
+                    called = self._call(member, DelegationStore(self._identity / DELEGATIONS, identity), called)
                 runtime.step(time.monotonic() + _STEP_S)
                 member.take_messages()
                 if not member.attachment.is_attached:
@@ -113,7 +113,7 @@ class Watch:
         finally:
             plane.close()
 
-    def _call(self, member: Member, held: Held, before: Iterable[Name]) -> list[Name]:
+    def _call(self, member: Member, held: DelegationStore, before: Iterable[Name]) -> list[Name]:
         topics = {topic.name: topic for topic in held if Right.CALL in topic.delegation.rights}
         for name in before:
             if name not in topics:

@@ -17,6 +17,7 @@ from typing import Final, NamedTuple, Protocol, TypeAlias
 from gdp.client.member import Message, Topic
 from gdp.errors import LocalError
 from gdp.names import Name
+from gdp.nodes.delegation_store import DelegationStore
 from gdp.trust.right import Right
 from proxy.bridge.exposed_service import ExposedService
 from proxy.bridge.exposed_topic import ExposedTopic
@@ -28,7 +29,6 @@ from proxy.bridge.site import Site
 from proxy.bridge.wishes import Complaint, Wish, exposed, imported
 from proxy.endpoints.endpoint import End, Endpoint, Event, Faulted, Graph, Role, proxy_node_name
 from proxy.faults import Fault
-from proxy.held import Held
 from proxy.rules.rule import Rule
 from proxy.tally import Tally
 
@@ -100,7 +100,13 @@ class Bridge:
     """
 
     def __init__(
-        self, site: Site, config: BridgeRules, endpoints: Sequence[Endpoint], held: Held, *, look_s: float = 0.0
+        self,
+        site: Site,
+        config: BridgeRules,
+        endpoints: Sequence[Endpoint],
+        held: DelegationStore,
+        *,
+        look_s: float = 0.0,
     ) -> None:
         self._site = site
         self._config = config
@@ -184,7 +190,7 @@ class Bridge:
         times = [flow.next_timeout() for flow in self._timed]
         return min([self._tick_at_s, *(time for time in times if time is not None)])
 
-    def reload(self, config: BridgeRules, held: Held) -> None:
+    def reload(self, config: BridgeRules, held: DelegationStore) -> None:
         """Take rules and delegations anew; flows whose rule is the same go on undisturbed while it is delegated."""
         self._config, self._held = config, held
         for key, (wish, flow) in list(self._flows.items()):

@@ -21,13 +21,13 @@ from gdp.crypto.statements import parse
 from gdp.errors import ConfigError, LocalError
 from gdp.nodes.config import RibConfig, SwitchConfig
 from gdp.nodes.control_socket import ControlHandlers, serve_control_in_thread
+from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import load_member
 from gdp.stores.keyring import load_identity, load_owner
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 from proxy.config import ProxyConfig
 from proxy.drop_ins import drop_in_directory
-from proxy.held import Held
 from tests.fog.enrolment.desk import CLUSTER, MAP, PLAN, Desk, made_desk
 
 
@@ -60,7 +60,7 @@ def test_a_machine_is_a_leaf_unless_it_may_become_the_gateway(desk: Desk, tmp_pa
 def test_a_machine_may_give_what_is_carried_and_nothing_else(desk: Desk, tmp_path: Path) -> None:
     desk.enrol(tmp_path / "home")
     config = ProxyConfig.load(tmp_path / "home" / "proxy.yaml")
-    held = Held(config.delegations, load_identity(config.identity, time.time()))
+    held = DelegationStore(config.delegations, load_identity(config.identity, time.time()))
     key = load_owner(desk.authority.owner).key.public.compressed
     assert {(topic.name, topic.delegation.rights) for topic in held} == {
         (metadata_of(PLAN).name(key), frozenset({Right.SERVE})),
@@ -154,7 +154,7 @@ def test_the_robot_gets_a_rule_a_name_and_none_is_left_when_the_cluster_is_gone(
     config = ProxyConfig.load(path)
     assert {"/plan", "/map"} <= {rule.name for rule in config.imports}
     assert next(rule for rule in config.imports if rule.name == "/plan").timeout_s == 9.0
-    held = Held(config.delegations, load_identity(config.identity, time.time()))
+    held = DelegationStore(config.delegations, load_identity(config.identity, time.time()))
     assert sorted(right.value for topic in held for right in topic.delegation.rights) == ["call", "read"]
     assert path.read_text() == first
     assert forget_rules(path, "c")

@@ -17,6 +17,7 @@ from gdp.client.publisher import Publisher
 from gdp.crypto.certificates import Role
 from gdp.metadata import Metadata
 from gdp.names import Name
+from gdp.nodes.delegation_store import DelegationStore
 from gdp.simulation.topology import ring5
 from gdp.simulation.world import World
 from gdp.trust.owner import Owner
@@ -27,7 +28,6 @@ from proxy.config import ProxyConfig, Rule
 from proxy.endpoints.endpoint import proxy_node_name
 from proxy.endpoints.fake import FakeEndpoint, FakeGraph
 from proxy.faults import Faults
-from proxy.held import Held
 from proxy.rules.rule import Kind
 from proxy.serial.channel import Qos, RosVersion
 from proxy.traffic import Traffic
@@ -49,7 +49,7 @@ _RIGHTS: Final[dict[tuple[Kind, bool], Right]] = {
 }
 
 
-class Granted(Held):
+class Granted(DelegationStore):
     """Delegations that lie in no file."""
 
     def __init__(self, directory: Path, topics: Sequence[Topic]) -> None:

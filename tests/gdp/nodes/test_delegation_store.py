@@ -10,10 +10,10 @@ from gdp.crypto.identity import Identity
 from gdp.errors import LocalError
 from gdp.metadata import Metadata
 from gdp.names import Name
+from gdp.nodes.delegation_store import DelegationStore
 from gdp.stores.issue import delegate, make_domain, make_node, make_owner
 from gdp.stores.keyring import DELEGATIONS, load_owner, save_delegation
 from gdp.trust.right import Right
-from proxy.held import Held
 
 CHATTER = Metadata({"kind": "topic", "name": "/chatter", "type": "std_msgs/msg/String"})
 OTHER = Metadata({"kind": "topic", "name": "/other", "type": "std_msgs/msg/String"})
@@ -39,8 +39,8 @@ def name(folder: Path, metadata: Metadata) -> Name:
     return metadata.name(load_owner(folder / "owner").key.public.compressed)
 
 
-def held(folder: Path, identity: Identity) -> Held:
-    return Held(folder / "robot" / DELEGATIONS, identity)
+def held(folder: Path, identity: Identity) -> DelegationStore:
+    return DelegationStore(folder / "robot" / DELEGATIONS, identity)
 
 
 def test_what_is_held_is_found_by_its_name_and_right(tmp_path: Path, robot: Identity) -> None:
