@@ -285,8 +285,8 @@ class ExposedService:
 
     def _give(self) -> None:
         """Give the local server what it is the turn of."""
-        for number, asked, raw in self._serving.take():
-            self._seat.endpoint.call(self._servers[asked.part], number, raw)
+        for turn in self._serving.take():
+            self._seat.endpoint.call(self._servers[turn.asked.part], turn.number, turn.request)
 
     def _cancel_goal(self, goal: bytes, now_s: float) -> None:
         self._cancels += 1
