@@ -155,7 +155,7 @@ def _control_handlers(
     return ControlHandlers(
         reload=reload,
         status=status,
-        drain=lambda: runtime.drain(lambda: not len(switch.resolver.pending_frames), DRAIN_MAX_S),
+        drain=lambda: runtime.drain(lambda: not switch.resolver.pending_frames, DRAIN_MAX_S),
         is_drained=lambda: runtime.has_drained,
     )
 
