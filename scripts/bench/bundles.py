@@ -20,7 +20,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-from bundles_end import BACKLOG, MESSAGE_BYTES
+from bundles_endpoint import BACKLOG, MESSAGE_BYTES
 from bundles_row import READY_S, Row
 from machine import machine_state
 from peers.process import FailedError

@@ -9,7 +9,7 @@ import json
 from contextlib import ExitStack
 from typing import Final
 
-from bundles_end import topics
+from bundles_endpoint import topics
 from peers.chain import LEFT, MIDDLE, RIGHT, Chain
 from peers.process import FailedError, Started
 
@@ -65,10 +65,10 @@ class Row:
         self._undo.close()
 
     def end(self, what: str, **settings: str | float) -> Started:
-        """Start an end of ``bundles_end.py``: ``send`` at A, ``read`` at B."""
+        """Start an end of ``bundles_endpoint.py``: ``send`` at A, ``read`` at B."""
         node = LEFT if what == "send" else RIGHT
         told = json.dumps({"config": str(self._files / f"end-{node}.yaml"), **settings})
-        return self._chain.start(node, what, ["-m", "bundles_end", what, told])
+        return self._chain.start(node, what, ["-m", "bundles_endpoint", what, told])
 
     def _admit(self, node: str, names: list[str]) -> None:
         """Let an end publish or read the topics, and write its configuration."""

@@ -7,7 +7,7 @@
 Our planes (scapy, raw, kernel with and without redirect_peer), the Linux bridge and the kernel's IPv4 forwarding stand
 in the same chain of namespaces, one after the other, and so again each round. Per size of frame and length of chain:
 
-frames/s            highest rate at which less than 0.1 % is lost and the last frame comes at once (``search.py``)
+frames/s            highest rate at which less than 0.1 % is lost and the last frame comes at once (``rate_search.py``)
 RTT, polling ends   of single frames, by ends that ask their socket again and again: the path alone; not measured for
                     planes that are processes where these would share the ends' cores
 RTT, sleeping ends  by ends that wait in epoll, as nodes do
@@ -33,11 +33,11 @@ from pathlib import Path
 from typing import Final
 
 from chains import Chain
-from contenders import Bridge, Contender, Direct, IPv4, Plane
+from baselines import Bridge, Contender, Direct, IPv4, Plane
 from machine import machine_state, offload_text
 from plot import panel_of, require_plot, save_bars
 from report import Goal, Rounds, percentile, progress, show, write_json
-from search import LOSS_MAX, highest
+from rate_search import LOSS_MAX, highest
 
 from gdp.errors import LocalError
 from gdp.testbed.runs import Runs

@@ -29,12 +29,12 @@ from pathlib import Path
 from typing import Final
 
 from machine import machine_state
-from peers.contender import Contender
+from peers.baseline import Contender
 from peers.cyclone_net import CycloneNet
 from peers.exchange import ANSWER, SIZE_MIN, Load
 from peers.figures import MEDIAN, P99, case_of, goals_of
 from peers.gdp_net import ENCODINGS, GdpNet
-from peers.turns import Plan, Turns
+from peers.rounds import Plan, Turns
 from peers.zenoh_net import ZenohNet
 from plot import Panel, panel_of, require_plot, save_bars
 from report import Rounds, Settings, show, write_json

@@ -31,7 +31,7 @@ from typing import Final
 from machine import machine_state
 from peers.process import FailedError
 from plot import Panel, panel_of, require_plot, save_bars
-from priority_end import TICK_S
+from priority_endpoint import TICK_S
 from priority_row import MTU, SHAPED_BITS_S, Row
 from report import Goal, Rounds, Settings, percentile, progress, show, write_json
 

@@ -18,7 +18,7 @@ from functools import partial
 from typing import Final
 
 from peers.process import FailedError, Started
-from priority_end import CONTROL, IMAGES
+from priority_endpoint import CONTROL, IMAGES
 from pyroute2 import IPRoute
 
 from gdp.metadata import Metadata
@@ -98,9 +98,9 @@ class Row:
         self._undo.close()
 
     def end(self, node: str, what: str, **settings: str | float) -> Started:
-        """Start an end of ``priority_end.py`` on a machine."""
+        """Start an end of ``priority_endpoint.py`` on a machine."""
         told = json.dumps({"config": str(self._config(node)), **settings})
-        return self._start(node, what, ["-m", "priority_end", what, told])
+        return self._start(node, what, ["-m", "priority_endpoint", what, told])
 
     def _start(self, node: str, what: str, arguments: Sequence[str]) -> Started:
         started = Started(self._run, f"{what} at {node}", partial(self._spaces.command, node), arguments)

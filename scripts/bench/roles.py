@@ -13,7 +13,7 @@ import time
 from typing import Any
 
 from ends import answer_pings, count_frames, ping, send, spread_frames
-from fill import ENTRY_LEASE_S, fill, resident_bytes
+from table_fill import ENTRY_LEASE_S, fill, resident_bytes
 from frames import NAME_AT, SINK, SOURCE, spread_names
 from worker import answer, command, command_waits, integer
 

@@ -32,11 +32,11 @@ from pathlib import Path
 from typing import Final
 
 from chains import Chain
-from contenders import Plane
+from baselines import Plane
 from machine import machine_state
 from plot import Panel, panel_of, require_plot, save_bars
 from report import Goal, Rounds, progress, show, write_json
-from search import LOSS_MAX, Try, highest
+from rate_search import LOSS_MAX, Try, highest
 from worker import Worker, number
 
 from gdp.errors import LocalError

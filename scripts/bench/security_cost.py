@@ -1,7 +1,7 @@
 """What security costs: this tree beside an earlier commit, in turn, round by round.
 
 ends         processor time to seal and sign a message, to open and verify it, in 100 and 10,000 bytes; advertisements
-             that one RIB takes in a second (``security_cost_end.py``): the best of many short blocks, in turn
+             that one RIB takes in a second (``security_cost_endpoint.py``): the best of many short blocks, in turn
 forwarding   one switch in namespaces: frames a second of the plane ``kernel``, flat out, and processor time of a frame
              at the plane ``raw``, at a steady rate
 messages     ``bundles.py`` as each tree has it: real processes over three switches, 20 reliable topics, 100 bytes, with
@@ -30,7 +30,7 @@ from typing import Final
 
 from bundles import BUNDLES, CPU, OVERLOAD, RATE, SINGLE
 from chains import Chain
-from contenders import Plane
+from baselines import Plane
 from machine import machine_state, thread_s
 from peers.figures import MEDIAN
 from peers.process import FailedError
@@ -141,7 +141,7 @@ def _output(tree: Path, *argv: str) -> str:
 
 
 def _ends(trees: Trees, _: argparse.Namespace) -> dict[str, Figures]:
-    script = str(Path(__file__).with_name("security_cost_end.py"))
+    script = str(Path(__file__).with_name("security_cost_endpoint.py"))
     found: dict[str, Figures] = {who: {} for who in trees}
     with ExitStack() as undo:
         ends = {
@@ -179,7 +179,7 @@ def _line(end: subprocess.Popen[str], asked: str | None = None) -> str:
         end.stdin.flush()
     line = end.stdout.readline()
     if not line:
-        raise FailedError("security_cost_end.py ended")
+        raise FailedError("security_cost_endpoint.py ended")
     return line
 
 

@@ -27,7 +27,7 @@ from pictures import save_distributions
 from recorded import LIMIT_S, RECORDED, draw, load
 from samples import Sample, Summary, least_of_two, p99
 from series import Series
-from study import (
+from experiment import (
     Asking,
     Finding,
     JsonOption,

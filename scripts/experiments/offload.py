@@ -27,7 +27,7 @@ from offload_page import page_of, save_picture
 from peers.process import FailedError, Started
 from report import progress
 from ros_row import DIRECT_DOMAIN, LEFT, READY_S, RIGHT, Carried, Row
-from study import JsonOption, OutOption, QuickOption, place_of
+from experiment import JsonOption, OutOption, QuickOption, place_of
 
 from gdp.errors import LocalError
 from gdp.testbed.cgroups import Cgroup
@@ -51,7 +51,7 @@ ALONE: Final = {
 SLOWER: Final = {"vSLAM": 0.68 / 1.39, "motion planning": 161.8 / 4.292, "grasp planning": 14.0 / 0.535}
 MTU: Final = 1_500
 _QUICK: Final = "grasp planning"
-_END: Final = str(ROOT / "scripts" / "experiments" / "offload_end.py")
+_END: Final = str(ROOT / "scripts" / "experiments" / "offload_endpoint.py")
 _ANSWER_S: Final = 200.0
 _ROBOTS_READY_S: Final = 180.0
 _ALONE_S: Final = 1_100.0

@@ -18,14 +18,14 @@ from typing import Final
 
 import bench_path  # noqa: F401 - finds ``peers``
 import rclpy
-from peers.lines import say
+from peers.jsonl import say
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.service_introspection import ServiceIntrospectionState
 from rclpy.task import Future
 from samples import Sample
-from series import Rivalry, Series
+from series import Contention, Series
 from service_msgs.msg import ServiceEventInfo
 from tasks import TASKS, WARM_UP, Response, Task
 
@@ -38,7 +38,7 @@ _LATE_S: Final = 0.02
 _LINGER_S: Final = 0.5  # in which an answer too many would come
 
 
-class _Asker:
+class _Client:
     """Calls in turn. Each round of the services carries the same request, so that what they do can be compared."""
 
     def __init__(self, node: Node, task: Task, services: Sequence[str]) -> None:
@@ -116,7 +116,7 @@ class _Asker:
 def ask(node: Node, executor: SingleThreadedExecutor, told: Mapping[str, object]) -> None:
     """Call so often, and print what came of each call, in a line of its own."""
     series = Series(**told)  # type: ignore[arg-type]
-    asker = _Asker(node, TASKS[series.task](series.problem), series.services)
+    asker = _Client(node, TASKS[series.task](series.problem), series.services)
     answers = asker.count_answers() if series.counts_answers else None
     done: Future[None] = Future()
     asker.wait_for_servers()
@@ -154,14 +154,14 @@ def ask(node: Node, executor: SingleThreadedExecutor, told: Mapping[str, object]
 
 def busy(node: Node, executor: SingleThreadedExecutor, told: Mapping[str, object]) -> None:
     """Be the second client, until killed."""
-    rivalry = Rivalry(**told)  # type: ignore[arg-type]
-    asker = _Asker(node, TASKS[rivalry.task](""), [rivalry.service])
+    contention = Contention(**told)  # type: ignore[arg-type]
+    asker = _Client(node, TASKS[contention.task](""), [contention.service])
     asker.wait_for_servers()
     begun_s = time.monotonic()
     say(event="begins", at_s=begun_s)
 
     def tick() -> None:
-        if (time.monotonic() - begun_s) % (rivalry.on_s + rivalry.off_s) < rivalry.on_s and not asker.under_way:
+        if (time.monotonic() - begun_s) % (contention.on_s + contention.off_s) < contention.on_s and not asker.under_way:
             asker.ask(tick)
 
     node.create_timer(_TICK_S, tick)

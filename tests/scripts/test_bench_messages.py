@@ -23,7 +23,7 @@ from peers.chain import LEFT, NODES, RIGHT, address, five, routes
 from peers.cyclone_net import cyclone_xml
 from peers.exchange import ANSWER, IMAGE, SIZE_MIN, Load, answer_to, exchange, image
 from peers.figures import MEDIAN, case_of, goals_of
-from peers.lines import EndSettings
+from peers.jsonl import EndSettings
 from report import Rounds
 
 from proxy.serial.channel import Channel

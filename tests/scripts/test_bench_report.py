@@ -19,7 +19,7 @@ sys.path.append(str(Path(__file__).resolve().parents[2] / "scripts" / "bench"))
 from frames import NAME_AT, SINK, SOURCE, gdp_frame, ip_checksum, ip_frame, spread_names, table_key, table_name
 from machine import machine_state, offload_text
 from report import Rounds, Spread, number_text, percentile, write_json
-from search import LATE_MAX_S, LOSS_MAX, Try, highest
+from rate_search import LATE_MAX_S, LOSS_MAX, Try, highest
 
 CASE, COLUMN = "1,400 B", "frames/s"
 MACS = bytes(range(12))

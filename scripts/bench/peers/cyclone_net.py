@@ -9,13 +9,13 @@ from contextlib import ExitStack
 from typing import Final
 
 from peers.chain import LEFT, NODES, RIGHT, Chain, address
-from peers.contender import READY_S, Measured, ask_end, start_end
+from peers.baseline import READY_S, Measured, ask_end, start_end
 from peers.exchange import Load
 from peers.process import Started
 
 __all__ = ["CycloneNet", "cyclone_xml"]
 
-_MODULE: Final = "peers.cyclone_end"
+_MODULE: Final = "peers.cyclone_endpoint"
 
 
 def cyclone_xml(own: str, other: str) -> str:

@@ -14,16 +14,16 @@ from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, ROOT_CERTIFICATE
 from gdp.trust.right import Right
 from peers.chain import LEFT, MIDDLE, RIGHT, Chain
-from peers.contender import READY_S, Measured, ask_end, start_end
+from peers.baseline import READY_S, Measured, ask_end, start_end
 from peers.exchange import Load
-from peers.gdp_end import PONG, ping_topic
+from peers.gdp_endpoint import PONG, ping_topic
 from peers.process import FailedError, Started
 from proxy.ring.materials import Materials
 
 __all__ = ["ENCODINGS", "GdpNet"]
 
 ENCODINGS: Final = ("json", "cbor", "cdr")
-_MODULE: Final = "peers.gdp_end"
+_MODULE: Final = "peers.gdp_endpoint"
 _IFACE: Final = {LEFT: MIDDLE[0], RIGHT: MIDDLE[-1]}  # a device is called like the neighbour it leads to
 
 

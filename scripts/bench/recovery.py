@@ -13,10 +13,10 @@ Then there are two figures more: until another machine has the role, and the lon
 A real ROS node calls ``/echo`` at the robot all the while. Asked: not one request fails. Every machine has a switch, a
 proxy and a real ROS node of its own; they, the robot and the supervisor share this machine's cores.
 
-    sudo .venv/bin/python scripts/bench/healing.py                     # the whole; writes docs/benchmarks/healing.*
-    sudo .venv/bin/python scripts/bench/healing.py --quick --no-save   # one round: does it work?
-    sudo .venv/bin/python scripts/bench/healing.py --only killed --rounds 10 --no-save
-    sudo .venv/bin/python scripts/bench/healing.py --gateway replica   # three machines; writes healing_gateway.*
+    sudo .venv/bin/python scripts/bench/recovery.py                     # the whole; writes docs/benchmarks/healing.*
+    sudo .venv/bin/python scripts/bench/recovery.py --quick --no-save   # one round: does it work?
+    sudo .venv/bin/python scripts/bench/recovery.py --only killed --rounds 10 --no-save
+    sudo .venv/bin/python scripts/bench/recovery.py --gateway replica   # three machines; writes healing_gateway.*
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from typing import Protocol
 
 from peers.chain import LEFT, Chain
 from peers.exchange import Load
-from peers.lines import EndSettings
+from peers.jsonl import EndSettings
 from peers.process import FailedError, Started
 
 __all__ = ["Contender", "Measured", "ask_end", "start_end"]

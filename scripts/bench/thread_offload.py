@@ -1,6 +1,6 @@
 """Whether hashing or verifying in a thread of its own pays: both ways side by side, in one process and run.
 
-    .venv/bin/python scripts/bench/overlap.py [--rounds 5] [--count 60] [--json FILE]
+    .venv/bin/python scripts/bench/thread_offload.py [--rounds 5] [--count 60] [--json FILE]
 
 Place: benchmark; one process, no network. An image of 921,600 bytes is sealed as parts for MTU 1500 and hashed as they
 come, in place and by a thread beside; a small message is verified in place and by a thread beside. What a thread does

@@ -17,7 +17,7 @@ from report import Rounds, percentile, progress
 
 from gdp.testbed.runs import Runs
 from peers.chain import Chain
-from peers.contender import Contender, Measured
+from peers.baseline import Contender, Measured
 from peers.exchange import Load
 from peers.figures import CPU, MEDIAN, P99, case_of
 from peers.process import FailedError

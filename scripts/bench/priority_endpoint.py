@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from peers.lines import say
+from peers.jsonl import say
 
 from gdp.client.member import Member, Topic
 from gdp.client.publisher import Publisher

@@ -16,8 +16,8 @@ from itertools import cycle, islice
 from pathlib import Path
 from typing import Final
 
-from peers.lines import say
-from priority_end import End, Timer
+from peers.jsonl import say
+from priority_endpoint import End, Timer
 from report import percentile
 
 from gdp.client.publisher import Publisher

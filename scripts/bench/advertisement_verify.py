@@ -9,7 +9,7 @@ Every claim is for another name, so that none of its own signatures was seen bef
     refresh    AdCerts known, a new sequence number: one check
 
 Example:
-    python scripts/bench/claims.py --claims 2000 --json claims.json
+    python scripts/bench/advertisement_verify.py --claims 2000 --json claims.json
 """
 
 from __future__ import annotations
