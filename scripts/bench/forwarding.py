@@ -32,12 +32,12 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from baselines import Baseline, Bridge, Direct, IPv4, Plane
 from chains import Chain
-from baselines import Bridge, Contender, Direct, IPv4, Plane
 from machine import machine_state, offload_text
 from plot import panel_of, require_plot, save_bars
-from report import Goal, Rounds, percentile, progress, show, write_json
 from rate_search import LOSS_MAX, highest
+from report import Rounds, Target, percentile, progress, show, write_json
 
 from gdp.errors import LocalError
 from gdp.testbed.runs import Runs
@@ -55,7 +55,7 @@ OUTPUT: Final = Path(__file__).parents[2] / "docs" / "benchmarks"
 
 
 class Bench:
-    """The rounds of one run: what is known so far, and how to measure one contender in one chain."""
+    """The rounds of one run: what is known so far, and how to measure one baseline in one chain."""
 
     def __init__(self, seconds: float, pings: int) -> None:
         self.over = Rounds()
@@ -65,40 +65,40 @@ class Bench:
         self._ends_cpu: dict[int, float] = {}
         self._ends_trip: dict[int, float] = {}
 
-    def measure(self, contender: Contender, chain: Chain, sizes: Sequence[int], lengths: Sequence[int]) -> None:
-        """Set a contender up, measure each size, take it down; say why if it cannot be had.
+    def measure(self, baseline: Baseline, chain: Chain, sizes: Sequence[int], lengths: Sequence[int]) -> None:
+        """Set a baseline up, measure each size, take it down; say why if it cannot be had.
 
         Args:
-            contender: who.
+            baseline: who.
             chain: where.
             sizes: of frames, bytes.
             lengths: the chains whose tables the figures stand in.
         """
-        if contender.name in self.over.reasons:
+        if baseline.name in self.over.reasons:
             return
         try:
-            standing = contender.stand(chain)
+            standing = baseline.stand(chain)
         except LocalError as error:
-            self.over.absent(contender.name, str(error))
+            self.over.absent(baseline.name, str(error))
             return
         with standing:
             for size in sizes:
-                figures = self._figures(contender, chain, size)
+                figures = self._figures(baseline, chain, size)
                 for length in lengths:
                     for column, value in figures.items():
-                        self.over.add(contender.name, case_of(size, length), column, value)
+                        self.over.add(baseline.name, case_of(size, length), column, value)
 
-    def _figures(self, contender: Contender, chain: Chain, size: int) -> dict[str, float | None]:
-        wire, workers = contender.wire(chain, size), contender.workers()
-        pings = min(self._pings, 50) if contender.name == "scapy" else self._pings
+    def _figures(self, baseline: Baseline, chain: Chain, size: int) -> dict[str, float | None]:
+        wire, workers = baseline.wire(chain, size), baseline.workers()
+        pings = min(self._pings, 50) if baseline.name == "scapy" else self._pings
         slept = chain.round_trips(wire, pings, poll=False)
-        apart = not contender.processes or len(os.sched_getaffinity(0)) >= 2 + len(workers)
+        apart = not baseline.processes or len(os.sched_getaffinity(0)) >= 2 + len(workers)
         polled = chain.round_trips(wire, pings, poll=True) if apart else []
         trip = statistics.median(polled) if polled else None
         if trip is not None and not chain.switches:
             self._ends_trip[size] = trip
-        asked = contender.name, case_of(size, chain.switches)
-        guess = self._guesses.get(asked, GUESSES.get(contender.name)) if contender.processes else None
+        asked = baseline.name, case_of(size, chain.switches)
+        guess = self._guesses.get(asked, GUESSES.get(baseline.name)) if baseline.processes else None
         best = highest(lambda rate: chain.attempt(wire, workers, rate, self._seconds), guess)
         cpu = share = None
         if best is not None:
@@ -126,14 +126,14 @@ def case_of(size: int, switches: int) -> str:
     return f"{size:,} B, {switches} switch{'es' if switches > 1 else ''}"
 
 
-def contenders_of(only: Sequence[str]) -> list[Contender]:
-    """Return the contenders asked for, all without a wish; those that are compared follow each other closely."""
-    quick: list[Contender] = [*(Plane(name, processes=False) for name in OURS if name not in GUESSES), Bridge(), IPv4()]
+def baselines_of(only: Sequence[str]) -> list[Baseline]:
+    """Return the baselines asked for, all without a wish; those that are compared follow each other closely."""
+    quick: list[Baseline] = [*(Plane(name, processes=False) for name in OURS if name not in GUESSES), Bridge(), IPv4()]
     known = [*quick, *(Plane(name, processes=True) for name in OURS if name in GUESSES)]
     return [each for each in known if not only or each.name in only]
 
 
-def goals_of(over: Rounds) -> list[Goal]:
+def targets_of(over: Rounds) -> list[Target]:
     """Return the figures that the kernel plane is to reach, all in the longer chain."""
     case, plain = case_of(1_400, 3), "kernel, redirect"
     return [
@@ -184,11 +184,11 @@ def main() -> None:
                     progress(f"round {number + 1} of {rounds}, MTU {mtu}: ends alone")
                     bench.measure(Direct(), chains[0], bytes_each, LENGTHS)
                     for length in LENGTHS:
-                        for contender in contenders_of(options.only):
+                        for baseline in baselines_of(options.only):
                             progress(
-                                f"round {number + 1} of {rounds}, MTU {mtu}, {length} in the middle: {contender.name}"
+                                f"round {number + 1} of {rounds}, MTU {mtu}, {length} in the middle: {baseline.name}"
                             )
-                            bench.measure(contender, chains[length], bytes_each, [length])
+                            bench.measure(baseline, chains[length], bytes_each, [length])
     except KeyboardInterrupt:
         sys.exit("stopped; everything that was made is gone")
     except LocalError as error:
@@ -203,11 +203,11 @@ def main() -> None:
         "scheduler": "SCHED_FIFO" if options.realtime else "ordinary",
         "offloads of the devices (none touches AF_PACKET frames)": found,
     }
-    goals = goals_of(bench.over)
-    show("Forwarding", state, settings, bench.over, goals)
+    targets = targets_of(bench.over)
+    show("Forwarding", state, settings, bench.over, targets)
     if options.no_save:
         return
-    write_json(options.json, "forwarding", state, settings, bench.over, goals)
+    write_json(options.json, "forwarding", state, settings, bench.over, targets)
     if not options.no_plot:
         draw(options.plot, str(state), bench.over)
 

@@ -32,7 +32,7 @@ from gdp.errors import GdpError
 from gdp.testbed.runs import Runs
 
 OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks" / "hellos.json"
-GOAL: Final = 1.0  # percent of a core
+TARGET: Final = 1.0  # percent of a core
 SETTLE_S: Final = 8.0  # hellos are frequent until keepalives have taken over
 _TICK_S: Final = 1 / os.sysconf("SC_CLK_TCK")
 _CASES: Final[dict[str, int | None]] = {"keepalives as shipped": None, "no keepalives": 0}
@@ -89,8 +89,8 @@ def main() -> None:
         sys.exit(f"error: {error}")
     table = Table(f"{options.neighbours} neighbours", "% of a core, median", "lowest-highest", "to reach")
     for case, figures in found.items():
-        goal = f"≤ {GOAL:g}" if case != "no keepalives" else ""
-        table.add_row(case, f"{statistics.median(figures):.2f}", f"{min(figures):.2f}-{max(figures):.2f}", goal)
+        target = f"≤ {TARGET:g}" if case != "no keepalives" else ""
+        table.add_row(case, f"{statistics.median(figures):.2f}", f"{min(figures):.2f}-{max(figures):.2f}", target)
     Console().print(table)
     if not options.no_save:
         OUTPUT.write_text(json.dumps({"machine": asdict(state), "neighbours": options.neighbours, **found}, indent=1))

@@ -10,7 +10,7 @@ Five machines in namespaces, A - s1 - s2 - s3 - B, and in turn on them, round by
     sudo .venv/bin/python scripts/bench/messages.py                     # the whole; writes docs/benchmarks/messages.*
     sudo .venv/bin/python scripts/bench/messages.py --quick             # one round of few messages: does it work?
     sudo .venv/bin/python scripts/bench/messages.py --only gdp-raw --only zenoh-mtls --mtu 1500 --size 921600
-    sudo .venv/bin/python scripts/bench/messages.py --realtime          # every contender under SCHED_FIFO
+    sudo .venv/bin/python scripts/bench/messages.py --realtime          # every baseline under SCHED_FIFO
 
 Messages go one at a time, as in a control loop. A figure of a round is the median (or p99) of its messages; the table
 shows the median of the rounds, and in brackets their lowest and highest. Only the whole bench writes under
@@ -29,10 +29,10 @@ from pathlib import Path
 from typing import Final
 
 from machine import machine_state
-from peers.baseline import Contender
+from peers.baseline import Baseline
 from peers.cyclone_net import CycloneNet
 from peers.exchange import ANSWER, SIZE_MIN, Load
-from peers.figures import MEDIAN, P99, case_of, goals_of
+from peers.figures import MEDIAN, P99, case_of, targets_of
 from peers.gdp_net import ENCODINGS, GdpNet
 from peers.rounds import Plan, Turns
 from peers.zenoh_net import ZenohNet
@@ -49,9 +49,9 @@ OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks"
 QUICK_COUNT: Final = 10
 
 
-def contenders_of(only: Sequence[str], encodings: tuple[str, ...], spin_s: float) -> tuple[Contender, ...]:
-    """Return the contenders called so; all, if none is named."""
-    every: tuple[Contender, ...] = (
+def baselines_of(only: Sequence[str], encodings: tuple[str, ...], spin_s: float) -> tuple[Baseline, ...]:
+    """Return the baselines called so; all, if none is named."""
+    every: tuple[Baseline, ...] = (
         GdpNet("kernel", encodings, spin_s),
         GdpNet("raw", encodings, spin_s),
         ZenohNet(secured=True),
@@ -78,7 +78,7 @@ def arguments(names: Sequence[str]) -> argparse.ArgumentParser:
         "--count", type=positive, default=80, help="messages above 100 kB; of smaller ones four times that"
     )
     parser.add_argument("--quick", action="store_true", help=f"one round of {QUICK_COUNT} messages")
-    parser.add_argument("--only", action="append", choices=names, help="this contender; may be repeated")
+    parser.add_argument("--only", action="append", choices=names, help="this baseline; may be repeated")
     parser.add_argument("--mtu", type=int, action="append", help="bytes after the Ethernet header; may be repeated")
     parser.add_argument("--size", type=size_of, action="append", help="bytes of a message; may be repeated")
     parser.add_argument("--offloads", choices=("off", "on", "both"), default="both", help="of the veth devices")
@@ -119,7 +119,7 @@ def plan_of(options: argparse.Namespace) -> Plan:
     return Plan(
         tuple(options.mtu or MTUS),
         {"off": (False,), "on": (True,), "both": (False, True)}[options.offloads],
-        contenders_of(options.only or (), tuple(options.encoding or ENCODINGS), options.spin_us / 1e6),
+        baselines_of(options.only or (), tuple(options.encoding or ENCODINGS), options.spin_us / 1e6),
         Load(tuple(options.size or SIZES), QUICK_COUNT if options.quick else options.count),
         1 if options.quick else options.rounds,
     )
@@ -127,7 +127,7 @@ def plan_of(options: argparse.Namespace) -> Plan:
 
 def main() -> None:
     """Run the bench, or a part of it."""
-    options = arguments([each.name for each in contenders_of((), (), 0.0)]).parse_args()
+    options = arguments([each.name for each in baselines_of((), (), 0.0)]).parse_args()
     plan = plan_of(options)
     is_whole = not (options.quick or options.only or options.mtu or options.size or options.offloads != "both")
     json_path = options.json or (OUTPUT / "messages.json" if is_whole else None)
@@ -157,11 +157,11 @@ def main() -> None:
         "trouble": turns.notes or "none",
         "took, s": round(time.monotonic() - begun_s),
     }
-    goals = goals_of(turns.over, [label for label in plan.labels if label.startswith("gdp")], plan.cases)
+    targets = targets_of(turns.over, [label for label in plan.labels if label.startswith("gdp")], plan.cases)
     title = "Messages over three machines, an answer back"
-    show(title, state, settings, turns.over, goals)
+    show(title, state, settings, turns.over, targets)
     if json_path:
-        write_json(json_path, "messages", state, settings, turns.over, goals)
+        write_json(json_path, "messages", state, settings, turns.over, targets)
     if plot_path:
         save_bars(plot_path, title, str(state), panels_of(turns.over, plan))
 

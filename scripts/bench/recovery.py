@@ -32,7 +32,7 @@ from healing_stage import Cluster
 from machine import machine_state
 from peers.process import FailedError
 from plot import Panel, panel_of, require_plot, save_bars
-from report import Goal, Rounds, Settings, progress, show, write_json
+from report import Rounds, Settings, Target, progress, show, write_json
 
 from gdp.errors import GdpError
 
@@ -98,15 +98,15 @@ def measure(cluster: Cluster, case: str) -> dict[str, float | None]:
     return {**first, SERVING: (served.served_unix_s or at_s) - at_s}
 
 
-def goals_of(over: Rounds) -> list[Goal]:
+def targets_of(over: Rounds) -> list[Target]:
     """Return what was asked for of what was measured."""
     found = []
     for case, columns in COLUMNS.items():
         for column in columns:
             if over.spread(WHO, CASES[case], column) is not None:
                 asked_s = ASKED_S.get((case, column))
-                found.append(over.goal(f"{CASES[case]}: {column}", WHO, CASES[case], column, asked_s, at_most=True))
-    return [*found, over.goal(f"{TRAFFIC}: {FAILED}", WHO, TRAFFIC, FAILED, 0.0, at_most=True)]
+                found.append(over.target(f"{CASES[case]}: {column}", WHO, CASES[case], column, asked_s, at_most=True))
+    return [*found, over.target(f"{TRAFFIC}: {FAILED}", WHO, TRAFFIC, FAILED, 0.0, at_most=True)]
 
 
 def panels_of(over: Rounds) -> list[Panel]:
@@ -175,10 +175,10 @@ def main() -> None:
         "took, s": round(time.monotonic() - begun_s),
     }
     title = f"A cluster of {machines} machines of the provider local heals; gateway: {options.gateway}"
-    goals = goals_of(over)
-    show(title, state, settings, over, goals)
+    targets = targets_of(over)
+    show(title, state, settings, over, targets)
     if not options.no_save:
-        write_json(options.json or OUTPUT / f"{name}.json", name, state, settings, over, goals)
+        write_json(options.json or OUTPUT / f"{name}.json", name, state, settings, over, targets)
     if is_drawn:
         save_bars(options.plot or OUTPUT / f"{name}.png", title, str(state), panels_of(over))
 

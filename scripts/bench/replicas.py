@@ -35,7 +35,7 @@ from field import READY_S, ROBOT, Field, Served, Server, Work  # noqa: E402 - it
 from machine import machine_state  # noqa: E402
 from peers.process import FailedError  # noqa: E402
 from plot import Panel, panel_of, require_plot, save_bars  # noqa: E402
-from report import Goal, Rounds, Settings, percentile, progress, show, write_json  # noqa: E402
+from report import Rounds, Settings, Target, percentile, progress, show, write_json  # noqa: E402
 
 from gdp.errors import LocalError  # noqa: E402
 from gdp.testbed.runs import Runs  # noqa: E402
@@ -203,20 +203,20 @@ class Bench:
             self.over.add(who, CASES[case], column, value)
 
 
-def goals_of(over: Rounds) -> list[Goal]:
+def targets_of(over: Rounds) -> list[Target]:
     """Return what was asked for of what was measured."""
     killed, added, hedged = CASES.values()
-    goals = []
+    targets = []
     if killed in over.cases():
         for column in ("failed", "answered wrongly", "answers too many"):
-            goals.append(over.goal(f"{killed}: {column}", THREE, killed, column, 0.0, at_most=True))
+            targets.append(over.target(f"{killed}: {column}", THREE, killed, column, 0.0, at_most=True))
     if added in over.cases():
-        goals.append(over.difference(f"{added}: {TWO} - {ONE}, ms", TWO, ONE, added, MEDIAN, ADDED_MS))
+        targets.append(over.difference(f"{added}: {TWO} - {ONE}, ms", TWO, ONE, added, MEDIAN, ADDED_MS))
     if hedged in over.cases():
-        goals.append(over.goal(f"{hedged}: {LATE}, {EXTRA}", LATE, hedged, EXTRA, 100 * _BUDGET, at_most=True))
+        targets.append(over.target(f"{hedged}: {LATE}, {EXTRA}", LATE, hedged, EXTRA, 100 * _BUDGET, at_most=True))
         for who, asked in ((LATE, GAIN), (BOTH, None)):
-            goals.append(over.ratio(f"{hedged}: {ONE} / {who}, p99.9", ONE, who, hedged, P999, asked))
-    return goals
+            targets.append(over.ratio(f"{hedged}: {ONE} / {who}, p99.9", ONE, who, hedged, P999, asked))
+    return targets
 
 
 def panels_of(over: Rounds) -> list[Panel]:
@@ -277,11 +277,11 @@ def main() -> None:
         "seed": options.seed,
         "took, s": round(time.monotonic() - begun_s),
     }
-    goals = goals_of(bench.over)
+    targets = targets_of(bench.over)
     title = "Calls of a service with replicas, over two switches"
-    show(title, state, settings, bench.over, goals)
+    show(title, state, settings, bench.over, targets)
     if not options.no_save:
-        write_json(options.json, "replicas", state, settings, bench.over, goals)
+        write_json(options.json, "replicas", state, settings, bench.over, targets)
     if is_drawn:
         save_bars(options.plot, title, str(state), panels_of(bench.over))
 

@@ -20,7 +20,7 @@ from typing import Final
 from machine import machine_state
 from peers.process import FailedError
 from plot import Panel, require_plot, save_bars
-from report import Goal, Rounds, Settings, progress, show, write_json
+from report import Rounds, Settings, Target, progress, show, write_json
 from ros_row import BUFFER_BYTES, Carried, Row
 
 from gdp.errors import LocalError
@@ -57,7 +57,7 @@ class Bench:
     title: str
     carried: Sequence[Carried]
     turns: Sequence[Turn]
-    goals: Callable[[Rounds], list[Goal]]
+    targets: Callable[[Rounds], list[Target]]
     panels: Callable[[Rounds], list[Panel]]
     settings: Mapping[str, str | int | float] = field(default_factory=dict)
 
@@ -101,10 +101,10 @@ def perform(bench: Bench, options: Options) -> None:
         "trouble": notes or "none",
         "took, s": round(time.monotonic() - begun_s),
     }
-    goals = bench.goals(over)
-    show(bench.title, state, settings, over, goals)
+    targets = bench.targets(over)
+    show(bench.title, state, settings, over, targets)
     if not options.no_save:
-        write_json(options.json, bench.name, state, settings, over, goals)
+        write_json(options.json, bench.name, state, settings, over, targets)
     if is_drawn:
         save_bars(options.plot, bench.title, str(state), bench.panels(over))
 

@@ -31,12 +31,12 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from chains import Chain
 from baselines import Plane
+from chains import Chain
 from machine import machine_state
 from plot import Panel, panel_of, require_plot, save_bars
-from report import Goal, Rounds, progress, show, write_json
 from rate_search import LOSS_MAX, Try, highest
+from report import Rounds, Target, progress, show, write_json
 from worker import Worker, number
 
 from gdp.errors import LocalError
@@ -110,7 +110,7 @@ def case_of(names: int) -> str:
     return f"{names:,} names"
 
 
-def goals_of(over: Rounds, sizes: Sequence[int], rib_names: int) -> list[Goal]:
+def targets_of(over: Rounds, sizes: Sequence[int], rib_names: int) -> list[Target]:
     """Return the figures that are to be reached."""
     small, large = case_of(min(sizes)), case_of(max(sizes))
     return [
@@ -122,8 +122,8 @@ def goals_of(over: Rounds, sizes: Sequence[int], rib_names: int) -> list[Goal]:
             over.ratio(f"{plane}: {large} / {small}, {CPU}", plane, plane, large, CPU, None, other_case=small)
             for plane in PLANES
         ),
-        *(over.goal(f"{plane}, {large}: {INSTALLS} in bulk", plane, large, INSTALLS, 300_000) for plane in PLANES),
-        over.goal(f"RIB: {ADVERTISED}, one core", RIB, f"RIB, {rib_names:,} names", ADVERTISED, 2_000),
+        *(over.target(f"{plane}, {large}: {INSTALLS} in bulk", plane, large, INSTALLS, 300_000) for plane in PLANES),
+        over.target(f"RIB: {ADVERTISED}, one core", RIB, f"RIB, {rib_names:,} names", ADVERTISED, 2_000),
     ]
 
 
@@ -171,11 +171,11 @@ def main() -> None:
         "frames": f"{FRAME_BYTES} B, one switch, {options.spread:,} names of the table",
         "cores": "source 0, sink 1, switch anywhere",
     }
-    goals = goals_of(over, sizes, rib_names)
-    show("Scale", state, settings, over, goals)
+    targets = targets_of(over, sizes, rib_names)
+    show("Scale", state, settings, over, targets)
     if options.no_save:
         return
-    write_json(options.json, "scale", state, settings, over, goals)
+    write_json(options.json, "scale", state, settings, over, targets)
     if not options.no_plot:
         save_bars(options.plot, "Scale", str(state), panels_of(over, sizes))
 

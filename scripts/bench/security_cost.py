@@ -28,13 +28,13 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
 
+from baselines import Plane
 from bundles import BUNDLES, CPU, OVERLOAD, RATE, SINGLE
 from chains import Chain
-from baselines import Plane
 from machine import machine_state, thread_s
 from peers.figures import MEDIAN
 from peers.process import FailedError
-from report import Goal, Rounds, progress, show
+from report import Rounds, Target, progress, show
 
 from gdp.testbed.runs import Runs
 
@@ -80,27 +80,27 @@ def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
                 for who, figures_of in PARTS[part](dict(turns[:: 1 if number % 2 else -1]), options).items():
                     for (case, column), value in figures_of.items():
                         over.add(who, case, column, value)
-            goals = _goals(over)
-            show(f"Cost of security: {part}", state, {"rounds": options.rounds, BEFORE: options.base}, over, goals)
-            has_met = has_met and all(goal.reached is not False for goal in goals)
+            targets = _targets(over)
+            show(f"Cost of security: {part}", state, {"rounds": options.rounds, BEFORE: options.base}, over, targets)
+            has_met = has_met and all(target.met is not False for target in targets)
             figures[part] = {
                 BEFORE: options.base,
                 "rounds": over.values,
-                "ratios": {goal.what: str(goal.got) for goal in goals},
-                "reached": {goal.what: goal.reached for goal in goals},
+                "ratios": {target.what: str(target.measured) for target in targets},
+                "met": {target.what: target.met for target in targets},
             }
     return figures, has_met
 
 
-def _goals(over: Rounds) -> list[Goal]:
-    goals = []
+def _targets(over: Rounds) -> list[Target]:
+    targets = []
     for case in over.cases():
         for column in over.columns(case):
             is_rate = column.endswith("/s")
             asked = 1 - ASKED if is_rate else 1 + ASKED
             what = f"{case}, {column}: {HERE} / {BEFORE}"
-            goals.append(over.ratio(what, HERE, BEFORE, case, column, asked, at_most=not is_rate))
-    return goals
+            targets.append(over.ratio(what, HERE, BEFORE, case, column, asked, at_most=not is_rate))
+    return targets
 
 
 @contextmanager

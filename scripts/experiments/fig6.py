@@ -13,12 +13,6 @@ from dataclasses import asdict, dataclass
 from typing import Annotated, Final
 
 import typer
-from image_request import TYPE
-from field import Served, Work
-from machine import machine_state
-from pictures import save_distributions
-from samples import Sample, Summary
-from series import Contention, Series
 from experiment import (
     Asking,
     Finding,
@@ -30,6 +24,12 @@ from experiment import (
     field_of,
     place_of,
 )
+from field import Served, Work
+from image_request import TYPE
+from machine import machine_state
+from pictures import save_distributions
+from samples import Sample, Summary
+from series import Contention, Series
 
 __all__: list[str] = []
 

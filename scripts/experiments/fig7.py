@@ -10,12 +10,6 @@ from __future__ import annotations
 from typing import Annotated, Final
 
 import typer
-from image_request import TYPE
-from field import Served, Work
-from machine import machine_state
-from pictures import save_distributions
-from samples import Sample, Summary
-from series import Series
 from experiment import (
     Asking,
     Finding,
@@ -27,6 +21,12 @@ from experiment import (
     field_of,
     place_of,
 )
+from field import Served, Work
+from image_request import TYPE
+from machine import machine_state
+from pictures import save_distributions
+from samples import Sample, Summary
+from series import Series
 
 __all__: list[str] = []
 

@@ -12,14 +12,14 @@ from enum import Enum, auto
 from typing import Annotated, Final
 
 import typer
-from image_request import TYPE
+from experiment import Asking, Finding, JsonOption, OutOption, QuickOption, Report, conclude, field_of, place_of
 from field import Field, Served, Work
+from image_request import TYPE
 from machine import machine_state
 from pictures import Span, save_timeline
 from report import progress
 from samples import Sample, Summary
 from series import Series
-from experiment import Asking, Finding, JsonOption, OutOption, QuickOption, Report, conclude, field_of, place_of
 
 __all__: list[str] = []
 

@@ -22,12 +22,12 @@ from typing import Annotated, Final, Literal, TypeAlias
 
 import typer
 from bench_path import ROOT
+from experiment import JsonOption, OutOption, QuickOption, place_of
 from machine import machine_state
 from offload_page import page_of, save_picture
 from peers.process import FailedError, Started
 from report import progress
 from ros_row import DIRECT_DOMAIN, LEFT, READY_S, RIGHT, Carried, Row
-from experiment import JsonOption, OutOption, QuickOption, place_of
 
 from gdp.errors import LocalError
 from gdp.testbed.cgroups import Cgroup
@@ -38,7 +38,7 @@ __all__: list[str] = []
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 OVERLAY: Final = "overlay"
-CONTENDERS: Final = {"ROS 2, Cyclone DDS": "cyclone", "ROS 2, Fast DDS": "fast", OVERLAY: "fast"}
+BASELINES: Final = {"ROS 2, Cyclone DDS": "cyclone", "ROS 2, Fast DDS": "fast", OVERLAY: "fast"}
 ROUNDS: Final = 3
 AT_ONCE: Final = 34  # requests a round that are answered without computing: the network alone
 COMPUTED: Final = {"vSLAM": 34, "grasp planning": 34, "motion planning": 1}  # requests a round that are computed
@@ -61,7 +61,7 @@ Part: TypeAlias = Literal["network", "alone", "both"]
 
 @dataclass(slots=True)
 class Measured:
-    """What one contender took, in seconds, a value a request. ``failed``: answers that were wrong."""
+    """What one baseline took, in seconds, a value a request. ``failed``: answers that were wrong."""
 
     there_s: list[float] = field(default_factory=list)
     back_s: list[float] = field(default_factory=list)
@@ -118,7 +118,7 @@ def main(
 
 
 def _network(name: str, rounds: int, *, quick: bool) -> dict[str, object]:
-    """Let every contender carry a task, in turn, round by round."""
+    """Let every baseline carry a task, in turn, round by round."""
     from offload_tasks import TASKS
 
     shape = TASKS[name]()
@@ -126,11 +126,11 @@ def _network(name: str, rounds: int, *, quick: bool) -> dict[str, object]:
     carried = [Carried(prefix + topic, type_name, "cdr") for topic, type_name in shape.parts]
     carried.append(Carried(prefix + shape.answer[0], shape.answer[1], "cdr", source=RIGHT))
     at_once, computed = (3, 2) if quick else (AT_ONCE, COMPUTED[name])
-    found = {who: Measured() for who in CONTENDERS}
+    found = {who: Measured() for who in BASELINES}
     size = 0
     with _run() as run, Row(run, carried, mtu=MTU, bridged=True) as row:
         for at in range(1, rounds + 1):
-            for who, middleware in CONTENDERS.items():
+            for who, middleware in BASELINES.items():
                 progress(f"{name}, round {at} of {rounds}: {who}")
                 told = {"task": name, "prefix": prefix, "middleware": middleware, "domain": DIRECT_DOMAIN}
                 told |= {"at_once": at_once, "count": at_once + computed}

@@ -1,6 +1,6 @@
 """The processes of ``offload.py``: a robot that asks, a server that computes, and a robot that computes by itself.
 
-Process of its own: ``offload_endpoint.py robot|cloud|alone SETTINGS``. Robot and server are nodes of ROS 2, by one of two
+Process of its own: ``offload_endpoint.py robot|cloud|alone SETTINGS``. Both are nodes of ROS 2, by one of two
 middlewares: ``rclpy`` with Fast DDS, or Cyclone DDS. Of the latter there is no wheel for rclpy, so the messages are
 serialised by rclpy and carried by this project's endpoint ``dds``, which is what ``rmw_cyclonedds`` does in one piece.
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import Final
 
-from peers.chain import LEFT, NODES, RIGHT, Chain, address
 from peers.baseline import READY_S, Measured, ask_end, start_end
+from peers.chain import LEFT, NODES, RIGHT, Chain, address
 from peers.exchange import Load
 from peers.process import Started
 
@@ -38,7 +38,7 @@ class CycloneNet:
         """Start B, then A.
 
         Raises:
-            FailedError: as ``Contender.measure``.
+            FailedError: as ``Baseline.measure``.
         """
         with ExitStack() as stack:
             pong = stack.enter_context(_end(chain, RIGHT, load, {}))

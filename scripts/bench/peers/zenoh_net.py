@@ -8,9 +8,9 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import Final
 
+from peers.baseline import READY_S, Measured, ask_end, start_end
 from peers.certificates import make_certificates
 from peers.chain import LEFT, MIDDLE, NODES, RIGHT, Chain, address
-from peers.baseline import READY_S, Measured, ask_end, start_end
 from peers.exchange import Load
 from peers.jsonl import EndSettings
 from peers.process import Started
@@ -33,7 +33,7 @@ class ZenohNet:
         """Start routers from the left, then B, then A.
 
         Raises:
-            FailedError: as ``Contender.measure``.
+            FailedError: as ``Baseline.measure``.
         """
         with ExitStack() as stack:
             routers = []
