@@ -179,7 +179,7 @@ def panels_of(over: Rounds, mtu: int) -> list[Panel]:
 
 def main() -> None:
     """Run the bench."""
-    options = parse(__doc__ or "", "ros", rounds=3, seconds=SECONDS, mtus=MTUS, quick_s=QUICK_S)
+    options = parse(__doc__ or "", rounds=3, seconds=SECONDS, mtus=MTUS, quick_s=QUICK_S)
     perform(bench_of(options), options)
 
 

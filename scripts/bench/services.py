@@ -141,7 +141,7 @@ def bench_of(options: Options) -> Bench:
 
 def main() -> None:
     """Run the bench."""
-    options = parse(__doc__ or "", "services", rounds=3, seconds=SECONDS, mtus=(MTU,), quick_s=QUICK_S)
+    options = parse(__doc__ or "", rounds=3, seconds=SECONDS, mtus=(MTU,), quick_s=QUICK_S)
     perform(bench_of(options), options)
 
 

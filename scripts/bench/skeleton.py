@@ -162,8 +162,12 @@ def new_run(runs: Runs | None = None) -> Iterator[Run]:
 
 
 def run_bench(parser: argparse.ArgumentParser, measure: Callable[[Options, Runs], Outcome]) -> None:
+    """Parse the command line, and run a bench to its table, JSON record and picture."""
+    perform(parse(parser), measure)
+
+
+def perform(options: Options, measure: Callable[[Options, Runs], Outcome]) -> None:
     """Run a bench to its table, JSON record and picture."""
-    options = parse(parser)
     is_saved = not getattr(options, "no_save", False)
     is_drawn = is_saved and not getattr(options, "no_plot", True)
     if is_drawn:

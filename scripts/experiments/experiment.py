@@ -6,7 +6,6 @@ Place: shell; prints, and writes ``figN.json`` and ``figN.md`` where it is told 
 from __future__ import annotations
 
 import json
-import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,15 +17,12 @@ import typer
 from bench_path import ROOT
 from field import ROBOT, Field, Served, Work
 from machine import MachineState
-from peers.process import FailedError
 from report import number_text, progress
 from rich.console import Console
 from rich.table import Table
 from samples import Sample, Summary
 from series import Series
-
-from gdp.errors import LocalError
-from gdp.testbed.runs import Runs
+from skeleton import clean_exit, new_run
 
 __all__ = [
     "Asking",
@@ -135,19 +131,8 @@ def field_of(
     served: Sequence[Served], work: Mapping[str, Work], delays: Mapping[str, float] | None = None
 ) -> Iterator[Field]:
     """Have a field for a while; leaves with a clear word if there can be none."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
-    runs = Runs()
-    runs.sweep()
-    run = runs.start()
-    try:
-        with Field(run, served, work, delays=delays) as place:
-            yield place
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except (LocalError, FailedError) as error:
-        sys.exit(f"error: {error}")
-    finally:
-        run.end()
+    with clean_exit(), new_run() as run, Field(run, served, work, delays=delays) as place:
+        yield place
 
 
 class Asking:

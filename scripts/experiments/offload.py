@@ -14,9 +14,8 @@ import json
 import os
 import signal
 import statistics
-import sys
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Final, Literal, TypeAlias
 
@@ -25,13 +24,12 @@ from bench_path import ROOT
 from experiment import JsonOption, OutOption, QuickOption, place_of
 from machine import machine_state
 from offload_page import page_of, save_picture
-from peers.process import FailedError, Started
+from peers.process import Started
 from report import progress
 from ros_row import DIRECT_DOMAIN, LEFT, READY_S, RIGHT, Carried, Row
+from skeleton import clean_exit, new_run
 
-from gdp.errors import LocalError
 from gdp.testbed.cgroups import Cgroup
-from gdp.testbed.runs import Run, Runs
 
 __all__: list[str] = []
 
@@ -93,8 +91,7 @@ def main(
     tasks: dict[str, dict[str, object]] = {}
     if kept is not None and kept.exists():
         tasks = json.loads(kept.read_text(encoding="utf-8"))["tasks"]
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
-    try:
+    with clean_exit():
         for name in names:
             state = machine_state()
             told = tasks.setdefault(name, {})
@@ -102,10 +99,6 @@ def main(
                 told["network"] = _network(name, 1 if quick else rounds, quick=quick) | {"machine": asdict(state)}
             if part != "network":
                 told["alone"] = _alone(name, quick=quick) | {"machine": asdict(state)}
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except (LocalError, FailedError) as error:
-        sys.exit(f"error: {error}")
     document = {"experiment": "offload", "slower": SLOWER, "tasks": tasks}
     page = page_of(document)
     print(json.dumps(document) if as_json else page)
@@ -128,7 +121,7 @@ def _network(name: str, rounds: int, *, quick: bool) -> dict[str, object]:
     at_once, computed = (3, 2) if quick else (AT_ONCE, COMPUTED[name])
     found = {who: Measured() for who in BASELINES}
     size = 0
-    with _run() as run, Row(run, carried, mtu=MTU, bridged=True) as row:
+    with new_run() as run, Row(run, carried, mtu=MTU, bridged=True) as row:
         for at in range(1, rounds + 1):
             for who, middleware in BASELINES.items():
                 progress(f"{name}, round {at} of {rounds}: {who}")
@@ -177,7 +170,7 @@ def _alone(name: str, *, quick: bool) -> dict[str, object]:
     count, robots = (1, 1) if quick else ALONE[name]
     cores = 1 / SLOWER[name] if SLOWER[name] > 1 and not quick else 1.0
     times, failed = [], 0
-    with _run() as run, ExitStack() as stack:
+    with new_run() as run, ExitStack() as stack:
         started = []
         for number in range(robots):
             argv = [_END, "alone", json.dumps({"task": name, "count": count})]
@@ -199,18 +192,6 @@ def _alone(name: str, *, quick: bool) -> dict[str, object]:
                 failed += not said["is_right"]
             progress(f"{name}, on the robot: {len(times)} of {count * robots}")
     return {"cores": cores, "took_s": _short(times), "failed": failed, "side_by_side": robots}
-
-
-@contextmanager
-def _run() -> Iterator[Run]:
-    """Have a run of the testbed for a while."""
-    runs = Runs()
-    runs.sweep()
-    run = runs.start()
-    try:
-        yield run
-    finally:
-        run.end()
 
 
 def _float(said: Mapping[str, object], key: str) -> float:

@@ -196,10 +196,10 @@ def test_a_ratio_is_taken_within_one_round_and_one_case() -> None:
         over.add("zenoh-mtls", case, MEDIAN, theirs)
     over.add("zenoh-mtls", case_of(921_600, 1_500, offloads=False), MEDIAN, 1.0)
     (target,) = targets_of(over, ["gdp-raw cdr"], [(921_600, 1_500, True)])[:1]
-    assert target.got is not None
-    assert target.got.median == 0.75
-    assert target.asked == 0.8
-    assert target.reached
+    assert target.measured is not None
+    assert target.measured.median == 0.75
+    assert target.target == 0.8
+    assert target.met
 
 
 def test_a_contender_that_is_not_here_reaches_nothing_and_says_why() -> None:
@@ -207,7 +207,7 @@ def test_a_contender_that_is_not_here_reaches_nothing_and_says_why() -> None:
     over.add("zenoh-mtls", case, MEDIAN, 1.0)
     over.absent("gdp-kernel cdr", "no CAP_BPF")
     (target,) = targets_of(over, ["gdp-kernel cdr"], [(100, 1_500, False)])
-    assert target.reached is None
+    assert target.met is None
     assert "no CAP_BPF" in str(target)
 
 

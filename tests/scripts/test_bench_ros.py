@@ -26,7 +26,7 @@ from proxy.rules.rule import Rule
 @pytest.fixture
 def options(monkeypatch: pytest.MonkeyPatch) -> Options:
     monkeypatch.setattr(sys, "argv", ["bench"])
-    return parse("", "bench", rounds=3, seconds=5.0, mtus=(1_500, 9_000), quick_s=1.0)
+    return parse("", rounds=3, seconds=5.0, mtus=(1_500, 9_000), quick_s=1.0)
 
 
 def benches(options: Options) -> list[Bench]:
