@@ -131,7 +131,7 @@ def command_line(
 def parse(parser: argparse.ArgumentParser, words: Sequence[str] | None = None) -> Options:
     """Return the options, with those of ``--quick`` applied; ``words`` as ``sys.argv[1:]``."""
     options = parser.parse_args(words)
-    if getattr(options, "quick", False):
+    if getattr(options, "quick", False) and hasattr(options, "quick_values"):
         vars(options).update(options.quick_values)
     return options
 
