@@ -174,7 +174,7 @@ def _notes(tasks: Document, slower: Mapping[str, float]) -> list[str]:
     notes += [
         "The data are recorded ones: RGB-D frames 2 to 5 of the five in slambook2 for vSLAM (the paper: TUM fr2/loop),"
         " three of them cropped to 516 x 386 with an armchair's mask for grasps, OMPL.app's meshes of Home. Answers are"
-        " checked: motion within 0.1 m and 0.1 rad of the recorded poses, a path from start to target, a grasp on the"
+        " checked: motion within 0.1 m and 0.1 rad of the recorded poses, a path from start to goal, a grasp on the"
         " object.",
         "*Robot only* is the same computation in a control group that gets as much less of a core as the paper's robot"
         f" was slower than its server (robot only over total less network: {ratios}). So the ratio is the paper's,"
