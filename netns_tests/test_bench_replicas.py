@@ -28,7 +28,7 @@ def bench(name: str, *options: str) -> str:
 
 def test_no_request_fails_while_two_of_three_replicas_are_killed_and_come_back() -> None:
     told = bench("replicas.py", "--only", "killed", "--rounds", "1", "--requests", "800", "--rate", "200")
-    assert told.count("asked ≤ 0.00, got 0.00, reached") == 3, told
+    assert told.count("target ≤ 0.00, measured 0.00, met") == 3, told
 
 
 def test_replicas_are_measured_beside_a_single_server() -> None:

@@ -23,7 +23,7 @@ needs_ros2 = pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy is not
         ["scale.py", "--quick", "--no-save"],
         ["messages.py", "--quick", "--mtu", "9000", "--offloads", "off"],
         ["library.py", "--rounds", "1", "--count", "5"],
-        ["overlap.py", "--rounds", "1", "--count", "5"],
+        ["thread_offload.py", "--rounds", "1", "--count", "5"],
         ["priority.py", "--quick", "--no-save"],
         ["bundles.py", "--quick", "--no-save"],
         pytest.param(["ros.py", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),
@@ -31,7 +31,7 @@ needs_ros2 = pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy is not
         pytest.param(["fogros.py", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),
         ["survive.py", "--only", "cut", "--rounds", "1", "--no-save"],
         ["serial.py", "--help"],
-        ["claims.py", "--claims", "100"],
+        ["advertisement_verify.py", "--claims", "100"],
     ],
     ids=lambda command: command[0],
 )

@@ -54,7 +54,7 @@ def test_an_experiment_runs_to_its_page_without_a_failed_request(name: str, tmp_
     told = run(name, tmp_path)
     assert all(is_right for group in told["groups"].values() for *_, is_right in group), told["groups"]
     if name == "fig9":
-        found = {each["what"]: each["got"] for each in told["findings"]}
+        found = {each["what"]: each["measured"] for each in told["findings"]}
         assert found["kills"] >= 1
         assert found["failed requests"] == found["answers too many"] == 0
 

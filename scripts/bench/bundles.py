@@ -13,23 +13,18 @@ nothing lost at the steady rate; in overload at least three times what one seal 
 
 from __future__ import annotations
 
-import argparse
-import signal
-import sys
-import time
-from pathlib import Path
 from typing import Final
 
-from bundles_end import BACKLOG, MESSAGE_BYTES
-from bundles_row import READY_S, Row
-from machine import machine_state
+from bundles_endpoint import BACKLOG, MESSAGE_BYTES, topics
 from peers.process import FailedError
-from plot import panel_of, require_plot, save_bars
-from report import Goal, Rounds, Settings, progress, show, write_json
+from plot import panel_of
+from report import Rounds, Target
+from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, run_bench
+from testbed import LEFT, RIGHT, Lab, MemberRow, row
 
-from gdp.errors import LocalError
 from gdp.host.run_registry import Runs
 from gdp.nodes.spin import SPIN_US
+from gdp.trust.right import Right
 
 BUNDLES: Final = "bundles"
 SINGLE: Final = "one seal a message"
@@ -44,20 +39,21 @@ PER_SEAL: Final = "messages a seal"
 CPU: Final = ("sender, CPU us/message", "reader, CPU us/message")
 CORES: Final = ("sender, cores", "reader, cores")
 RATIO: Final = 3.0
-OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks"
+READY_S: Final = 20.0
+COLUMNS: Final = (LOST, RATE, MEDIAN, P99, PER_SEAL, *CPU, *CORES)
 QUICK_S: Final = 1.0
 
 
-def measure(row: Row, settings: dict[str, str | float]) -> dict[str, float]:
+def measure_once(members: MemberRow, settings: dict[str, str | float]) -> dict[str, float]:
     """Return the figures of one try, by column.
 
     Raises:
         FailedError: an end did not come up, or not everything was confirmed.
     """
     patience_s = 3 * READY_S + float(settings["seconds"])
-    with row.end("read", **settings) as reader:
+    with members.endpoint(RIGHT, "read", **settings) as reader:
         reader.read(READY_S)
-        with row.end("send", **settings) as sender:
+        with members.endpoint(LEFT, "send", **settings) as sender:
             sent, got = sender.read(patience_s), reader.read(patience_s)
     of_a = {key: value for key, value in sent.items() if isinstance(value, int | float)}
     of_b = {key: value for key, value in got.items() if isinstance(value, int | float)}
@@ -75,91 +71,59 @@ def measure(row: Row, settings: dict[str, str | float]) -> dict[str, float]:
     }
 
 
-def run_rounds(row: Row, rounds: int, settings: dict[str, str | float]) -> tuple[Rounds, list[str]]:
-    """Return the figures of all rounds, and what went wrong."""
-    over, notes = Rounds(), list[str]()
-    for at in range(1, rounds + 1):
-        for case, rate in ((STEADY, STEADY_RATE), (OVERLOAD, 0)):
-            for who in (BUNDLES, SINGLE):
-                progress(f"round {at}/{rounds}, {case}: {who}")
-                try:
-                    found = measure(row, {**settings, "rate": rate, "bundles": who == BUNDLES})
-                except FailedError as error:
-                    progress(f"FAILED: {error}")
-                    notes.append(f"round {at}, {case}, {who}: {error}")
-                    found = {}
-                for column in (LOST, RATE, MEDIAN, P99, PER_SEAL, *CPU, *CORES):
-                    over.add(who, case, column, found.get(column))
-    return over, notes
-
-
-def goals_of(over: Rounds) -> list[Goal]:
+def targets_of(over: Rounds) -> list[Target]:
     """Return what was asked for."""
     return [
-        over.goal(f"{STEADY}: {LOST}", BUNDLES, STEADY, LOST, 0.0, at_most=True),
+        over.target(f"{STEADY}: {LOST}", BUNDLES, STEADY, LOST, 0.0, at_most=True),
         over.ratio(f"{OVERLOAD}: {BUNDLES} / {SINGLE}, {RATE}", BUNDLES, SINGLE, OVERLOAD, RATE, RATIO),
-        over.goal(f"{OVERLOAD}: {LOST}", BUNDLES, OVERLOAD, LOST, 0.0, at_most=True),
+        over.target(f"{OVERLOAD}: {LOST}", BUNDLES, OVERLOAD, LOST, 0.0, at_most=True),
     ]
 
 
-def arguments() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=10.0, help="of each figure (default: %(default)s)")
-    parser.add_argument("--topics", type=int, default=20)
-    parser.add_argument("--mtu", type=int, default=1_500, help="bytes after the Ethernet header")
-    parser.add_argument("--quick", action="store_true", help=f"one round of {QUICK_S:g} s each")
-    parser.add_argument("--spin-us", type=int, default=SPIN_US, help="as spin_us of proxy.yaml (default: %(default)s)")
-    parser.add_argument("--json", type=Path, default=OUTPUT / "bundles.json", help="where the figures go")
-    parser.add_argument("--plot", type=Path, default=OUTPUT / "bundles.png", help="where the picture goes")
-    parser.add_argument("--no-plot", action="store_true", help="no picture")
-    parser.add_argument("--no-save", action="store_true", help="print only")
-    return parser
-
-
-def main() -> None:
-    """Run the bench."""
-    options = arguments().parse_args()
-    is_drawn = not (options.no_plot or options.no_save)
-    if is_drawn:
-        require_plot()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
-    state, begun_s = machine_state(), time.monotonic()
-    rounds, seconds = (1, QUICK_S) if options.quick else (options.rounds, options.seconds)
-    runs = Runs()
-    runs.sweep()
-    run = runs.start()
-    try:
-        with Row(run, options.topics, mtu=options.mtu) as row:
-            told = {"topics": options.topics, "seconds": seconds, "spin_s": options.spin_us / 1e6}
-            over, notes = run_rounds(row, rounds, dict(told))
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except (LocalError, FailedError) as error:
-        sys.exit(f"error: {error}")
-    finally:
-        run.end()
-    settings: Settings = {
-        "rounds": rounds,
-        "seconds": seconds,
-        "topics": options.topics,
-        "message, B": MESSAGE_BYTES,
-        "under way in overload, of a topic": BACKLOG,
-        "MTU": options.mtu,
-        "ends spin, us": options.spin_us,
-        "trouble": notes or "none",
-        "took, s": round(time.monotonic() - begun_s),
-    }
-    title, goals = "Small messages on many topics, over three kernel switches", goals_of(over)
-    show(title, state, settings, over, goals)
-    if not options.no_save:
-        write_json(options.json, "bundles", state, settings, over, goals)
-    if is_drawn:
-        panels = [panel_of(over, case, column, [BUNDLES, SINGLE], ours=[BUNDLES])
-                  for case, column in ((STEADY, MEDIAN), (OVERLOAD, RATE))]  # fmt: skip
-        save_bars(options.plot, title, str(state), panels)
+def measure(options: Options, runs: Runs) -> Outcome:
+    """Measure both cases with and without bundles, round by round."""
+    settings = {"topics": options.topics, "seconds": options.seconds, "spin_s": options.spin_us / 1e6}
+    rights = {LEFT: {Right.PUBLISH: topics(options.topics)}, RIGHT: {Right.READ: topics(options.topics)}}
+    recorder = Recorder()
+    with (
+        new_run(runs) as run,
+        MemberRow(Lab(run, row(options.mtu)), "bundles_endpoint", rights, plane="kernel") as members,
+    ):
+        trials = [
+            Trial(case, who, COLUMNS, lambda _, own=own: measure_once(members, {**settings, **own}))  # type: ignore[misc]
+            for case, rate in ((STEADY, STEADY_RATE), (OVERLOAD, 0))
+            for who in (BUNDLES, SINGLE)
+            for own in ({"rate": rate, "bundles": who == BUNDLES},)
+        ]
+        recorder.interleave(trials, options.rounds)
+    over = recorder.rounds
+    return Outcome(
+        "bundles",
+        "Small messages on many topics, over three kernel switches",
+        over,
+        targets_of(over),
+        {
+            "rounds": options.rounds,
+            "seconds": options.seconds,
+            "topics": options.topics,
+            "message, B": MESSAGE_BYTES,
+            "under way in overload, of a topic": BACKLOG,
+            "MTU": options.mtu,
+            "ends spin, us": options.spin_us,
+            "trouble": recorder.notes or "none",
+        },
+        lambda: [
+            panel_of(over, case, column, [BUNDLES, SINGLE], ours=[BUNDLES])
+            for case, column in ((STEADY, MEDIAN), (OVERLOAD, RATE))
+        ],
+    )
 
 
 if __name__ == "__main__":
-    main()
+    parser = command_line(
+        __doc__, rounds=5, seconds=10.0, quick={"rounds": 1, "seconds": QUICK_S}, has_record=True, has_plot=True
+    )
+    parser.add_argument("--topics", type=int, default=20)
+    parser.add_argument("--mtu", type=int, default=1_500, help="bytes after the Ethernet header")
+    parser.add_argument("--spin-us", type=int, default=SPIN_US, help="as spin_us of proxy.yaml (default: %(default)s)")
+    run_bench(parser, measure)

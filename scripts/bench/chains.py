@@ -1,6 +1,6 @@
 """A chain of namespaces for the forwarding and scale benches: a source, some switches, a sink, each in its own.
 
-Place: I/O; ``gdp.simulation`` makes and removes the namespaces. What the switches are is ``contenders.py``'s.
+Place: I/O; ``gdp.simulation`` makes and removes the namespaces. What the switches are is ``baselines.py``'s.
 ::
 
     s1 (source) -- s2 -- ... -- s(n+1) -- s(n+2) (sink)        devices are called like the neighbour they lead to
@@ -16,7 +16,7 @@ from typing import TypeVar
 from frames import Wire
 from machine import offloads, soft_interrupts_s, thread_s
 from pyroute2 import IPRoute
-from search import Try
+from rate_search import Try
 from worker import Worker, floats, integer, number
 
 from gdp.host import netns_files

@@ -21,7 +21,7 @@ from typing import Final
 from fogros_tasks import TASKS, Task
 from peers.process import FailedError
 from plot import panel_of
-from report import Goal, Rounds
+from report import Rounds, Target
 from ros_row import LEFT, READY_S, RIGHT, Carried, Row
 from ros_stage import DIRECT, Bench, Options, Turn, parse, perform
 
@@ -106,15 +106,15 @@ def turns_of(options: Options) -> Iterator[Turn]:
                 yield Turn(case_of(task, mtu), trip.contender, mtu, columns, trip.measure)
 
 
-def goals_of(over: Rounds, mtu: int) -> list[Goal]:
+def targets_of(over: Rounds, mtu: int) -> list[Target]:
     """Return what the overlay adds, task by task; no bound is asked for."""
-    goals = []
+    targets = []
     for task in TASKS:
         case = case_of(task, mtu)
         for who in OURS:
-            goals.append(over.difference(f"{case}: {who} - {DIRECT}, ms", who, DIRECT, case, MEDIAN, None))
-            goals.append(over.ratio(f"{case}: {who} / {DIRECT}", who, DIRECT, case, MEDIAN, None))
-    return goals
+            targets.append(over.difference(f"{case}: {who} - {DIRECT}, ms", who, DIRECT, case, MEDIAN, None))
+            targets.append(over.ratio(f"{case}: {who} / {DIRECT}", who, DIRECT, case, MEDIAN, None))
+    return targets
 
 
 def bench_of(options: Options) -> Bench:
@@ -125,14 +125,14 @@ def bench_of(options: Options) -> Bench:
         "What a robot waits for the network: three tasks of FogROS G",
         [each for task in TASKS for encoding in ENCODINGS for each in carried_of(task, encoding)],
         list(turns_of(options)),
-        lambda over: [goal for mtu in options.mtus for goal in goals_of(over, mtu)],
+        lambda over: [target for mtu in options.mtus for target in targets_of(over, mtu)],
         lambda over: [panel_of(over, case, MEDIAN, [*OURS, DIRECT], p99=P99, ours=OURS) for case in cases],
     )
 
 
 def main() -> None:
     """Run the bench."""
-    options = parse(__doc__ or "", "fogros", rounds=3, seconds=SECONDS, mtus=MTUS, quick_s=QUICK_S)
+    options = parse(__doc__ or "", rounds=3, seconds=SECONDS, mtus=MTUS, quick_s=QUICK_S)
     perform(bench_of(options), options)
 
 

@@ -7,7 +7,7 @@
 Our planes (scapy, raw, kernel with and without redirect_peer), the Linux bridge and the kernel's IPv4 forwarding stand
 in the same chain of namespaces, one after the other, and so again each round. Per size of frame and length of chain:
 
-frames/s            highest rate at which less than 0.1 % is lost and the last frame comes at once (``search.py``)
+frames/s            highest rate at which less than 0.1 % is lost and the last frame comes at once (``rate_search.py``)
 RTT, polling ends   of single frames, by ends that ask their socket again and again: the path alone; not measured for
                     planes that are processes where these would share the ends' cores
 RTT, sleeping ends  by ends that wait in epoll, as nodes do
@@ -21,27 +21,25 @@ Everything made is removed, whatever happens.
 
 from __future__ import annotations
 
-import argparse
 import os
-import signal
 import statistics
-import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
-from pathlib import Path
 from typing import Final
 
+from baselines import Baseline, Bridge, Direct, IPv4, Plane
 from chains import Chain
-from contenders import Bridge, Contender, Direct, IPv4, Plane
-from machine import machine_state, offload_text
-from plot import panel_of, require_plot, save_bars
-from report import Goal, Rounds, percentile, progress, show, write_json
-from search import LOSS_MAX, highest
+from machine import offload_text
+from plot import Panel, panel_of
+from rate_search import LOSS_MAX, highest
+from report import Rounds, Target, percentile, progress
+from skeleton import Options, Outcome, command_line, run_bench
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import Runs
 
+PINGS: Final = 1_000
 SIZES: Final = {1_500: (128, 1_400), 9_000: (8_900,)}
 LENGTHS: Final = (1, 3)
 OURS: Final = ("kernel", "kernel, redirect", "raw", "scapy")
@@ -51,11 +49,10 @@ RATE, LOSS, SINK_LOSS = "frames/s", "loss %", "of it at the sink %"
 CPU, SHARE = "CPU µs/frame", "forwarding's share, µs"
 POLLED, POLLED_P99, PART = "RTT µs, polling ends: median", "p99, polling", "forwarding's part, µs"
 SLEPT, SLEPT_P99 = "RTT µs, sleeping ends: median", "p99, sleeping"
-OUTPUT: Final = Path(__file__).parents[2] / "docs" / "benchmarks"
 
 
 class Bench:
-    """The rounds of one run: what is known so far, and how to measure one contender in one chain."""
+    """The rounds of one run: what is known so far, and how to measure one baseline in one chain."""
 
     def __init__(self, seconds: float, pings: int) -> None:
         self.over = Rounds()
@@ -65,40 +62,40 @@ class Bench:
         self._ends_cpu: dict[int, float] = {}
         self._ends_trip: dict[int, float] = {}
 
-    def measure(self, contender: Contender, chain: Chain, sizes: Sequence[int], lengths: Sequence[int]) -> None:
-        """Set a contender up, measure each size, take it down; say why if it cannot be had.
+    def measure(self, baseline: Baseline, chain: Chain, sizes: Sequence[int], lengths: Sequence[int]) -> None:
+        """Set a baseline up, measure each size, take it down; say why if it cannot be had.
 
         Args:
-            contender: who.
+            baseline: who.
             chain: where.
             sizes: of frames, bytes.
             lengths: the chains whose tables the figures stand in.
         """
-        if contender.name in self.over.reasons:
+        if baseline.name in self.over.reasons:
             return
         try:
-            standing = contender.stand(chain)
+            standing = baseline.stand(chain)
         except LocalError as error:
-            self.over.absent(contender.name, str(error))
+            self.over.absent(baseline.name, str(error))
             return
         with standing:
             for size in sizes:
-                figures = self._figures(contender, chain, size)
+                figures = self._figures(baseline, chain, size)
                 for length in lengths:
                     for column, value in figures.items():
-                        self.over.add(contender.name, case_of(size, length), column, value)
+                        self.over.add(baseline.name, case_of(size, length), column, value)
 
-    def _figures(self, contender: Contender, chain: Chain, size: int) -> dict[str, float | None]:
-        wire, workers = contender.wire(chain, size), contender.workers()
-        pings = min(self._pings, 50) if contender.name == "scapy" else self._pings
+    def _figures(self, baseline: Baseline, chain: Chain, size: int) -> dict[str, float | None]:
+        wire, workers = baseline.wire(chain, size), baseline.workers()
+        pings = min(self._pings, 50) if baseline.name == "scapy" else self._pings
         slept = chain.round_trips(wire, pings, poll=False)
-        apart = not contender.processes or len(os.sched_getaffinity(0)) >= 2 + len(workers)
+        apart = not baseline.processes or len(os.sched_getaffinity(0)) >= 2 + len(workers)
         polled = chain.round_trips(wire, pings, poll=True) if apart else []
         trip = statistics.median(polled) if polled else None
         if trip is not None and not chain.switches:
             self._ends_trip[size] = trip
-        asked = contender.name, case_of(size, chain.switches)
-        guess = self._guesses.get(asked, GUESSES.get(contender.name)) if contender.processes else None
+        asked = baseline.name, case_of(size, chain.switches)
+        guess = self._guesses.get(asked, GUESSES.get(baseline.name)) if baseline.processes else None
         best = highest(lambda rate: chain.attempt(wire, workers, rate, self._seconds), guess)
         cpu = share = None
         if best is not None:
@@ -126,14 +123,14 @@ def case_of(size: int, switches: int) -> str:
     return f"{size:,} B, {switches} switch{'es' if switches > 1 else ''}"
 
 
-def contenders_of(only: Sequence[str]) -> list[Contender]:
-    """Return the contenders asked for, all without a wish; those that are compared follow each other closely."""
-    quick: list[Contender] = [*(Plane(name, processes=False) for name in OURS if name not in GUESSES), Bridge(), IPv4()]
+def baselines_of(only: Sequence[str]) -> list[Baseline]:
+    """Return the baselines asked for, all without a wish; those that are compared follow each other closely."""
+    quick: list[Baseline] = [*(Plane(name, processes=False) for name in OURS if name not in GUESSES), Bridge(), IPv4()]
     known = [*quick, *(Plane(name, processes=True) for name in OURS if name in GUESSES)]
     return [each for each in known if not only or each.name in only]
 
 
-def goals_of(over: Rounds) -> list[Goal]:
+def targets_of(over: Rounds) -> list[Target]:
     """Return the figures that the kernel plane is to reach, all in the longer chain."""
     case, plain = case_of(1_400, 3), "kernel, redirect"
     return [
@@ -150,80 +147,64 @@ def goals_of(over: Rounds) -> list[Goal]:
     ]
 
 
-def main() -> None:
-    """Run the bench."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--seconds", type=float, default=0.3, help="length of one try")
-    parser.add_argument("--only", action="append", choices=[*OURS, *OTHERS], default=[], help="may be repeated")
-    parser.add_argument("--realtime", action="store_true", help="SCHED_FIFO for every process alike")
-    parser.add_argument("--quick", action="store_true", help="one short round of 1,400 bytes: does everything work?")
-    parser.add_argument("--json", type=Path, default=OUTPUT / "forwarding.json")
-    parser.add_argument("--plot", type=Path, default=OUTPUT / "forwarding.png")
-    parser.add_argument("--no-plot", action="store_true")
-    parser.add_argument("--no-save", action="store_true", help="print only")
-    options = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
-    state = machine_state()
-    if not (options.no_plot or options.no_save):
-        require_plot()
+def measure(options: Options, runs: Runs) -> Outcome:
+    """Measure every baseline in every chain, round by round."""
     if options.realtime:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     sizes = {1_500: (1_400,)} if options.quick else SIZES
-    rounds, seconds, pings = (1, 0.15, 200) if options.quick else (options.rounds, options.seconds, 1_000)
-    bench, runs = Bench(seconds, pings), Runs()
-    runs.sweep()
-    try:
-        with ExitStack() as undo:
-            chains = {length: undo.enter_context(Chain(runs, length, 1_500)) for length in (0, *LENGTHS)}
-            found = offload_text(chains[LENGTHS[-1]].offloads())
-            for number in range(rounds):
-                for mtu, bytes_each in sizes.items():
-                    for chain in chains.values():
-                        chain.set_mtu(mtu)
-                    progress(f"round {number + 1} of {rounds}, MTU {mtu}: ends alone")
-                    bench.measure(Direct(), chains[0], bytes_each, LENGTHS)
-                    for length in LENGTHS:
-                        for contender in contenders_of(options.only):
-                            progress(
-                                f"round {number + 1} of {rounds}, MTU {mtu}, {length} in the middle: {contender.name}"
-                            )
-                            bench.measure(contender, chains[length], bytes_each, [length])
-    except KeyboardInterrupt:
-        sys.exit("stopped; everything that was made is gone")
-    except LocalError as error:
-        sys.exit(str(error))
+    bench = Bench(options.seconds, 200 if options.quick else PINGS)
+    with ExitStack() as undo:
+        chains = {length: undo.enter_context(Chain(runs, length, 1_500)) for length in (0, *LENGTHS)}
+        found = offload_text(chains[LENGTHS[-1]].offloads())
+        for number in range(1, options.rounds + 1):
+            for mtu, bytes_each in sizes.items():
+                where = f"round {number} of {options.rounds}, MTU {mtu}"
+                for chain in chains.values():
+                    chain.set_mtu(mtu)
+                progress(f"{where}: ends alone")
+                bench.measure(Direct(), chains[0], bytes_each, LENGTHS)
+                for length in LENGTHS:
+                    for baseline in baselines_of(options.only):
+                        progress(f"{where}, {length} in the middle: {baseline.name}")
+                        bench.measure(baseline, chains[length], bytes_each, [length])
     settings = {
-        "rounds": rounds,
-        "seconds a try": seconds,
-        "pings": pings,
+        "rounds": options.rounds,
+        "seconds a try": options.seconds,
+        "pings": 200 if options.quick else PINGS,
         "loss below": LOSS_MAX,
         "MTU": list(sizes),
         "cores": "source 0, sink 1, switches anywhere",
         "scheduler": "SCHED_FIFO" if options.realtime else "ordinary",
         "offloads of the devices (none touches AF_PACKET frames)": found,
     }
-    goals = goals_of(bench.over)
-    show("Forwarding", state, settings, bench.over, goals)
-    if options.no_save:
-        return
-    write_json(options.json, "forwarding", state, settings, bench.over, goals)
-    if not options.no_plot:
-        draw(options.plot, str(state), bench.over)
+    return Outcome(
+        "forwarding", "Forwarding", bench.over, targets_of(bench.over), settings, lambda: panels_of(bench.over)
+    )
 
 
-def draw(path: Path, footer: str, over: Rounds) -> None:
-    """Draw rates of each size, round trips and costs, in the longer chain."""
+def panels_of(over: Rounds) -> list[Panel]:
+    """Return panels of rates by size, round trips and costs, in the longer chain."""
     everyone = (*OURS, *OTHERS, "ends alone")
     panel = partial(panel_of, over, ours=OURS)
     case = case_of(1_400, LENGTHS[-1])
-    rates = [panel(each, RATE, everyone) for each in over.cases() if each.endswith(f"{LENGTHS[-1]} switches")]
-    trips = [
+    return [
+        *(panel(each, RATE, everyone) for each in over.cases() if each.endswith(f"{LENGTHS[-1]} switches")),
+        panel(case, SHARE, everyone, log=True),
         panel(case, POLLED, everyone, p99=POLLED_P99, log=True),
         panel(case, SLEPT, everyone, p99=SLEPT_P99, log=True),
     ]
-    save_bars(path, "Forwarding", footer, [*rates, panel(case, SHARE, everyone, log=True), *trips])
 
 
 if __name__ == "__main__":
-    main()
+    parser = command_line(
+        __doc__,
+        rounds=3,
+        seconds=0.3,
+        seconds_of="length of one try",
+        quick={"rounds": 1, "seconds": 0.15},
+        has_record=True,
+        has_plot=True,
+    )
+    parser.add_argument("--only", action="append", choices=[*OURS, *OTHERS], default=[], help="may be repeated")
+    parser.add_argument("--realtime", action="store_true", help="SCHED_FIFO for every process alike")
+    run_bench(parser, measure)

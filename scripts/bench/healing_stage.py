@@ -1,4 +1,4 @@
-"""Cluster of ``healing.py``: machines of the provider ``local``, a robot and its node that calls.
+"""Cluster of ``recovery.py``: machines of the provider ``local``, a robot and its node that calls.
 
 Place: shell; what it makes is a run's, and what ``fog`` makes for it ends with ``fog down``, also after a crash.
 """

@@ -9,12 +9,9 @@ up, the processor time of the one in the middle is taken over each round, with k
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
-import signal
 import statistics
-import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -23,16 +20,15 @@ from typing import Final
 from faults.overlay import Overlay
 from faults.plan import Plan, make_topology
 from machine import machine_state
-from peers.process import FailedError
 from report import progress
 from rich.console import Console
 from rich.table import Table
+from skeleton import clean_exit, command_line, new_run
 
-from gdp.errors import GdpError
 from gdp.host.run_registry import Runs
 
 OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks" / "hellos.json"
-GOAL: Final = 1.0  # percent of a core
+TARGET: Final = 1.0  # percent of a core
 SETTLE_S: Final = 8.0  # hellos are frequent until keepalives have taken over
 _TICK_S: Final = 1 / os.sysconf("SC_CLK_TCK")
 _CASES: Final[dict[str, int | None]] = {"keepalives as shipped": None, "no keepalives": 0}
@@ -54,43 +50,34 @@ def processor_s(pid: int) -> float:
 def measure(runs: Runs, neighbours: int, seconds: float, rounds: int, keepalive_ms: int | None) -> list[float]:
     """Return the percent of a core that the switch in the middle took, one figure a round."""
     more = {} if keepalive_ms is None else {"switch": {"keepalive_ms": keepalive_ms}}
-    run = runs.start()
-    try:
-        with Overlay(run, plan(neighbours), more=more) as overlay:
-            overlay.start_all()
-            time.sleep(SETTLE_S)
-            pid, figures = overlay.pid("switch s0"), []
-            for _ in range(rounds):
-                before, begun_s = processor_s(pid), time.monotonic()
-                time.sleep(seconds)
-                figures.append(100 * (processor_s(pid) - before) / (time.monotonic() - begun_s))
-            return figures
-    finally:
-        run.end()
+    with new_run(runs) as run, Overlay(run, plan(neighbours), more=more) as overlay:
+        overlay.start_all()
+        time.sleep(SETTLE_S)
+        pid, figures = overlay.pid("switch s0"), []
+        for _ in range(rounds):
+            before, begun_s = processor_s(pid), time.monotonic()
+            time.sleep(seconds)
+            figures.append(100 * (processor_s(pid) - before) / (time.monotonic() - begun_s))
+    return figures
 
 
 def main() -> None:
     """Measure both cases."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__, rounds=5, seconds=20.0, seconds_of="of each round")
     parser.add_argument("--neighbours", type=int, default=20)
-    parser.add_argument("--seconds", type=float, default=20.0, help="of each round (default: %(default)s)")
-    parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--no-save", action="store_true", help=f"do not write {OUTPUT.name}")
     options = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
     state, runs = machine_state(), Runs()
     runs.sweep()
     found: dict[str, list[float]] = {}
-    try:
+    with clean_exit():
         for case, keepalive_ms in _CASES.items():
             progress(f"{options.neighbours} neighbours, {case}")
             found[case] = measure(runs, options.neighbours, options.seconds, options.rounds, keepalive_ms)
-    except (GdpError, FailedError) as error:
-        sys.exit(f"error: {error}")
     table = Table(f"{options.neighbours} neighbours", "% of a core, median", "lowest-highest", "to reach")
     for case, figures in found.items():
-        goal = f"≤ {GOAL:g}" if case != "no keepalives" else ""
-        table.add_row(case, f"{statistics.median(figures):.2f}", f"{min(figures):.2f}-{max(figures):.2f}", goal)
+        target = f"≤ {TARGET:g}" if case != "no keepalives" else ""
+        table.add_row(case, f"{statistics.median(figures):.2f}", f"{min(figures):.2f}-{max(figures):.2f}", target)
     Console().print(table)
     if not options.no_save:
         OUTPUT.write_text(json.dumps({"machine": asdict(state), "neighbours": options.neighbours, **found}, indent=1))

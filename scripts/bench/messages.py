@@ -10,7 +10,7 @@ Five machines in namespaces, A - s1 - s2 - s3 - B, and in turn on them, round by
     sudo .venv/bin/python scripts/bench/messages.py                     # the whole; writes docs/benchmarks/messages.*
     sudo .venv/bin/python scripts/bench/messages.py --quick             # one round of few messages: does it work?
     sudo .venv/bin/python scripts/bench/messages.py --only gdp-raw --only zenoh-mtls --mtu 1500 --size 921600
-    sudo .venv/bin/python scripts/bench/messages.py --realtime          # every contender under SCHED_FIFO
+    sudo .venv/bin/python scripts/bench/messages.py --realtime          # every baseline under SCHED_FIFO
 
 Messages go one at a time, as in a control loop. A figure of a round is the median (or p99) of its messages; the table
 shows the median of the rounds, and in brackets their lowest and highest. Only the whole bench writes under
@@ -21,37 +21,32 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
-import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from machine import machine_state
-from peers.contender import Contender
+from peers.baseline import Baseline
 from peers.cyclone_net import CycloneNet
 from peers.exchange import ANSWER, SIZE_MIN, Load
-from peers.figures import MEDIAN, P99, case_of, goals_of
+from peers.figures import MEDIAN, P99, case_of, targets_of
 from peers.gdp_net import ENCODINGS, GdpNet
-from peers.turns import Plan, Turns
+from peers.rounds import Plan, Turns
 from peers.zenoh_net import ZenohNet
-from plot import Panel, panel_of, require_plot, save_bars
-from report import Rounds, Settings, show, write_json
+from plot import Panel, panel_of
+from report import Rounds
+from skeleton import Options, Outcome, command_line, parse, perform
 
-from gdp.errors import LocalError
 from gdp.host.run_registry import Runs
 from gdp.nodes.spin import SPIN_US
 
 SIZES: Final = (100, 10_000, 921_600)
 MTUS: Final = (1_500, 9_000)
-OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks"
 QUICK_COUNT: Final = 10
 
 
-def contenders_of(only: Sequence[str], encodings: tuple[str, ...], spin_s: float) -> tuple[Contender, ...]:
-    """Return the contenders called so; all, if none is named."""
-    every: tuple[Contender, ...] = (
+def baselines_of(only: Sequence[str], encodings: tuple[str, ...], spin_s: float) -> tuple[Baseline, ...]:
+    """Return the baselines called so; all, if none is named."""
+    every: tuple[Baseline, ...] = (
         GdpNet("kernel", encodings, spin_s),
         GdpNet("raw", encodings, spin_s),
         ZenohNet(secured=True),
@@ -72,13 +67,13 @@ def panels_of(over: Rounds, plan: Plan) -> list[Panel]:
 
 def arguments(names: Sequence[str]) -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__)
     parser.add_argument("--rounds", type=positive, default=5)
     parser.add_argument(
         "--count", type=positive, default=80, help="messages above 100 kB; of smaller ones four times that"
     )
     parser.add_argument("--quick", action="store_true", help=f"one round of {QUICK_COUNT} messages")
-    parser.add_argument("--only", action="append", choices=names, help="this contender; may be repeated")
+    parser.add_argument("--only", action="append", choices=names, help="this baseline; may be repeated")
     parser.add_argument("--mtu", type=int, action="append", help="bytes after the Ethernet header; may be repeated")
     parser.add_argument("--size", type=size_of, action="append", help="bytes of a message; may be repeated")
     parser.add_argument("--offloads", choices=("off", "on", "both"), default="both", help="of the veth devices")
@@ -119,51 +114,49 @@ def plan_of(options: argparse.Namespace) -> Plan:
     return Plan(
         tuple(options.mtu or MTUS),
         {"off": (False,), "on": (True,), "both": (False, True)}[options.offloads],
-        contenders_of(options.only or (), tuple(options.encoding or ENCODINGS), options.spin_us / 1e6),
+        baselines_of(options.only or (), tuple(options.encoding or ENCODINGS), options.spin_us / 1e6),
         Load(tuple(options.size or SIZES), QUICK_COUNT if options.quick else options.count),
         1 if options.quick else options.rounds,
     )
 
 
-def main() -> None:
-    """Run the bench, or a part of it."""
-    options = arguments([each.name for each in contenders_of((), (), 0.0)]).parse_args()
+def measure(options: Options, runs: Runs) -> Outcome:
+    """Measure every baseline in every case, round by round."""
     plan = plan_of(options)
-    is_whole = not (options.quick or options.only or options.mtu or options.size or options.offloads != "both")
-    json_path = options.json or (OUTPUT / "messages.json" if is_whole else None)
-    plot_path = options.plot or (OUTPUT / "messages.png" if is_whole else None)
-    if plot_path:
-        require_plot()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
-    state, begun_s = machine_state(), time.monotonic()
     if options.realtime:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))  # children inherit it
-    runs, turns = Runs(), Turns(plan)
-    runs.sweep()
-    try:
-        turns.run(runs)
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except LocalError as error:
-        sys.exit(f"error: {error}")
-    settings: Settings = {
-        "rounds": plan.rounds,
-        "messages a round": [plan.load.repeats(size) for size in plan.load.sizes],
-        "answer, B": ANSWER.size,
-        "scheduler": "SCHED_FIFO" if options.realtime else "ordinary",
-        "ends of gdp spin, us": options.spin_us,
-        "shared memory": "off everywhere",
-        **{f"offloads {'on' if on else 'off'}": text for on, text in turns.offload_states.items()},
-        "trouble": turns.notes or "none",
-        "took, s": round(time.monotonic() - begun_s),
-    }
-    goals = goals_of(turns.over, [label for label in plan.labels if label.startswith("gdp")], plan.cases)
-    title = "Messages over three machines, an answer back"
-    show(title, state, settings, turns.over, goals)
-    if json_path:
-        write_json(json_path, "messages", state, settings, turns.over, goals)
-    if plot_path:
-        save_bars(plot_path, title, str(state), panels_of(turns.over, plan))
+    turns = Turns(plan)
+    turns.run(runs)
+    return Outcome(
+        "messages",
+        "Messages over three machines, an answer back",
+        turns.over,
+        targets_of(turns.over, [label for label in plan.labels if label.startswith("gdp")], plan.cases),
+        {
+            "rounds": plan.rounds,
+            "messages a round": [plan.load.repeats(size) for size in plan.load.sizes],
+            "answer, B": ANSWER.size,
+            "scheduler": "SCHED_FIFO" if options.realtime else "ordinary",
+            "ends of gdp spin, us": options.spin_us,
+            "shared memory": "off everywhere",
+            **{f"offloads {'on' if on else 'off'}": text for on, text in turns.offload_states.items()},
+            "trouble": turns.notes or "none",
+        },
+        lambda: panels_of(turns.over, plan),
+        is_whole=is_whole(options),
+    )
+
+
+def is_whole(options: Options) -> bool:
+    """Return whether all cases are measured, so that the figures belong into ``docs/benchmarks``."""
+    return not (options.quick or options.only or options.mtu or options.size or options.offloads != "both")
+
+
+def main() -> None:
+    """Run the bench, or a part of it."""
+    options = parse(arguments([each.name for each in baselines_of((), (), 0.0)]))
+    options.no_plot = options.plot is None and not is_whole(options)
+    perform(options, measure)
 
 
 if __name__ == "__main__":

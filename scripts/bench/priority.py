@@ -19,26 +19,30 @@ when a tick was due to when B's program has it. Asked: p99 of no flood above twi
 
 from __future__ import annotations
 
-import argparse
-import signal
-import sys
-import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from pathlib import Path
+from functools import partial
 from typing import Final
 
-from machine import machine_state
 from peers.process import FailedError
-from plot import Panel, panel_of, require_plot, save_bars
-from priority_end import TICK_S
-from priority_row import MTU, SHAPED_BITS_S, Row
-from report import Goal, Rounds, Settings, percentile, progress, show, write_json
+from plot import Panel, panel_of
+from priority_endpoint import CONTROL, TICK_S
+from priority_endpoint import IMAGES as IMAGE_TOPIC
+from pyroute2 import IPRoute
+from report import Rounds, Target, percentile
+from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, run_bench
+from testbed import MIDDLE, Lab, MemberRow, make_topology
 
-from gdp.errors import LocalError
 from gdp.host.run_registry import Run, Runs
 from gdp.nodes.spin import SPIN_US
+from gdp.trust.right import Right
 
+MTU: Final = 1_500
+SHAPED_BITS_S: Final = 100_000_000
+_BURST_BYTES: Final = 2 * (MTU + 14)  # tbf must be able to send one frame; more would let a flood run ahead
+_LINKS: Final = (("a", "s1"), ("c", "s1"), ("b", "s3"), ("s1", "s2"), ("s2", "s3"))
+# Under SCHED_FIFO: a flood never sleeps, so equals would starve.
+_PRIORITIES: Final = {"switch": 3, "rib": 3, "tick": 2, "read": 2, "flood": 1}
 PLANES: Final = ("kernel", "raw")
 LINKS: Final = {"free": "free links", "shaped": f"{SHAPED_BITS_S // 1_000_000} Mbit/s"}
 IDLE: Final = "idle"
@@ -53,7 +57,6 @@ P99: Final = "p99, ms"
 WORST: Final = "worst, ms"
 IMAGES: Final = "images/s"
 OF_BOUND: Final = "p99 / (2 x idle p99 + frame)"
-OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks"
 QUICK_S: Final = 1.0
 READY_S: Final = 20.0
 FRAME_MS: Final = {"free": 0.0, "shaped": (MTU + 14) * 8e3 / SHAPED_BITS_S}
@@ -64,7 +67,7 @@ def case_of(plane: str, link: str) -> str:
     return f"{plane}, {LINKS[link]}"
 
 
-def measure(row: Row, flood: str, seconds: float, spin_s: float) -> dict[str, float]:
+def measure_flood(members: MemberRow, flood: str, seconds: float, spin_s: float) -> dict[str, float]:
     """Return the figures of one flood, by column.
 
     Raises:
@@ -72,12 +75,12 @@ def measure(row: Row, flood: str, seconds: float, spin_s: float) -> dict[str, fl
     """
     where, kind = FLOODS[flood]
     with ExitStack() as stack:
-        reader = stack.enter_context(row.end("b", "read", spin_s=spin_s))
+        reader = stack.enter_context(members.endpoint("b", "read", spin_s=spin_s))
         reader.read(READY_S)
         if where == "c":
-            stack.enter_context(row.end("c", "flood", flood=kind, spin_s=spin_s)).read(READY_S)
+            stack.enter_context(members.endpoint("c", "flood", flood=kind, spin_s=spin_s)).read(READY_S)
         own = kind if where == "a" else ""
-        ticker = stack.enter_context(row.end("a", "tick", flood=own, seconds=seconds, spin_s=spin_s))
+        ticker = stack.enter_context(members.endpoint("a", "tick", flood=own, seconds=seconds, spin_s=spin_s))
         ticker.read(2 * READY_S + seconds)
         said = reader.read(READY_S)
     latencies_s, images_s = said.get("latencies_s"), said.get("images_s")
@@ -94,74 +97,42 @@ def measure(row: Row, flood: str, seconds: float, spin_s: float) -> dict[str, fl
     }
 
 
-class Turns:
-    """The rounds under way: in each, every plane on every link, and there every flood.
-
-    Attributes:
-        over: the figures.
-        notes: what went wrong.
-    """
-
-    def __init__(
-        self,
-        runs: Runs,
-        planes: Sequence[str],
-        links: Sequence[str],
-        seconds: float,
-        spin_s: float,
-        *,
-        realtime: bool,
-    ) -> None:
-        self._runs = runs
-        self._is_realtime = realtime
-        self._cases = [(plane, link) for plane in planes for link in links]
-        self._seconds = seconds
-        self._spin_s = spin_s
-        self.over = Rounds()
-        self.notes: list[str] = []
-
-    def run(self, rounds: int) -> None:
-        """Run all rounds.
-
-        Raises:
-            LocalError: the kernel refuses.
-        """
-        for at in range(1, rounds + 1):
-            for plane, link in self._cases:
-                run = self._runs.start()
-                try:
-                    self._on_row(run, plane, link, f"round {at}/{rounds}")
-                finally:
-                    run.end()
-
-    def _on_row(self, run: Run, plane: str, link: str, where: str) -> None:
-        case = case_of(plane, link)
-        bound_ms: float | None = None
-        with Row(run, plane, shaped=link == "shaped", realtime=self._is_realtime) as row:
-            for flood in FLOODS:
-                progress(f"{where}, {case}: {flood}")
-                try:
-                    found: dict[str, float] = measure(row, flood, self._seconds, self._spin_s)
-                except FailedError as error:
-                    progress(f"FAILED: {error}")
-                    self.notes.append(f"{where}, {case}, {flood}: {error}")
-                    found = {}
-                if flood == IDLE and found:
-                    bound_ms = 2 * found[P99] + FRAME_MS[link]
-                for column in (MEDIAN, P99, WORST, IMAGES):
-                    self.over.add(flood, case, column, found.get(column))
-                is_known = bound_ms is not None and P99 in found
-                self.over.add(flood, case, OF_BOUND, found[P99] / bound_ms if is_known and bound_ms else None)
+def measure_row(run: Run, plane: str, link: str, recorder: Recorder, number: int, options: Options) -> None:
+    """Measure every flood on one plane and link; the idle one sets the round's bound."""
+    case, columns = case_of(plane, link), (MEDIAN, P99, WORST, IMAGES)
+    topology = make_topology(_LINKS, mtu=MTU, rib="s2", members=("a", "c", "b"), switches=("a", "c", *MIDDLE, "b"))
+    lab = Lab(run, topology, priorities=_PRIORITIES if options.realtime else None)
+    if link == "shaped":
+        lab.inside("s1", partial(_shape, "s2"))
+    topics = (CONTROL, IMAGE_TOPIC)
+    rights = {node: {Right.READ if node == "b" else Right.PUBLISH: topics} for node in ("a", "c", "b")}
+    bound_ms: float | None = None
+    with MemberRow(lab, "priority_endpoint", rights, plane=plane) as members:
+        for flood in FLOODS:
+            work = partial(measure_flood, members, flood, options.seconds, options.spin_us / 1e6)
+            trial = Trial(case, flood, columns, lambda _, work=work: work())  # type: ignore[misc]
+            found = recorder.attempt(trial, number, options.rounds)
+            if flood == IDLE and found:
+                bound_ms = 2 * found[P99] + FRAME_MS[link]
+            recorder.rounds.add(flood, case, OF_BOUND, found[P99] / bound_ms if bound_ms and found else None)
 
 
-def goals_of(over: Rounds, cases: Sequence[str]) -> list[Goal]:
+def _shape(device: str) -> None:
+    """Limit a device to ``SHAPED_BITS_S``: a token bucket around ``pfifo_fast``, three bands that every kernel has."""
+    with IPRoute() as here:
+        (index,) = here.link_lookup(ifname=device)
+        here.tc("add", "tbf", index, 0x10000, rate=SHAPED_BITS_S // 8, burst=_BURST_BYTES, limit=1 << 20)
+        here.tc("add", "pfifo_fast", index, 0x20000, parent=0x10001)
+
+
+def targets_of(over: Rounds, cases: Sequence[str]) -> list[Target]:
     """Return what was asked for: no flood passes the bound, which idle itself makes in each round."""
     floods = [flood for flood in FLOODS if flood != IDLE]
-    goals = [over.goal(f"{case}: {flood}, {OF_BOUND}", flood, case, OF_BOUND, 1.0, at_most=True)
+    targets = [over.target(f"{case}: {flood}, {OF_BOUND}", flood, case, OF_BOUND, 1.0, at_most=True)
              for case in cases for flood in floods]  # fmt: skip
     told = [over.ratio(f"{case}: {flood} / {IDLE}, p99", flood, IDLE, case, P99, None)
             for case in cases for flood in floods]  # fmt: skip
-    return goals + told
+    return targets + told
 
 
 def panels_of(over: Rounds, cases: Sequence[str]) -> list[Panel]:
@@ -169,61 +140,44 @@ def panels_of(over: Rounds, cases: Sequence[str]) -> list[Panel]:
     return [panel_of(over, case, MEDIAN, list(FLOODS), p99=P99, ours=list(FLOODS)) for case in cases]
 
 
-def arguments() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=8.0, help="of ticks for each figure (default: %(default)s)")
-    parser.add_argument("--quick", action="store_true", help=f"one round of {QUICK_S:g} s each")
+def measure(options: Options, runs: Runs) -> Outcome:
+    """Measure every plane on every link, round by round."""
+    recorder, rows = Recorder(), [(each, on) for each in options.only or PLANES for on in options.link or LINKS]
+    for number in range(1, options.rounds + 1):
+        for plane, link in rows:
+            with new_run(runs) as run:
+                measure_row(run, plane, link, recorder, number, options)
+    over, cases = recorder.rounds, [case_of(plane, link) for plane, link in rows]
+    return Outcome(
+        "priority",
+        "A tick of 100 bytes at 100 Hz beside images, over three switches",
+        over,
+        targets_of(over, cases),
+        {
+            "rounds": options.rounds,
+            "ticks for each figure": round(options.seconds / TICK_S),
+            "MTU": MTU,
+            "one frame's time at 100 Mbit/s, ms": round(FRAME_MS["shaped"], 3),
+            "scheduler": "SCHED_FIFO" if options.realtime else "ordinary",
+            "ends spin, us": options.spin_us,
+            "trouble": recorder.notes or "none",
+        },
+        lambda: panels_of(over, cases),
+    )
+
+
+if __name__ == "__main__":
+    parser = command_line(
+        __doc__,
+        rounds=5,
+        seconds=8.0,
+        seconds_of="of ticks for each figure",
+        quick={"rounds": 1, "seconds": QUICK_S},
+        has_record=True,
+        has_plot=True,
+    )
     parser.add_argument("--only", action="append", choices=PLANES, help="this data plane")
     parser.add_argument("--link", action="append", choices=list(LINKS), help="on such links")
     parser.add_argument("--spin-us", type=int, default=SPIN_US, help="as spin_us of proxy.yaml (default: %(default)s)")
     parser.add_argument("--realtime", action="store_true", help="SCHED_FIFO: what else runs does not disturb")
-    parser.add_argument("--json", type=Path, default=OUTPUT / "priority.json", help="where the figures go")
-    parser.add_argument("--plot", type=Path, default=OUTPUT / "priority.png", help="where the picture goes")
-    parser.add_argument("--no-plot", action="store_true", help="no picture")
-    parser.add_argument("--no-save", action="store_true", help="print only")
-    return parser
-
-
-def main() -> None:
-    """Run the bench, or a part of it."""
-    options = arguments().parse_args()
-    is_drawn = not (options.no_plot or options.no_save)
-    if is_drawn:
-        require_plot()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
-    state, begun_s = machine_state(), time.monotonic()
-    planes, links = options.only or PLANES, options.link or list(LINKS)
-    rounds, seconds = (1, QUICK_S) if options.quick else (options.rounds, options.seconds)
-    runs = Runs()
-    runs.sweep()
-    turns = Turns(runs, planes, links, seconds, options.spin_us / 1e6, realtime=options.realtime)
-    try:
-        turns.run(rounds)
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except (LocalError, FailedError) as error:
-        sys.exit(f"error: {error}")
-    settings: Settings = {
-        "rounds": rounds,
-        "ticks for each figure": round(seconds / TICK_S),
-        "MTU": MTU,
-        "one frame's time at 100 Mbit/s, ms": round(FRAME_MS["shaped"], 3),
-        "scheduler": "SCHED_FIFO" if options.realtime else "ordinary",
-        "ends spin, us": options.spin_us,
-        "trouble": turns.notes or "none",
-        "took, s": round(time.monotonic() - begun_s),
-    }
-    cases = [case_of(plane, link) for plane in planes for link in links]
-    title = "A tick of 100 bytes at 100 Hz beside images, over three switches"
-    goals = goals_of(turns.over, cases)
-    show(title, state, settings, turns.over, goals)
-    if not options.no_save:
-        write_json(options.json, "priority", state, settings, turns.over, goals)
-    if is_drawn:
-        save_bars(options.plot, title, str(state), panels_of(turns.over, cases))
-
-
-if __name__ == "__main__":
-    main()
+    run_bench(parser, measure)

@@ -17,9 +17,7 @@ The fourth figure, two replicas against the least of two of the same samples, is
 
 from __future__ import annotations
 
-import argparse
 import random
-import signal
 import sys
 import threading
 import time
@@ -32,12 +30,11 @@ _HERE: Final = Path(__file__).resolve().parent
 sys.path.append(str(_HERE.parent / "experiments"))
 
 from field import READY_S, ROBOT, Field, Served, Server, Work  # noqa: E402 - it lies with the experiments
-from machine import machine_state  # noqa: E402
 from peers.process import FailedError  # noqa: E402
-from plot import Panel, panel_of, require_plot, save_bars  # noqa: E402
-from report import Goal, Rounds, Settings, percentile, progress, show, write_json  # noqa: E402
+from plot import Panel, panel_of  # noqa: E402
+from report import Rounds, Target, percentile, progress  # noqa: E402
+from skeleton import Options, Outcome, command_line, new_run, run_bench  # noqa: E402
 
-from gdp.errors import LocalError  # noqa: E402
 from gdp.host.run_registry import Runs  # noqa: E402
 
 KILLED, ADDED, HEDGED = "killed", "added", "hedged"
@@ -59,8 +56,7 @@ KILLS: Final = "replicas killed"
 EXTRA: Final = "requests too many, %"
 ADDED_MS: Final = 0.2
 GAIN: Final = 5.0
-OUTPUT: Final = _HERE.parents[1] / "docs" / "benchmarks"
-_END: Final = _HERE / "replicas_end.py"
+_END: Final = _HERE / "replicas_endpoint.py"
 TYPE: Final = "rcl_interfaces/srv/ListParameters"
 _MACHINES: Final = ("m1", "m2", "m3")
 _LANES: Final = 200
@@ -191,32 +187,28 @@ class Bench:
         names = {each: " ".join(one.name for one in served if each in one.machines) for each in _MACHINES}
         role = "serve" if settings is None else "straggle"
         work = {each: Work(role, {**(settings or {}), "services": its}, _END) for each, its in names.items() if its}
-        run = self._runs.start()
-        try:
-            with Field(run, served, work) as here:
-                yield here
-        finally:
-            run.end()
+        with new_run(self._runs) as run, Field(run, served, work) as here:
+            yield here
 
     def _add(self, case: str, who: str, figures: Mapping[str, float | None]) -> None:
         for column, value in figures.items():
             self.over.add(who, CASES[case], column, value)
 
 
-def goals_of(over: Rounds) -> list[Goal]:
+def targets_of(over: Rounds) -> list[Target]:
     """Return what was asked for of what was measured."""
     killed, added, hedged = CASES.values()
-    goals = []
+    targets = []
     if killed in over.cases():
         for column in ("failed", "answered wrongly", "answers too many"):
-            goals.append(over.goal(f"{killed}: {column}", THREE, killed, column, 0.0, at_most=True))
+            targets.append(over.target(f"{killed}: {column}", THREE, killed, column, 0.0, at_most=True))
     if added in over.cases():
-        goals.append(over.difference(f"{added}: {TWO} - {ONE}, ms", TWO, ONE, added, MEDIAN, ADDED_MS))
+        targets.append(over.difference(f"{added}: {TWO} - {ONE}, ms", TWO, ONE, added, MEDIAN, ADDED_MS))
     if hedged in over.cases():
-        goals.append(over.goal(f"{hedged}: {LATE}, {EXTRA}", LATE, hedged, EXTRA, 100 * _BUDGET, at_most=True))
+        targets.append(over.target(f"{hedged}: {LATE}, {EXTRA}", LATE, hedged, EXTRA, 100 * _BUDGET, at_most=True))
         for who, asked in ((LATE, GAIN), (BOTH, None)):
-            goals.append(over.ratio(f"{hedged}: {ONE} / {who}, p99.9", ONE, who, hedged, P999, asked))
-    return goals
+            targets.append(over.ratio(f"{hedged}: {ONE} / {who}, p99.9", ONE, who, hedged, P999, asked))
+    return targets
 
 
 def panels_of(over: Rounds) -> list[Panel]:
@@ -229,61 +221,31 @@ def panels_of(over: Rounds) -> list[Panel]:
     ]
 
 
-def arguments() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", action="append", choices=list(CASES), help="this part; may be repeated")
-    parser.add_argument("--rounds", type=int, help=f"of each part (default: {_told(ROUNDS)})")
-    parser.add_argument("--requests", type=int, help=f"of a round (default: {_told(REQUESTS)})")
-    parser.add_argument("--rate", type=float, default=RATE, help="of 'killed', a second (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=7, help="of the deaths (default: %(default)s)")
-    parser.add_argument("--quick", action="store_true", help="one short round of each")
-    parser.add_argument("--json", type=Path, default=OUTPUT / "replicas.json", help="where the figures go")
-    parser.add_argument("--plot", type=Path, default=OUTPUT / "replicas.png", help="where the picture goes")
-    parser.add_argument("--no-plot", action="store_true", help="no picture")
-    parser.add_argument("--no-save", action="store_true", help="print only")
-    return parser
-
-
-def main() -> None:
-    """Run the bench, or a part of it."""
-    options = arguments().parse_args()
-    is_drawn = not (options.no_plot or options.no_save)
-    if is_drawn:
-        require_plot()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
-    state, begun_s = machine_state(), time.monotonic()
-    runs = Runs()
-    runs.sweep()
+def measure(options: Options, runs: Runs) -> Outcome:
+    """Measure the parts in turn, round by round."""
     bench = Bench(runs, options.rate, random.Random(options.seed))
     parts = {KILLED: bench.killed, ADDED: bench.added, HEDGED: bench.hedged}
     only = options.only or list(parts)
     counts = {each: options.requests or (QUICK if options.quick else REQUESTS)[each] for each in only}
     rounds = {each: 1 if options.quick else options.rounds or ROUNDS[each] for each in only}
-    try:
-        for at in range(1, max(rounds.values()) + 1):  # parts take turns, as contenders do elsewhere
-            for each in only:
-                if at <= rounds[each]:
-                    progress(f"round {at}/{rounds[each]}, {each}: {counts[each]} requests")
-                    parts[each](counts[each])
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except (LocalError, FailedError) as error:
-        sys.exit(f"error: {error}")
-    settings: Settings = {
-        "rounds": _told(rounds),
-        "requests of a round": _told(counts),
-        "requests a second while killed": options.rate,
-        "seed": options.seed,
-        "took, s": round(time.monotonic() - begun_s),
-    }
-    goals = goals_of(bench.over)
-    title = "Calls of a service with replicas, over two switches"
-    show(title, state, settings, bench.over, goals)
-    if not options.no_save:
-        write_json(options.json, "replicas", state, settings, bench.over, goals)
-    if is_drawn:
-        save_bars(options.plot, title, str(state), panels_of(bench.over))
+    for at in range(1, max(rounds.values()) + 1):
+        for each in only:
+            if at <= rounds[each]:
+                progress(f"round {at}/{rounds[each]}, {each}: {counts[each]} requests")
+                parts[each](counts[each])
+    return Outcome(
+        "replicas",
+        "Calls of a service with replicas, over two switches",
+        bench.over,
+        targets_of(bench.over),
+        {
+            "rounds": _told(rounds),
+            "requests of a round": _told(counts),
+            "requests a second while killed": options.rate,
+            "seed": options.seed,
+        },
+        lambda: panels_of(bench.over),
+    )
 
 
 def _ask(here: Field, services: Sequence[str], count: int, told: Mapping[str, object]) -> Said:
@@ -325,4 +287,10 @@ def _told(numbers: Mapping[str, int]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    parser = command_line(__doc__, quick={"rounds": 1}, has_record=True, has_plot=True)
+    parser.add_argument("--only", action="append", choices=list(CASES), help="this part; may be repeated")
+    parser.add_argument("--rounds", type=int, help=f"of each part (default: {_told(ROUNDS)})")
+    parser.add_argument("--requests", type=int, help=f"of a round (default: {_told(REQUESTS)})")
+    parser.add_argument("--rate", type=float, default=RATE, help="of 'killed', a second (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=7, help="of the deaths (default: %(default)s)")
+    run_bench(parser, measure)

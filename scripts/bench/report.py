@@ -11,9 +11,9 @@ Place: pure, but for ``show`` (prints), ``progress`` (stderr) and ``write_json``
             over.add(contender, "1400 B, 3 switches", "frames/s", 450_000.0)      # None: it could not be measured
     over.absent("kernel", "no CAP_BPF")                              # is shown as "not here: no CAP_BPF"
     over.spread("kernel", "1400 B, 3 switches", "frames/s")          # Spread(median, low, high) | None
-    goal = over.ratio("kernel / bridge, frames/s", "kernel", "bridge", "1400 B, 3 switches", "frames/s", 1.3)
-    show(title, state, settings, over, [goal, ...])                  # tables, ratio lines
-    write_json(path, "forwarding", state, settings, over, [goal, ...])
+    target = over.ratio("kernel / bridge, frames/s", "kernel", "bridge", "1400 B, 3 switches", "frames/s", 1.3)
+    show(title, state, settings, over, [target, ...])                  # tables, ratio lines
+    write_json(path, "forwarding", state, settings, over, [target, ...])
     save_bars(path, ...)                                             # plot.py
 
 A ratio is taken in each round and then medianed, so that what slows a whole round slows both of its sides. A figure of
@@ -34,7 +34,7 @@ from machine import MachineState
 from rich.console import Console
 from rich.table import Table
 
-__all__ = ["Goal", "Rounds", "Settings", "Spread", "number_text", "percentile", "progress", "show", "write_json"]
+__all__ = ["Rounds", "Settings", "Spread", "Target", "number_text", "percentile", "progress", "show", "write_json"]
 
 Settings = Mapping[str, str | int | float | bool | Sequence[int] | Sequence[str]]
 _CONSOLE_COLUMNS = 165
@@ -64,38 +64,38 @@ class Spread:
 
 
 @dataclass(frozen=True, slots=True)
-class Goal:
+class Target:
     """A figure that was asked for, and what came of it.
 
     Attributes:
         what: the figure in words, with its unit unless it is a ratio.
-        asked: the bound; None where the figure is only told.
+        target: the bound; None where there is none.
         at_most: the bound is an upper one.
-        got: over rounds; None when a side of it could not be measured.
+        measured: over rounds; None when a side of it could not be measured.
         why_not: then, the reason.
     """
 
     what: str
-    asked: float | None
+    target: float | None
     at_most: bool
-    got: Spread | None
+    measured: Spread | None
     why_not: str = ""
 
     @property
-    def reached(self) -> bool | None:
+    def met(self) -> bool | None:
         """Tell whether the median keeps the bound; None when there is none, or nothing was measured."""
-        if self.got is None or self.asked is None:
+        if self.measured is None or self.target is None:
             return None
-        return self.got.median <= self.asked if self.at_most else self.got.median >= self.asked
+        return self.measured.median <= self.target if self.at_most else self.measured.median >= self.target
 
     def __str__(self) -> str:
-        got = f"got {self.got}" if self.got else f"got nothing: {self.why_not}"
-        if self.asked is None:
-            return f"{self.what}: {got}"
-        asked = f"asked {'≤' if self.at_most else '≥'} {number_text(self.asked)}"
-        if self.got is None:
-            return f"{self.what}: {asked}, {got}"
-        return f"{self.what}: {asked}, {got}, {'reached' if self.reached else 'NOT reached'}"
+        measured = f"measured {self.measured}" if self.measured else f"not measured: {self.why_not}"
+        if self.target is None:
+            return f"{self.what}: {measured}"
+        target = f"target {'≤' if self.at_most else '≥'} {number_text(self.target)}"
+        if self.measured is None:
+            return f"{self.what}: {target}, {measured}"
+        return f"{self.what}: {target}, {measured}, {'met' if self.met else 'MISSED'}"
 
 
 @dataclass(slots=True)
@@ -130,11 +130,11 @@ class Rounds:
         """Return the columns that any contender has in a case."""
         return list(dict.fromkeys(column for cases in self.values.values() for column in cases.get(case, {})))
 
-    def goal(
+    def target(
         self, what: str, contender: str, case: str, column: str, asked: float | None, *, at_most: bool = False
-    ) -> Goal:
+    ) -> Target:
         """Return a bound on one contender's figure."""
-        return _goal(what, asked, at_most, self.column(contender, case, column), self._why_not(contender, case))
+        return _target(what, asked, at_most, self.column(contender, case, column), self._why_not(contender, case))
 
     def ratio(
         self,
@@ -147,7 +147,7 @@ class Rounds:
         *,
         other_case: str | None = None,
         at_most: bool = False,
-    ) -> Goal:
+    ) -> Target:
         """Return a bound on ``one / other``, round by round.
 
         Args:
@@ -156,7 +156,7 @@ class Rounds:
         beside = other_case or case
         pairs = zip(self.column(one, case, column), self.column(other, beside, column), strict=False)
         ratios = [None if a is None or not b else a / b for a, b in pairs]
-        return _goal(what, asked, at_most, ratios, self._why_not(one, case) or self._why_not(other, beside))
+        return _target(what, asked, at_most, ratios, self._why_not(one, case) or self._why_not(other, beside))
 
     def difference(
         self,
@@ -169,12 +169,12 @@ class Rounds:
         *,
         other_case: str | None = None,
         at_most: bool = True,
-    ) -> Goal:
+    ) -> Target:
         """Return a bound on ``one - other``, round by round."""
         beside = other_case or case
         pairs = zip(self.column(one, case, column), self.column(other, beside, column), strict=False)
         gaps = [None if a is None or b is None else a - b for a, b in pairs]
-        return _goal(what, asked, at_most, gaps, self._why_not(one, case) or self._why_not(other, beside))
+        return _target(what, asked, at_most, gaps, self._why_not(one, case) or self._why_not(other, beside))
 
     def _why_not(self, contender: str, case: str) -> str:
         if contender in self.reasons:
@@ -182,11 +182,11 @@ class Rounds:
         return "" if case in self.values.get(contender, {}) else f"{contender} was not asked for"
 
 
-def _goal(what: str, asked: float | None, at_most: bool, values: Iterable[float | None], why_not: str) -> Goal:
+def _target(what: str, asked: float | None, at_most: bool, values: Iterable[float | None], why_not: str) -> Target:
     known = [value for value in values if value is not None]
     if known:
-        return Goal(what, asked, at_most, Spread.of(known))
-    return Goal(what, asked, at_most, None, why_not or "no round measured it")
+        return Target(what, asked, at_most, Spread.of(known))
+    return Target(what, asked, at_most, None, why_not or "no round measured it")
 
 
 def percentile(values: Iterable[float], share: float) -> float:
@@ -218,7 +218,7 @@ def progress(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def show(title: str, state: MachineState, settings: Settings, over: Rounds, goals: Sequence[Goal] = ()) -> None:
+def show(title: str, state: MachineState, settings: Settings, over: Rounds, targets: Sequence[Target] = ()) -> None:
     """Print the machine, a table a case, and a line for each figure that was asked for."""
     console = Console() if sys.stdout.isatty() else Console(width=_CONSOLE_COLUMNS)
     console.print(f"[bold]{title}[/bold]\n{state}", highlight=False)
@@ -238,8 +238,8 @@ def show(title: str, state: MachineState, settings: Settings, over: Rounds, goal
         console.print(table)
     for contender, reason in over.reasons.items():
         console.print(f"{contender} - not here: {reason}", markup=False, highlight=False, soft_wrap=True)
-    for goal in goals:
-        console.print(str(goal), markup=False, highlight=False, soft_wrap=True)
+    for target in targets:
+        console.print(str(target), markup=False, highlight=False, soft_wrap=True)
 
 
 def _setting_text(value: str | float | Sequence[int] | Sequence[str]) -> str:
@@ -247,16 +247,16 @@ def _setting_text(value: str | float | Sequence[int] | Sequence[str]) -> str:
 
 
 def write_json(
-    path: Path, bench: str, state: MachineState, settings: Settings, over: Rounds, goals: Sequence[Goal] = ()
+    path: Path, bench: str, state: MachineState, settings: Settings, over: Rounds, targets: Sequence[Target] = ()
 ) -> None:
-    """Write all values of all rounds, and the goals with what came of them."""
+    """Write all values of all rounds, and the targets with what came of them."""
     answer = {
         "bench": bench,
         "machine": asdict(state),
         "settings": dict(settings),
         "rounds": over.values,
         "not_here": over.reasons,
-        "goals": [{**asdict(goal), "reached": goal.reached} for goal in goals],
+        "targets": [{**asdict(target), "met": target.met} for target in targets],
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(answer, indent=1) + "\n", encoding="utf-8")

@@ -13,8 +13,8 @@ import time
 from typing import Any
 
 from ends import answer_pings, count_frames, ping, send, spread_frames
-from fill import ENTRY_LEASE_S, fill, resident_bytes
 from frames import NAME_AT, SINK, SOURCE, spread_names
+from table_fill import ENTRY_LEASE_S, fill, resident_bytes
 from worker import answer, command, command_waits, integer
 
 from gdp.errors import DropReason, LocalError

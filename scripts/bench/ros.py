@@ -24,7 +24,7 @@ from typing import Final
 
 from peers.process import FailedError
 from plot import Panel, panel_of
-from report import Goal, Rounds
+from report import Rounds, Target
 from ros_row import LEFT, READY_S, RIGHT, Carried, Row
 from ros_stage import DIRECT, Bench, Options, Turn, parse, perform
 
@@ -125,7 +125,7 @@ def bench_of(options: Options) -> Bench:
         "Real ROS 2 nodes over three kernel switches",
         carried,
         [turn for mtu in options.mtus for turn in turns_of(options, mtu)],
-        lambda over: [goal for mtu in options.mtus for goal in goals_of(over, mtu)],
+        lambda over: [target for mtu in options.mtus for target in targets_of(over, mtu)],
         lambda over: [panel for mtu in options.mtus for panel in panels_of(over, mtu)],
         {"seconds of image and small in round 1": first_s(options)},
     )
@@ -151,21 +151,21 @@ def turns_of(options: Options, mtu: int) -> Iterator[Turn]:
             yield Turn(case_of(kind, mtu), stream.contender, mtu, columns, stream.measure)
 
 
-def goals_of(over: Rounds, mtu: int) -> list[Goal]:
+def targets_of(over: Rounds, mtu: int) -> list[Target]:
     """Return what was asked for at one MTU."""
-    goals = []
+    targets = []
     for kind, added_ms in ((TEXT, 1.0), (QUICK, 1.0), (IMAGE, 3.0), (SMALL, None)):
         case = case_of(kind, mtu)
         for encoding in ENCODINGS[kind]:
             who = f"overlay, {encoding}"
             if case not in over.cases():
                 continue
-            goals.append(over.difference(f"{case}: {who} - {DIRECT}, ms", who, DIRECT, case, MEDIAN, added_ms))
-            goals.append(over.goal(f"{case}: {who}, {LOST}", who, case, LOST, 0.0, at_most=True))
+            targets.append(over.difference(f"{case}: {who} - {DIRECT}, ms", who, DIRECT, case, MEDIAN, added_ms))
+            targets.append(over.target(f"{case}: {who}, {LOST}", who, case, LOST, 0.0, at_most=True))
             if kind in (IMAGE, SMALL):
                 cores = 1.0 if kind == IMAGE else None
-                goals.append(over.goal(f"{case}: {who}, {CORES}", who, case, CORES, cores, at_most=True))
-    return goals
+                targets.append(over.target(f"{case}: {who}, {CORES}", who, case, CORES, cores, at_most=True))
+    return targets
 
 
 def panels_of(over: Rounds, mtu: int) -> list[Panel]:
@@ -179,7 +179,7 @@ def panels_of(over: Rounds, mtu: int) -> list[Panel]:
 
 def main() -> None:
     """Run the bench."""
-    options = parse(__doc__ or "", "ros", rounds=3, seconds=SECONDS, mtus=MTUS, quick_s=QUICK_S)
+    options = parse(__doc__ or "", rounds=3, seconds=SECONDS, mtus=MTUS, quick_s=QUICK_S)
     perform(bench_of(options), options)
 
 

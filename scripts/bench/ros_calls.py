@@ -11,11 +11,11 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from peers.lines import say
+from peers.jsonl import say
 from rclpy.client import Client
 from rclpy.task import Future
 from report import percentile
-from ros_end import End, Settings, reliable, run_role
+from ros_endpoint import End, Settings, reliable, run_role
 from std_srvs.srv import SetBool
 
 _WARM_UP: Final = 100

@@ -30,45 +30,24 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final, Literal
 
-import yaml
-from peers.process import FailedError, Started
+from peers.process import Started
 from pyroute2 import IPRoute
+from testbed import LEFT, MIDDLE, RIGHT, ROW, Lab, OverlayNodes, make_topology
+from testbed import SOCKET_BUFFER_BYTES as BUFFER_BYTES
 
-from gdp.host import netns_files
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
-from gdp.simulation.namespaces import Namespaces
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
-from gdp.stores.issue import delegate, install_delegation
-from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
 from gdp.trust.right import Right
 from proxy.config import Encoding
-from ring.materials import Materials
 
 __all__ = ["BUFFER_BYTES", "DIRECT_DOMAIN", "LEFT", "READY_S", "RIGHT", "Carried", "Row"]
 
-LEFT: Final = "a"
-RIGHT: Final = "b"
 READY_S: Final = 30.0
-_MIDDLE: Final = ("s1", "s2", "s3")
-_IFACE: Final = {LEFT: _MIDDLE[0], RIGHT: _MIDDLE[-1]}  # a device is called like the neighbour it leads to
 _BRIDGES: Final = ("p1", "p2", "p3")
 _ADDRESSES: Final = {LEFT: "10.98.0.1", RIGHT: "10.98.0.2"}
 _DOMAINS: Final = {LEFT: 141, RIGHT: 142}
 DIRECT_DOMAIN: Final = 143
 _RIGHTS: Final = {"topic": (Right.PUBLISH, Right.READ), "service": (Right.SERVE, Right.CALL)}
-BUFFER_BYTES: Final = 4 << 20
-_PROFILE: Final = f"""<?xml version="1.0" encoding="UTF-8" ?>
-<dds xmlns="http://www.eprosima.com"><profiles>
- <transport_descriptors><transport_descriptor>
-  <transport_id>udp</transport_id><type>UDPv4</type>
-  <sendBufferSize>{BUFFER_BYTES}</sendBufferSize><receiveBufferSize>{BUFFER_BYTES}</receiveBufferSize>
- </transport_descriptor></transport_descriptors>
- <participant profile_name="participant" is_default_profile="true"><rtps>
-  <userTransports><transport_id>udp</transport_id></userTransports><useBuiltinTransports>false</useBuiltinTransports>
- </rtps></participant>
-</profiles></dds>
-"""
 _BRIDGE: Final = "bridge"
 _TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK")
 
@@ -109,34 +88,21 @@ class Row:
     """
 
     def __init__(self, run: Run, carried: Sequence[Carried], *, mtu: int, bridged: bool = False) -> None:
-        self._run = run
-        self._undo = ExitStack()
         direct = (LEFT, *(_BRIDGES if bridged else ()), RIGHT)
-        self._topology = _topology(mtu, direct)
-        self._spaces = Namespaces(self._topology, run)
+        links = [*pairwise(ROW), *pairwise(direct)]
+        self._lab = Lab(run, make_topology(links, mtu=mtu, rib="s2", members=(LEFT, RIGHT)))
         for node in direct[1:-1]:
-            netns_files.inside(self._spaces.path(node), _bridge)
+            self._lab.inside(node, _bridge)
         for node, device in ((LEFT, direct[1]), (RIGHT, direct[-2])):
-            netns_files.inside(self._spaces.path(node), partial(_number, device, _ADDRESSES[node]))
-        self._files = run.directory / "keys"
-        self._files.mkdir(mode=0o700)
-        (self._files / "dds.xml").write_text(_PROFILE, encoding="utf-8")
-        materials = Materials(self._topology, self._files, metrics=False)
+            self._lab.inside(node, partial(_number, device, _ADDRESSES[node]))
         with ExitStack() as undo:
-            for node in _MIDDLE:
-                config = str(materials.switch(node, "auto"))
-                argv = ["-m", "gdp.cli.switch", "--json", "--data-plane", "kernel", "--config", config]
-                took = str(undo.enter_context(self._start(node, "switch", argv)).read(READY_S).get("data_plane"))
-                if not took.startswith("kernel"):
-                    raise FailedError(f"the switch took the data plane {took} instead")
-            (at,) = self._topology.attached("rib")
-            rib = ["-m", "gdp.cli.rib", "--json", "--config", str(materials.rib(at))]
-            undo.enter_context(self._start(at.switch, "rib", rib)).read(READY_S)
+            self._nodes = OverlayNodes(self._lab, MIDDLE, plane="kernel", ready_s=READY_S)
+            undo.callback(self._nodes.close)
             proxies = []
             for node in (LEFT, RIGHT):
                 argv = ["-m", "proxy.cli", "--config", self._admit(node, carried)]
-                proxy = self._start(node, "proxy", argv, self._environment(_DOMAINS[node]))
-                proxies.append(undo.enter_context(proxy))
+                environment = self._nodes.ros_environment(_DOMAINS[node])
+                proxies.append(undo.enter_context(self._lab.start(node, "proxy", argv, environment)))
             for proxy in proxies:
                 proxy.read_line(READY_S)
             self.proxies = [each.pid for each in proxies]
@@ -154,62 +120,21 @@ class Row:
 
     def process(self, node: str, what: str, arguments: Sequence[str], *, direct: bool) -> Started:
         """Start a Python process that is a ROS node at A or B."""
-        domain = DIRECT_DOMAIN if direct else _DOMAINS[node]
-        return self._start(node, what, arguments, [*self._environment(domain), f"CYCLONEDDS_URI={_cyclone(node)}"])
+        environment = self._nodes.ros_environment(DIRECT_DOMAIN if direct else _DOMAINS[node])
+        return self._lab.start(node, what, arguments, [*environment, f"CYCLONEDDS_URI={_cyclone(node)}"])
 
     def proxies_cpu_s(self) -> float:
         """Return the processor time that both proxies have used, as proc(5) counts it in ``/proc/<pid>/stat``."""
         return sum(_cpu_s(pid) for pid in self.proxies)
 
-    def _start(self, node: str, what: str, arguments: Sequence[str], environment: Sequence[str] = ()) -> Started:
-        def command(argv: Sequence[str]) -> list[str]:
-            return self._spaces.command(node, ["env", *environment, *argv])
-
-        return Started(self._run, f"{what} at {node}", command, arguments)
-
-    def _environment(self, domain: int) -> list[str]:
-        profile = self._files / "dds.xml"
-        return [
-            f"ROS_DOMAIN_ID={domain}",
-            "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET",
-            "RMW_IMPLEMENTATION=rmw_fastrtps_cpp",
-            f"FASTRTPS_DEFAULT_PROFILES_FILE={profile}",  # its name before Fast DDS 3
-            f"FASTDDS_DEFAULT_PROFILES_FILE={profile}",
-        ]
-
     def _admit(self, node: str, carried: Sequence[Carried]) -> str:
         """Let a proxy carry its side of everything, and write its configuration; return the file."""
-        identity, owner = self._files / "nodes" / f"proxy-{node}", self._files / "owner"
         sides: dict[str, list[dict[str, object]]] = {"expose": [], "import": []}
         for each in carried:
             is_source = each.source == node
-            right = _RIGHTS[each.kind][not is_source]
-            install_delegation(identity, delegate(owner, identity / CARD, each.metadata, [right]))
-            sides["expose" if is_source else "import"].append(each.rule(owner / OWNER_PUBLIC))
-        content = {
-            "identity": str(identity),
-            "domain": {"root": str(self._files / "domains" / "row" / ROOT_CERTIFICATE)},
-            "iface": _IFACE[node],
-            "delegations": str(identity / DELEGATIONS),
-            "ros": {"endpoint": "ros2", "domain": _DOMAINS[node]},
-            **sides,
-        }
-        path = self._files / f"proxy-{node}.yaml"
-        path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-        return str(path)
-
-
-def _topology(mtu: int, direct: Sequence[str]) -> Topology:
-    nodes = (LEFT, *_MIDDLE, RIGHT)
-    return Topology(
-        links=tuple(Link(a, b, mtu=mtu) for a, b in [*pairwise(nodes), *pairwise(direct)]),
-        domains=(DomainPlan("row", (*nodes, *direct[1:-1])),),
-        attachments=(
-            Attachment("s2", "rib", "rib"),
-            Attachment(LEFT, "proxy", "end"),
-            Attachment(RIGHT, "proxy", "end"),
-        ),
-    )
+            self._nodes.admit(node, each.metadata, _RIGHTS[each.kind][not is_source])
+            sides["expose" if is_source else "import"].append(each.rule(self._nodes.owner_key))
+        return str(self._nodes.admit_proxy(node, _DOMAINS[node], sides))
 
 
 def _number(device: str, address: str) -> None:

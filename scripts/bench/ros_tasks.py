@@ -15,10 +15,10 @@ from typing import Final, TypeAlias
 
 from fogros_tasks import CAMERA, IMAGE, NUMBERS, OCTETS, POSE, TASKS, Part, Task
 from geometry_msgs.msg import PoseStamped
-from peers.lines import say
+from peers.jsonl import say
 from rclpy.serialization import serialize_message
 from report import percentile
-from ros_end import End, Settings, reliable, run_role
+from ros_endpoint import End, Settings, reliable, run_role
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64MultiArray, MultiArrayLayout, UInt8MultiArray
 

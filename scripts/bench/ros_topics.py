@@ -14,9 +14,9 @@ from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Final
 
-from peers.lines import say
+from peers.jsonl import say
 from report import percentile
-from ros_end import End, Settings, reliable, run_role
+from ros_endpoint import End, Settings, reliable, run_role
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 

@@ -18,9 +18,7 @@ Half of the entries are for a destination, half for destination and source. The 
 
 from __future__ import annotations
 
-import argparse
 import json
-import signal
 import statistics
 import subprocess
 import sys
@@ -31,12 +29,12 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from baselines import Plane
 from chains import Chain
-from contenders import Plane
-from machine import machine_state
-from plot import Panel, panel_of, require_plot, save_bars
-from report import Goal, Rounds, progress, show, write_json
-from search import LOSS_MAX, Try, highest
+from plot import Panel, panel_of
+from rate_search import LOSS_MAX, Try, highest
+from report import Rounds, Target, progress
+from skeleton import Options, Outcome, command_line, run_bench
 from worker import Worker, number
 
 from gdp.errors import LocalError
@@ -52,7 +50,6 @@ REPEATS: Final = 3  # of a try that needs no search; their median is the round's
 INSTALLS, RENEWALS, RATE, CPU = "installs/s", "renewals/s", "frames/s", "CPU µs/frame"
 TABLE, MAP = "table B/entry", "map B/entry"
 ADVERTISED, ASKED, KEPT = "advertisements verified/s", "queries/s", "B/name"
-OUTPUT: Final = Path(__file__).parents[2] / "docs" / "benchmarks"
 
 
 def measure_plane(kind: str, chains: dict[int, Chain], over: Rounds, seconds: float, spread: int) -> None:
@@ -110,7 +107,7 @@ def case_of(names: int) -> str:
     return f"{names:,} names"
 
 
-def goals_of(over: Rounds, sizes: Sequence[int], rib_names: int) -> list[Goal]:
+def targets_of(over: Rounds, sizes: Sequence[int], rib_names: int) -> list[Target]:
     """Return the figures that are to be reached."""
     small, large = case_of(min(sizes)), case_of(max(sizes))
     return [
@@ -122,62 +119,35 @@ def goals_of(over: Rounds, sizes: Sequence[int], rib_names: int) -> list[Goal]:
             over.ratio(f"{plane}: {large} / {small}, {CPU}", plane, plane, large, CPU, None, other_case=small)
             for plane in PLANES
         ),
-        *(over.goal(f"{plane}, {large}: {INSTALLS} in bulk", plane, large, INSTALLS, 300_000) for plane in PLANES),
-        over.goal(f"RIB: {ADVERTISED}, one core", RIB, f"RIB, {rib_names:,} names", ADVERTISED, 2_000),
+        *(over.target(f"{plane}, {large}: {INSTALLS} in bulk", plane, large, INSTALLS, 300_000) for plane in PLANES),
+        over.target(f"RIB: {ADVERTISED}, one core", RIB, f"RIB, {rib_names:,} names", ADVERTISED, 2_000),
     ]
 
 
-def main() -> None:
-    """Run the bench."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--seconds", type=float, default=0.3, help="length of one try")
-    parser.add_argument("--spread", type=int, default=SPREAD, help="names that frames go to; a power of two")
-    parser.add_argument("--only", action="append", choices=[*PLANES, RIB], default=[], help="may be repeated")
-    parser.add_argument("--quick", action="store_true", help="one round, up to 10,000 names: does everything work?")
-    parser.add_argument("--json", type=Path, default=OUTPUT / "scale.json")
-    parser.add_argument("--plot", type=Path, default=OUTPUT / "scale.png")
-    parser.add_argument("--no-plot", action="store_true")
-    parser.add_argument("--no-save", action="store_true", help="print only")
-    options = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
-    state = machine_state()
-    if not (options.no_plot or options.no_save):
-        require_plot()
-    sizes = (1_000, 10_000) if options.quick else SIZES
-    rounds, seconds, rib_names = (1, 0.15, 300) if options.quick else (options.rounds, options.seconds, 3_000)
-    over, runs = Rounds(), Runs()
-    runs.sweep()
-    try:
-        with ExitStack() as undo:
-            chains = {names: undo.enter_context(Chain(runs, 1, 1_500)) for names in sizes}
-            for turn in range(rounds):
-                for kind in PLANES:
-                    if kind not in over.reasons and (not options.only or kind in options.only):
-                        progress(f"round {turn + 1} of {rounds}: {kind}")
-                        measure_plane(kind, chains, over, seconds, options.spread)
-                if not options.only or RIB in options.only:
-                    progress(f"round {turn + 1} of {rounds}: RIB")
-                    measure_rib(rib_names, over)
-    except KeyboardInterrupt:
-        sys.exit("stopped; everything that was made is gone")
-    except LocalError as error:
-        sys.exit(str(error))
+def measure(options: Options, runs: Runs) -> Outcome:
+    """Measure both planes and the RIB, round by round."""
+    sizes, rib_names = ((1_000, 10_000), 300) if options.quick else (SIZES, 3_000)
+    over = Rounds()
+    with ExitStack() as undo:
+        chains = {names: undo.enter_context(Chain(runs, 1, 1_500)) for names in sizes}
+        for number in range(1, options.rounds + 1):
+            for kind in PLANES:
+                if kind not in over.reasons and (not options.only or kind in options.only):
+                    progress(f"round {number} of {options.rounds}: {kind}")
+                    measure_plane(kind, chains, over, options.seconds, options.spread)
+            if not options.only or RIB in options.only:
+                progress(f"round {number} of {options.rounds}: RIB")
+                measure_rib(rib_names, over)
     settings = {
-        "rounds": rounds,
-        "seconds a try": seconds,
+        "rounds": options.rounds,
+        "seconds a try": options.seconds,
         "loss below": LOSS_MAX,
         "MTU": 1_500,
         "frames": f"{FRAME_BYTES} B, one switch, {options.spread:,} names of the table",
         "cores": "source 0, sink 1, switch anywhere",
     }
-    goals = goals_of(over, sizes, rib_names)
-    show("Scale", state, settings, over, goals)
-    if options.no_save:
-        return
-    write_json(options.json, "scale", state, settings, over, goals)
-    if not options.no_plot:
-        save_bars(options.plot, "Scale", str(state), panels_of(over, sizes))
+    targets = targets_of(over, sizes, rib_names)
+    return Outcome("scale", "Scale", over, targets, settings, lambda: panels_of(over, sizes))
 
 
 def panels_of(over: Rounds, sizes: Sequence[int]) -> list[Panel]:
@@ -201,4 +171,15 @@ def panel_of_cases(over: Rounds, column: str, cases: Sequence[str]) -> Panel:
 
 
 if __name__ == "__main__":
-    main()
+    parser = command_line(
+        __doc__,
+        rounds=3,
+        seconds=0.3,
+        seconds_of="length of one try",
+        quick={"rounds": 1, "seconds": 0.15},
+        has_record=True,
+        has_plot=True,
+    )
+    parser.add_argument("--spread", type=int, default=SPREAD, help="names that frames go to; a power of two")
+    parser.add_argument("--only", action="append", choices=[*PLANES, RIB], default=[], help="may be repeated")
+    run_bench(parser, measure)

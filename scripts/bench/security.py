@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import signal
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -31,10 +30,7 @@ import security_replays
 import security_revocation
 import security_rotation
 from machine import MachineState, machine_state
-from peers.process import FailedError
-from report import progress
-
-from gdp.errors import GdpError
+from skeleton import clean_exit
 
 OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks" / "security.json"
 COMMANDS: Final[Mapping[str, ModuleType]] = {
@@ -74,14 +70,8 @@ def save(path: Path, command: str, figures: Mapping[str, object], state: Machine
 def main() -> None:
     """Run one subcommand."""
     options, state = arguments().parse_args(), machine_state()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
-    try:
+    with clean_exit():
         figures, has_met = COMMANDS[options.command].run(options)
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except (GdpError, FailedError) as error:
-        progress(f"FAILED {error}")
-        sys.exit(1)
     if not options.no_save:
         save(options.json, options.command, figures, state)
     sys.exit(options.strict and not has_met)

@@ -1,15 +1,16 @@
 """What security costs: this tree beside an earlier commit, in turn, round by round.
 
 ends         processor time to seal and sign a message, to open and verify it, in 100 and 10,000 bytes; advertisements
-             that one RIB takes in a second (``security_cost_end.py``): the best of many short blocks, in turn
+             that one RIB takes in a second (``security_cost_endpoint.py``): the best of many short blocks, in turn
 forwarding   one switch in namespaces: frames a second of the plane ``kernel``, flat out, and processor time of a frame
              at the plane ``raw``, at a steady rate
 messages     ``bundles.py`` as each tree has it: real processes over three switches, 20 reliable topics, 100 bytes, with
              as many messages as come to be confirmed; with bundles, and with one seal a message
 trips        ``messages.py`` as each tree has it, on the plane ``raw``: a message there and a small answer back
 
-The other commit is checked out beside (``git worktree``), and removed after. Asked is that no median is worse by more
-than 5 %. A ratio is taken in each round, since what slows a round slows both.
+The other commit is checked out in a ``git worktree``, and removed after. Its packages run under scripts of the commit
+``SCRIPTS``, the last one whose scripts use the names of that time, so that renames in this tree do not disturb it.
+Asked is that no median is worse by more than 5 %. A ratio is taken in each round, since what slows a round slows both.
 
     sudo .venv/bin/python scripts/bench/security.py cost
     .venv/bin/python scripts/bench/security.py cost --part ends --rounds 9      # no root
@@ -25,27 +26,36 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from baselines import Plane
 from bundles import BUNDLES, CPU, OVERLOAD, RATE, SINGLE
 from chains import Chain
-from contenders import Plane
 from machine import machine_state, thread_s
 from peers.figures import MEDIAN
 from peers.process import FailedError
-from report import Goal, Rounds, progress, show
+from report import Rounds, Target, progress, show
+from worker import Worker
 
 from gdp.host.run_registry import Runs
 
 __all__ = ["add_arguments", "run"]
 
 BASE: Final = "49da3d8"  # the last commit before the work on security
+SCRIPTS: Final = "83dca9c"  # the last commit whose scripts import the packages of BASE by their names
 HERE: Final = "this tree"
 BEFORE: Final = "before"
 ASKED: Final = 0.05
 SIZES: Final = (128, 1_400)
 _TREE: Final = Path(__file__).resolve().parents[2]
+_BENCH: Final = _TREE / "scripts" / "bench"
+_BASE_CASES: Final = (
+    "overload",
+    ("bundles", "one seal a message"),
+    ("messages/s", "sender, CPU us/message", "reader, CPU us/message"),
+)
 _BLOCKS: Final = 40  # of 100 messages, at each tree in turn
 _BLOCKS_SLOW: Final = 8
 _STEADY_HZ: Final = 20_000.0
@@ -54,7 +64,25 @@ _TRIES: Final = 3
 _PATIENCE_S: Final = 300.0
 
 Figures = dict[tuple[str, str], float]  # by case and column; those of a rate end with "/s"
-Trees = Mapping[str, Path]
+
+
+@dataclass(frozen=True, slots=True)
+class Tree:
+    """Packages of one commit, and the scripts that fit them.
+
+    Attributes:
+        endpoint: measures what a message and an advertisement cost.
+        roles: the processes of ``_forwarding``.
+        cases: of ``bundles.py``: the case, the rows, the columns.
+    """
+
+    path: Path
+    endpoint: Path
+    roles: Path
+    cases: tuple[str, tuple[str, ...], tuple[str, ...]]
+
+
+Trees = Mapping[str, Tree]
 Part = Callable[[Trees, argparse.Namespace], dict[str, Figures]]
 
 
@@ -71,36 +99,41 @@ def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
     figures: dict[str, object] = {}
     has_met = True
     state = machine_state()
-    with _checked_out(options.base) as base:
+    own = Tree(
+        _TREE, _BENCH / "security_cost_endpoint.py", _BENCH / "roles.py", (OVERLOAD, (BUNDLES, SINGLE), (RATE, *CPU))
+    )
+    with _checked_out(options.base) as path, _checked_out(SCRIPTS) as scripts:
+        bench = scripts / "scripts" / "bench"
+        base = Tree(path, bench / "security_cost_end.py", bench / "roles.py", _BASE_CASES)
         for part in options.part or PARTS:
             over = Rounds()
             for number in range(options.rounds):
                 progress(f"{part}, round {number + 1} of {options.rounds}")
-                turns = [(BEFORE, base), (HERE, _TREE)]
+                turns = [(BEFORE, base), (HERE, own)]
                 for who, figures_of in PARTS[part](dict(turns[:: 1 if number % 2 else -1]), options).items():
                     for (case, column), value in figures_of.items():
                         over.add(who, case, column, value)
-            goals = _goals(over)
-            show(f"Cost of security: {part}", state, {"rounds": options.rounds, BEFORE: options.base}, over, goals)
-            has_met = has_met and all(goal.reached is not False for goal in goals)
+            targets = _targets(over)
+            show(f"Cost of security: {part}", state, {"rounds": options.rounds, BEFORE: options.base}, over, targets)
+            has_met = has_met and all(target.met is not False for target in targets)
             figures[part] = {
                 BEFORE: options.base,
                 "rounds": over.values,
-                "ratios": {goal.what: str(goal.got) for goal in goals},
-                "reached": {goal.what: goal.reached for goal in goals},
+                "ratios": {target.what: str(target.measured) for target in targets},
+                "met": {target.what: target.met for target in targets},
             }
     return figures, has_met
 
 
-def _goals(over: Rounds) -> list[Goal]:
-    goals = []
+def _targets(over: Rounds) -> list[Target]:
+    targets = []
     for case in over.cases():
         for column in over.columns(case):
             is_rate = column.endswith("/s")
             asked = 1 - ASKED if is_rate else 1 + ASKED
             what = f"{case}, {column}: {HERE} / {BEFORE}"
-            goals.append(over.ratio(what, HERE, BEFORE, case, column, asked, at_most=not is_rate))
-    return goals
+            targets.append(over.ratio(what, HERE, BEFORE, case, column, asked, at_most=not is_rate))
+    return targets
 
 
 @contextmanager
@@ -141,13 +174,12 @@ def _output(tree: Path, *argv: str) -> str:
 
 
 def _ends(trees: Trees, _: argparse.Namespace) -> dict[str, Figures]:
-    script = str(Path(__file__).with_name("security_cost_end.py"))
     found: dict[str, Figures] = {who: {} for who in trees}
     with ExitStack() as undo:
         ends = {
             who: undo.enter_context(
                 subprocess.Popen(
-                    [sys.executable, script], env=_environment(tree), text=True,
+                    [sys.executable, str(tree.endpoint)], env=_environment(tree.path), text=True,
                     stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                 )
             )
@@ -179,11 +211,11 @@ def _line(end: subprocess.Popen[str], asked: str | None = None) -> str:
         end.stdin.flush()
     line = end.stdout.readline()
     if not line:
-        raise FailedError("security_cost_end.py ended")
+        raise FailedError("security_cost_endpoint.py ended")
     return line
 
 
-def _forwarding(tree: Path, _: argparse.Namespace) -> Figures:
+def _forwarding(tree: Tree, _: argparse.Namespace) -> Figures:
     found: Figures = {}
     runs = Runs()
     runs.sweep()
@@ -210,13 +242,14 @@ def _forwarding(tree: Path, _: argparse.Namespace) -> Figures:
 
 
 @contextmanager
-def _packages_of(tree: Path) -> Iterator[None]:
+def _packages_of(tree: Tree) -> Iterator[None]:
     """Have processes that are started meanwhile use the packages of a tree."""
-    before = os.environ.get("PYTHONPATH")
-    os.environ["PYTHONPATH"] = str(tree)
+    before, roles = os.environ.get("PYTHONPATH"), Worker.roles
+    os.environ["PYTHONPATH"], Worker.roles = str(tree.path), tree.roles
     try:
         yield
     finally:
+        Worker.roles = roles
         if before is None:
             del os.environ["PYTHONPATH"]
         else:
@@ -232,22 +265,23 @@ def _own_bench(tree: Path, name: str, *argv: str) -> Mapping[str, Mapping[str, M
         return found
 
 
-def _messages(tree: Path, options: argparse.Namespace) -> Figures:
-    found = _own_bench(tree, "bundles.py", "--no-plot", "--seconds", str(options.seconds))
+def _messages(tree: Tree, options: argparse.Namespace) -> Figures:
+    found = _own_bench(tree.path, "bundles.py", "--no-plot", "--seconds", str(options.seconds))
     figures: Figures = {}
-    for who in (BUNDLES, SINGLE):
-        for column in (RATE, *CPU):
-            value = found[who][OVERLOAD][column][0]
+    case, rows, columns = tree.cases
+    for who, row in zip((BUNDLES, SINGLE), rows, strict=True):
+        for column, name in zip((RATE, *CPU), columns, strict=True):
+            value = found[row][case][name][0]
             if value is None:
-                raise FailedError(f"bundles.py of {tree} has no {column}")
+                raise FailedError(f"bundles.py of {tree.path} has no {name}")
             figures[f"100 B, overload, {who}", column] = value
     return figures
 
 
-def _trips(tree: Path, _: argparse.Namespace) -> Figures:
+def _trips(tree: Tree, _: argparse.Namespace) -> Figures:
     sizes = [word for size in (100, 10_000) for word in ("--size", str(size))]
     cut = ["--only", "gdp-raw", "--mtu", "1500", "--offloads", "off", "--encoding", "cdr", "--count", "100"]
-    found = _own_bench(tree, "messages.py", *cut, *sizes)
+    found = _own_bench(tree.path, "messages.py", *cut, *sizes)
     return {
         (case, column): value
         for cases in found.values()
@@ -257,7 +291,7 @@ def _trips(tree: Path, _: argparse.Namespace) -> Figures:
     }
 
 
-def _one_by_one(measure: Callable[[Path, argparse.Namespace], Figures]) -> Part:
+def _one_by_one(measure: Callable[[Tree, argparse.Namespace], Figures]) -> Part:
     return lambda trees, options: {who: measure(tree, options) for who, tree in trees.items()}
 
 

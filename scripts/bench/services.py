@@ -18,7 +18,7 @@ from typing import Final
 
 from peers.process import FailedError
 from plot import Panel, panel_of
-from report import Goal, Rounds
+from report import Rounds, Target
 from ros_row import LEFT, READY_S, RIGHT, Carried, Row
 from ros_stage import DIRECT, Bench, Options, Turn, parse, perform
 
@@ -103,18 +103,18 @@ def case_of(case: str, mtu: int) -> str:
     return f"{case}, MTU {mtu}"
 
 
-def goals_of(over: Rounds, mtu: int) -> list[Goal]:
+def targets_of(over: Rounds, mtu: int) -> list[Target]:
     """Return what was asked for."""
     one, load = case_of(ONE, mtu), case_of(LOAD, mtu)
-    goals = []
+    targets = []
     for encoding in ENCODINGS[ONE]:
         who = f"overlay, {encoding}"
-        goals.append(over.difference(f"{one}: {who} - {DIRECT}, ms", who, DIRECT, one, MEDIAN, ADDED_MS))
+        targets.append(over.difference(f"{one}: {who} - {DIRECT}, ms", who, DIRECT, one, MEDIAN, ADDED_MS))
     for encoding in ENCODINGS[LOAD]:
         who = f"overlay, {encoding}"
         for column in (LOST, WRONG):
-            goals.append(over.goal(f"{load}: {who}, {column}", who, load, column, 0.0, at_most=True))
-    return goals
+            targets.append(over.target(f"{load}: {who}, {column}", who, load, column, 0.0, at_most=True))
+    return targets
 
 
 def panels_of(over: Rounds, mtu: int) -> list[Panel]:
@@ -134,14 +134,14 @@ def bench_of(options: Options) -> Bench:
         "Calls of a ROS 2 service over three kernel switches",
         [Carried(service_of(encoding), TYPE, encoding, source=RIGHT, kind="service") for encoding in encodings],
         list(turns_of(options)),
-        lambda over: [goal for mtu in options.mtus for goal in goals_of(over, mtu)],
+        lambda over: [target for mtu in options.mtus for target in targets_of(over, mtu)],
         lambda over: [panel for mtu in options.mtus for panel in panels_of(over, mtu)],
     )
 
 
 def main() -> None:
     """Run the bench."""
-    options = parse(__doc__ or "", "services", rounds=3, seconds=SECONDS, mtus=(MTU,), quick_s=QUICK_S)
+    options = parse(__doc__ or "", rounds=3, seconds=SECONDS, mtus=(MTU,), quick_s=QUICK_S)
     perform(bench_of(options), options)
 
 

@@ -20,12 +20,10 @@ from __future__ import annotations
 import argparse
 import gc
 import os
-import signal
 import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
@@ -36,9 +34,8 @@ from peers.process import FailedError
 from report import progress
 from rich.console import Console
 from rich.table import Table
+from skeleton import clean_exit, command_line, new_run
 
-from gdp.errors import GdpError
-from gdp.host.run_registry import Runs
 from gdp.simulation.topology import chain
 from gdp.simulation.world import World
 from gdp.trust.right import Right
@@ -166,12 +163,7 @@ def soak_real(options: argparse.Namespace, samples: Samples) -> None:
         FailedError: a process did not come up, or ended.
         GdpError: the kernel refuses.
     """
-    runs = Runs()
-    runs.sweep()  # what a killed run left
-    with ExitStack() as undo:
-        run = runs.start()
-        undo.callback(run.end)
-        overlay = undo.enter_context(Overlay(run, _plan(), plane=options.plane, churn_hz=options.hz))
+    with new_run() as run, Overlay(run, _plan(), plane=options.plane, churn_hz=options.hz) as overlay:
         overlay.start_all()
         progress("real processes: up")
         begun_s = time.monotonic()
@@ -229,25 +221,19 @@ def show(samples: Samples, publishers: int) -> bool:
 
 def main() -> None:
     """Soak; exit 1 when something grows."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__, seconds=SECONDS, seconds_of="on real processes")
     parser.add_argument("--only", choices=("memory", "real"), help="this part")
     parser.add_argument("--cycles", type=int, default=CYCLES, help="subscriptions in memory (default: %(default)s)")
     parser.add_argument("--publishers", type=int, default=PUBLISHERS, help="in memory (default: %(default)s)")
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="on real processes (default: %(default)s)")
     parser.add_argument("--hz", type=float, default=10.0, help="changes a second there (default: %(default)s)")
     parser.add_argument("--plane", default="auto", help="as gdp-switch --data-plane (default: %(default)s)")
     options = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
     samples: Samples = defaultdict(list)
-    try:
+    with clean_exit():
         if options.only != "real":
             soak_memory(options, samples)
         if options.only != "memory":
             soak_real(options, samples)
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except (GdpError, FailedError) as error:
-        sys.exit(f"error: {error}")
     sys.exit(not show(samples, options.publishers))
 
 

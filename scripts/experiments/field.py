@@ -22,18 +22,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-import yaml
 from bench_path import ROOT
 from peers.process import Started
+from testbed import Lab, OverlayNodes, make_topology
 
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
-from gdp.simulation.namespaces import Namespaces
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
-from gdp.stores.issue import delegate, install_delegation
-from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
+from gdp.simulation.topology import Topology
 from gdp.trust.right import Right
-from ring.materials import Materials
 
 __all__ = ["READY_S", "ROBOT", "Field", "Served", "Server", "Work"]
 
@@ -42,17 +38,6 @@ READY_S: Final = 40.0
 _NEAR, _GATE = "s1", "gate"
 _HERE: Final = ROOT / "scripts" / "experiments"
 _DOMAIN: Final = 150  # of the robot; the machines' follow
-_PROFILE: Final = """<?xml version="1.0" encoding="UTF-8" ?>
-<dds xmlns="http://www.eprosima.com"><profiles>
- <transport_descriptors><transport_descriptor>
-  <transport_id>udp</transport_id><type>UDPv4</type>
-  <sendBufferSize>4194304</sendBufferSize><receiveBufferSize>4194304</receiveBufferSize>
- </transport_descriptor></transport_descriptors>
- <participant profile_name="participant" is_default_profile="true"><rtps>
-  <userTransports><transport_id>udp</transport_id></userTransports><useBuiltinTransports>false</useBuiltinTransports>
- </rtps></participant>
-</profiles></dds>
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,28 +156,16 @@ class Field:
         delays: Mapping[str, float] | None = None,
         mtu: int = 1_500,
     ) -> None:
-        self._run = run
-        self._undo = ExitStack()
         self._machines = tuple(work)
         self._relays = {machine: f"x{machine}" for machine in delays or {}}
-        topology = self._topology(mtu)
-        self._spaces = Namespaces(topology, run)
-        self._files = run.directory / "keys"
-        self._files.mkdir(mode=0o700)
-        (self._files / "dds.xml").write_text(_PROFILE, encoding="utf-8")
-        materials = Materials(topology, self._files, metrics=False)
+        self._lab = Lab(run, self._topology(mtu))
         with ExitStack() as undo:
             for machine, seconds in (delays or {}).items():
                 relay = [str(_HERE / "relay.py"), _GATE, machine, str(1e3 * seconds)]
-                undo.enter_context(self.process(self._relays[machine], "relay", relay)).read_line(READY_S)
-            planes = set()
-            for node in (_NEAR, _GATE):
-                argv = ["-m", "gdp.cli.switch", "--json", "--config", str(materials.switch(node, "auto"))]
-                planes.add(str(undo.enter_context(self.process(node, "switch", argv)).read(READY_S)["data_plane"]))
-            self.data_plane = ", ".join(sorted(planes))
-            (at,) = topology.attached("rib")
-            rib = ["-m", "gdp.cli.rib", "--json", "--config", str(materials.rib(at))]
-            undo.enter_context(self.process(at.switch, "rib", rib)).read(READY_S)
+                undo.enter_context(self._lab.start(self._relays[machine], "relay", relay)).read_line(READY_S)
+            self._nodes = OverlayNodes(self._lab, (_NEAR, _GATE), plane="auto", ready_s=READY_S)
+            undo.callback(self._nodes.close)
+            self.data_plane = ", ".join(sorted(self._nodes.planes))
             argv = ["-m", "proxy.cli", "--config", self._admit(ROBOT, served)]
             robot = undo.enter_context(self.process(ROBOT, "proxy", argv))
             self.servers = {each: Server(self, each, self._admit(each, served), work[each]) for each in self._machines}
@@ -215,55 +188,29 @@ class Field:
         return self.process(place, role, [str(program), role, json.dumps(settings)])
 
     def process(self, node: str, what: str, arguments: Sequence[str]) -> Started:
-        """Start a Python process in a namespace."""
-
-        def command(argv: Sequence[str]) -> list[str]:
-            return self._spaces.command(node, ["env", *self._environment(node), *argv])
-
-        return Started(self._run, f"{what} at {node}", command, arguments)
-
-    def _environment(self, node: str) -> list[str]:
-        profile = self._files / "dds.xml"
-        return [
-            f"ROS_DOMAIN_ID={self._domain(node)}",
-            "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET",
-            "RMW_IMPLEMENTATION=rmw_fastrtps_cpp",
-            f"FASTRTPS_DEFAULT_PROFILES_FILE={profile}",  # its name before Fast DDS 3
-            f"FASTDDS_DEFAULT_PROFILES_FILE={profile}",
-            "OPENBLAS_NUM_THREADS=1",  # a machine here is one core's worth
-            "OMP_NUM_THREADS=1",
-        ]
+        """Start a Python process in a namespace, in its ROS domain, with one thread for linear algebra."""
+        threads = ["OPENBLAS_NUM_THREADS=1", "OMP_NUM_THREADS=1"]  # a machine here is one core's worth
+        environment = [*self._nodes.ros_environment(self._domain(node)), *threads]
+        return self._lab.start(node, what, arguments, environment)
 
     def _domain(self, node: str) -> int:
         return _DOMAIN + 1 + self._machines.index(node) if node in self._machines else _DOMAIN
 
     def _admit(self, node: str, served: Sequence[Served]) -> str:
         """Let a proxy carry its side of everything, and write its configuration; return the file."""
-        identity, owner = self._files / "nodes" / f"proxy-{node}", self._files / "owner"
         side, right = ("import", Right.CALL) if node == ROBOT else ("expose", Right.SERVE)
         rules = []
         for each in served:
             if node == ROBOT or node in each.machines:
-                install_delegation(identity, delegate(owner, identity / CARD, each.metadata, [right]))
-                rules.append(each.rule(owner / OWNER_PUBLIC, each.imports if node == ROBOT else each.expose))
-        content = {
-            "identity": str(identity),
-            "domain": {"root": str(self._files / "domains" / "field" / ROOT_CERTIFICATE)},
-            "iface": _NEAR if node == ROBOT else self._relays.get(node, _GATE),
-            "delegations": str(identity / DELEGATIONS),
-            "ros": {"endpoint": "ros2", "domain": self._domain(node)},
-            side: rules,
-        }
-        path = self._files / f"proxy-{node}.yaml"
-        path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-        return str(path)
+                self._nodes.admit(node, each.metadata, right)
+                further = each.imports if node == ROBOT else each.expose
+                rules.append(each.rule(self._nodes.owner_key, further))
+        return str(self._nodes.admit_proxy(node, self._domain(node), {side: rules}))
 
     def _topology(self, mtu: int) -> Topology:
-        links = [Link(ROBOT, _NEAR, mtu=mtu), Link(_NEAR, _GATE, mtu=mtu)]
+        links = [(ROBOT, _NEAR), (_NEAR, _GATE)]
         for machine in self._machines:
             relay = self._relays.get(machine)
-            between = [(_GATE, machine)] if relay is None else [(_GATE, relay), (relay, machine)]
-            links += [Link(a, b, mtu=mtu) for a, b in between]
+            links += [(_GATE, machine)] if relay is None else [(_GATE, relay), (relay, machine)]
         nodes = (ROBOT, _NEAR, _GATE, *self._relays.values(), *self._machines)
-        ends = tuple(Attachment(each, "proxy", "end") for each in (ROBOT, *self._machines))
-        return Topology(tuple(links), (DomainPlan("field", nodes),), (Attachment(_GATE, "rib", "rib"), *ends))
+        return make_topology(links, mtu=mtu, rib=_GATE, members=(ROBOT, *self._machines), switches=nodes)

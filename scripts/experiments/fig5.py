@@ -21,13 +21,7 @@ from typing import Annotated, Final
 
 import typer
 from bench_path import ROOT
-from field import Field, Served, Work
-from machine import machine_state
-from pictures import save_distributions
-from recorded import LIMIT_S, RECORDED, draw, load
-from samples import Sample, Summary, least_of_two, p99
-from series import Series
-from study import (
+from experiment import (
     Asking,
     Finding,
     JsonOption,
@@ -38,6 +32,12 @@ from study import (
     field_of,
     place_of,
 )
+from field import Field, Served, Work
+from machine import machine_state
+from pictures import save_distributions
+from recorded import LIMIT_S, RECORDED, draw, load
+from samples import Sample, Summary, least_of_two, p99
+from series import Series
 
 __all__: list[str] = []
 

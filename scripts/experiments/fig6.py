@@ -13,13 +13,7 @@ from dataclasses import asdict, dataclass
 from typing import Annotated, Final
 
 import typer
-from carrier import TYPE
-from field import Served, Work
-from machine import machine_state
-from pictures import save_distributions
-from samples import Sample, Summary
-from series import Rivalry, Series
-from study import (
+from experiment import (
     Asking,
     Finding,
     JsonOption,
@@ -30,6 +24,12 @@ from study import (
     field_of,
     place_of,
 )
+from field import Served, Work
+from image_request import TYPE
+from machine import machine_state
+from pictures import save_distributions
+from samples import Sample, Summary
+from series import Contention, Series
 
 __all__: list[str] = []
 
@@ -112,8 +112,8 @@ def main(
         times = _times()
         work = {each: Work(setting.role, {"services": names[each], "takes_s": times[each]}) for each in _MACHINES}
         with field_of(served, work) as here:
-            rivalry = asdict(Rivalry("segment", _ONE, ON_S, OFF_S))
-            rival = here.client(_MACHINES[0], "busy", **rivalry) if setting.is_contended else nullcontext()
+            contention = asdict(Contention("segment", _ONE, ON_S, OFF_S))
+            rival = here.client(_MACHINES[0], "busy", **contention) if setting.is_contended else nullcontext()
             with rival, Asking(here, series) as asking:
                 found, plane = asking.by_service(what), here.data_plane
         groups[f"{what}, one server"], groups[f"{what}, two replicas"] = found[_ONE], found[_TWO]

@@ -10,13 +10,7 @@ from __future__ import annotations
 from typing import Annotated, Final
 
 import typer
-from carrier import TYPE
-from field import Served, Work
-from machine import machine_state
-from pictures import save_distributions
-from samples import Sample, Summary
-from series import Series
-from study import (
+from experiment import (
     Asking,
     Finding,
     JsonOption,
@@ -27,6 +21,12 @@ from study import (
     field_of,
     place_of,
 )
+from field import Served, Work
+from image_request import TYPE
+from machine import machine_state
+from pictures import save_distributions
+from samples import Sample, Summary
+from series import Series
 
 __all__: list[str] = []
 

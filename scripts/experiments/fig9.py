@@ -12,14 +12,14 @@ from enum import Enum, auto
 from typing import Annotated, Final
 
 import typer
-from carrier import TYPE
+from experiment import Asking, Finding, JsonOption, OutOption, QuickOption, Report, conclude, field_of, place_of
 from field import Field, Served, Work
+from image_request import TYPE
 from machine import machine_state
 from pictures import Span, save_timeline
 from report import progress
 from samples import Sample, Summary
 from series import Series
-from study import Asking, Finding, JsonOption, OutOption, QuickOption, Report, conclude, field_of, place_of
 
 __all__: list[str] = []
 
@@ -59,7 +59,7 @@ class _Phase(Enum):
     COMING = auto()
 
 
-class _Reaper:
+class _FaultInjector:
     """Kills one machine after the other, driven by the answers as they come."""
 
     def __init__(self, place: Field, steady_s: float) -> None:
@@ -114,23 +114,23 @@ def main(
     )
     served = [Served(_SERVICE, TYPE, labels, imports=imports)]
     with field_of(served, work) as here, Asking(here, series) as asking:
-        reaper = _Reaper(here, _QUICK_STEADY_S if quick else _STEADY_S)
+        fault_injector = _FaultInjector(here, _QUICK_STEADY_S if quick else _STEADY_S)
         samples = []
         for sample in asking:
             samples.append(sample)
-            reaper.see(sample)
+            fault_injector.see(sample)
         plane = here.data_plane
     from_s, end_s = samples[0].begun_s, max(each.begun_s for each in samples)
-    spans = [Span(label, a - from_s, (b if b > a else end_s) - from_s) for label, a, b in reaper.spans]
+    spans = [Span(label, a - from_s, (b if b > a else end_s) - from_s) for label, a, b in fault_injector.spans]
     report = Report(
         "fig9",
         "Figure 9: a tag's pose while replicas are killed and come back",
         "sudo .venv/bin/python scripts/experiments/fig9.py",
         _SETTING,
         _groups(samples, spans, from_s),
-        _findings(samples, asking, reaper),
+        _findings(samples, asking, fault_injector),
         _NOTES,
-        {"replicas": machines, "requests a second": _HZ, "kills": reaper.kills, "switches": plane},
+        {"replicas": machines, "requests a second": _HZ, "kills": fault_injector.kills, "switches": plane},
     )
     if place is not None:
         save_timeline(place / "fig9.png", report.title, samples, spans, from_s)
@@ -149,12 +149,12 @@ def _groups(samples: list[Sample], spans: list[Span], from_s: float) -> dict[str
     return {name: each for name, each in groups.items() if each}
 
 
-def _findings(samples: list[Sample], asking: Asking, reaper: _Reaper) -> list[Finding]:
-    longest_s = max((to_s - from_s for _, from_s, to_s in reaper.spans), default=0.0)
+def _findings(samples: list[Sample], asking: Asking, fault_injector: _FaultInjector) -> list[Finding]:
+    longest_s = max((to_s - from_s for _, from_s, to_s in fault_injector.spans), default=0.0)
     found = Summary.of(samples)
     return [
         Finding("requests", found.count),
-        Finding("kills", reaper.kills),
+        Finding("kills", fault_injector.kills),
         Finding("failed requests", found.failed, 0, at_most=True, paper="0"),
         Finding("answers too many", asking.twice or 0, 0, at_most=True),
         Finding("answers that reached a call", asking.heard or 0, found.count),

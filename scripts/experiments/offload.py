@@ -14,31 +14,29 @@ import json
 import os
 import signal
 import statistics
-import sys
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Final, Literal, TypeAlias
 
 import typer
 from bench_path import ROOT
+from experiment import JsonOption, OutOption, QuickOption, place_of
 from machine import machine_state
 from offload_page import page_of, save_picture
-from peers.process import FailedError, Started
+from peers.process import Started
 from report import progress
 from ros_row import DIRECT_DOMAIN, LEFT, READY_S, RIGHT, Carried, Row
-from study import JsonOption, OutOption, QuickOption, place_of
+from skeleton import clean_exit, new_run
 
-from gdp.errors import LocalError
 from gdp.host.cgroups import Cgroup
-from gdp.host.run_registry import Run, Runs
 
 __all__: list[str] = []
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 OVERLAY: Final = "overlay"
-CONTENDERS: Final = {"ROS 2, Cyclone DDS": "cyclone", "ROS 2, Fast DDS": "fast", OVERLAY: "fast"}
+BASELINES: Final = {"ROS 2, Cyclone DDS": "cyclone", "ROS 2, Fast DDS": "fast", OVERLAY: "fast"}
 ROUNDS: Final = 3
 AT_ONCE: Final = 34  # requests a round that are answered without computing: the network alone
 COMPUTED: Final = {"vSLAM": 34, "grasp planning": 34, "motion planning": 1}  # requests a round that are computed
@@ -51,7 +49,7 @@ ALONE: Final = {
 SLOWER: Final = {"vSLAM": 0.68 / 1.39, "motion planning": 161.8 / 4.292, "grasp planning": 14.0 / 0.535}
 MTU: Final = 1_500
 _QUICK: Final = "grasp planning"
-_END: Final = str(ROOT / "scripts" / "experiments" / "offload_end.py")
+_END: Final = str(ROOT / "scripts" / "experiments" / "offload_endpoint.py")
 _ANSWER_S: Final = 200.0
 _ROBOTS_READY_S: Final = 180.0
 _ALONE_S: Final = 1_100.0
@@ -61,7 +59,7 @@ Part: TypeAlias = Literal["network", "alone", "both"]
 
 @dataclass(slots=True)
 class Measured:
-    """What one contender took, in seconds, a value a request. ``failed``: answers that were wrong."""
+    """What one baseline took, in seconds, a value a request. ``failed``: answers that were wrong."""
 
     there_s: list[float] = field(default_factory=list)
     back_s: list[float] = field(default_factory=list)
@@ -93,8 +91,7 @@ def main(
     tasks: dict[str, dict[str, object]] = {}
     if kept is not None and kept.exists():
         tasks = json.loads(kept.read_text(encoding="utf-8"))["tasks"]
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
-    try:
+    with clean_exit():
         for name in names:
             state = machine_state()
             told = tasks.setdefault(name, {})
@@ -102,10 +99,6 @@ def main(
                 told["network"] = _network(name, 1 if quick else rounds, quick=quick) | {"machine": asdict(state)}
             if part != "network":
                 told["alone"] = _alone(name, quick=quick) | {"machine": asdict(state)}
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except (LocalError, FailedError) as error:
-        sys.exit(f"error: {error}")
     document = {"experiment": "offload", "slower": SLOWER, "tasks": tasks}
     page = page_of(document)
     print(json.dumps(document) if as_json else page)
@@ -118,7 +111,7 @@ def main(
 
 
 def _network(name: str, rounds: int, *, quick: bool) -> dict[str, object]:
-    """Let every contender carry a task, in turn, round by round."""
+    """Let every baseline carry a task, in turn, round by round."""
     from offload_tasks import TASKS
 
     shape = TASKS[name]()
@@ -126,11 +119,11 @@ def _network(name: str, rounds: int, *, quick: bool) -> dict[str, object]:
     carried = [Carried(prefix + topic, type_name, "cdr") for topic, type_name in shape.parts]
     carried.append(Carried(prefix + shape.answer[0], shape.answer[1], "cdr", source=RIGHT))
     at_once, computed = (3, 2) if quick else (AT_ONCE, COMPUTED[name])
-    found = {who: Measured() for who in CONTENDERS}
+    found = {who: Measured() for who in BASELINES}
     size = 0
-    with _run() as run, Row(run, carried, mtu=MTU, bridged=True) as row:
+    with new_run() as run, Row(run, carried, mtu=MTU, bridged=True) as row:
         for at in range(1, rounds + 1):
-            for who, middleware in CONTENDERS.items():
+            for who, middleware in BASELINES.items():
                 progress(f"{name}, round {at} of {rounds}: {who}")
                 told = {"task": name, "prefix": prefix, "middleware": middleware, "domain": DIRECT_DOMAIN}
                 told |= {"at_once": at_once, "count": at_once + computed}
@@ -177,7 +170,7 @@ def _alone(name: str, *, quick: bool) -> dict[str, object]:
     count, robots = (1, 1) if quick else ALONE[name]
     cores = 1 / SLOWER[name] if SLOWER[name] > 1 and not quick else 1.0
     times, failed = [], 0
-    with _run() as run, ExitStack() as stack:
+    with new_run() as run, ExitStack() as stack:
         started = []
         for number in range(robots):
             argv = [_END, "alone", json.dumps({"task": name, "count": count})]
@@ -199,18 +192,6 @@ def _alone(name: str, *, quick: bool) -> dict[str, object]:
                 failed += not said["is_right"]
             progress(f"{name}, on the robot: {len(times)} of {count * robots}")
     return {"cores": cores, "took_s": _short(times), "failed": failed, "side_by_side": robots}
-
-
-@contextmanager
-def _run() -> Iterator[Run]:
-    """Have a run of the testbed for a while."""
-    runs = Runs()
-    runs.sweep()
-    run = runs.start()
-    try:
-        yield run
-    finally:
-        run.end()
 
 
 def _float(said: Mapping[str, object], key: str) -> float:

@@ -17,12 +17,12 @@ from dataclasses import dataclass
 from typing import Annotated, Final
 
 import typer
+from experiment import Asking, Finding, JsonOption, OutOption, QuickOption, Report, conclude, field_of, place_of
 from field import Field, Served, Work
 from machine import machine_state
 from pictures import Span, save_timeline
 from samples import Sample
 from series import Series
-from study import Asking, Finding, JsonOption, OutOption, QuickOption, Report, conclude, field_of, place_of
 
 from fog.plan.failure import chance_down, joint
 

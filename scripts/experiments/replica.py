@@ -5,8 +5,8 @@ Place: process of its own, started by ``field.py`` on a machine: ``replica.py RO
 ``plan`` and ``replay`` serve ``nav_msgs/srv/GetPlan``: the request's start names the problem in its ``frame_id`` (one
 that nobody knows is answered at once, without a way), its goal's stamp holds the number of the request in seconds; the
 answer's header names the machine, and its stamp is how long it worked. Both break off when the service's ``/stop`` is
-called (``std_srvs/srv/Trigger``). ``detect``, ``segment``, ``light`` and ``tag`` serve what ``carrier.py`` tells, one
-request at a time.
+called (``std_srvs/srv/Trigger``). ``detect``, ``segment``, ``light`` and ``tag`` serve what ``image_request.py``
+describes, one request at a time.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from typing import Final
 import bench_path  # noqa: F401 - finds ``peers``
 import rclpy
 from builtin_interfaces.msg import Time
-from carrier import answer_of, frame_of
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
+from image_request import answer_of, frame_of
 from nav_msgs.srv import GetPlan
-from peers.lines import say
+from peers.jsonl import say
 from rcl_interfaces.srv import SetParameters
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor

@@ -195,7 +195,7 @@ def _gains(name: str, document: Any) -> Iterator[Row]:
 
 
 def _kills(document: Any) -> Iterator[Row]:
-    found = {each["what"]: each["got"] for each in document["findings"]}
+    found = {each["what"]: each["measured"] for each in document["findings"]}
     samples = document["groups"]["all"]
     times = [sample[0] for sample in samples]
     conditions = (
@@ -207,7 +207,7 @@ def _kills(document: Any) -> Iterator[Row]:
 
 
 def _outages(document: Any) -> Iterator[Row]:
-    found = {each["what"]: each["got"] for each in document["findings"]}
+    found = {each["what"]: each["measured"] for each in document["findings"]}
     arithmetic = found["two machines: by arithmetic, 15 h up and 20 min down, %"]
     yield Row(
         "FT availability", "two down together, 15 h and 20 min", "< 0.05 %", f"{arithmetic:.3f} %", "", "", "arithmetic"

@@ -18,14 +18,14 @@ from typing import Final
 
 import bench_path  # noqa: F401 - finds ``peers``
 import rclpy
-from peers.lines import say
+from peers.jsonl import say
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.service_introspection import ServiceIntrospectionState
 from rclpy.task import Future
 from samples import Sample
-from series import Rivalry, Series
+from series import Contention, Series
 from service_msgs.msg import ServiceEventInfo
 from tasks import TASKS, WARM_UP, Response, Task
 
@@ -38,7 +38,7 @@ _LATE_S: Final = 0.02
 _LINGER_S: Final = 0.5  # in which an answer too many would come
 
 
-class _Asker:
+class _Client:
     """Calls in turn. Each round of the services carries the same request, so that what they do can be compared."""
 
     def __init__(self, node: Node, task: Task, services: Sequence[str]) -> None:
@@ -116,18 +116,18 @@ class _Asker:
 def ask(node: Node, executor: SingleThreadedExecutor, told: Mapping[str, object]) -> None:
     """Call so often, and print what came of each call, in a line of its own."""
     series = Series(**told)  # type: ignore[arg-type]
-    asker = _Asker(node, TASKS[series.task](series.problem), series.services)
-    answers = asker.count_answers() if series.counts_answers else None
+    client = _Client(node, TASKS[series.task](series.problem), series.services)
+    answers = client.count_answers() if series.counts_answers else None
     done: Future[None] = Future()
-    asker.wait_for_servers()
+    client.wait_for_servers()
     deadline_s = time.monotonic() + _PATIENCE_S
-    while asker.sent < series.warm_up or not asker.winners.issuperset(series.machines):
+    while client.sent < series.warm_up or not client.winners.issuperset(series.machines):
         if time.monotonic() > deadline_s:
-            raise TimeoutError(f"no answer of {', '.join({*series.machines} - asker.winners)}")
+            raise TimeoutError(f"no answer of {', '.join({*series.machines} - client.winners)}")
         first: Future[None] = Future()
-        asker.ask(partial(first.set_result, None))
+        client.ask(partial(first.set_result, None))
         executor.spin_until_future_complete(first, timeout_sec=series.patience_s)
-    asker.begin_anew()
+    client.begin_anew()
     if answers is not None:
         executor.spin_until_future_complete(Future(), timeout_sec=_LINGER_S)
         answers.clear()
@@ -137,11 +137,11 @@ def ask(node: Node, executor: SingleThreadedExecutor, told: Mapping[str, object]
     def tick() -> None:
         nonlocal due_s
         now_s = time.monotonic()
-        while asker.sent < series.count and len(asker.under_way) < series.lanes and due_s <= now_s:
+        while client.sent < series.count and len(client.under_way) < series.lanes and due_s <= now_s:
             due_s = max(due_s, now_s - _LATE_S) + series.gap_s  # who was held up for long does not catch up
-            asker.ask(tick)
-        asker.give_up(series.patience_s)
-        if not done.done() and asker.ended == series.count:
+            client.ask(tick)
+        client.give_up(series.patience_s)
+        if not done.done() and client.ended == series.count:
             done.set_result(None)
 
     node.create_timer(_TICK_S, tick)
@@ -154,15 +154,16 @@ def ask(node: Node, executor: SingleThreadedExecutor, told: Mapping[str, object]
 
 def busy(node: Node, executor: SingleThreadedExecutor, told: Mapping[str, object]) -> None:
     """Be the second client, until killed."""
-    rivalry = Rivalry(**told)  # type: ignore[arg-type]
-    asker = _Asker(node, TASKS[rivalry.task](""), [rivalry.service])
-    asker.wait_for_servers()
+    contention = Contention(**told)  # type: ignore[arg-type]
+    client = _Client(node, TASKS[contention.task](""), [contention.service])
+    client.wait_for_servers()
     begun_s = time.monotonic()
     say(event="begins", at_s=begun_s)
 
     def tick() -> None:
-        if (time.monotonic() - begun_s) % (rivalry.on_s + rivalry.off_s) < rivalry.on_s and not asker.under_way:
-            asker.ask(tick)
+        period_s = contention.on_s + contention.off_s
+        if (time.monotonic() - begun_s) % period_s < contention.on_s and not client.under_way:
+            client.ask(tick)
 
     node.create_timer(_TICK_S, tick)
     executor.spin()

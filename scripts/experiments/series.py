@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["Rivalry", "Series"]
+__all__ = ["Contention", "Series"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class Series:
 
 
 @dataclass(frozen=True, slots=True)
-class Rivalry:
+class Contention:
     """Calls of one service, one after the other for ``on_s``, none for ``off_s``, and so on."""
 
     task: str

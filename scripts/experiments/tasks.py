@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final, Protocol, TypeAlias
 
-from carrier import request_of, said_in
+from image_request import request_of, said_in
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.srv import SetParameters
 from vision import Scene

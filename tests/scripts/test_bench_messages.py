@@ -19,12 +19,13 @@ from rosbags.typesys import Stores, get_typestore
 sys.path.append(str(Path(__file__).resolve().parents[2] / "scripts" / "bench"))
 
 from peers.certificates import make_certificates
-from peers.chain import LEFT, NODES, RIGHT, address, five, routes
+from peers.chain import LEFT, NODES, RIGHT, address, routes
 from peers.cyclone_net import cyclone_xml
 from peers.exchange import ANSWER, IMAGE, SIZE_MIN, Load, answer_to, exchange, image
-from peers.figures import MEDIAN, case_of, goals_of
-from peers.lines import EndSettings
+from peers.figures import MEDIAN, case_of, targets_of
+from peers.jsonl import EndSettings
 from report import Rounds
+from testbed import row
 
 from proxy.serial.channel import Channel
 from proxy.serial.serializer import Encoding, Serializer
@@ -142,7 +143,7 @@ def test_an_answer_has_sixteen_bytes() -> None:
 @pytest.mark.parametrize("start", NODES)
 @pytest.mark.parametrize("end", NODES)
 def test_every_machine_reaches_every_address_over_its_neighbours(start: str, end: str) -> None:
-    topology = five(1_500)
+    topology = row(1_500)
     for link in topology.links_of(end):
         target, at, passed = ip_address(address(end, link.other(end))), start, [start]
         while at != end:
@@ -156,7 +157,7 @@ def test_every_machine_reaches_every_address_over_its_neighbours(start: str, end
 
 
 def test_two_ends_of_a_link_share_a_network_and_nobody_else_does() -> None:
-    links = five(9_000).links
+    links = row(9_000).links
     nets = [{ip_network(f"{address(*pair)}/24", strict=False) for pair in ((x.a, x.b), (x.b, x.a))} for x in links]
     assert all(len(each) == 1 for each in nets)
     assert len(set.union(*nets)) == len(links)
@@ -194,28 +195,28 @@ def test_a_ratio_is_taken_within_one_round_and_one_case() -> None:
         over.add("gdp-raw cdr", case, MEDIAN, ours)
         over.add("zenoh-mtls", case, MEDIAN, theirs)
     over.add("zenoh-mtls", case_of(921_600, 1_500, offloads=False), MEDIAN, 1.0)
-    (goal,) = goals_of(over, ["gdp-raw cdr"], [(921_600, 1_500, True)])[:1]
-    assert goal.got is not None
-    assert goal.got.median == 0.75
-    assert goal.asked == 0.8
-    assert goal.reached
+    (target,) = targets_of(over, ["gdp-raw cdr"], [(921_600, 1_500, True)])[:1]
+    assert target.measured is not None
+    assert target.measured.median == 0.75
+    assert target.target == 0.8
+    assert target.met
 
 
 def test_a_contender_that_is_not_here_reaches_nothing_and_says_why() -> None:
     over, case = Rounds(), case_of(100, 1_500, offloads=False)
     over.add("zenoh-mtls", case, MEDIAN, 1.0)
     over.absent("gdp-kernel cdr", "no CAP_BPF")
-    (goal,) = goals_of(over, ["gdp-kernel cdr"], [(100, 1_500, False)])
-    assert goal.reached is None
-    assert "no CAP_BPF" in str(goal)
+    (target,) = targets_of(over, ["gdp-kernel cdr"], [(100, 1_500, False)])
+    assert target.met is None
+    assert "no CAP_BPF" in str(target)
 
 
 def test_only_what_was_run_is_asked_for_and_only_of_rows_that_carry_bytes_as_they_are() -> None:
     over = Rounds()
-    assert goals_of(over, ["gdp-raw cdr"], [(10_000, 1_500, False)]) == []
-    goals = goals_of(over, ["gdp-raw json", "gdp-raw cdr"], [(100, 1_500, False), (921_600, 9_000, True)])
-    assert [goal.what.split(",")[0] for goal in goals] == ["gdp-raw cdr / zenoh-mtls", "gdp-raw cdr - cyclone"]
+    assert targets_of(over, ["gdp-raw cdr"], [(10_000, 1_500, False)]) == []
+    targets = targets_of(over, ["gdp-raw json", "gdp-raw cdr"], [(100, 1_500, False), (921_600, 9_000, True)])
+    assert [target.what.split(",")[0] for target in targets] == ["gdp-raw cdr / zenoh-mtls", "gdp-raw cdr - cyclone"]
 
 
 def test_the_ends_stand_at_the_two_ends() -> None:
-    assert {at.switch for at in five(1_500).attached("proxy")} == {LEFT, RIGHT}
+    assert {at.switch for at in row(1_500).attached("proxy")} == {LEFT, RIGHT}

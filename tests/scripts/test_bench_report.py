@@ -18,8 +18,8 @@ sys.path.append(str(Path(__file__).resolve().parents[2] / "scripts" / "bench"))
 
 from frames import NAME_AT, SINK, SOURCE, gdp_frame, ip_checksum, ip_frame, spread_names, table_key, table_name
 from machine import machine_state, offload_text
+from rate_search import LATE_MAX_S, LOSS_MAX, Try, highest
 from report import Rounds, Spread, number_text, percentile, write_json
-from search import LATE_MAX_S, LOSS_MAX, Try, highest
 
 CASE, COLUMN = "1,400 B", "frames/s"
 MACS = bytes(range(12))
@@ -35,37 +35,37 @@ def rounds(**values: list[float | None]) -> Rounds:
 
 
 def test_a_ratio_is_taken_in_each_round_before_the_median() -> None:
-    goal = rounds(ours=[20.0, 2.0, 30.0], theirs=[10.0, 1.0, 30.0]).ratio("", "ours", "theirs", CASE, COLUMN, 1.5)
-    assert goal.got == Spread(2.0, 1.0, 2.0)
-    assert goal.reached
+    target = rounds(ours=[20.0, 2.0, 30.0], theirs=[10.0, 1.0, 30.0]).ratio("", "ours", "theirs", CASE, COLUMN, 1.5)
+    assert target.measured == Spread(2.0, 1.0, 2.0)
+    assert target.met
 
 
 def test_a_round_that_failed_on_one_side_is_no_ratio() -> None:
-    goal = rounds(ours=[None, 3.0], theirs=[1.0, 1.0]).ratio("", "ours", "theirs", CASE, COLUMN, 4.0)
-    assert goal.got == Spread(3.0, 3.0, 3.0)
-    assert not goal.reached
-    assert "NOT reached" in str(goal)
+    target = rounds(ours=[None, 3.0], theirs=[1.0, 1.0]).ratio("", "ours", "theirs", CASE, COLUMN, 4.0)
+    assert target.measured == Spread(3.0, 3.0, 3.0)
+    assert not target.met
+    assert "MISSED" in str(target)
 
 
 def test_an_upper_bound_is_kept_from_below() -> None:
     over = rounds(ours=[7.0], theirs=[10.0])
-    assert over.ratio("", "ours", "theirs", CASE, COLUMN, 0.7, at_most=True).reached
-    assert not over.ratio("", "ours", "theirs", CASE, COLUMN, 0.6, at_most=True).reached
-    assert not over.difference("", "theirs", "ours", CASE, COLUMN, 2.5).reached
+    assert over.ratio("", "ours", "theirs", CASE, COLUMN, 0.7, at_most=True).met
+    assert not over.ratio("", "ours", "theirs", CASE, COLUMN, 0.6, at_most=True).met
+    assert not over.difference("", "theirs", "ours", CASE, COLUMN, 2.5).met
 
 
 def test_who_is_not_here_leaves_a_reason_in_place_of_a_figure() -> None:
     over = rounds(theirs=[1.0])
     over.absent("ours", "no CAP_BPF")
-    goal = over.ratio("speed", "ours", "theirs", CASE, COLUMN, 1.0)
-    assert goal.reached is None
-    assert str(goal) == "speed: asked ≥ 1.00, got nothing: ours is not here: no CAP_BPF"
+    target = over.ratio("speed", "ours", "theirs", CASE, COLUMN, 1.0)
+    assert target.met is None
+    assert str(target) == "speed: target ≥ 1.00, not measured: ours is not here: no CAP_BPF"
 
 
 def test_a_figure_without_a_bound_is_only_told() -> None:
-    goal = rounds(ours=[1.0], theirs=[4.0]).ratio("beside", "ours", "theirs", CASE, COLUMN, None)
-    assert goal.reached is None
-    assert str(goal) == "beside: got 0.25"
+    target = rounds(ours=[1.0], theirs=[4.0]).ratio("beside", "ours", "theirs", CASE, COLUMN, None)
+    assert target.met is None
+    assert str(target) == "beside: measured 0.25"
 
 
 @pytest.mark.parametrize(("share", "value"), [(0.5, 50), (0.99, 99), (1.0, 100), (0.0, 1)])
@@ -89,13 +89,13 @@ def test_a_figure_shows_the_digits_that_mean_something(value: float, text: str) 
 def test_the_file_holds_every_round_and_what_came_of_the_goals(tmp_path: Path) -> None:
     over = rounds(ours=[1.0, 2.0], theirs=[1.0, 1.0])
     over.absent("scapy", "not installed")
-    goal = over.ratio("speed", "ours", "theirs", CASE, COLUMN, 1.5)
+    target = over.ratio("speed", "ours", "theirs", CASE, COLUMN, 1.5)
     path = tmp_path / "new" / "figures.json"
-    write_json(path, "forwarding", machine_state(), {"MTU": [1_500]}, over, [goal])
+    write_json(path, "forwarding", machine_state(), {"MTU": [1_500]}, over, [target])
     written = json.loads(path.read_text())
     assert written["rounds"]["ours"][CASE][COLUMN] == [1.0, 2.0]
     assert written["not_here"] == {"scapy": "not installed"}
-    assert written["goals"][0]["reached"]
+    assert written["targets"][0]["met"]
     assert written["machine"]["kernel"]
 
 

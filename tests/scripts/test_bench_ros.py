@@ -26,7 +26,7 @@ from proxy.rules.rule import Rule
 @pytest.fixture
 def options(monkeypatch: pytest.MonkeyPatch) -> Options:
     monkeypatch.setattr(sys, "argv", ["bench"])
-    return parse("", "bench", rounds=3, seconds=5.0, mtus=(1_500, 9_000), quick_s=1.0)
+    return parse("", rounds=3, seconds=5.0, mtus=(1_500, 9_000), quick_s=1.0)
 
 
 def benches(options: Options) -> list[Bench]:
@@ -84,10 +84,10 @@ def test_what_was_asked_is_judged_by_what_the_turns_fill_in(options: Options) ->
         for turn in bench.turns:
             for column in turn.columns:
                 over.add(turn.contender, turn.case, column, 0.0)
-        goals = bench.goals(over)
-        assert goals
-        assert [goal.what for goal in goals if goal.got is None and " / " not in goal.what] == []
-        assert all(goal.reached for goal in goals if goal.asked is not None)
+        targets = bench.targets(over)
+        assert targets
+        assert [target.what for target in targets if target.measured is None and " / " not in target.what] == []
+        assert all(target.met for target in targets if target.target is not None)
         assert all(panel.bars for panel in bench.panels(over) if panel.title in over.cases())
 
 

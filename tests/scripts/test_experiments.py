@@ -81,7 +81,7 @@ def test_an_object_too_many_or_elsewhere_is_wrong() -> None:
 
 def test_a_frame_comes_through_its_carrier_unchanged() -> None:
     needs("scipy", "rcl_interfaces")
-    from carrier import answer_of, frame_of, number_of, request_of, said_in
+    from image_request import answer_of, frame_of, number_of, request_of, said_in
     from vision import Scene
 
     frame = Scene.draw(2).frame

@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-from peers.lines import say
+from peers.jsonl import say
 
 from gdp.errors import DROP_COUNTERS
 from gdp.ports.batch import make_batch

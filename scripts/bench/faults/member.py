@@ -20,8 +20,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
-from peers.lines import say
-from priority_end import End
+from peers.jsonl import say
+from priority_endpoint import End
 
 from faults.records import Kind, RecordWriter
 from gdp.client.member import Message

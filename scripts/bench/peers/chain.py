@@ -8,48 +8,22 @@ right end .2; the three in the middle forward IPv4::
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final
 
 from machine import offload_text, offloads, set_offloads
 from pyroute2 import IPRoute
+from testbed import LEFT, MIDDLE, RIGHT, ROW, Lab, row
 
-from gdp.host import netns_files
 from gdp.host.run_registry import Run
-from gdp.simulation.namespaces import Namespaces
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
-from peers.process import Started
 
-__all__ = ["LEFT", "MIDDLE", "NODES", "RIGHT", "Chain", "address", "five", "routes"]
+__all__ = ["LEFT", "MIDDLE", "NODES", "RIGHT", "Chain", "address", "routes"]
 
-LEFT: Final = "a"
-MIDDLE: Final = ("s1", "s2", "s3")
-RIGHT: Final = "b"
-NODES: Final = (LEFT, *MIDDLE, RIGHT)
+NODES: Final = ROW
 _LINKS: Final = len(NODES) - 1
 _FORWARD: Final = Path("/proc/sys/net/ipv4/ip_forward")
-
-T = TypeVar("T")
-
-
-def five(mtu: int) -> Topology:
-    """Return the five as a topology; only the three in the middle switch, and A and B hang at s1 and s3 as proxies.
-
-    Raises:
-        LocalError: the MTU is out of bounds.
-    """
-    return Topology(
-        links=tuple(Link(a, b, mtu=mtu) for a, b in pairwise(NODES)),
-        domains=(DomainPlan("chain", NODES),),
-        attachments=(
-            Attachment("s2", "rib", "rib"),
-            Attachment(LEFT, "proxy", "end"),
-            Attachment(RIGHT, "proxy", "end"),
-        ),
-    )
 
 
 def address(node: str, towards: str) -> str:
@@ -68,37 +42,23 @@ def routes(node: str) -> dict[str, str]:
     return found
 
 
-class Chain:
-    """The five namespaces, addressed and routed; ``run.end()`` removes them.
+class Chain(Lab):
+    """The five machines, addressed and routed.
 
     Raises:
         LocalError: the kernel refuses.
     """
 
     def __init__(self, mtu: int, run: Run) -> None:
+        super().__init__(run, row(mtu))
         self.mtu = mtu
-        self.run = run
-        self.topology = five(mtu)
-        self.directory = run.directory
-        self._spaces = Namespaces(self.topology, run)
         for node in NODES:
-            self._inside(node, partial(_number, node))
+            self.inside(node, partial(_number, node))
 
     def set_offloads(self, *, on: bool) -> str:
         """Switch the offloads of every device of the row, and return how they are then, as the devices say."""
-        found = [self._inside(node, partial(_switch_offloads, _neighbours(node), on=on)) for node in NODES]
+        found = [self.inside(node, partial(_switch_offloads, _neighbours(node), on=on)) for node in NODES]
         return offload_text([one for each in found for one in each])
-
-    def start(self, node: str, what: str, arguments: Sequence[str]) -> Started:
-        """Start Python with these arguments on a machine; it dies with us.
-
-        Args:
-            what: for its log and for error messages.
-        """
-        return Started(self.run, f"{what} at {node}", lambda argv: self._spaces.command(node, argv), arguments)
-
-    def _inside(self, node: str, work: Callable[[], T]) -> T:
-        return netns_files.inside(self._spaces.path(node), work)
 
 
 def _neighbours(node: str) -> tuple[str, ...]:

@@ -8,14 +8,14 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import Final
 
+from peers.baseline import READY_S, Measured, ask_end, start_end
 from peers.chain import LEFT, NODES, RIGHT, Chain, address
-from peers.contender import READY_S, Measured, ask_end, start_end
 from peers.exchange import Load
 from peers.process import Started
 
 __all__ = ["CycloneNet", "cyclone_xml"]
 
-_MODULE: Final = "peers.cyclone_end"
+_MODULE: Final = "peers.cyclone_endpoint"
 
 
 def cyclone_xml(own: str, other: str) -> str:
@@ -38,7 +38,7 @@ class CycloneNet:
         """Start B, then A.
 
         Raises:
-            FailedError: as ``Contender.measure``.
+            FailedError: as ``Baseline.measure``.
         """
         with ExitStack() as stack:
             pong = stack.enter_context(_end(chain, RIGHT, load, {}))

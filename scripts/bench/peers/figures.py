@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Final
 
-from report import Goal, Rounds
+from report import Rounds, Target
 
-__all__ = ["CPU", "MEDIAN", "P99", "case_of", "goals_of"]
+__all__ = ["CPU", "MEDIAN", "P99", "case_of", "targets_of"]
 
 MEDIAN: Final = "RTT median, ms"
 P99: Final = "RTT p99, ms"
@@ -35,22 +35,22 @@ def case_of(size: int, mtu: int, *, offloads: bool) -> str:
     return f"{size:,} B, MTU {mtu}, offloads {'on' if offloads else 'off'}"
 
 
-def goals_of(over: Rounds, ours: Iterable[str], cases: Sequence[tuple[int, int, bool]]) -> list[Goal]:
+def targets_of(over: Rounds, ours: Iterable[str], cases: Sequence[tuple[int, int, bool]]) -> list[Target]:
     """Return what was asked for, of each of our rows, in the cases that were run.
 
     Args:
         cases: bytes, MTU, offloads.
     """
-    goals: list[Goal] = []
+    targets: list[Target] = []
     for label in (label for label in ours if label.endswith(" cdr")):
         for size, mtu, offloads, asked in _RATIOS:
             if (size, mtu, offloads) in cases:
                 case = case_of(size, mtu, offloads=offloads)
                 what = f"{label} / {_SECURED}, {case}"
-                goals.append(over.ratio(what, label, _SECURED, case, MEDIAN, asked, at_most=True))
+                targets.append(over.ratio(what, label, _SECURED, case, MEDIAN, asked, at_most=True))
         for size, mtu, offloads in cases:
             if size == _IMAGE:
                 case = case_of(size, mtu, offloads=offloads)
                 what = f"{label} - {_UNSECURED}, ms, {case}"
-                goals.append(over.difference(what, label, _UNSECURED, case, MEDIAN, _ADDED_MS))
-    return goals
+                targets.append(over.difference(what, label, _UNSECURED, case, MEDIAN, _ADDED_MS))
+    return targets

@@ -8,16 +8,16 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import Final
 
+from peers.baseline import READY_S, Measured, ask_end, start_end
 from peers.certificates import make_certificates
 from peers.chain import LEFT, MIDDLE, NODES, RIGHT, Chain, address
-from peers.contender import READY_S, Measured, ask_end, start_end
 from peers.exchange import Load
-from peers.lines import EndSettings
+from peers.jsonl import EndSettings
 from peers.process import Started
 
 __all__ = ["ZenohNet"]
 
-_MODULE: Final = "peers.zenoh_end"
+_MODULE: Final = "peers.zenoh_endpoint"
 _PORT: Final = 7447
 
 
@@ -33,7 +33,7 @@ class ZenohNet:
         """Start routers from the left, then B, then A.
 
         Raises:
-            FailedError: as ``Contender.measure``.
+            FailedError: as ``Baseline.measure``.
         """
         with ExitStack() as stack:
             routers = []

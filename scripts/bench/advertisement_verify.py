@@ -9,7 +9,7 @@ Every claim is for another name, so that none of its own signatures was seen bef
     refresh    AdCerts known, a new sequence number: one check
 
 Example:
-    python scripts/bench/claims.py --claims 2000 --json claims.json
+    python scripts/bench/advertisement_verify.py --claims 2000 --json claims.json
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
 from gdp.trust.verifier import ClaimVerifier
 
-GOAL_PER_S = 2_000
+TARGET_PER_S = 2_000
 RUNS = 5
 PROXIES = 20
 
@@ -145,7 +145,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to this file")
     options = parser.parse_args()
     results = run(options.claims)
-    table = Table(title=f"claims verified per second of one core, median of {RUNS} (goal {GOAL_PER_S}, 'new')")
+    table = Table(title=f"claims verified per second of one core, median of {RUNS} (target {TARGET_PER_S}, 'new')")
     for column in ("workload", "median", "lowest", "highest", "bytes"):
         table.add_column(column, justify="left" if column == "workload" else "right")
     for name, figures in results.items():

@@ -1,6 +1,6 @@
 """The processes of ``offload.py``: a robot that asks, a server that computes, and a robot that computes by itself.
 
-Process of its own: ``offload_end.py robot|cloud|alone SETTINGS``. Robot and server are nodes of ROS 2, by one of two
+Process of its own: ``offload_endpoint.py robot|cloud|alone SETTINGS``. Both are nodes of ROS 2, by one of two
 middlewares: ``rclpy`` with Fast DDS, or Cyclone DDS. Of the latter there is no wheel for rclpy, so the messages are
 serialised by rclpy and carried by this project's endpoint ``dds``, which is what ``rmw_cyclonedds`` does in one piece.
 
@@ -22,7 +22,7 @@ from typing import Final, Protocol, TypeAlias
 
 import bench_path  # noqa: F401 - finds ``peers``
 from offload_tasks import TASKS
-from peers.lines import say
+from peers.jsonl import say
 from rclpy.serialization import deserialize_message, serialize_message
 from ros_tasks import TYPES, Message, number_of, set_number
 
@@ -55,14 +55,14 @@ class _FastEnd:
     def __init__(self, domain: int) -> None:
         del domain  # ROS_DOMAIN_ID
         import rclpy
-        from ros_end import End
+        from ros_endpoint import End
 
         rclpy.init()
         self._end = End("offload")
 
     def publisher(self, topic: str, type_name: str) -> Callable[[Message], None]:
         """Return what publishes on a topic."""
-        from ros_end import reliable
+        from ros_endpoint import reliable
 
         publish: Callable[[Message], None] = self._end.node.create_publisher(
             TYPES[type_name], topic, reliable()
@@ -71,7 +71,7 @@ class _FastEnd:
 
     def subscribe(self, topic: str, type_name: str, take: Callable[[Message], None]) -> None:
         """Call ``take`` with each message."""
-        from ros_end import reliable
+        from ros_endpoint import reliable
 
         self._end.node.create_subscription(TYPES[type_name], topic, take, reliable())
 

@@ -6,7 +6,6 @@ Place: shell; prints, and writes ``figN.json`` and ``figN.md`` where it is told 
 from __future__ import annotations
 
 import json
-import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,15 +17,12 @@ import typer
 from bench_path import ROOT
 from field import ROBOT, Field, Served, Work
 from machine import MachineState
-from peers.process import FailedError
 from report import number_text, progress
 from rich.console import Console
 from rich.table import Table
 from samples import Sample, Summary
 from series import Series
-
-from gdp.errors import LocalError
-from gdp.host.run_registry import Runs
+from skeleton import clean_exit, new_run
 
 __all__ = [
     "Asking",
@@ -56,28 +52,28 @@ class Finding:
     """A figure, beside what was asked for and what the paper has.
 
     Args:
-        asked: the least that it is to be; None: it is only told.
-        at_most: ``asked`` is the most instead.
+        target: the least that it is to be; None: there is no target.
+        at_most: ``target`` is the most instead.
         paper: in words; empty: not known for sure.
     """
 
     what: str
-    got: float
-    asked: float | None = None
+    measured: float
+    target: float | None = None
     at_most: bool = False
     paper: str = ""
 
     @property
-    def verdict(self) -> str:
-        """Return ``reached``, ``NOT reached`` or nothing."""
-        if self.asked is None:
+    def outcome(self) -> str:
+        """Return ``met``, ``MISSED`` or nothing."""
+        if self.target is None:
             return ""
-        return "reached" if (self.got <= self.asked if self.at_most else self.got >= self.asked) else "NOT reached"
+        return "met" if (self.measured <= self.target if self.at_most else self.measured >= self.target) else "MISSED"
 
     def cells(self) -> tuple[str, ...]:
         """Return its row of a table."""
-        asked = "" if self.asked is None else f"{'≤' if self.at_most else '≥'} {number_text(self.asked)}"
-        return self.what, number_text(self.got), asked, self.verdict, self.paper
+        target = "" if self.target is None else f"{'≤' if self.at_most else '≥'} {number_text(self.target)}"
+        return self.what, number_text(self.measured), target, self.outcome, self.paper
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +112,7 @@ class Report:
             "machine": asdict(state),
             "settings": dict(self.settings),
             "groups": {name: [_short(each) for each in samples] for name, samples in self.groups.items()},
-            "findings": [{**asdict(each), "verdict": each.verdict} for each in self.findings],
+            "findings": [{**asdict(each), "outcome": each.outcome} for each in self.findings],
         }
 
     def to_page(self, state: MachineState, pictures: Sequence[str]) -> str:
@@ -124,7 +120,7 @@ class Report:
         parts = [f"# {self.title}", *self.setting, f"```bash\n{self.command}\n```"]
         parts += [f"![{self.title}]({each})" for each in pictures]
         parts += [_table(("", *_COLUMNS), self.rows())]
-        parts += [_table(("figure", "here", "asked", "", "paper"), [each.cells() for each in self.findings])]
+        parts += [_table(("figure", "here", "target", "", "paper"), [each.cells() for each in self.findings])]
         parts += ["\n".join(f"- {note}" for note in self.notes)]
         told = "; ".join(f"{key}: {value}" for key, value in self.settings.items())
         return "\n\n".join([*parts, f"Measured on {state}. {told}."]) + "\n"
@@ -135,19 +131,8 @@ def field_of(
     served: Sequence[Served], work: Mapping[str, Work], delays: Mapping[str, float] | None = None
 ) -> Iterator[Field]:
     """Have a field for a while; leaves with a clear word if there can be none."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
-    runs = Runs()
-    runs.sweep()
-    run = runs.start()
-    try:
-        with Field(run, served, work, delays=delays) as place:
-            yield place
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except (LocalError, FailedError) as error:
-        sys.exit(f"error: {error}")
-    finally:
-        run.end()
+    with clean_exit(), new_run() as run, Field(run, served, work, delays=delays) as place:
+        yield place
 
 
 class Asking:
@@ -215,7 +200,7 @@ def _show(report: Report, state: MachineState) -> None:
     latencies = Table("", *_COLUMNS, title="latency at the robot's node", title_justify="left")
     for row in report.rows():
         latencies.add_row(*row)
-    findings = Table("figure", "here", "asked", "", "paper", title="figures", title_justify="left")
+    findings = Table("figure", "here", "target", "", "paper", title="figures", title_justify="left")
     for finding in report.findings:
         findings.add_row(*finding.cells())
     console.print(latencies, findings)

@@ -1,6 +1,6 @@
 """Who forwards in the middle of a chain: our planes, the Linux bridge, the kernel's IPv4.
 
-Place: I/O; sets namespaces of the bench up and back. Every contender stands in the same chain, one at a time, and
+Place: I/O; sets namespaces of the bench up and back. Every baseline stands in the same chain, one at a time, and
 leaves it as it was.
 
 The others are set up as cheaply as they can be. The bridge learns both addresses from a round trip before it is
@@ -25,7 +25,7 @@ from worker import Worker
 
 from gdp.frame.kinds import ETHERTYPE
 
-__all__ = ["Bridge", "Contender", "Direct", "IPv4", "Plane"]
+__all__ = ["Baseline", "Bridge", "Direct", "IPv4", "Plane"]
 
 _IPV4: Final = 0x0800
 _NOBODY: Final = "02:67:64:70:ff:ff"
@@ -33,7 +33,7 @@ _BRIDGE: Final = "bridge"
 _IP_SETTINGS: Final = Path("/proc/sys/net/ipv4")
 
 
-class Contender(Protocol):
+class Baseline(Protocol):
     """A way to forward.
 
     Attributes:

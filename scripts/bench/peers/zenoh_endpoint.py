@@ -17,7 +17,7 @@ from typing import Final
 import zenoh
 
 from peers.exchange import answer_to, exchange
-from peers.lines import EndSettings, say
+from peers.jsonl import EndSettings, say
 
 __all__ = ["main"]
 

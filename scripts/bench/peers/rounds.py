@@ -1,8 +1,8 @@
-"""The turns of the bench of messages: in every round, on every row, each contender once.
+"""The turns of the bench of messages: in every round, on every row, each baseline once.
 
 Place: shell; lays the rows and takes them down.
 
-A contender that fails the first time is not here, for the reason that it gives. One that fails later has no figures in
+A baseline that fails the first time is not here, for the reason that it gives. One that fails later has no figures in
 that round, and the failure is told with the results.
 """
 
@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from report import Rounds, percentile, progress
 
 from gdp.host.run_registry import Runs
+from peers.baseline import Baseline, Measured
 from peers.chain import Chain
-from peers.contender import Contender, Measured
 from peers.exchange import Load
 from peers.figures import CPU, MEDIAN, P99, case_of
 from peers.process import FailedError
@@ -31,7 +31,7 @@ class Plan:
 
     mtus: tuple[int, ...]
     offloads: tuple[bool, ...]
-    contenders: tuple[Contender, ...]
+    baselines: tuple[Baseline, ...]
     load: Load
     rounds: int
 
@@ -43,7 +43,7 @@ class Plan:
     @property
     def labels(self) -> list[str]:
         """Return all rows."""
-        return [label for contender in self.contenders for label in contender.labels]
+        return [label for baseline in self.baselines for label in baseline.labels]
 
 
 class Turns:
@@ -78,18 +78,18 @@ class Turns:
                         self._round(number, chain, on)
 
     def _round(self, number: int, chain: Chain, on: bool) -> None:
-        for contender in self.plan.contenders:
-            if contender.name in self._absent:
+        for baseline in self.plan.baselines:
+            if baseline.name in self._absent:
                 continue
-            where = f"round {number}/{self.plan.rounds}, MTU {chain.mtu}, offloads {_word(on)}: {contender.name}"
+            where = f"round {number}/{self.plan.rounds}, MTU {chain.mtu}, offloads {_word(on)}: {baseline.name}"
             begun_s = time.monotonic()
             try:
-                measured = contender.measure(chain, self.plan.load)
+                measured = baseline.measure(chain, self.plan.load)
             except FailedError as error:
                 progress(f"{where} FAILED: {error}")
-                self._miss(contender, chain.mtu, on, where, str(error))
+                self._miss(baseline, chain.mtu, on, where, str(error))
                 continue
-            self._seen.add(contender.name)
+            self._seen.add(baseline.name)
             self._add(measured, chain.mtu, on)
             resent = sum({each.label: each.resent for each in measured}.values())
             if resent:
@@ -105,15 +105,15 @@ class Turns:
                 if place in each.cpu_s:
                     self.over.add(each.label, case, column, 1e3 * each.cpu_s[place])
 
-    def _miss(self, contender: Contender, mtu: int, on: bool, where: str, reason: str) -> None:
+    def _miss(self, baseline: Baseline, mtu: int, on: bool, where: str, reason: str) -> None:
         """Take note of a failure: who never came up is not here, whoever did has no figures in this round."""
-        if contender.name not in self._seen:
-            self._absent.add(contender.name)
-            for label in contender.labels:
+        if baseline.name not in self._seen:
+            self._absent.add(baseline.name)
+            for label in baseline.labels:
                 self.over.absent(label, reason)
             return
         self.notes.append(f"{where}: {reason}")
-        for label in contender.labels:
+        for label in baseline.labels:
             for size in self.plan.load.sizes:
                 for column in (MEDIAN, P99, *CPU.values()):
                     self.over.add(label, case_of(size, mtu, offloads=on), column, None)

@@ -17,7 +17,7 @@ from types import FrameType
 from typing import Final
 
 import rclpy
-from peers.lines import say
+from peers.jsonl import say
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future

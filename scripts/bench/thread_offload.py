@@ -1,6 +1,6 @@
 """Whether hashing or verifying in a thread of its own pays: both ways side by side, in one process and run.
 
-    .venv/bin/python scripts/bench/overlap.py [--rounds 5] [--count 60] [--json FILE]
+    .venv/bin/python scripts/bench/thread_offload.py [--rounds 5] [--count 60] [--json FILE]
 
 Place: benchmark; one process, no network. An image of 921,600 bytes is sealed as parts for MTU 1500 and hashed as they
 come, in place and by a thread beside; a small message is verified in place and by a thread beside. What a thread does
@@ -112,14 +112,14 @@ def main() -> None:
             for who, work in ("AES-GCM", encrypt_large), ("SHA-256", hash_large):
                 both = median_ms(partial(by_two, work), 5) / median_ms(work, 5)
                 over.add(who, "two threads, twice the work", "time ratio", both)
-    goals = [
+    targets = [
         over.ratio("thread / in place, image", "thread", "in place", "an image sealed", "ms", None),
         over.ratio("thread / in place, verify", "thread", "in place", "a message verified", "ms", None),
     ]
     settings = {"rounds": options.rounds, "count": options.count}
-    show("hashing and verifying beside", state, settings, over, goals)
+    show("hashing and verifying beside", state, settings, over, targets)
     if options.json is not None:
-        write_json(options.json, "overlap", state, settings, over, goals)
+        write_json(options.json, "overlap", state, settings, over, targets)
 
 
 if __name__ == "__main__":

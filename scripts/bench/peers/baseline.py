@@ -1,4 +1,4 @@
-"""What the bench asks of every contender, and what it gets.
+"""What the bench asks of every baseline, and what it gets.
 
 Place: shell; starts processes on the row.
 """
@@ -9,12 +9,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from testbed import Lab
+
 from peers.chain import LEFT, Chain
 from peers.exchange import Load
-from peers.lines import EndSettings
+from peers.jsonl import EndSettings
 from peers.process import FailedError, Started
 
-__all__ = ["Contender", "Measured", "ask_end", "start_end"]
+__all__ = ["Baseline", "Measured", "ask_end", "start_end"]
 
 READY_S = 20.0
 _MEASURED_S = 180.0
@@ -22,7 +24,7 @@ _MEASURED_S = 180.0
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """One size by one contender: seconds of every message, CPU seconds a message by place.
+    """One size by one baseline: seconds of every message, CPU seconds a message by place.
 
     Attributes:
         resent: parts that had to be sent again, over all sizes; known of ours only.
@@ -35,7 +37,7 @@ class Measured:
     resent: int = 0
 
 
-class Contender(Protocol):
+class Baseline(Protocol):
     """One way to carry messages. ``labels`` are its rows: an encoding each, where it has several."""
 
     @property
@@ -55,7 +57,7 @@ class Contender(Protocol):
 
 
 def start_end(
-    chain: Chain, module: str, node: str, load: Load, own: Mapping[str, str], pids: Mapping[str, Sequence[int]]
+    chain: Lab, module: str, node: str, load: Load, own: Mapping[str, str], pids: Mapping[str, Sequence[int]]
 ) -> Started:
     """Start an end, ``ping`` at A or ``pong`` at B."""
     settings = EndSettings(

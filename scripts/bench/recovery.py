@@ -13,28 +13,24 @@ Then there are two figures more: until another machine has the role, and the lon
 A real ROS node calls ``/echo`` at the robot all the while. Asked: not one request fails. Every machine has a switch, a
 proxy and a real ROS node of its own; they, the robot and the supervisor share this machine's cores.
 
-    sudo .venv/bin/python scripts/bench/healing.py                     # the whole; writes docs/benchmarks/healing.*
-    sudo .venv/bin/python scripts/bench/healing.py --quick --no-save   # one round: does it work?
-    sudo .venv/bin/python scripts/bench/healing.py --only killed --rounds 10 --no-save
-    sudo .venv/bin/python scripts/bench/healing.py --gateway replica   # three machines; writes healing_gateway.*
+    sudo .venv/bin/python scripts/bench/recovery.py                     # the whole; writes docs/benchmarks/healing.*
+    sudo .venv/bin/python scripts/bench/recovery.py --quick --no-save   # one round: does it work?
+    sudo .venv/bin/python scripts/bench/recovery.py --only killed --rounds 10 --no-save
+    sudo .venv/bin/python scripts/bench/recovery.py --gateway replica   # three machines; writes healing_gateway.*
 """
 
 from __future__ import annotations
 
-import argparse
-import signal
-import sys
 import time
-from pathlib import Path
 from typing import Final
 
 from healing_stage import Cluster
-from machine import machine_state
 from peers.process import FailedError
-from plot import Panel, panel_of, require_plot, save_bars
-from report import Goal, Rounds, Settings, progress, show, write_json
+from plot import Panel, panel_of
+from report import Rounds, Target, progress
+from skeleton import Options, Outcome, command_line, run_bench
 
-from gdp.errors import GdpError
+from gdp.host.run_registry import Runs
 
 PREEMPTED, KILLED, FROZEN, SUPERVISOR = "preempted", "killed", "frozen", "supervisor"
 DEDICATED, REPLICA = "dedicated", "replica"
@@ -58,13 +54,12 @@ COLUMNS: Final = {
 }
 TRAFFIC, FAILED = "requests meanwhile", "failed"
 ASKED_S: Final = {(PREEMPTED, SERVING): 5.0, (KILLED, DETECTED): 1.0, (SUPERVISOR, RECONCILED): 2.0}
-OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks"
 NOTICE_S: Final = 8.0
 ROUNDS: Final = 5
 RATE: Final = 50.0
 
 
-def measure(cluster: Cluster, case: str) -> dict[str, float | None]:
+def measure_case(cluster: Cluster, case: str) -> dict[str, float | None]:
     """Let it happen once; return the figures by column, when all is whole again.
 
     Raises:
@@ -98,15 +93,15 @@ def measure(cluster: Cluster, case: str) -> dict[str, float | None]:
     return {**first, SERVING: (served.served_unix_s or at_s) - at_s}
 
 
-def goals_of(over: Rounds) -> list[Goal]:
+def targets_of(over: Rounds) -> list[Target]:
     """Return what was asked for of what was measured."""
     found = []
     for case, columns in COLUMNS.items():
         for column in columns:
             if over.spread(WHO, CASES[case], column) is not None:
                 asked_s = ASKED_S.get((case, column))
-                found.append(over.goal(f"{CASES[case]}: {column}", WHO, CASES[case], column, asked_s, at_most=True))
-    return [*found, over.goal(f"{TRAFFIC}: {FAILED}", WHO, TRAFFIC, FAILED, 0.0, at_most=True)]
+                found.append(over.target(f"{CASES[case]}: {column}", WHO, CASES[case], column, asked_s, at_most=True))
+    return [*found, over.target(f"{TRAFFIC}: {FAILED}", WHO, TRAFFIC, FAILED, 0.0, at_most=True)]
 
 
 def panels_of(over: Rounds) -> list[Panel]:
@@ -119,69 +114,44 @@ def panels_of(over: Rounds) -> list[Panel]:
     ]
 
 
-def arguments() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", action="append", choices=list(CASES), help="this part; may be repeated")
-    parser.add_argument("--gateway", choices=[DEDICATED, REPLICA], default=DEDICATED, help="(default: %(default)s)")
-    parser.add_argument("--machines", type=int, help="(default: 2, with --gateway replica 3)")
-    parser.add_argument("--rounds", type=int, default=ROUNDS, help="(default: %(default)s)")
-    parser.add_argument("--rate", type=float, default=RATE, help="requests a second (default: %(default)s)")
-    parser.add_argument("--quick", action="store_true", help="one round")
-    parser.add_argument("--json", type=Path, help="where the figures go (default: docs/benchmarks)")
-    parser.add_argument("--plot", type=Path, help="where the picture goes (default: docs/benchmarks)")
-    parser.add_argument("--no-plot", action="store_true", help="no picture")
-    parser.add_argument("--no-save", action="store_true", help="print only")
-    return parser
-
-
-def main() -> None:
-    """Run the bench, or a part of it."""
-    options = arguments().parse_args()
-    is_drawn = not (options.no_plot or options.no_save)
-    if is_drawn:
-        require_plot()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
-    state, begun_s = machine_state(), time.monotonic()
+def measure(options: Options, runs: Runs) -> Outcome:
+    """Measure every case, round by round."""
+    del runs  # the cluster has runs of its own
     is_replica = options.gateway == REPLICA
     cases = options.only or [case for case in CASES if is_replica or case != FROZEN]
     if FROZEN in cases and not is_replica:
-        sys.exit("error: --only frozen is measured with --gateway replica")
-    over, rounds = Rounds(), 1 if options.quick else options.rounds
-    machines = options.machines or (3 if is_replica else 2)
-    name = "healing_gateway" if is_replica else "healing"
-    try:
-        with Cluster(options.rate, machines, options.gateway) as cluster:
-            for at in range(1, rounds + 1):
-                for case in cases:
-                    progress(f"round {at}/{rounds}: {CASES[case]}")
-                    got = measure(cluster, case)
-                    progress(", ".join(f"{column}: {value:.2f}" for column, value in got.items() if value is not None))
-                    for column, value in got.items():
-                        over.add(WHO, CASES[case], column, value)
-            said = cluster.end_caller()
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except (GdpError, FailedError) as error:
-        sys.exit(f"error: {error}")
-    for column, value in said.items():
-        over.add(WHO, TRAFFIC, column, value)
-    settings: Settings = {
-        "rounds": rounds,
-        "machines": machines,
-        "gateway": options.gateway,
-        "requests a second": options.rate,
-        "notice, s": NOTICE_S,
-        "took, s": round(time.monotonic() - begun_s),
-    }
-    title = f"A cluster of {machines} machines of the provider local heals; gateway: {options.gateway}"
-    goals = goals_of(over)
-    show(title, state, settings, over, goals)
-    if not options.no_save:
-        write_json(options.json or OUTPUT / f"{name}.json", name, state, settings, over, goals)
-    if is_drawn:
-        save_bars(options.plot or OUTPUT / f"{name}.png", title, str(state), panels_of(over))
+        raise FailedError("--only frozen is measured with --gateway replica")
+    over, machines = Rounds(), options.machines or (3 if is_replica else 2)
+    with Cluster(options.rate, machines, options.gateway) as cluster:
+        for at in range(1, options.rounds + 1):
+            for case in cases:
+                progress(f"round {at}/{options.rounds}: {CASES[case]}")
+                found = measure_case(cluster, case)
+                progress(", ".join(f"{column}: {value:.2f}" for column, value in found.items() if value is not None))
+                for column, value in found.items():
+                    over.add(WHO, CASES[case], column, value)
+        for column, count in cluster.end_caller().items():
+            over.add(WHO, TRAFFIC, column, count)
+    return Outcome(
+        "healing_gateway" if is_replica else "healing",
+        f"A cluster of {machines} machines of the provider local heals; gateway: {options.gateway}",
+        over,
+        targets_of(over),
+        {
+            "rounds": options.rounds,
+            "machines": machines,
+            "gateway": options.gateway,
+            "requests a second": options.rate,
+            "notice, s": NOTICE_S,
+        },
+        lambda: panels_of(over),
+    )
 
 
 if __name__ == "__main__":
-    main()
+    parser = command_line(__doc__, rounds=ROUNDS, quick={"rounds": 1}, has_record=True, has_plot=True)
+    parser.add_argument("--only", action="append", choices=list(CASES), help="this part; may be repeated")
+    parser.add_argument("--gateway", choices=[DEDICATED, REPLICA], default=DEDICATED, help="(default: %(default)s)")
+    parser.add_argument("--machines", type=int, help="(default: 2, with --gateway replica 3)")
+    parser.add_argument("--rate", type=float, default=RATE, help="requests a second (default: %(default)s)")
+    run_bench(parser, measure)

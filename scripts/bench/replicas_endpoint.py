@@ -19,7 +19,7 @@ from functools import partial
 from typing import Final
 
 import rclpy
-from peers.lines import say
+from peers.jsonl import say
 from rcl_interfaces.srv import ListParameters
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.client import Client
@@ -27,7 +27,7 @@ from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.service_introspection import ServiceIntrospectionState
 from rclpy.task import Future
-from ros_end import End, Settings, reliable, run_role
+from ros_endpoint import End, Settings, reliable, run_role
 from service_msgs.msg import ServiceEventInfo
 
 __all__: list[str] = []

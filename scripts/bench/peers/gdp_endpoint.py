@@ -31,7 +31,7 @@ from gdp.nodes.runtime import Runtime
 from gdp.ports.raw import RawPlane
 from gdp.stores.keyring import load_delegations
 from peers.exchange import IMAGE, PATIENCE_S, answer_to, exchange
-from peers.lines import EndSettings, say
+from peers.jsonl import EndSettings, say
 from proxy.serial.channel import Channel
 from proxy.serial.serializer import Encoding, Serializer
 from proxy.serial.standard import standard_definition

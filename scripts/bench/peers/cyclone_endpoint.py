@@ -26,7 +26,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
 from peers.exchange import ANSWER, answer_to, exchange
-from peers.lines import EndSettings, say
+from peers.jsonl import EndSettings, say
 
 __all__ = ["main"]
 

@@ -1,0 +1,231 @@
+"""Test bed of the benches and experiments: topologies, machines in namespaces, and the overlay's nodes on them.
+
+I/O. ``make_topology`` describes a network, ``Lab`` is its machines, ``OverlayNodes`` are switches and RIB on a lab.
+A device is named like the neighbour that it leads to. ``run.end()`` removes namespaces and processes of a lab.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from itertools import chain, pairwise
+from pathlib import Path
+from typing import Final, TypeVar
+
+import yaml
+from peers.process import FailedError, Started
+
+from gdp.host import netns_files
+from gdp.host.run_registry import Run
+from gdp.metadata import Metadata
+from gdp.simulation.namespaces import Namespaces
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from gdp.stores.issue import delegate, install_delegation
+from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
+from gdp.trust.right import Right
+from ring.materials import Materials
+
+LEFT: Final = "a"
+MIDDLE: Final = ("s1", "s2", "s3")
+RIGHT: Final = "b"
+ROW: Final = (LEFT, *MIDDLE, RIGHT)
+SOCKET_BUFFER_BYTES: Final = 4 << 20
+_DOMAIN: Final = "lab"
+_PROFILE: Final = f"""<?xml version="1.0" encoding="UTF-8" ?>
+<dds xmlns="http://www.eprosima.com"><profiles>
+ <transport_descriptors><transport_descriptor>
+  <transport_id>udp</transport_id><type>UDPv4</type>
+  <sendBufferSize>{SOCKET_BUFFER_BYTES}</sendBufferSize><receiveBufferSize>{SOCKET_BUFFER_BYTES}</receiveBufferSize>
+ </transport_descriptor></transport_descriptors>
+ <participant profile_name="participant" is_default_profile="true"><rtps>
+  <userTransports><transport_id>udp</transport_id></userTransports><useBuiltinTransports>false</useBuiltinTransports>
+ </rtps></participant>
+</profiles></dds>
+"""
+
+T = TypeVar("T")
+
+
+def make_topology(
+    links: Iterable[tuple[str, str]], *, mtu: int, rib: str, members: Sequence[str], switches: Sequence[str] = ()
+) -> Topology:
+    """Return the topology of one trust domain; ``rib`` is the switch with the RIB, ``members`` run no switch.
+
+    Args:
+        mtu: bytes after the Ethernet header, of every link.
+        switches: nodes that come first in the topology's order.
+
+    Raises:
+        LocalError: they do not fit together.
+    """
+    pairs = list(links)
+    nodes = tuple(dict.fromkeys((*switches, *chain.from_iterable(pairs))))
+    return Topology(
+        links=tuple(Link(a, b, mtu=mtu) for a, b in pairs),
+        domains=(DomainPlan(_DOMAIN, nodes),),
+        attachments=(Attachment(rib, "rib", "rib"), *(Attachment(each, "proxy", "end") for each in members)),
+    )
+
+
+def row(mtu: int) -> Topology:
+    """Return A - s1 - s2 - s3 - B with the RIB at s2.
+
+    Raises:
+        LocalError: the MTU is out of bounds.
+    """
+    return make_topology(pairwise(ROW), mtu=mtu, rib="s2", members=(LEFT, RIGHT))
+
+
+class Lab:
+    """Machines of a topology, each in a namespace.
+
+    Args:
+        priorities: SCHED_FIFO priority by the first word of a process's name; empty: the ordinary scheduler.
+
+    Raises:
+        LocalError: the kernel refuses.
+    """
+
+    def __init__(self, run: Run, topology: Topology, *, priorities: Mapping[str, int] | None = None) -> None:
+        self.run = run
+        self.directory = run.directory
+        self.topology = topology
+        self.namespaces = Namespaces(topology, run)
+        self._priorities = priorities or {}
+
+    def inside(self, node: str, work: Callable[[], T]) -> T:
+        """Call ``work`` in a machine's namespace."""
+        return netns_files.inside(self.namespaces.path(node), work)
+
+    def start(self, node: str, what: str, arguments: Sequence[str], environment: Sequence[str] = ()) -> Started:
+        """Start Python on a machine; ``what`` names its log, ``environment`` holds ``KEY=value``."""
+
+        def command(argv: Sequence[str]) -> list[str]:
+            return self.namespaces.command(node, ["env", *environment, *argv] if environment else list(argv))
+
+        started = Started(self.run, f"{what} at {node}", command, arguments)
+        if (priority := self._priorities.get(what)) is not None:
+            os.sched_setscheduler(started.pid, os.SCHED_FIFO, os.sched_param(priority))
+        return started
+
+
+class OverlayNodes:
+    """Switches and RIB of a lab, running, with keys of their own; a context manager that ends them.
+
+    Args:
+        members: nodes without a switch.
+        switches: nodes with one, in the order in which they start.
+        plane: as ``gdp-switch --data-plane``; any but ``auto`` must be the one that the switch takes.
+        label: of the folder with keys; one lab may have several in turn.
+
+    Raises:
+        FailedError: a process did not come up.
+    """
+
+    def __init__(
+        self, lab: Lab, switches: Sequence[str], *, plane: str, ready_s: float = 20.0, label: str = "keys"
+    ) -> None:
+        self.lab = lab
+        number = sum(1 for _ in lab.directory.glob(f"{label}-*"))
+        self.files = lab.directory / f"{label}-{number}"
+        self.files.mkdir(mode=0o700)
+        credentials = Materials(lab.topology, self.files, metrics=False)
+        self.planes: set[str] = set()
+        self.undo = ExitStack()
+        with ExitStack() as undo:
+            self.switches = []
+            for node in switches:
+                config = str(credentials.switch(node, "auto"))
+                data_plane = [] if plane == "auto" else ["--data-plane", plane]
+                argv = ["-m", "gdp.cli.switch", "--json", *data_plane, "--config", config]
+                self.switches.append(undo.enter_context(lab.start(node, "switch", argv)))
+            for switch in self.switches:
+                taken = str(switch.read(ready_s).get("data_plane"))
+                if plane != "auto" and not taken.startswith(plane):
+                    raise FailedError(f"the switch took the data plane {taken} instead of {plane}")
+                self.planes.add(taken)
+            (at,) = lab.topology.attached("rib")
+            rib = ["-m", "gdp.cli.rib", "--json", "--config", str(credentials.rib(at))]
+            undo.enter_context(lab.start(at.switch, "rib", rib)).read(ready_s)
+            self.undo = undo.pop_all()
+
+    def close(self) -> None:
+        """End all processes, the last one first."""
+        self.undo.close()
+
+    def admit(self, node: str, metadata: Metadata, right: Right) -> None:
+        """Give a member's node a delegation."""
+        identity = self._identity(node)
+        install_delegation(identity, delegate(self.files / "owner", identity / CARD, metadata, [right]))
+
+    def admit_member(self, node: str, topics: Mapping[Right, Iterable[str]]) -> Path:
+        """Let a member without ROS use topics; return its configuration file."""
+        for right, names in topics.items():
+            for name in names:
+                self.admit(node, Metadata({"kind": "topic", "name": name}), right)
+        return self._write(f"end-{node}.yaml", self._member(node))
+
+    def admit_proxy(self, node: str, ros_domain: int, rules: Mapping[str, Sequence[Mapping[str, object]]]) -> Path:
+        """Write a proxy's configuration with its rules by side; return the file."""
+        identity = self._identity(node)
+        own = {"delegations": str(identity / DELEGATIONS), "ros": {"endpoint": "ros2", "domain": ros_domain}}
+        return self._write(f"proxy-{node}.yaml", {**self._member(node), **own, **rules})
+
+    @property
+    def owner_key(self) -> Path:
+        """The public key of the owner of all names."""
+        return self.files / "owner" / OWNER_PUBLIC
+
+    def ros_environment(self, domain: int) -> list[str]:
+        """Return the environment of a ROS process: UDP alone, and socket buffers that hold a camera image.
+
+        Shared memory of Fast DDS would cross the namespaces of one host, and the discovery range ``LOCALHOST`` switches
+        it on again; so the range is ``SUBNET``, and the namespaces confine.
+        """
+        profile = self.files / "dds.xml"
+        profile.write_text(_PROFILE, encoding="utf-8")
+        return [
+            f"ROS_DOMAIN_ID={domain}",
+            "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET",
+            "RMW_IMPLEMENTATION=rmw_fastrtps_cpp",
+            f"FASTRTPS_DEFAULT_PROFILES_FILE={profile}",  # its name before Fast DDS 3
+            f"FASTDDS_DEFAULT_PROFILES_FILE={profile}",
+        ]
+
+    def _identity(self, node: str) -> Path:
+        return self.files / "nodes" / f"proxy-{node}"
+
+    def _member(self, node: str) -> dict[str, object]:
+        iface = next(self.lab.topology.links_of(node)).other(node)
+        root = str(self.files / "domains" / self.lab.topology.domain_of(node).label / ROOT_CERTIFICATE)
+        return {"identity": str(self._identity(node)), "domain": {"root": root}, "iface": iface}
+
+    def _write(self, name: str, content: Mapping[str, object]) -> Path:
+        path = self.files / name
+        path.write_text(yaml.safe_dump(dict(content), sort_keys=False), encoding="utf-8")
+        return path
+
+
+class MemberRow:
+    """Switches and RIB with members that one endpoint module runs; a context manager that ends them."""
+
+    def __init__(
+        self, lab: Lab, endpoint: str, topics: Mapping[str, Mapping[Right, Iterable[str]]], *, plane: str
+    ) -> None:
+        self._lab = lab
+        self._endpoint = endpoint
+        self._nodes = OverlayNodes(lab, MIDDLE, plane=plane)
+        self._configs = {node: self._nodes.admit_member(node, own) for node, own in topics.items()}
+
+    def __enter__(self) -> MemberRow:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._nodes.close()
+
+    def endpoint(self, node: str, role: str, **settings: str | float) -> Started:
+        """Start a role of the endpoint module at a member."""
+        told = json.dumps({"config": str(self._configs[node]), **settings})
+        return self._lab.start(node, role, ["-m", self._endpoint, role, told])
