@@ -28,6 +28,6 @@ require_extra("fog", ("numpy", "rich", "rosbags"), "fog")
 
 
 def __getattr__(name: str) -> object:
-    from fog.launch.words import word
+    from fog.launch.lazy_names import word
 
     return word(name)

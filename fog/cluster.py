@@ -13,7 +13,7 @@ from typing import Literal
 from fog.hardware import Hardware
 from gdp.errors import LocalError
 
-__all__ = ["Carried", "CloudNode", "ClusterPlan", "Wanted"]
+__all__ = ["CloudNode", "ClusterPlan", "ExportedInterface", "MachineRequest"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class CloudNode:
 
 
 @dataclass(frozen=True, slots=True)
-class Carried:
+class ExportedInterface:
     """A service, action or topic that the cluster's nodes offer to the robot.
 
     Args:
@@ -50,7 +50,7 @@ class Carried:
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class MachineRequest:
     """One replica's machine.
 
     Args:
@@ -75,8 +75,8 @@ class ClusterPlan:
 
     name: str
     nodes: tuple[CloudNode, ...]
-    machines: tuple[Wanted, ...]
-    carried: tuple[Carried, ...] = ()
+    machines: tuple[MachineRequest, ...]
+    carried: tuple[ExportedInterface, ...] = ()
     _: KW_ONLY
     idle_s: float | None = None
     budget_usd: float | None = None
@@ -100,9 +100,10 @@ class ClusterPlan:
                 for each in items["nodes"]
             ]
             machines = [
-                Wanted(Hardware(**each["hardware"]), each["region"], each["is_spot"]) for each in items["machines"]
+                MachineRequest(Hardware(**each["hardware"]), each["region"], each["is_spot"])
+                for each in items["machines"]
             ]
-            carried = [Carried(**each) for each in items["carried"]]
+            carried = [ExportedInterface(**each) for each in items["carried"]]
             return cls(
                 items["name"],
                 tuple(nodes),

@@ -11,7 +11,7 @@ from enum import Enum
 
 from fog.offer import Offer
 
-__all__ = ["Boot", "Machine", "MachineSpec", "MachineState", "Program"]
+__all__ = ["Machine", "MachineBundle", "MachineSpec", "MachineState", "Program"]
 
 
 class MachineState(Enum):
@@ -62,7 +62,7 @@ class Program:
 
 
 @dataclass(frozen=True, slots=True)
-class Boot:
+class MachineBundle:
     """All that a machine needs to become what it is to be.
 
     Args:

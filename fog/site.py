@@ -21,11 +21,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Final, Literal, TypedDict
+from typing import Annotated, ClassVar, Final, Literal, TypedDict
 
 from pydantic import AfterValidator, Field, model_validator
 
-from fog.enrolment.boots import RobotDevices, robot_boot
+from fog.enrolment.bootstrap import RobotDevices, robot_boot
 from fog.enrolment.config import ENROLMENT_PORT, EnrolmentConfig, host_and_port
 from fog.enrolment.members import Authority
 from fog.host.bundle import install
@@ -37,7 +37,7 @@ from fog.providers.skypilot.config import SkyPilotConfig
 from fog.topology import AUTOMATIC, AUTOMATIC_REPLICA, Gateway, Topology
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError
-from gdp.limits import CLAIM_LEASE_S
+from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.nodes.config import LeaseSeconds, SwitchConfig
 from gdp.nodes.schema import Directory, ExistingFile, Ifname, Section, Unique, load, relative
 from gdp.stores.files import private, read_private, write_all
@@ -58,6 +58,8 @@ _FILE: Final = "fog.yaml"
 
 class SiteConfig(Section):
     """``fog.yaml``."""
+
+    renamed: ClassVar[Mapping[str, str]] = {"papers_days": "credential_days"}
 
     domain: Directory = Field(description="Directory of the trust domain, with its root key: admits machines.")
     owner: Directory = Field(description="Directory of the owner of the names that clusters serve.")
@@ -89,11 +91,11 @@ class SiteConfig(Section):
     state: Annotated[Path, AfterValidator(relative)] | None = Field(
         default=None, description="Folder of the journal. Default: $FOG_STATE, else ~/.local/state/gdp-fog."
     )
-    papers_days: float = Field(
+    credential_days: float = Field(
         default=7.0, gt=0, le=3_650, description="How long a machine's keys hold; it is replaced before they end."
     )
     lease_s: LeaseSeconds = Field(
-        default=CLAIM_LEASE_S,
+        default=ADVERTISEMENT_LEASE_S,
         description="Lease of the machines' claims, in seconds: `lease_s` of their proxy.yaml.",
     )
     enrolment: EnrolmentConfig = Field(
@@ -195,7 +197,7 @@ class _Settings(TypedDict):
     skypilot: SkyPilotConfig
     topology: Gateway
     machine_iface: str
-    papers_days: float
+    credential_days: float
     lease_s: float
     idle_s: float | None
     budget_usd: float | None
@@ -232,8 +234,8 @@ class Site:
     skypilot: SkyPilotConfig = field(default_factory=SkyPilotConfig)
     topology: Gateway = AUTOMATIC
     machine_iface: str = "eth0"
-    papers_days: float = 7.0
-    lease_s: float = CLAIM_LEASE_S
+    credential_days: float = 7.0
+    lease_s: float = ADVERTISEMENT_LEASE_S
     idle_s: float | None = None
     budget_usd: float | None = None
     latency_ms: Mapping[str, float] = field(default_factory=dict)
@@ -460,7 +462,7 @@ def _settings(config: SiteConfig) -> _Settings:
         "skypilot": config.skypilot,
         "topology": config.topology,
         "machine_iface": config.device,
-        "papers_days": config.papers_days,
+        "credential_days": config.credential_days,
         "lease_s": config.lease_s,
         "idle_s": config.idle_s,
         "budget_usd": config.budget_usd,

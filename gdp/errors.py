@@ -44,8 +44,8 @@ class DropReason(IntEnum):
     NO_READER = 8  # a topic that nobody joined
     PORT_DOWN = 9
     PORT_FULL = 10  # the device's queue refused it
-    PARKED_FULL = 11
-    PARKED_EXPIRED = 12
+    PENDING_FULL = 11
+    PENDING_EXPIRED = 12
     # the message
     BAD_TAG = 13  # AES-GCM refused the part
     BAD_SIGNATURE = 14

@@ -49,7 +49,9 @@ NACKS_PER_REPORT: Final = 24  # ranges: a report, sealed and alone in its frame,
 
 # Control plane
 CONTROL_MAX_BYTES: Final = 16 << 10  # one statement with its evidence
-CLAIM_MAX_BYTES: Final = 6_500  # with its evidence: a relay or an answer around one, a join around two fit a statement
+ADVERTISEMENT_MAX_BYTES: Final = (
+    6_500  # with its evidence: a relay or an answer around one, a join around two fit a statement
+)
 WITHDRAWAL_MAX_BYTES: Final = 1 << 10
 SEQUENCE_AHEAD_S: Final = 366 * 86_400.0  # sequence numbers are wall-clock milliseconds, at most so far ahead
 RECORD_OVERHEAD_BYTES: Final = 33  # what a channel puts around a statement: head and tag
@@ -67,7 +69,9 @@ CLOCKS_APART_S: Final = 7_200.0  # two clocks, each an hour off at most
 # Leases
 LEASE_MIN_S: Final = 1.0
 LEASE_MAX_S: Final = 3_600.0
-CLAIM_LEASE_S: Final = 24.0  # what a node asks for unless its configuration says otherwise; renewed after a third
+ADVERTISEMENT_LEASE_S: Final = (
+    24.0  # what a node asks for unless its configuration says otherwise; renewed after a third
+)
 NEGATIVE_LEASE_S: Final = 0.5  # short: a question may just miss the claim that answers it
 
 # Neighbours and link state
@@ -86,17 +90,17 @@ WAIT_REPORT_S: Final = 5.0  # a node that makes no progress for so long says why
 
 # Tables
 TABLE_MAX: Final = 1 << 20
-PARKED_FRAMES_MAX: Final = 2_048
-PARKED_BYTES_MAX: Final = 4 << 20
-PARKED_S: Final = 1.5
+PENDING_FRAMES_MAX: Final = 2_048
+PENDING_BYTES_MAX: Final = 4 << 20
+PENDING_S: Final = 1.5
 ATTACHED_MAX: Final = 16_384  # claims of the nodes attached to a switch, some 3 KiB each
 READERS_MAX: Final = 16_384  # claims of the readers attached to a switch
 TREES_MAX: Final = 65_536  # branches of a switch's trees, some 4 KiB each
 JOINS_PER_S: Final = 2_000.0  # of one neighbouring switch; each is verified
 JOINS_BURST: Final = 16_384.0
-CLAIMS_PER_S: Final = 2_048.0  # claims and withdrawals of one neighbour; each is verified and relayed
-CLAIMS_BURST: Final = 2.0 * ATTACHED_MAX
-CLAIMS_WINDOW: Final = 1_024  # how far claims of one node may overtake each other
+ADVERTISEMENTS_PER_S: Final = 2_048.0  # claims and withdrawals of one neighbour; each is verified and relayed
+ADVERTISEMENTS_BURST: Final = 2.0 * ATTACHED_MAX
+ADVERTISEMENTS_WINDOW: Final = 1_024  # how far claims of one node may overtake each other
 QUESTIONS_PER_S: Final = 16.0  # new names that an attached node may have a RIB asked for
 QUESTIONS_BURST: Final = 256.0
 SWITCH_QUESTIONS_PER_S: Final = 256.0  # ... or a neighbouring switch
@@ -112,4 +116,4 @@ LINK_STATES_BURST: Final = 100.0
 REVOCATIONS_PER_ROOT: Final = 262_144  # of one trusted domain
 REVOCATIONS_OF_OWNERS: Final = 65_536  # of all owners and nodes whose certificates are held here
 REVOCATIONS_PER_ISSUER: Final = 1_024  # of one of these
-REVOCATIONS_PER_GIVER: Final = 8_192  # that came over one neighbour, or from one relay
+REVOCATIONS_PER_ORIGIN: Final = 8_192  # that came over one neighbour, or from one relay

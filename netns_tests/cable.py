@@ -79,7 +79,7 @@ def _line_of(process: subprocess.Popen[bytes]) -> str:
 
 
 @contextlib.contextmanager
-def cable(space: Space) -> Iterator[list[str]]:
+def sim_link(space: Space) -> Iterator[list[str]]:
     """Join this namespace with another by ``eth0``; yield what runs a command in the other."""
     with Space() as other:
         other.ip("set", "lo", "up")

@@ -31,7 +31,7 @@ import yaml
 
 from gdp.crypto.certificates import Role
 from gdp.host import netns_files
-from gdp.host.run_registry import Run, Runs
+from gdp.host.run_registry import Run, RunRegistry
 from gdp.metadata import Metadata
 from gdp.simulation.namespaces import Namespaces
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
@@ -164,7 +164,7 @@ class Proxy:
 
     def start(self) -> None:
         """Start it; return when it is attached."""
-        argv = ["proxy.cli", "--config", str(self._pair.write_proxy(self._label, self._port))]
+        argv = ["proxy.cli.proxy", "--config", str(self._pair.write_proxy(self._label, self._port))]
         self._process = self._pair.start(self.machine, argv, self._log, " is attached", self._label)
 
     def end(self, how: signal.Signals = signal.SIGTERM) -> None:
@@ -360,7 +360,7 @@ class Pair:
 @contextmanager
 def pair_of(*crossings: Crossing, hidden: Mapping[str, str] | None = None) -> Iterator[Pair]:
     """The two machines, with proxies that carry these; ``hidden``: a package that a proxy has not. All ends with it."""
-    run = Runs().start()
+    run = RunRegistry().start()
     with ExitStack() as undo:
         undo.callback(run.end)
         yield Pair(run, undo, crossings, hidden or {})

@@ -13,10 +13,10 @@ from typing import Final
 import yaml
 
 from fog.hardware import Hardware
-from fog.machine import Boot, Machine, MachineSpec, Program
+from fog.machine import Machine, MachineBundle, MachineSpec, Program
 from fog.offer import Offer
+from fog.providers.local.netlinks import UP
 from fog.providers.local.provider import LocalProvider
-from fog.providers.local.wire import UP
 from gdp.crypto.certificates import Role
 from gdp.metadata import Metadata
 from gdp.names import Name
@@ -51,14 +51,14 @@ def machine_of(provider: LocalProvider, machine: str) -> Machine:
     return found
 
 
-def plain_gateway(_: str, __: Sequence[str]) -> Boot:
+def plain_gateway(_: str, __: Sequence[str]) -> MachineBundle:
     """Return a gateway that forwards nothing."""
-    return Boot({}, (Program("idle", ("sleep", "1000")),))
+    return MachineBundle({}, (Program("idle", ("sleep", "1000")),))
 
 
-def ticking(code: str = _TICKS) -> Boot:
+def ticking(code: str = _TICKS) -> MachineBundle:
     """Return a machine that writes a line every now and then."""
-    return Boot({}, (Program("ticker", ("{python}", "-c", code), "ready"),))
+    return MachineBundle({}, (Program("ticker", ("{python}", "-c", code), "ready"),))
 
 
 def leftovers(provider_folder: Path, ids: Sequence[str]) -> list[str]:
@@ -89,18 +89,20 @@ class Domain:
         self._running: list[subprocess.Popen[str] | subprocess.Popen[bytes]] = []
         make_domain(folder / "domain", "test")
 
-    def gateway(self, label: str, ifaces: Sequence[str]) -> Boot:
+    def gateway(self, label: str, ifaces: Sequence[str]) -> MachineBundle:
         """Return what a gateway runs."""
-        return Boot(self._switch(label, ifaces), (_command("switch", "gdp.cli.switch"),))
+        return MachineBundle(self._switch(label, ifaces), (_command("switch", "gdp.cli.switch"),))
 
-    def machine(self, name: str) -> Boot:
+    def machine(self, name: str) -> MachineBundle:
         """Return what a machine runs: a switch, and a proxy that carries nothing."""
         files = self._switch(name, ["eth0"], ["proxy0"])
         files |= self._node(Role.PROXY, name, {"iface": "proxy0", "delegations": f"proxy/{DELEGATIONS}"})
         files[f"proxy/{DELEGATIONS}/.none"] = b""
-        return Boot(files, (_command("switch", "gdp.cli.switch"), _command("proxy", "proxy.cli", " is attached")))
+        return MachineBundle(
+            files, (_command("switch", "gdp.cli.switch"), _command("proxy", "proxy.cli.proxy", " is attached"))
+        )
 
-    def replica(self, name: str, service: Metadata) -> Boot:
+    def replica(self, name: str, service: Metadata) -> MachineBundle:
         """Return what a machine runs that serves, and that may be the gateway of its group: a switch and a member."""
         ports = [{"iface": "eth0"}, {"iface": UP, "optional": True}]
         files = self._node(Role.SWITCH, name, {"ports": ports, "attach": ["proxy0"]})
@@ -110,7 +112,7 @@ class Domain:
         wait = 'until ip link show proxy0 >/dev/null 2>&1; do sleep 0.05; done; exec "$@"'
         member = ("env", f"PYTHONPATH={ROOT}", "sh", "-c", wait, "member")  # a machine has no checkout of the tests
         program = Program("proxy", (*member, "{python}", "-m", "netns_tests.uplink_child", *words), "up")
-        return Boot(files, (_command("switch", "gdp.cli.switch"), program))
+        return MachineBundle(files, (_command("switch", "gdp.cli.switch"), program))
 
     def start_robot(self, uplink: str, *attach: str) -> None:
         """Start the robot's switch and the domain's RIB in this namespace; ``attach``: what else the switch makes."""

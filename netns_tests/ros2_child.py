@@ -10,7 +10,7 @@ from __future__ import annotations
 import select
 import sys
 
-from proxy.endpoints.endpoint import Heard
+from proxy.endpoints.endpoint import MessageReceived
 from proxy.endpoints.ros2 import Ros2Endpoint
 
 if __name__ == "__main__":
@@ -18,7 +18,7 @@ if __name__ == "__main__":
     endpoint.subscribe("/out", "std_msgs/msg/String", None)
     back = endpoint.advertise(endpoint.channel("/back", "std_msgs/msg/String"))
     while sys.stdin not in (ready := select.select([endpoint, sys.stdin], [], [])[0]):
-        for event in endpoint.take() if ready else ():
-            if isinstance(event, Heard):
+        for event in endpoint.poll_events() if ready else ():
+            if isinstance(event, MessageReceived):
                 endpoint.publish(back, event.raw)
-    endpoint.shut()
+    endpoint.remove_entity()

@@ -17,7 +17,7 @@ from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import ETHERTYPE, Flag, Kind
 from gdp.limits import HOPS_MAX
 from gdp.ports.kernel.plane import KernelPlane
-from gdp.ports.linked import LinkedPlane
+from gdp.ports.netdev import NetdevPlane
 from gdp.ports.raw import RawPlane
 from gdp.switch.table import NOWHERE, Table
 from netns_tests.spaces import Space
@@ -26,7 +26,7 @@ from netns_tests.test_planes import LOOK_S, PATIENCE_S, far_end
 __all__ = ["FORGOTTEN", "KINDS", "NOWHERE_NAME", "UNKNOWN", "B", "Row", "frame", "mac_of", "waiting"]
 
 B, UNKNOWN, NOWHERE_NAME, FORGOTTEN = (bytes([0xE0 + n]) * 32 for n in range(4))
-KINDS: Mapping[str, Callable[[Sequence[str], Table], LinkedPlane]] = {"raw": RawPlane, "kernel": KernelPlane}
+KINDS: Mapping[str, Callable[[Sequence[str], Table], NetdevPlane]] = {"raw": RawPlane, "kernel": KernelPlane}
 LINKS = ("a", "b", "c", "d")
 BUFFER_BYTES = 1 << 26
 SO_SNDBUFFORCE, SO_RCVBUFFORCE = 32, 33
@@ -67,19 +67,19 @@ class Row:
         sent: frames that A's device took.
         delivered: what came to B, in order.
         discarded: frames that the kernel had nobody to give to, as the test found them counted.
-        handed_up: frames that planes gave to their node, which here has no use for them.
+        punted: frames that planes gave to their node, which here has no use for them.
     """
 
     def __init__(self, space: Space, kind: str, **mtus: int) -> None:
         for link in LINKS:
             space.veth(f"{link}0", f"{link}1", mac_of(f"{link}0"), mac_of(f"{link}1"), mtus.get(link, 1_500))
         self.space = space
-        self.sent = self.handed_up = self.discarded = 0
+        self.sent = self.punted = self.discarded = 0
         self.delivered: list[bytes] = []
         self.a, self.b = far_end("a0"), far_end("d1")
         self.a.setsockopt(socket.SOL_SOCKET, SO_SNDBUFFORCE, BUFFER_BYTES)  # it holds what waits at the next queue
         self.b.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER_BYTES)
-        self.planes: list[LinkedPlane] = []
+        self.planes: list[NetdevPlane] = []
         for left, right in pairwise(LINKS):
             table = Table()
             to_next = (1, mac_of(f"{right}1") + mac_of(f"{right}0"))
@@ -97,7 +97,7 @@ class Row:
     def poll(self, *planes: int) -> None:
         """Let planes (all, if none is named) work once."""
         for plane in [self.planes[at] for at in planes] or self.planes:
-            self.handed_up += len(plane.poll(0))
+            self.punted += len(plane.poll(0))
 
     def until(self, done: Callable[[], bool]) -> None:
         """Let all planes work until something is so."""
@@ -105,7 +105,7 @@ class Row:
         while not done():
             assert time.monotonic() < deadline_s, f"it did not come about: {self.sums()}"
             self.poll()
-            self.handed_up += len(self.planes[-1].poll(LOOK_S / 10))
+            self.punted += len(self.planes[-1].poll(LOOK_S / 10))
             self.delivered += waiting(self.b)
 
     def drops(self) -> dict[DropReason, int]:
@@ -116,14 +116,14 @@ class Row:
 
     def sums(self) -> tuple[int, int]:
         """Return how many frames were sent, and of how many it is known what became of them."""
-        return self.sent, len(self.delivered) + sum(self.drops().values()) + self.handed_up + self.discarded
+        return self.sent, len(self.delivered) + sum(self.drops().values()) + self.punted + self.discarded
 
     def settle(self) -> None:
         """Return when every frame that was sent is accounted for, and nothing more happens."""
         self.until(lambda: self.sums()[1] >= self.sent)
         for plane in self.planes:
             while arrivals := plane.poll(LOOK_S):
-                self.handed_up += len(arrivals)
+                self.punted += len(arrivals)
         self.delivered += waiting(self.b)
 
     def close(self) -> None:

@@ -14,7 +14,7 @@ import yaml
 
 from gdp.crypto.certificates import Role
 from gdp.host.processes import Process, end_all
-from gdp.host.run_registry import Run, Runs
+from gdp.host.run_registry import Run, RunRegistry
 from gdp.metadata import Metadata
 from gdp.simulation.namespaces import Namespaces
 from gdp.simulation.topology import DomainPlan, Topology
@@ -107,7 +107,7 @@ def _end(process: subprocess.Popen[str]) -> None:
 @contextmanager
 def session_lab(rights: Rights) -> Iterator[SessionLab]:
     """Run a lab whose nodes have these rights, without any only an empty machine; end it on leaving."""
-    run = Runs().start()
+    run = RunRegistry().start()
     with ExitStack() as undo:
         undo.callback(run.end)
         yield SessionLab(run, undo, rights)

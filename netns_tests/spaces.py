@@ -8,7 +8,7 @@ import select
 import subprocess
 from pathlib import Path
 
-from gdp.ports.link import LinkWatch
+from gdp.ports.rtnetlink import LinkMonitor
 
 _PATIENCE_S = 10.0
 _CLONE_NEWNET = 0x40000000
@@ -64,11 +64,11 @@ class Space:
         Raises:
             TimeoutError: they did not come up.
         """
-        watch = LinkWatch()
+        watch = LinkMonitor()
         try:
-            while not all(link and link.up for link in map(watch.ask, names)):
+            while not all(link and link.up for link in map(watch.get, names)):
                 if not select.select([watch], [], [], _PATIENCE_S)[0]:
                     raise TimeoutError(f"{names} did not come up")
-                watch.news()
+                watch.poll()
         finally:
             watch.close()

@@ -11,7 +11,7 @@ from faults.disk import Disk
 from faults.plan import make_topology
 from faults.store import StoreCluster
 
-from gdp.host.run_registry import Runs
+from gdp.host.run_registry import RunRegistry
 from gdp.simulation.namespaces import Namespaces
 
 __all__: list[str] = []
@@ -20,7 +20,7 @@ __all__: list[str] = []
 def main() -> None:
     """Make both, say so, and wait for the end of standard input."""
     topology, _ = make_topology({"a": ("s1",)}, {}, (), ("s1",), {"P": "s1"})
-    run = Runs().start()
+    run = RunRegistry().start()
     Disk(run).fill()
     StoreCluster(run, Namespaces(topology, run), ["s1"])
     print(run.id, flush=True)

@@ -78,7 +78,7 @@ def test_every_wrong_frame_is_dropped_for_its_own_reason_at_whichever_switch(lay
         )
     row.settle()
     assert row.sums() == (row.sent, row.sent)
-    assert (len(row.delivered), row.handed_up) == (rounds, rounds)
+    assert (len(row.delivered), row.punted) == (rounds, rounds)
     assert row.drops() == {
         DropReason.NO_ROUTE: rounds,
         DropReason.HOPS_EXPIRED: 3 * rounds,
@@ -94,7 +94,7 @@ def test_a_name_that_one_switch_forgets_in_the_middle_of_a_stream_is_handed_up_t
     row.last_table.remove(FORGOTTEN)
     row.send(*[frame(FORGOTTEN)] * 50)
     row.settle()
-    assert (len(row.delivered), row.handed_up, row.drops()) == (50, 50, {})
+    assert (len(row.delivered), row.punted, row.drops()) == (50, 50, {})
 
 
 @pytest.mark.parametrize("end", ["c0", "c1"])
@@ -158,7 +158,7 @@ def test_what_a_full_socket_drops_is_counted_with_what_it_hands_up(
     row.send(*[frame(UNKNOWN, bytes(1_000))] * 500)
     row.settle()
     assert row.sums() == (500, 500)
-    assert row.handed_up > 0
+    assert row.punted > 0
     assert row.drops()[DropReason.PORT_FULL] > 0
 
 

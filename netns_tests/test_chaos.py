@@ -19,7 +19,7 @@ from faults.store import has_server
 
 from gdp.host.netns_files import processes_inside
 from gdp.host.processes import Process
-from gdp.host.run_registry import Runs
+from gdp.host.run_registry import RunRegistry
 from netns_tests.live_pair import until
 from tests.pages import ROOT
 from tests.script_packages import PYTHON_PATH
@@ -51,18 +51,20 @@ def test_nothing_grows_in_real_processes_while_readers_and_publishers_come_and_g
 
 def test_a_killed_run_is_taken_down_by_the_next() -> None:
     def started() -> set[str]:
-        return {record.run for record in Runs().all()} - before
+        return {record.run for record in RunRegistry().all()} - before
 
-    before = {record.run for record in Runs().all()}
+    before = {record.run for record in RunRegistry().all()}
     process = subprocess.Popen(argv_of("chaos.py", ["--seconds", "60"]), stderr=subprocess.DEVNULL)
     until(started, "a run that is recorded")
     (run,) = started()
-    until(lambda: any(record.run == run and len(record.processes) > 20 for record in Runs().all()), "its processes")
-    (record,) = (record for record in Runs().all() if record.run == run)
+    until(
+        lambda: any(record.run == run and len(record.processes) > 20 for record in RunRegistry().all()), "its processes"
+    )
+    (record,) = (record for record in RunRegistry().all() if record.run == run)
     process.send_signal(signal.SIGKILL)
     process.wait()
     until(lambda: not any(each.alive for each in record.processes), "their end: they die with their parent")
-    assert run in Runs().sweep()
+    assert run in RunRegistry().sweep()
     assert not any(Path(path).exists() for path in [*record.namespaces, *record.files])
 
 
@@ -75,14 +77,14 @@ def test_the_disk_and_the_servers_of_a_killed_run_are_gone_after_the_next_sweep(
         assert child.stdout is not None
         run = child.stdout.readline().strip()
         child.send_signal(signal.SIGKILL)
-    (record,) = (record for record in Runs().all() if record.run == run)
+    (record,) = (record for record in RunRegistry().all() if record.run == run)
     spaces, folder = [Path(path) for path in record.namespaces], Path(record.files[0])
     servers = processes_inside(spaces)
     assert len(servers) == 6
     assert (folder / "disk").is_mount()
     record.processes.clear()  # as if it had been killed before it could note the servers
     (Path("/run/gdp") / f"{run}.json").write_text(record.to_text())
-    assert run in Runs().sweep()
+    assert run in RunRegistry().sweep()
     assert not any(server.alive for server in servers)
     assert not any(path.exists() for path in [*spaces, folder])
 
@@ -94,7 +96,7 @@ def rib_log(overlay: Overlay) -> str:
 def test_a_rib_comes_through_a_full_disk_and_starts_on_one() -> None:
     topology, members = make_topology({"a": ("s1", "s2")}, {}, ("s1-s2",), ("s1",), {"P": "s1", "R": "s2"})
     plan = Plan(topology, members, flows=(Flow("/t", "P", ("R",), hz=100.0),))
-    run = Runs().start()
+    run = RunRegistry().start()
     try:
         with Overlay(run, plan, has_disk=True, more={"rib": {"lease_s": 2.0}}) as overlay:
             assert overlay.disk is not None
@@ -126,7 +128,7 @@ def overlay() -> Iterator[Overlay]:
     """Two switches with a publisher and a reader, running."""
     topology, members = make_topology({"a": ("s1", "s2")}, {}, ("s1-s2",), ("s1",), {"P": "s1", "R": "s2"})
     plan = Plan(topology, members, flows=(Flow("/t", "P", ("R",), hz=100.0),))
-    run = Runs().start()
+    run = RunRegistry().start()
     try:
         with Overlay(run, plan, has_clocks=True) as made:
             made.start_all()

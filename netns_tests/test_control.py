@@ -32,7 +32,7 @@ class Nodes:
         self.commands = commands
         self.switch = self._start("gdp.cli.switch", "switch", "--data-plane", "raw")
         self.rib = self._start("gdp.cli.rib", "rib", "--await-iface", "30")
-        self.proxy = self._start("proxy.cli", "proxy", "--await-iface", "30")
+        self.proxy = self._start("proxy.cli.proxy", "proxy", "--await-iface", "30")
 
     def gdp(self, *words: str) -> tuple[int, str]:
         """Run ``gdp`` in the folder of the nodes; return its exit code and all that it printed."""
@@ -108,6 +108,6 @@ def test_the_socket_of_a_killed_node_is_replaced(nodes: Nodes) -> None:
     code, text = nodes.gdp("status", "proxy")
     assert (code, "no process serves this control socket" in text) == (3, True)
     (nodes.commands.home / "kept" / "received.mcap").unlink(missing_ok=True)
-    again = nodes.commands.start("proxy.cli", "proxy")
+    again = nodes.commands.start("proxy.cli.proxy", "proxy")
     again.until('"ready"')
     assert nodes.gdp("status", "proxy")[0] == 0

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from fog_demo.stage import STATE, standing_runs, sweep
-from gdp.host.run_registry import Runs
+from gdp.host.run_registry import RunRegistry
 from netns_tests.local_site import leftovers
 from tests.pages import ROOT
 
@@ -34,7 +34,7 @@ def all_of(record_of: int) -> tuple[Path, list[str]]:
     """Return the folder of the provider's records, and the ids of all that a running demonstration made."""
     (demo,) = (each for each in standing_runs("demo").all() if each.owner.pid == record_of)
     records = Path(demo.files[0]) / STATE / "local"
-    return records, [demo.run, *(each.run for each in Runs(records).all())]
+    return records, [demo.run, *(each.run for each in RunRegistry(records).all())]
 
 
 def line_with(words: Sequence[str], process: subprocess.Popen[str]) -> str:

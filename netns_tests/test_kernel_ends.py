@@ -17,7 +17,7 @@ from pyroute2 import IPRoute
 
 from gdp.errors import LocalError
 from gdp.ports.kernel.assembler import Assembler
-from gdp.ports.kernel.loaded import PROGRAM
+from gdp.ports.kernel.loaded_program import PROGRAM
 from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.kernel.syscall import (
     Command,

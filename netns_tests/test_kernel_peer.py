@@ -17,13 +17,13 @@ from pyroute2 import IPRoute
 
 from gdp.errors import LocalError
 from gdp.host.netns_files import inside
+from gdp.ports.kernel.abi import PortAt, PortFlag
 from gdp.ports.kernel.assembler import Assembler
-from gdp.ports.kernel.device import has_free_peer
+from gdp.ports.kernel.device import peer_is_bare
 from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.kernel.program import UP
-from gdp.ports.kernel.shapes import PortAt, PortFlag
 from gdp.ports.kernel.syscall import Command, address, bpf, create_link, load_program
-from gdp.ports.netlink import Questions
+from gdp.ports.netlink import NetlinkSocket
 from netns_tests.conftest import MakeKernel
 from netns_tests.spaces import Space
 from netns_tests.test_kernel_plane import LOOK_S, PATIENCE_S, filled
@@ -80,30 +80,30 @@ def passing_program() -> Iterator[int]:
 def test_the_other_end_is_reached_straight_only_where_nothing_is_passed_by(space: Space) -> None:
     space.veth("p0", "q0", PORT_MACS[IN], PEER_MACS[IN])
     port = socket.if_nametoindex("p0")
-    asking = Questions()
+    asking = NetlinkSocket()
     with contextlib.closing(asking), elsewhere() as holder, passing_program() as program, passing_xdp() as xdp:
-        assert not has_free_peer(asking, port)  # the other end is here
+        assert not peer_is_bare(asking, port)  # the other end is here
         space.ip("set", "q0", "netns", str(holder))
-        assert has_free_peer(asking, port)
+        assert peer_is_bare(asking, port)
         with IPRoute() as ask:
             ask.tc("add", "pfifo", port, handle=0x10000)
-            assert not has_free_peer(asking, port)
+            assert not peer_is_bare(asking, port)
             ask.tc("del", "pfifo", port, handle=0x10000, parent=0xFFFFFFFF)
-            assert has_free_peer(asking, port)
+            assert peer_is_bare(asking, port)
             ask.tc("add", "clsact", port)
-            assert has_free_peer(asking, port)
+            assert peer_is_bare(asking, port)
             ask.tc("add-filter", "bpf", port, parent=0xFFFFFFF3, fd=program, name="passing", direct_action=True)
-            assert not has_free_peer(asking, port)
+            assert not peer_is_bare(asking, port)
             ask.tc("del", "clsact", port)
         link = create_link(program, port, TCX_EGRESS)
-        assert not has_free_peer(asking, port)
+        assert not peer_is_bare(asking, port)
         os.close(link)
-        assert has_free_peer(asking, port)
+        assert peer_is_bare(asking, port)
         there = Path(f"/proc/{holder}/ns/net")
         link = inside(there, lambda: create_link(xdp, socket.if_nametoindex("q0"), XDP))
-        assert not has_free_peer(asking, port)
+        assert not peer_is_bare(asking, port)
         os.close(link)
-        assert has_free_peer(asking, port)
+        assert peer_is_bare(asking, port)
 
 
 def is_straight(plane: KernelPlane, port: int) -> bool:
@@ -150,7 +150,7 @@ def test_a_question_that_is_refused_takes_the_plain_way_until_it_is_answered(
         plane = make_kernel(filled())
         assert is_straight(plane, WIDE)
         with monkeypatch.context() as patch:
-            patch.setattr(Questions, "_ask", refuse)
+            patch.setattr(NetlinkSocket, "_ask", refuse)
             plane._next_upkeep_s = 0.0
             plane.poll(0)
             assert not is_straight(plane, WIDE)

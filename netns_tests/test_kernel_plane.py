@@ -13,9 +13,9 @@ from pyroute2 import IPRoute
 
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
-from gdp.ports.kernel.device import Refusals
+from gdp.ports.kernel.abi import BRANCHES_MAX
+from gdp.ports.kernel.device import TxDrops
 from gdp.ports.kernel.plane import KernelPlane
-from gdp.ports.kernel.shapes import BRANCHES_MAX
 from gdp.switch.forwarder import Forward, decide, rewrite
 from gdp.switch.table import Hops, Table
 from netns_tests.conftest import MakeKernel
@@ -64,11 +64,11 @@ def filled(entries: dict[bytes, Hops] = ENTRIES) -> Table:
 def settle(plane: KernelPlane, taken: int) -> int:
     """Poll until the plane took this many frames since it was made; return how many were handed up."""
     deadline_s = time.monotonic() + PATIENCE_S
-    handed_up = 0
+    punted = 0
     while plane.counters.frames_in < taken or plane._epoll.poll(0):
         assert time.monotonic() < deadline_s, "frames are missing"
-        handed_up += len(plane.poll(LOOK_S))
-    return handed_up
+        punted += len(plane.poll(LOOK_S))
+    return punted
 
 
 def waiting(end: socket.socket) -> list[bytes]:
@@ -104,13 +104,13 @@ def test_what_was_sent_is_delivered_or_dropped_by_reason(
     for _ in range(rounds):
         for each in kinds.values():
             ends[IN].send(each)
-    handed_up = settle(plane, rounds * len(kinds))
+    punted = settle(plane, rounds * len(kinds))
     delivered = len(waiting(ends[WIDE])) + len(waiting(ends[NARROW]))
     counters = plane.counters
     copies_more = 3 * rounds  # two ways: three of the kinds have one copy more than there are frames
     dropped = sum(counters.drops)
     assert counters.frames_in == rounds * len(kinds)
-    assert rounds * len(kinds) + copies_more == delivered + dropped + handed_up
+    assert rounds * len(kinds) + copies_more == delivered + dropped + punted
     assert counters.forwarded == delivered == 5 * rounds
     assert {DropReason(reason): count for reason, count in enumerate(counters.drops) if count} == {
         DropReason.TRUNCATED: rounds,
@@ -119,7 +119,7 @@ def test_what_was_sent_is_delivered_or_dropped_by_reason(
         DropReason.NO_ROUTE: rounds,
         DropReason.PORT_DOWN: 2 * rounds,
     }
-    assert counters.handed_up == handed_up == 2 * rounds
+    assert counters.punted == punted == 2 * rounds
 
 
 def test_what_the_kernel_takes_wakes_nobody(make_kernel: MakeKernel, ends: dict[int, socket.socket]) -> None:
@@ -165,7 +165,7 @@ def test_what_was_refused_until_the_end_is_counted(make_kernel: MakeKernel, ends
 def test_an_idle_poll_asks_no_device(make_kernel: MakeKernel, monkeypatch: pytest.MonkeyPatch) -> None:
     plane = make_kernel(filled())
     looks: list[object] = []
-    monkeypatch.setattr(Refusals, "look", lambda *given: looks.append(given))
+    monkeypatch.setattr(TxDrops, "look", lambda *given: looks.append(given))
     plane._next_upkeep_s = float("inf")
     for _ in range(5):
         plane.poll(0)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from gdp.ports.link import Link, LinkWatch
+from gdp.ports.rtnetlink import Link, LinkMonitor
 from netns_tests.spaces import Space
 
 pytestmark = pytest.mark.netns
@@ -18,8 +18,8 @@ MAC, PEER_MAC = bytes([2, 0, 0, 0, 0, 1]), bytes([2, 0, 0, 0, 0, 2])
 
 
 @pytest.fixture
-def watch(space: Space) -> Iterator[LinkWatch]:
-    opened = LinkWatch()
+def watch(space: Space) -> Iterator[LinkMonitor]:
+    opened = LinkMonitor()
     yield opened
     opened.close()
 
@@ -28,26 +28,26 @@ def last(links: list[Link], ifname: str) -> Link:
     return [link for link in links if link.ifname == ifname][-1]
 
 
-def test_every_device_is_listed_with_its_facts(watch: LinkWatch, space: Space) -> None:
+def test_every_device_is_listed_with_its_facts(watch: LinkMonitor, space: Space) -> None:
     space.veth("one", "two", MAC, PEER_MAC, mtu=1_400)
     one = last(watch.all(), "one")
     assert (one.mac, one.mtu, one.up, one.gone) == (MAC, 1_400, True, False)
     assert {link.ifname for link in watch.all()} >= {"lo", "one", "two"}
 
 
-def test_one_device_is_found_by_its_name(watch: LinkWatch, space: Space) -> None:
+def test_one_device_is_found_by_its_name(watch: LinkMonitor, space: Space) -> None:
     space.veth("one", "two", MAC, PEER_MAC)
-    assert watch.ask("one") == last(watch.all(), "one")
+    assert watch.get("one") == last(watch.all(), "one")
 
 
-def test_a_name_that_no_device_has_finds_none(watch: LinkWatch) -> None:
-    assert watch.ask("nothing") is None
-    assert watch.ask("a-name-longer-than-any") is None
+def test_a_name_that_no_device_has_finds_none(watch: LinkMonitor) -> None:
+    assert watch.get("nothing") is None
+    assert watch.get("a-name-longer-than-any") is None
 
 
-def test_nothing_new_is_an_empty_list(watch: LinkWatch) -> None:
-    watch.news()
-    assert watch.news() == []
+def test_nothing_new_is_an_empty_list(watch: LinkMonitor) -> None:
+    watch.poll()
+    assert watch.poll() == []
 
 
 @pytest.mark.parametrize(
@@ -61,34 +61,36 @@ def test_nothing_new_is_an_empty_list(watch: LinkWatch) -> None:
     ],
     ids=["carrier lost", "switched off", "mtu", "address", "deleted"],
 )
-def test_a_change_is_news(words: tuple[str, ...], seen: Callable[[Link], bool], watch: LinkWatch, space: Space) -> None:
+def test_a_change_is_news(
+    words: tuple[str, ...], seen: Callable[[Link], bool], watch: LinkMonitor, space: Space
+) -> None:
     space.veth("one", "two", MAC, PEER_MAC)
-    watch.news()
+    watch.poll()
     space.ip(*words)
     news: list[Link] = []
     while not any(link.ifname == "one" and seen(link) for link in news):  # the kernel may tell of a carrier a bit later
         assert select.select([watch], [], [], PATIENCE_S)[0], news
-        news += watch.news()
+        news += watch.poll()
     assert seen(last(news, "one"))
 
 
-def test_a_device_that_leaves_a_bridge_is_not_gone(watch: LinkWatch, space: Space) -> None:
+def test_a_device_that_leaves_a_bridge_is_not_gone(watch: LinkMonitor, space: Space) -> None:
     space.veth("one", "two", MAC, PEER_MAC)
     space.ip("add", "bridge", "type", "bridge")
     space.ip("set", "one", "master", "bridge")
-    watch.news()
+    watch.poll()
     space.ip("set", "one", "nomaster")
-    assert not any(link.gone for link in watch.news())
+    assert not any(link.gone for link in watch.poll())
 
 
-def test_news_that_the_kernel_had_to_skip_is_made_up_for(watch: LinkWatch, space: Space) -> None:
+def test_news_that_the_kernel_had_to_skip_is_made_up_for(watch: LinkMonitor, space: Space) -> None:
     space.veth("one", "two", MAC, PEER_MAC)
     space.veth("three", "four", MAC, PEER_MAC)
-    watch.news()
+    watch.poll()
     watch._news.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2_048)  # room for a message or two
     for mtu in range(1_000, 1_020):
         space.ip("set", "one", "mtu", str(mtu))
     space.ip("del", "three")
-    news = watch.news()
+    news = watch.poll()
     assert last(news, "one").mtu == 1_019
     assert last(news, "three").gone

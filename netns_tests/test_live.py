@@ -182,14 +182,14 @@ def test_an_action_lasts_longer_than_any_timeout_and_each_client_has_its_own_goa
     assert pair.proxy("b").warnings("/fold") == []
 
 
-def test_a_late_joiner_gets_what_was_latched(a: Peer, b: Peer) -> None:
+def test_a_late_reassembler_gets_what_was_latched(a: Peer, b: Peer) -> None:
     a.tell("!map = talk(String, '/map', 'transient_local', 1)")
     a.tell("!map.publish(String(data='old')); map.publish(String(data='new'))")
     b.tell("read(String, '/map', 1, 'transient_local')")
     b.waits_for("heard['/map']", [["new"]])
 
 
-def test_what_two_nodes_latched_in_one_topic_reaches_a_late_joiner(a: Peer, b: Peer, pair: Pair) -> None:
+def test_what_two_nodes_latched_in_one_topic_reaches_a_late_reassembler(a: Peer, b: Peer, pair: Pair) -> None:
     other = node_of(pair, "a", "other")
     for node, frame in ((a, "arm"), (other, "base")):
         node.tell("!statics = talk(TransformStamped, '/statics', 'transient_local', 1)")
@@ -213,7 +213,7 @@ def say(node: Peer, first: int, end: int) -> object:
 
 def test_of_two_proxies_in_one_graph_one_carries_and_the_other_takes_over(a: Peer, b: Peer, pair: Pair) -> None:
     proxies = [pair.proxy("b"), pair.proxy("twin")]
-    until(lambda: any(proxy.faults("rival") for proxy in proxies), "one gives way")
+    until(lambda: any(proxy.bridge.faults("rival") for proxy in proxies), "one gives way")
     b.tell("read(String, '/twice', 1_000)")
     until(lambda: say(a, 0, 1) or said(b), "/twice")
     say(a, 1, 101)

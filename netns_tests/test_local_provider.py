@@ -18,10 +18,10 @@ import pytest
 from fog.hardware import Hardware
 from fog.host.status import Status
 from fog.machine import MachineState
-from fog.providers.local import trouble
+from fog.providers.local import fault_injection
+from fog.providers.local.machine_handle import find
+from fog.providers.local.netlinks import exists
 from fog.providers.local.provider import LocalProvider
-from fog.providers.local.standing import find
-from fog.providers.local.wire import exists
 from fog.topology import Gateway
 from gdp.errors import LocalError, StoreError
 from gdp.host import netns_files
@@ -109,7 +109,7 @@ def test_who_asks_twice_has_one_machine(provider: LocalProvider) -> None:
 
 def test_a_machine_is_taken_at_the_moment_of_its_notice(provider: LocalProvider) -> None:
     machine = booted(provider)
-    trouble.notice(provider.runs, machine, 0.5)
+    fault_injection.notice(provider.runs, machine, 0.5)
     leaving = machine_of(provider, machine)
     assert leaving.state is MachineState.LEAVING
     assert leaving.leaves_at_unix_s is not None
@@ -123,8 +123,8 @@ def test_a_machine_is_taken_at_the_moment_of_its_notice(provider: LocalProvider)
 @pytest.mark.usefixtures("either")
 def test_a_frozen_machine_is_taken_at_the_moment_of_its_notice_too(provider: LocalProvider) -> None:
     machine = booted(provider)
-    trouble.freeze(provider.runs, machine)
-    trouble.notice(provider.runs, machine, 0.0)
+    fault_injection.freeze(provider.runs, machine)
+    fault_injection.notice(provider.runs, machine, 0.0)
     until(lambda: machine_of(provider, machine).state is MachineState.GONE, "taken")
 
 
@@ -139,7 +139,7 @@ def either(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_killed_machine_is_gone_with_its_link(provider: LocalProvider) -> None:
     machine = booted(provider)
     found = find(provider.runs, machine)
-    trouble.kill(provider.runs, machine)
+    fault_injection.kill(provider.runs, machine)
     until(lambda: machine_of(provider, machine).state is MachineState.GONE, "gone")
     assert machine_of(provider, machine).reason == "killed"
     assert not exists(found.gateway, found.plug)
@@ -148,13 +148,13 @@ def test_a_killed_machine_is_gone_with_its_link(provider: LocalProvider) -> None
 @pytest.mark.usefixtures("either")
 def test_a_frozen_machine_does_nothing_until_it_is_thawed(provider: LocalProvider) -> None:
     machine = booted(provider)
-    trouble.freeze(provider.runs, machine)
+    fault_injection.freeze(provider.runs, machine)
     time.sleep(0.05)  # it takes a moment to hold
     before = ticks(provider, machine)
     time.sleep(0.2)
     assert ticks(provider, machine) == before
     assert machine_of(provider, machine).state is MachineState.RUNNING
-    trouble.thaw(provider.runs, machine)
+    fault_injection.thaw(provider.runs, machine)
     until(lambda: ticks(provider, machine) > before, "going on")
 
 
@@ -162,12 +162,12 @@ def test_a_slow_machine_has_to_wait_for_its_processor(provider: LocalProvider) -
     machine = provider.create(spec("m1"), ticking("print('ready', flush=True)\nwhile True: pass"))
     if not find(provider.runs, machine).file.is_bounded:
         pytest.skip("cgroups are not writable here")
-    trouble.slow(provider.runs, machine, 0.05)
+    fault_injection.slow(provider.runs, machine, 0.05)
     stats = list(Path("/sys/fs/cgroup").glob(f"**/gdp-{machine}/cpu.stat"))
     until(lambda: any(re.search(r"nr_throttled [1-9]", each.read_text()) for each in stats), "throttled")
-    trouble.slow(provider.runs, machine, None)
+    fault_injection.slow(provider.runs, machine, None)
     with pytest.raises(LocalError, match="more than 0"):
-        trouble.slow(provider.runs, machine, 0.0)
+        fault_injection.slow(provider.runs, machine, 0.0)
 
 
 def test_a_machine_without_bounds_cannot_be_slowed(provider: LocalProvider, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -175,7 +175,7 @@ def test_a_machine_without_bounds_cannot_be_slowed(provider: LocalProvider, monk
     machine = booted(provider)
     assert not find(provider.runs, machine).file.is_bounded
     with pytest.raises(LocalError, match="no bound on processor time"):
-        trouble.slow(provider.runs, machine, 0.1)
+        fault_injection.slow(provider.runs, machine, 0.1)
 
 
 def listen(device: str) -> socket.socket:
@@ -200,11 +200,11 @@ def test_no_frame_of_a_delayed_link_is_early(provider: LocalProvider, away: bool
             assert body in sink.recv(2_000)
             return time.monotonic() - begun_s
 
-        trouble.delay(provider.runs, machine, 60.0)
+        fault_injection.delay(provider.runs, machine, 60.0)
         assert took_s(b"first") >= 0.06
-        trouble.delay(provider.runs, machine, 90.0)
+        fault_injection.delay(provider.runs, machine, 90.0)
         assert took_s(b"second") >= 0.09
-        trouble.delay(provider.runs, machine, 0.0)
+        fault_injection.delay(provider.runs, machine, 0.0)
         assert not exists(found.gateway, found.relay_out)
         took_s(b"third")
 

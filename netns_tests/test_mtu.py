@@ -16,16 +16,15 @@ from contextlib import closing
 
 import pytest
 
-from gdp.client.member import Member, Topic
+from gdp.client.participant import Participant, Topic
 from gdp.client.rib_host import RibHost
 from gdp.control.settings import NodeSettings
+from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
 from gdp.crypto.envelope import SIGNATURE_BYTES, part_room
 from gdp.crypto.identity import Identity, NodeKeys
-from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.validity import Validity
-from gdp.effects import Machine
 from gdp.errors import DropReason
 from gdp.frame.codec import ETHER_BYTES, decode
 from gdp.frame.kinds import Kind
@@ -36,12 +35,13 @@ from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.plane import MAC_BYTES, Plane
 from gdp.ports.raw import RawPlane
 from gdp.ports.scapy_plane import ScapyPlane
-from gdp.rib.machine import Rib, RibSettings
+from gdp.rib.core import RibCore, RibSettings
 from gdp.rib.store import MemoryStore
-from gdp.switch.machine import Switch
+from gdp.sansio import ProtocolCore
+from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
-from gdp.trust.card import Card
 from gdp.trust.domain import Policy
+from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.owner import Owner
 from gdp.trust.right import Right
 from netns_tests.spaces import Space
@@ -76,7 +76,7 @@ class Lab:
         self.space = space
         second = int(time.time())
         self._validity = Validity(second - 3_600, second + 3_600)
-        self._authority = DomainAuthority.found("lab", SigningKey.generate(), self._validity)
+        self._authority = CertificateAuthority.create("lab", SigningKey.generate(), self._validity)
         self._policy = Policy(self._authority.root, [self._authority.root])
         self._owner = Owner(SigningKey.generate(), secrets.token_bytes(32))
         self._runtimes: list[Runtime] = []
@@ -85,7 +85,9 @@ class Lab:
         self._add_switch("first", "r1", "a0")
         self._add_switch("second", "a1", "e1", "b1")
         rib = self._identity(Role.RIB, "rib")
-        self._run(RibHost(rib, self._policy, Rib(rib, self._policy, MemoryStore(), RibSettings()), settings()), "b0")
+        self._run(
+            RibHost(rib, self._policy, RibCore(rib, self._policy, MemoryStore(), RibSettings()), settings()), "b0"
+        )
         self._robot, robot = self._add_member("robot", "r0")
         self._server, server = self._add_member("server", "e0")
         self.publisher = self._robot.advertise(self._topic(robot, Right.PUBLISH), b"described", reliable=True)
@@ -111,7 +113,7 @@ class Lab:
         got: list[bytes] = []
 
         def is_enough() -> bool:
-            got.extend(each.delivered.message for each in self._server.take_messages())
+            got.extend(each.delivered.message for each in self._server.poll_messages())
             return len(got) >= count
 
         self.until(is_enough)
@@ -148,20 +150,22 @@ class Lab:
 
     def _add_switch(self, label: str, *ifnames: str) -> None:
         table = Table()
-        self._run(Switch(self._identity(Role.SWITCH, label), self._policy, table, settings()), *ifnames, table=table)
+        self._run(
+            SwitchCore(self._identity(Role.SWITCH, label), self._policy, table, settings()), *ifnames, table=table
+        )
 
-    def _add_member(self, label: str, ifname: str) -> tuple[Member, Identity]:
+    def _add_member(self, label: str, ifname: str) -> tuple[Participant, Identity]:
         identity = self._identity(Role.PROXY, label)
-        member = Member(identity, self._policy, settings())
+        member = Participant(identity, self._policy, settings())
         self._run(member, ifname)
         return member, identity
 
-    def _run(self, machine: Machine, *ifnames: str, table: Table | None = None) -> None:
+    def _run(self, machine: ProtocolCore, *ifnames: str, table: Table | None = None) -> None:
         self.planes.append(RawPlane(ifnames, table))
         self._runtimes.append(Runtime(machine, self.planes[-1]))
 
     def _topic(self, identity: Identity, right: Right) -> Topic:
-        card = Card.from_wire(Card.make(identity))
+        card = NodeDescriptor.from_wire(NodeDescriptor.make(identity))
         metadata = Metadata({"kind": "topic", "name": "/image"})
         delegation = self._owner.delegate(card, metadata, [right], [1], self._validity)
         return Topic(delegation, {epoch: grant.secret for epoch, grant in delegation.open(identity).items()})

@@ -15,7 +15,7 @@ import pytest
 from gdp.errors import LocalError
 from gdp.host import netns_files
 from gdp.host.processes import Process
-from gdp.host.run_registry import Run, Runs, in_first_user_namespace
+from gdp.host.run_registry import Run, RunRegistry, in_first_user_namespace
 from gdp.simulation.namespaces import Namespaces
 from gdp.simulation.topology import chain, ring5
 
@@ -23,13 +23,13 @@ pytestmark = pytest.mark.netns
 
 
 @pytest.fixture
-def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Runs:
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunRegistry:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    return Runs(tmp_path / "runs")
+    return RunRegistry(tmp_path / "runs")
 
 
 @pytest.fixture
-def run(runs: Runs) -> Iterator[Run]:
+def run(runs: RunRegistry) -> Iterator[Run]:
     started = runs.start()
     yield started
     started.end()
@@ -106,7 +106,7 @@ def test_the_namespace_that_the_test_runs_in_is_left_alone(run: Run) -> None:
     assert os.readlink("/proc/thread-self/ns/net") == before
 
 
-def test_the_end_of_a_run_removes_what_it_made_and_nothing_else(runs: Runs, tmp_path: Path) -> None:
+def test_the_end_of_a_run_removes_what_it_made_and_nothing_else(runs: RunRegistry, tmp_path: Path) -> None:
     mine, other = runs.start(), runs.start()
     left = Namespaces(chain(2), other)
     gone = Namespaces(chain(2), mine)
@@ -130,10 +130,10 @@ import subprocess, sys, tempfile, signal
 from pathlib import Path
 from gdp.simulation.namespaces import Namespaces
 from gdp.host.processes import Process
-from gdp.host.run_registry import Runs
+from gdp.host.run_registry import RunRegistry
 from gdp.simulation.topology import chain
 tempfile.tempdir = sys.argv[1]
-run = Runs(Path(sys.argv[1]) / "runs").start()
+run = RunRegistry(Path(sys.argv[1]) / "runs").start()
 namespaces = Namespaces(chain(2), run)
 pids = []
 for leash in (True, False):
@@ -147,7 +147,7 @@ signal.pause()
 """
 
 
-def test_what_a_killed_process_left_behind_is_swept_by_the_next(runs: Runs, tmp_path: Path) -> None:
+def test_what_a_killed_process_left_behind_is_swept_by_the_next(runs: RunRegistry, tmp_path: Path) -> None:
     argv = [sys.executable, "-c", ORPHAN, str(tmp_path)]
     where = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, env=where) as process:

@@ -22,7 +22,7 @@ _PATIENCE_S = 60.0
 _MACS = bytes.fromhex("020000000001"), bytes.fromhex("020000000002")
 _PROXY = "identity: proxy\ndomain: {root: proxy/root.crt}\ndelegations: proxy/delegations\niface: proxy0\n"
 _OTHER_HOST = ("unshare", "--mount", "sh", "-c", 'mount -t tmpfs -o mode=700 locks "$0" && exec "$@"', str(_place()))
-_PROGRAMS = {"switch": "gdp.cli.switch", "rib": "gdp.cli.rib", "proxy": "proxy.cli"}
+_PROGRAMS = {"switch": "gdp.cli.switch", "rib": "gdp.cli.rib", "proxy": "proxy.cli.proxy"}
 
 
 class Node:

@@ -10,9 +10,9 @@ import pytest
 
 from gdp.errors import LocalError
 from gdp.names import Name
-from gdp.nodes.awaiting import await_device
-from gdp.nodes.pairs import attach_pairs
-from gdp.ports.link import LinkWatch
+from gdp.nodes.veth import attach_pairs
+from gdp.nodes.wait_for_device import wait_for_device
+from gdp.ports.rtnetlink import LinkMonitor
 from netns_tests.spaces import Space
 
 pytestmark = [pytest.mark.netns, pytest.mark.usefixtures("space")]
@@ -23,7 +23,7 @@ PAIR = {"rib0", "rib0-s"}
 
 def devices() -> dict[str, int]:
     """Return the MTU of every device but the loopback."""
-    with contextlib.closing(LinkWatch()) as links:
+    with contextlib.closing(LinkMonitor()) as links:
         return {link.ifname: link.mtu for link in links.all() if link.ifname != "lo"}
 
 
@@ -55,7 +55,7 @@ def test_somebody_elses_device_is_refused_and_what_was_made_before_it_is_gone(sp
 
 
 def test_a_node_waits_for_the_device_that_its_switch_is_just_making() -> None:
-    waiting = threading.Thread(target=await_device, args=("rib0", 600.0))
+    waiting = threading.Thread(target=wait_for_device, args=("rib0", 600.0))
     waiting.start()
     with attach_pairs(["px0", "rib0"], ONE, 1_500):
         waiting.join(20.0)
@@ -64,8 +64,8 @@ def test_a_node_waits_for_the_device_that_its_switch_is_just_making() -> None:
 
 def test_a_device_that_is_there_is_not_waited_for() -> None:
     with attach_pairs(["rib0"], ONE, 1_500):
-        await_device("rib0", 600.0)
+        wait_for_device("rib0", 600.0)
 
 
 def test_whoever_waits_for_no_device_in_vain_goes_on() -> None:
-    await_device("rib0", 0.01)
+    wait_for_device("rib0", 0.01)

@@ -20,10 +20,10 @@ import pytest
 from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import ETHERTYPE, Kind
 from gdp.ports import raw, sockets
-from gdp.ports.batch import PlainBatch
 from gdp.ports.kernel.plane import KernelPlane
-from gdp.ports.linked import LinkedPlane
-from gdp.ports.plane import BROADCAST, Arrival, Plane
+from gdp.ports.mmsg import PlainBatch
+from gdp.ports.netdev import NetdevPlane
+from gdp.ports.plane import BROADCAST, Plane, ReceivedFrame
 from gdp.ports.raw import RawPlane
 from gdp.ports.scapy_plane import ScapyPlane
 from gdp.switch.table import Table
@@ -127,9 +127,9 @@ def numbered(count: int) -> list[bytes]:
     return [frame(ONE, number.to_bytes(4, "big") + os.urandom(400)) for number in range(count)]
 
 
-def poll_until(plane: Plane, done: Callable[[], bool]) -> list[Arrival]:
+def poll_until(plane: Plane, done: Callable[[], bool]) -> list[ReceivedFrame]:
     """Poll until something is so; return what was handed up."""
-    arrivals: list[Arrival] = []
+    arrivals: list[ReceivedFrame] = []
     deadline_s = time.monotonic() + PATIENCE_S
     while not done():
         assert time.monotonic() < deadline_s, "it did not come about"
@@ -139,11 +139,11 @@ def poll_until(plane: Plane, done: Callable[[], bool]) -> list[Arrival]:
 
 def _idle(plane: Plane) -> bool:
     """Whether nothing more is waiting for the plane."""
-    assert isinstance(plane, LinkedPlane)
+    assert isinstance(plane, NetdevPlane)
     return not plane._epoll.poll(0)
 
 
-def take_in(plane: Plane, count: int) -> list[Arrival]:
+def take_in(plane: Plane, count: int) -> list[ReceivedFrame]:
     """Poll until the plane took ``count`` frames more than this was asked for before; return what was handed up.
 
     Not more than it has taken by now: the kernel may have forwarded them while they were sent.
@@ -163,7 +163,7 @@ def test_each_fixture_becomes_what_the_reference_says(
     arrivals = take_in(switch, 1)
     ends[IN].send(MARK)
     arrivals += take_in(switch, 1)
-    assert arrivals == ([Arrival(IN, PEER_MACS[IN], case.frame[14:])] if case.handed_up else [])
+    assert arrivals == ([ReceivedFrame(IN, PEER_MACS[IN], case.frame[14:])] if case.punted else [])
     for port in (WIDE, NARROW):
         expected = [case.out[port]] if port in case.out else []
         assert [ends[port].recv(1 << 16) for _ in expected] == expected
@@ -171,17 +171,17 @@ def test_each_fixture_becomes_what_the_reference_says(
     drops = switch.counters.drops
     assert {DropReason(r): n for r, n in enumerate(drops) if n} == {r: case.drops.count(r) for r in case.drops}
     assert switch.counters.forwarded == switch.counters.frames_out == len(case.out) + 2
-    assert switch.counters.handed_up == len(arrivals)
+    assert switch.counters.punted == len(arrivals)
 
 
-def test_frames_of_all_fixtures_in_one_burst_get_each_its_own_verdict(
+def test_frames_of_all_fixtures_in_one_burst_get_each_its_own_ack(
     switch: Plane, ends: dict[int, socket.socket]
 ) -> None:
     order = Random(7).choices(CASES, k=4 * len(CASES))
     for case in order:
         ends[IN].send(case.frame)
     arrivals = take_in(switch, len(order))
-    assert sorted(arrival.frame for arrival in arrivals) == sorted(case.frame[14:] for case in order if case.handed_up)
+    assert sorted(arrival.frame for arrival in arrivals) == sorted(case.frame[14:] for case in order if case.punted)
     for port in (WIDE, NARROW):  # what is urgent overtakes the rest
         expected = [case.out[port] for case in order if port in case.out]
         assert sorted(ends[port].recv(1 << 16) for _ in expected) == sorted(expected)
@@ -234,7 +234,7 @@ def test_what_is_none_of_our_business_is_not_even_counted(
 def test_a_broadcast_hello_is_handed_up(switch: Plane, ends: dict[int, socket.socket]) -> None:
     hello = BROADCAST + frame(bytes(32), kind=Kind.HELLO)[6:]
     ends[IN].send(hello)
-    assert take_in(switch, 1) == [Arrival(IN, PEER_MACS[IN], hello[14:])]
+    assert take_in(switch, 1) == [ReceivedFrame(IN, PEER_MACS[IN], hello[14:])]
 
 
 def test_a_plane_does_not_hear_itself(node: Plane, ends: dict[int, socket.socket]) -> None:

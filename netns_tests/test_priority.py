@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterator
 import pytest
 from pyroute2 import IPRoute
 
-from gdp.effects import Arrival
 from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import ETHER_BYTES, FLAGS_AT, decode
 from gdp.frame.kinds import Flag, Kind
 from gdp.ports.raw import RawPlane
+from gdp.sansio import ReceivedFrame
 from netns_tests.rows import KINDS, Row, frame, mac_of
 from netns_tests.spaces import Space
 from netns_tests.test_planes import far_end, poll_until
@@ -131,7 +131,7 @@ def test_a41_a_neighbours_hello_is_not_lost_in_a_flood_of_strangers(reader: RawP
         for number in range(5_000):
             sender.send(hello_frame(number, b"\x06" + number.to_bytes(5, "big")))
         sender.send(hello_frame(9_999))
-    got = poll_until(reader, lambda: reader.counters.handed_up > 0)
+    got = poll_until(reader, lambda: reader.counters.punted > 0)
     assert decode(got[0].frame).number == 9_999
     begun_s = now_s = time.monotonic()
     while now_s < begun_s + 0.3:
@@ -147,8 +147,8 @@ def test_a_neighbour_that_has_gone_is_a_stranger_again_for_the_plane(reader: Raw
         reader.set_neighbours(0, known)
         with far_end("q0") as sender:
             sender.send(hello_frame(7))
-        had = reader.counters.handed_up
-        got = poll_until(reader, lambda had=had: reader.counters.handed_up > had)  # type: ignore[misc]
+        had = reader.counters.punted
+        got = poll_until(reader, lambda had=had: reader.counters.punted > had)  # type: ignore[misc]
         assert [decode(each.frame).number for each in got] == [7]
 
 
@@ -163,10 +163,10 @@ def test_a_reader_that_did_not_read_for_a_while_gets_first_what_neighbours_say_t
         for number in range(URGENT):
             sender.send(frame(urgent=True, number=number))
         sender.send(hello)
-    got: list[Arrival] = []
+    got: list[ReceivedFrame] = []
     while len(got) <= ORDINARY + URGENT:
         had = len(got)
-        got += poll_until(reader, lambda had=had: reader.counters.handed_up > had)  # type: ignore[misc]
+        got += poll_until(reader, lambda had=had: reader.counters.punted > had)  # type: ignore[misc]
     headers = [decode(each.frame) for each in got]
     assert headers[0].kind == Kind.HELLO
     assert [each.number for each in headers[1 : URGENT + 1] if each.flags & Flag.URGENT] == list(range(URGENT))

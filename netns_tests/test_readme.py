@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from netns_tests.cable import Terminals, cable
+from netns_tests.cable import Terminals, sim_link
 from netns_tests.spaces import Space
 from proxy.recordings.compare import compare
 from tests.machines import Machines
@@ -24,7 +24,7 @@ def test_a_recording_goes_from_one_machine_to_the_other_by_the_commands_of_a_pag
     page: list[Block], space: Space, tmp_path: Path
 ) -> None:
     machines = Machines(tmp_path)
-    with cable(space) as into_server:
+    with sim_link(space) as into_server:
         terminals = Terminals(machines, into_server)
         try:
             printed = _follow(machines, terminals, page)

@@ -13,7 +13,7 @@ from gdp.nodes.node_log import LOOK_S
 from gdp.stores.audit_log import verify_audit
 from gdp.stores.issue import renew_node
 from gdp.stores.rollover import begin_rollover, finish_rollover, trust_successor
-from netns_tests.cable import Terminals, cable
+from netns_tests.cable import Terminals, sim_link
 from netns_tests.spaces import Space
 from tests.machines import Machines
 from tests.pages import ROOT, blocks
@@ -32,7 +32,7 @@ def test_no_message_is_lost_while_memberships_and_the_root_are_replaced(space: S
     homes = {"robot": machines.robot, "server": machines.server}
     nodes = [homes[machine] / each for machine, folders in _NODES.items() for each in folders]
     domain = machines.robot / "lab"
-    with cable(space) as into_server:
+    with sim_link(space) as into_server:
         terminals = Terminals(machines, into_server)
         try:
             _stand_up(machines, terminals)

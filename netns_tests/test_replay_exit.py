@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from netns_tests.cable import Terminals, cable
+from netns_tests.cable import Terminals, sim_link
 from netns_tests.spaces import Space
 from tests.machines import Machines
 from tests.pages import ROOT, blocks
@@ -22,7 +22,7 @@ def test_gdp_replay_exits_1_for_a_reliable_topic_without_a_reader_and_0_once_it_
     space: Space, tmp_path: Path
 ) -> None:
     machines = Machines(tmp_path)
-    with cable(space) as into_server:
+    with sim_link(space) as into_server:
         terminals = Terminals(machines, into_server)
         try:
             recorder = _stand_up(machines, terminals)

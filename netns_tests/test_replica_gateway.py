@@ -21,12 +21,12 @@ import pytest
 from pyroute2 import IPRoute
 
 from fog.machine import MachineState
-from fog.providers.local import trouble
+from fog.providers.local import fault_injection
+from fog.providers.local.machine_handle import find
+from fog.providers.local.netlinks import UP, exists
 from fog.providers.local.provider import LocalProvider
-from fog.providers.local.standing import find
-from fog.providers.local.wire import UP, exists
 from fog.site import open_site
-from fog.supervisor.ground import local_provider
+from fog.supervisor.infrastructure import local_provider
 from fog.supervisor.journal import Journal
 from fog.topology import AUTOMATIC_REPLICA, Gateway
 from gdp.errors import LocalError
@@ -89,7 +89,7 @@ def test_the_uplink_moves_from_machine_to_machine(provider: LocalProvider) -> No
     assert [machine_of(provider, each).is_gateway for each in (first, second)] == [False, True]
     assert not exists(find(provider.runs, first).space, UP)
     lost = find(provider.runs, second)
-    trouble.kill(provider.runs, second)
+    fault_injection.kill(provider.runs, second)
     assert not exists(lost.gateway, lost.uplink_plug)
     assert exists(lost.gateway, UP)
 

@@ -128,7 +128,7 @@ def test_a53_commands_that_are_up_keep_only_what_they_need(commands: Commands, s
     switch = commands.start("gdp.cli.switch", "switch", "--data-plane", "raw")
     switch.until('"ready"')
     rib = commands.start("gdp.cli.rib", "rib", "--await-iface", "30")
-    proxy = commands.start("proxy.cli", "proxy", "--await-iface", "30")
+    proxy = commands.start("proxy.cli.proxy", "proxy", "--await-iface", "30")
     for node in (rib, proxy):
         node.until('"ready"')
     for node in (switch, rib, proxy):

@@ -14,7 +14,7 @@ from typing import Final
 
 import pytest
 
-from gdp.host.run_registry import Runs
+from gdp.host.run_registry import RunRegistry
 from netns_tests.lifetimes import LEASE_S, Lifetime, noted
 from proxy.recordings.reader import BagReader
 
@@ -226,7 +226,7 @@ def test_a_kept_ring_stands_until_it_is_taken_down(demo: Path) -> None:
     ended = ring(demo, "--rate", 0, "--keep")
     assert ended.returncode == 0, ended.stderr
     run = ended.stderr.split("The ring of run ")[1].split(" ")[0]
-    records = Runs()
+    records = RunRegistry()
     assert run not in records.sweep()
     assert left_of(run) != []
     down = ring("--down")

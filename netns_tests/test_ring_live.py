@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import LocalError
-from gdp.host.run_registry import Runs
+from gdp.host.run_registry import RunRegistry
 from netns_tests.lifetimes import LEASE_S
 from netns_tests.test_ring import PROJECT, WHERE, command, crossed, left_of, ring, topics
 from proxy.endpoints.ros1.install import rospy_folder
@@ -88,7 +88,7 @@ def test_kept_nodes_talk_on_and_the_ring_comes_down_when_told() -> None:
         if os.getuid() == 0 and Path(f"/run/netns/gdp-{run}-nuc1").exists() and Path("/usr/bin/rostopic").exists():
             told = subprocess.run(inside, capture_output=True, text=True, timeout=30, check=True)
             assert told.stdout.count("hello") == 2
-        assert run not in Runs().sweep()
+        assert run not in RunRegistry().sweep()
     finally:
         ring("--down")
     assert left_of(run) == []

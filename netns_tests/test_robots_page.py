@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from netns_tests.cable import Terminals, cable
+from netns_tests.cable import Terminals, sim_link
 from netns_tests.spaces import Space
 from tests.machines import Machines
 from tests.pages import ROOT, Block, blocks_between
@@ -83,7 +83,7 @@ def machines(tmp_path: Path) -> Machines:
 
 @pytest.fixture
 def into_server(space: Space) -> Iterator[list[str]]:
-    with cable(space) as words:
+    with sim_link(space) as words:
         yield words
 
 

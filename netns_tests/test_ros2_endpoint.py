@@ -49,7 +49,7 @@ def far() -> Iterator[Peer]:
         yield peer
 
 
-def test_a_message_crosses_the_cable_both_ways(far: Peer) -> None:
+def test_a_message_crosses_the_sim_link_both_ways(far: Peer) -> None:
     far.tell("!out = talk(String, '/out'); listen(String, '/back')")
     command = [sys.executable, "-m", "netns_tests.ros2_child", str(DOMAIN), NODE]
     child = subprocess.Popen(command, stdin=subprocess.PIPE, env={**os.environ, **SUBNET})

@@ -20,7 +20,7 @@ from pyroute2 import IPRoute
 
 from gdp.crypto.certificates import Role
 from gdp.host import netns_files
-from gdp.host.run_registry import Run, Runs
+from gdp.host.run_registry import Run, RunRegistry
 from gdp.metadata import Metadata
 from gdp.simulation.namespaces import Namespaces
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
@@ -131,7 +131,7 @@ def tell(robot: subprocess.Popen[bytes], word: object) -> None:
 
 @pytest.fixture
 def field() -> Iterator[Field]:
-    run = Runs().start()
+    run = RunRegistry().start()
     with ExitStack() as undo:
         undo.callback(run.end)
         yield Field(run, undo)

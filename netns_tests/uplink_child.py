@@ -16,7 +16,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from gdp.client.member import Member, Topic
+from gdp.client.participant import Participant, Topic
 from gdp.control.settings import NodeSettings
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import incarnation, wall_clock_ms
@@ -32,7 +32,7 @@ PATIENCE_S = 30.0
 class Robot:
     """Asks as it is told."""
 
-    def __init__(self, member: Member, runtime: Runtime, topic: Topic, requests: int, size: int) -> None:
+    def __init__(self, member: Participant, runtime: Runtime, topic: Topic, requests: int, size: int) -> None:
         self._member, self._runtime, self._service = member, runtime, topic.name
         self._requests, self._body = requests, bytes(size)
         self._stream = member.call(topic, b"requests")
@@ -68,13 +68,13 @@ def main(service: str, identity_at: str, root: str, device: str, role: str, *loa
     policy = Policy(load_root(Path(root)), [])
     (topic,) = DelegationStore(Path(identity_at) / DELEGATIONS, identity)
     assert topic.name.to_text() == service
-    member = Member(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes))
+    member = Participant(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes))
     plane = RawPlane([device])
     runtime = Runtime(member, plane)
     if role == "serve":
         member.serve(topic, b"a replica")
         print("up", flush=True)
-        runtime.run(lambda: bool(member.take_messages() and False))
+        runtime.run(lambda: bool(member.poll_messages() and False))
         return
     robot = Robot(member, runtime, topic, *map(int, load))
     words = os.fdopen(os.dup(sys.stdin.fileno()), "rb", buffering=0)

@@ -52,7 +52,7 @@ class Case:
     frame: bytes
     out: dict[int, bytes] = field(default_factory=dict)
     drops: tuple[DropReason, ...] = ()
-    handed_up: bool = False
+    punted: bool = False
 
 
 def frame(
@@ -117,10 +117,10 @@ CASES = [
     Case("an alternate that is too narrow", frame(RESCUED, bytes(701 - 96)), drops=(DropReason.TOO_BIG,)),
     Case("an alternate that is down too", frame(CUT_OFF), drops=(DropReason.PORT_DOWN,)),
     Case("an alternate goes round no more often", frame(RESCUED, hops_left=1), drops=(DropReason.HOPS_EXPIRED,)),
-    Case("a miss", frame(NOBODY), handed_up=True),
-    Case("a neighbour's word", frame(ONE, kind=Kind.HELLO), handed_up=True),
-    Case("a neighbour's unknown word", frame(ONE, kind=0xFF, hops_left=0), handed_up=True),
-    Case("a neighbour's word whose length is wrong", frame(ONE, kind=0x80, length=60_000), handed_up=True),
+    Case("a miss", frame(NOBODY), punted=True),
+    Case("a neighbour's word", frame(ONE, kind=Kind.HELLO), punted=True),
+    Case("a neighbour's unknown word", frame(ONE, kind=0xFF, hops_left=0), punted=True),
+    Case("a neighbour's word whose length is wrong", frame(ONE, kind=0x80, length=60_000), punted=True),
     Case("one hop left", frame(ONE, hops_left=1), drops=(DropReason.HOPS_EXPIRED,)),
     Case("no hops left", frame(ONE, hops_left=0), drops=(DropReason.HOPS_EXPIRED,)),
     Case("a miss with one hop left", frame(NOBODY, hops_left=1), drops=(DropReason.HOPS_EXPIRED,)),

@@ -25,8 +25,8 @@ from gdp.crypto.keys import SigningKey
 from gdp.errors import ConfigError
 from gdp.nodes.config import RibConfig, SwitchConfig
 from gdp.nodes.schema import Section
-from proxy import cli, delegate_cli, replay_cli
-from proxy.config import ProxyConfig, Rule
+from proxy.cli import delegate, proxy, replay
+from proxy.config.config import ProxyConfig, Rule
 from ring import cli as ring
 from tests.machines import Machines
 from tests.pages import PAGES, ROOT, Block, anchors, blocks, blocks_between, commands, links, rows
@@ -42,9 +42,9 @@ APPS = {
     "gdp": gdp.app,
     "gdp-switch": switch.app,
     "gdp-rib": rib.app,
-    "gdp-proxy": cli.app,
-    "gdp-delegate": delegate_cli.app,
-    "gdp-replay": replay_cli.app,
+    "gdp-proxy": proxy.app,
+    "gdp-delegate": delegate.app,
+    "gdp-replay": replay.app,
     "fog": fog,
     "scripts/ring_topology.sh": ring.app,
     "scripts/fog_demo.sh": demo.app,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from proxy.faults import Fault
+from proxy.bridge.faults import Fault
 from tests.pages import ROOT, rows
 
 PAGE = ROOT / "docs/tutorials/robots.md"

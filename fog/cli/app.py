@@ -11,9 +11,9 @@ from typing import Annotated
 
 import typer
 
-from fog.cli import changing, looking
-from fog.cli.ending import down
-from fog.cli.launching import launch
+from fog.cli import scale, status
+from fog.cli.down import down
+from fog.cli.launch import launch
 from fog.cli.plan import cost_table, plan
 from fog.providers.local.cli import local_app
 from fog.site import open_site
@@ -36,16 +36,16 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("launch")(launch)
-app.command("ls")(looking.ls)
-app.command("status")(looking.status)
-app.add_typer(changing.scale, name="scale")
-app.command("logs")(changing.logs)
-app.command("ssh")(changing.ssh)
-app.command("cost")(looking.cost)
+app.command("ls")(status.ls)
+app.command("status")(status.status)
+app.add_typer(scale.scale, name="scale")
+app.command("logs")(scale.logs)
+app.command("ssh")(scale.ssh)
+app.command("cost")(status.cost)
 app.command("plan")(plan)
 app.command("prices")(cost_table)
 app.command("down")(down)
-app.command("supervise")(changing.supervise)
+app.command("supervise")(scale.supervise)
 app.add_typer(local_app(lambda: open_site(None).state / "local"), name="local")
 
 

@@ -1,170 +1,202 @@
-"""What ``fog launch`` shows before anything starts: the machines with their price, the nodes, what they offer.
+"""``fog launch``: a launch file's cluster, and the robot's nodes once it serves.
 
-Place: command; reads launch files, starts nothing.
+Place: command.
 """
 
 from __future__ import annotations
 
-import json
-import shlex
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+import logging
+import signal
+import time
+from contextlib import closing
+from dataclasses import replace
+from enum import Enum
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final, Optional
 
 import typer
-from rich.console import Group
-from rich.table import Table
-from rich.text import Text
+from rich.console import Console
 
-from fog.cli.views import a_console, latency_lines, ms_text
-from fog.cluster import CloudNode
-from fog.latency.known import Latency
-from fog.launch.load import Loaded, key_values, load
-from fog.launch.probe import kept, offered
-from fog.offer import Offer
-from fog.plan.duration import duration_text
-from fog.plan.target import Target
-from fog.topology import Gateway
+from fog.cli.down import clear, end_cluster
+from fog.cli.market import choices, market, reached, refusal
+from fog.cli.options import AsJson, SiteFile, State, opened, peeked
+from fog.cli.robot_nodes import INTERRUPTED, resolved, run
+from fog.cli.views import a_console, event_line, print_json
+from fog.cluster import ClusterPlan
+from fog.site import Site, save_topology, with_gateway
+from fog.supervisor.background import LOG, ensure
+from fog.supervisor.infrastructure import command_of, open_provider, set_up
+from fog.supervisor.journal import Entry, Journal
+from gdp.errors import LocalError
 
-__all__ = ["BY_HAND", "Priced", "loaded_from", "priced", "show_plan"]
+__all__ = ["GatewayKind", "begin", "follow", "launch"]
 
-MONTH_H: Final = 730.0  # as clouds reckon
-BY_HAND: Final = "by fog down"
+log = logging.getLogger(__name__)
+
+_WAIT_S: Final = 600.0
+_STEP_S: Final = 0.05
 
 
-def loaded_from(path: Path, words: Sequence[str], *, dry_run: bool) -> Loaded:
-    """Run a launch file as ``fog launch FILE name:=value ...`` does.
+class GatewayKind(Enum):
+    """What the gateway of a site without ``fog.yaml`` is."""
 
-    Args:
-        dry_run: start nothing, not even to find out what the nodes offer; what was found before is used.
+    DEDICATED = "dedicated"
+    REPLICA = "replica"
+
+
+File = Annotated[Path, typer.Argument(metavar="FILE", help="a launch file (.py), or a plan (.json)")]
+Words = Annotated[Optional[list[str]], typer.Argument(metavar="[NAME:=VALUE]...")]  # noqa: UP045
+DryRun = Annotated[bool, typer.Option("--dry-run", help="show machines and price, start nothing")]
+Detach = Annotated[bool, typer.Option("--detach", help="end when the replicas serve; start no node of the robot")]
+Keep = Annotated[bool, typer.Option("--keep", help="leave the cluster when the robot's nodes end")]
+Gateway = Annotated[
+    Optional[GatewayKind],  # noqa: UP045
+    typer.Option("--gateway", help="without fog.yaml: a switch of its own, or one of the machines"),
+]
+EndsWith = Annotated[str, typer.Option("--ends-with", hidden=True)]  # what else, such as another launch, ends it
+Wait = Annotated[float, typer.Option("--wait", metavar="S", min=0.0, help="how long the replicas may take")]
+
+
+def launch(
+    file: File,
+    arguments: Words = None,
+    site: SiteFile = None,
+    state: State = None,
+    dry_run: DryRun = False,
+    detach: Detach = False,
+    keep: Keep = False,
+    wait: Wait = _WAIT_S,
+    gateway: Gateway = None,
+    ends_with: EndsWith = "",
+    as_json: AsJson = False,
+) -> None:
+    """Start a launch file's cluster; when its replicas serve, run the robot's nodes until they end or Ctrl-C.
+
+    With the robot's nodes the cluster ends, unless it is kept. A cluster of that name that is up takes the new plan.
+    What robot's nodes with output="log" print goes to a file in the state folder, which is told.
+
+    \b
+    Examples:
+      fog launch demo.launch.py --dry-run
+      fog launch demo.launch.py
+      fog launch demo.launch.py rate:=10 --detach
+    """
+    from fog.cli.launch_view import BY_HAND, Priced, loaded_from, show_plan  # half a second to import
+
+    def priced(here: Site) -> Priced:
+        loaded = loaded_from(file, arguments or [], dry_run=dry_run)
+        said = loaded.plan
+        plan = replace(
+            said,
+            idle_s=here.idle_s if said.idle_s is None else said.idle_s,
+            budget_usd=here.budget_usd if said.budget_usd is None else said.budget_usd,
+        )
+        with closing(open_provider(here, [each.region for each in plan.machines if each.region])) as provider:
+            found = market(provider, plan.machines, here.latencies)
+            if None in (chosen := choices(found, plan.machines)):
+                raise LocalError(refusal(provider, plan.machines, chosen))
+            plan, target = reached(plan, found)
+            topology = here.topology if here.provider == "local" else None
+            chosen = choices(found, plan.machines)
+            whole = Priced(replace(loaded, plan=plan), chosen, found.latencies, target, topology)
+        ends = ends_with
+        if not (detach or keep or loaded.keep) and loaded.robot_nodes:
+            ends = "the robot's nodes"
+        show_plan(whole, f"with {ends}, or {BY_HAND}" if ends else BY_HAND, as_json=as_json)
+        return whole
+
+    if dry_run:
+        with peeked(site, state) as here:
+            priced(_with(here, gateway))
+        return
+    with opened(site, state) as (known, journal):
+        here = _with(known, gateway)
+        loaded = priced(here).loaded
+        plan = loaded.plan
+        for node in plan.nodes:
+            command_of(here, node)  # complains before anything is started
+        robot = [] if detach else [resolved(each) for each in loaded.robot_nodes]
+        last = max((each.id for each in journal.events(last=1)), default=0)
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # it ends as with Ctrl-C
+        try:
+            begin(here, journal, plan)
+            follow(here, journal, plan, last, wait, as_json=as_json)
+        except KeyboardInterrupt:
+            if not detach:
+                end_cluster(here, journal, plan.name, "its launch was broken off", as_json=as_json)
+                clear(here, journal)
+            raise typer.Exit(INTERRUPTED) from None
+        if detach or not loaded.robot_nodes:
+            return
+        try:
+            code = run(robot, here.state / "nodes")
+        finally:
+            if not (keep or loaded.keep):
+                end_cluster(here, journal, plan.name, "its launch has ended", as_json=as_json)
+                clear(here, journal)
+        raise typer.Exit(code)
+
+
+def _with(site: Site, gateway: GatewayKind | None) -> Site:
+    return site if gateway is None else with_gateway(site, is_replica=gateway is GatewayKind.REPLICA)
+
+
+def begin(site: Site, journal: Journal, plan: ClusterPlan) -> None:
+    """Write that a cluster is wanted, and see to it that somebody cares for it.
 
     Raises:
-        ConfigError, LocalError: see ``fog.launch.load.load``.
+        LocalError: what it is to stand on cannot be made.
     """
-    loaded = load(path, key_values(words), None if dry_run else offered)
-    if loaded.is_known or kept(loaded.plan.nodes) is None:
-        return loaded
-    return load(path, key_values(words), offered)
+    set_up(site)
+    save_topology(site)
+    journal.want(plan, time.time())
+    ensure(site)
 
 
-@dataclass(frozen=True, slots=True)
-class Priced:
-    """A launch file's plan with what its machines would be.
+def follow(site: Site, journal: Journal, plan: ClusterPlan, after: int, patience_s: float, *, as_json: bool) -> None:
+    """Show what happens until all replicas serve; where no watch can tell, until all machines are up.
 
-    Args:
-        choice: for each machine of the plan.
-        latencies: of the regions that have offers.
-        target: what the plan's availability came to; None: it asks for none.
-        topology: the gateways to the machines; None: their provider makes none.
+    Raises:
+        LocalError: they do not in time, or the cluster is given up.
     """
+    console = a_console(stderr=as_json)
+    end_s = time.monotonic() + patience_s
+    wanted = len(plan.machines)
+    trouble = ""
+    is_watched = site.watch is not None
+    serve = "replicas serve" if is_watched else "machines up (not watched)"
 
-    loaded: Loaded
-    choice: Sequence[Offer | None]
-    latencies: Mapping[str, Latency]
-    target: Target | None = None
-    topology: Gateway | None = None
+    def news() -> tuple[int, str]:
+        last, told = after, trouble
+        for entry in journal.events(plan.name, after=after):
+            _tell(entry, console, as_json=as_json)
+            last = entry.id
+            told = entry.detail if entry.what in ("trouble", "refused", "failed") else told
+        return last, told
 
-    def gateway(self, offer: Offer | None) -> Gateway | None:
-        """Return the gateway next to a machine; None: there is none."""
-        return self.topology.serving(offer.region) if self.topology is not None and offer is not None else None
-
-
-def priced(said: Priced) -> dict[str, object]:
-    """Return a plan with its price, as ``--json`` says it."""
-    plan = said.loaded.plan
-    machines = [
-        {
-            "hardware": wanted.hardware.to_text(),
-            "spot": wanted.is_spot,
-            "wanted_region": wanted.region or None,
-            "provider": offer.provider if offer else None,
-            "region": offer.region if offer else None,
-            "type": offer.type_name if offer else None,
-            "usd_per_hour": offer.usd_per_hour if offer else None,
-            "latency_ms": said.latencies[offer.region].ms if offer else None,
-            "latency_source": said.latencies[offer.region].source if offer else None,
-            "gateway": {"name": gateway.gateway, "replica": gateway.replica}
-            if (gateway := said.gateway(offer)) is not None
-            else None,
-        }
-        for wanted, offer in zip(plan.machines, said.choice, strict=True)
-    ]
-    per_hour = None if None in said.choice else round(sum(offer.usd_per_hour for offer in said.choice if offer), 6)
-    target = said.target
-    return {
-        "cluster": plan.name,
-        "nodes": [_words(node) for node in plan.nodes],
-        "machines": machines,
-        "latencies": {region: asdict(each) for region, each in said.latencies.items()},
-        "usd_per_hour": per_hour,
-        "usd_per_month": None if per_hour is None else round(per_hour * MONTH_H, 2),
-        "budget_usd": plan.budget_usd,
-        "idle_s": plan.idle_s,
-        "availability": target
-        and {
-            "target": target.availability,
-            "replicas": len(target.machines),
-            "p_vm": target.p_vm,
-            "p_system": target.p_system,
-            "assumptions": list(target.assumptions),
-        },
-        "carried": [{"kind": each.kind, "name": each.name, "type": each.type_name} for each in plan.carried]
-        if said.loaded.is_known
-        else None,
-        "robot_nodes": [_words(each.node) for each in said.loaded.robot_nodes],
-        "notes": list(said.loaded.notes),
-    }
+    with console.status("") as spinner:
+        while True:
+            serving = sum(each.is_serving for each in journal.machines(plan.name, gone=False))
+            spinner.update(f"{serving} of {wanted} {serve}")
+            after, trouble = news()
+            if serving >= wanted:
+                break
+            if not (now := journal.cluster(plan.name)).is_up:
+                raise LocalError(f"cluster {plan.name} is given up: {now.why}")
+            if time.monotonic() >= end_s:
+                why = f"; last trouble: {trouble}" if trouble else ""
+                raise LocalError(
+                    f"{serving} of {wanted} {serve} after {patience_s:g} s{why}; it goes on: fog status;"
+                    f" the supervisor's words are in {site.state / LOG}"
+                )
+            ensure(site)
+            time.sleep(_STEP_S)
+    if not as_json:
+        console.print(f"{wanted} {serve}", style="green" if is_watched else "yellow")
 
 
-def show_plan(said: Priced, ends: str = BY_HAND, *, as_json: bool) -> None:
-    """Print a plan with its price, as a table or as one JSON object.
-
-    Args:
-        ends: how the cluster ends, but for its limits.
-    """
-    fields = priced(said)
+def _tell(entry: Entry, console: Console, *, as_json: bool) -> None:
     if as_json:
-        typer.echo(json.dumps(fields, ensure_ascii=False))
-        return
-    plan = said.loaded.plan
-    table = Table(title=f"cluster {plan.name}", title_justify="left", title_style="bold")
-    for heading in ("hardware", "kind", "region", "ms", "type", "USD/h"):
-        table.add_column(heading, justify="right" if heading in ("ms", "USD/h") else "left")
-    for wanted, offer in zip(plan.machines, said.choice, strict=True):
-        kind = "spot" if wanted.is_spot else "on demand"
-        found = (wanted.region, "-", "none", "-")
-        if offer:
-            found = offer.region, ms_text(said.latencies[offer.region]), offer.type_name, f"{offer.usd_per_hour:.4f}"
-        table.add_row(wanted.hardware.to_text(), kind, *map(Text, found), style=None if offer else "red")
-    a_console().print(Group(table, *_lines(said, fields, ends)))
-
-
-def _lines(said: Priced, fields: dict[str, object], ends: str) -> list[Text]:
-    plan, loaded, target = said.loaded.plan, said.loaded, said.target
-    limits = [f"after {duration_text(plan.idle_s)} without a call"] if plan.idle_s else []
-    limits += [f"after {plan.budget_usd:g} USD"] if plan.budget_usd else []
-    carried = [f"{each.kind} {each.name} ({each.type_name})" for each in plan.carried]
-    unknown = "found out by starting the nodes once on this machine"
-    replicas = {each.gateway: None for each in map(said.gateway, said.choice) if each is not None and each.replica}
-    lines = [
-        ("price", f"{fields['usd_per_hour']} USD/h, {fields['usd_per_month']} USD/month"),
-        ("ends", ", ".join([ends, *limits])),
-        *(("latency", line) for line in latency_lines(said.latencies)),
-        *(("gateway", f"{name}: one of these machines") for name in replicas),
-        *(("cloud", _words(node)) for node in plan.nodes),
-        ("offers", ", ".join(carried) or "nothing" if loaded.is_known else unknown),
-        *(("robot", _words(each.node)) for each in loaded.robot_nodes),
-        *(("note", note) for note in loaded.notes),
-    ]
-    if target is not None:
-        reached = f"{len(target.machines)} replicas: none is up {target.p_system:.4%} of the time"
-        lines.insert(1, ("target", f"{target.availability:.6g} available; {reached}"))
-        lines += [("assumed", line) for line in target.assumptions]
-    if fields["usd_per_hour"] is None:
-        lines[0] = ("price", "unknown: a machine is not to be had")
-    return [Text(f"{key:<7} {value}", style="yellow" if key == "note" else "") for key, value in lines]
-
-
-def _words(node: CloudNode) -> str:
-    return shlex.join((node.package, node.executable, *node.arguments))
+        print_json(entry)
+    else:
+        console.print(event_line(entry))

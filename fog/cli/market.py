@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from fog.catalog.measured import measured
-from fog.cluster import ClusterPlan, Wanted
+from fog.cluster import ClusterPlan, MachineRequest
 from fog.hardware import Hardware
 from fog.latency.known import Latencies, Latency
 from fog.offer import Offer
@@ -40,7 +40,7 @@ class Market:
         return {region: each.ms for region, each in self.latencies.items() if each.ms is not None}
 
 
-def market(provider: Provider, machines: Sequence[Wanted], latencies: Latencies) -> Market:
+def market(provider: Provider, machines: Sequence[MachineRequest], latencies: Latencies) -> Market:
     """Ask a provider, and measure how far its regions are where that is not known.
 
     Raises:
@@ -66,7 +66,7 @@ def reached(plan: ClusterPlan, found: Market) -> tuple[ClusterPlan, Target | Non
     return replace(plan, machines=target.machines, availability=None), target
 
 
-def choices(found: Market, machines: Sequence[Wanted]) -> list[Offer | None]:
+def choices(found: Market, machines: Sequence[MachineRequest]) -> list[Offer | None]:
     """Return for each machine what it would be now; None: nothing like it is to be had."""
     chosen: list[Offer | None] = []
     for each in machines:
@@ -78,7 +78,7 @@ def choices(found: Market, machines: Sequence[Wanted]) -> list[Offer | None]:
     return chosen
 
 
-def refusal(provider: Provider, machines: Sequence[Wanted], chosen: Sequence[Offer | None]) -> str:
+def refusal(provider: Provider, machines: Sequence[MachineRequest], chosen: Sequence[Offer | None]) -> str:
     """Return why a machine is not to be had, and what comes nearest."""
     missing = next(each for each, offer in zip(machines, chosen, strict=True) if offer is None)
     try:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from fog.cluster import Carried
+from fog.cluster import ExportedInterface
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.kem import KemPublicKey
 from gdp.crypto.subject import Subject
@@ -77,7 +77,7 @@ class Authority:
         return Enrolled(identity.member, files)
 
     def grant(
-        self, application: Application, carried: Iterable[Carried], *, until_unix_s: float, unix_s: float
+        self, application: Application, carried: Iterable[ExportedInterface], *, until_unix_s: float, unix_s: float
     ) -> tuple[Membership, Granted]:
         """Return the membership that a machine asks for, and what lets it give (serve, publish) what is carried.
 
@@ -98,7 +98,7 @@ class Authority:
         ]
         return member, Granted(member.wire, tuple(given))
 
-    def let(self, node: Path, delegations: Path, carried: Iterable[Carried], *, days: float) -> None:
+    def grant_access(self, node: Path, delegations: Path, carried: Iterable[ExportedInterface], *, days: float) -> None:
         """Let a node of the robot's side take (call, read) what is carried; what it had of these names is replaced.
 
         Raises:
@@ -114,14 +114,14 @@ class Authority:
         return self.owner / OWNER_PUBLIC
 
 
-def metadata_of(carried: Carried) -> Metadata:
+def metadata_of(carried: ExportedInterface) -> Metadata:
     """Return what the overlay's name of a service, action or topic digests."""
     own = {"kind": carried.kind, "name": carried.name, "type": carried.type_name}
     more = carried.options.get("metadata", {})
     return Metadata({**own, **more} if isinstance(more, dict) else own)
 
 
-def right_of(carried: Carried, *, gives: bool) -> Right:
+def right_of(carried: ExportedInterface, *, gives: bool) -> Right:
     """Return what is needed to give, or to take, what is carried."""
     give, take = _RIGHTS.get(carried.kind, _CALLS)
     return give if gives else take

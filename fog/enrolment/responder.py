@@ -12,20 +12,20 @@ import time
 from collections import OrderedDict
 from typing import Final, TypeVar
 
+from fog.enrolment.credentials import IssuedCredentials
 from fog.enrolment.members import Authority
-from fog.enrolment.papers import Papers
 from fog.enrolment.tickets import Kept, Tickets
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.identity import node_metadata
-from gdp.crypto.x509_form import Holder, read_request
+from gdp.crypto.x509_profile import SubjectInfo, read_request
 from gdp.errors import DropReason, StatementError
 from gdp.stores.audit_log import AuditLog
 from gdp.stores.keyring import ROOT_CERTIFICATE, load_root
 from gdp.trust.audit import Action, AuditTrail
 from gdp.trust.enrolment import (
     REFUSED,
-    Answer,
     Application,
+    EnrolmentResponse,
     Request,
     has_tag,
     open_request,
@@ -138,7 +138,9 @@ class Responder:
         self._trail.note(Action.ACCEPTED, _WHAT, who=papers.proxy, about=about)
         return sealed
 
-    def _issue(self, kept: Kept, applications: tuple[Application, ...], unix_s: float) -> tuple[bytes, Papers]:
+    def _issue(
+        self, kept: Kept, applications: tuple[Application, ...], unix_s: float
+    ) -> tuple[bytes, IssuedCredentials]:
         granted, members = [], list[Membership]()
         for planned, application in zip(kept.seats, applications, strict=True):
             member, given = self._authority.grant(
@@ -149,8 +151,8 @@ class Responder:
         root = load_root(self._authority.domain / ROOT_CERTIFICATE)
         serves = next((each for each in members if each.role is Role.PROXY), members[0])
         until_s = float(min(each.not_after_unix_s for each in members))
-        papers = Papers(serves.name.to_text(), until_s, tuple(each.fingerprint.hex() for each in members))
-        return Answer(root.to_pem(), tuple(granted)).to_wire(), papers
+        papers = IssuedCredentials(serves.name.to_text(), until_s, tuple(each.fingerprint.hex() for each in members))
+        return EnrolmentResponse(root.to_pem(), tuple(granted)).to_wire(), papers
 
     def _may_open(self, identifier: bytes) -> bool:
         opened = self._opened.get(identifier, 0)
@@ -166,7 +168,7 @@ class Responder:
         self._trail.note(Action.REFUSED, _WHAT, about=about, reason=reason)
 
 
-def _verified(identifier: bytes, kept: Kept, asked: Request) -> list[Holder]:
+def _verified(identifier: bytes, kept: Kept, asked: Request) -> list[SubjectInfo]:
     """Return whom the applications are about: exactly what was planned, each with its key's proof.
 
     Raises:
@@ -185,7 +187,7 @@ def _verified(identifier: bytes, kept: Kept, asked: Request) -> list[Holder]:
     return holders
 
 
-def _keys_digest(asked: Request, holders: list[Holder]) -> bytes:
+def _keys_digest(asked: Request, holders: list[SubjectInfo]) -> bytes:
     told = hashlib.sha256()
     for application, holder in zip(asked.applications, holders, strict=True):
         told.update(holder.key.compressed + application.kem.wire)

@@ -19,13 +19,15 @@ from gdp.stores.keyring import load_domain
 from gdp.trust.audit import Action
 from gdp.trust.revocation import Revocation
 
-__all__ = ["take_back"]
+__all__ = ["revoke_credentials"]
 
 _SUFFIX: Final = ".revoke"
 _TITLE_CHARS: Final = 32  # of the fingerprint
 
 
-def take_back(domain: Path, folder: Path, fingerprints: Iterable[str], *, until_unix_s: float, unix_s: float) -> bool:
+def revoke_credentials(
+    domain: Path, folder: Path, fingerprints: Iterable[str], *, until_unix_s: float, unix_s: float
+) -> bool:
     """Write a revocation for each membership, and remove those whose time is over; return whether one is new.
 
     Args:

@@ -22,8 +22,8 @@ from enum import Enum
 from pathlib import Path
 from typing import Final
 
-from fog.cluster import Carried
-from fog.enrolment.papers import Papers
+from fog.cluster import ExportedInterface
+from fog.enrolment.credentials import IssuedCredentials
 from gdp.crypto.certificates import Role
 from gdp.crypto.kem import KemPrivateKey
 from gdp.errors import StoreError
@@ -60,7 +60,7 @@ class PlannedSeat:
     """A seat, and what its member may give (serve, publish)."""
 
     seat: Seat
-    carried: tuple[Carried, ...] = ()
+    carried: tuple[ExportedInterface, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,7 +84,7 @@ class Kept:
     until_unix_s: float
     keys: bytes | None
     answer: bytes | None = field(repr=False)
-    papers: Papers | None
+    papers: IssuedCredentials | None
     is_reported: bool
 
 
@@ -97,7 +97,7 @@ class News:
     machine: str
     report: Report
     detail: str
-    papers: Papers | None
+    papers: IssuedCredentials | None
 
 
 class Tickets:
@@ -193,7 +193,7 @@ class Tickets:
                 ).rowcount
             )
 
-    def complete(self, identifier: bytes, answer: bytes, papers: Papers, detail: str) -> bool:
+    def complete(self, identifier: bytes, answer: bytes, papers: IssuedCredentials, detail: str) -> bool:
         """Keep what the keys of a ticket are given, and tell the supervisor; False: the ticket was taken back."""
         text = json.dumps(asdict(papers))
         with self._writing() as file:
@@ -275,14 +275,15 @@ def _seats_text(seats: Sequence[PlannedSeat]) -> str:
 def _seats(text: str) -> tuple[PlannedSeat, ...]:
     return tuple(
         PlannedSeat(
-            Seat(each["folder"], Role(each["role"]), each["label"]), tuple(Carried(**one) for one in each["carried"])
+            Seat(each["folder"], Role(each["role"]), each["label"]),
+            tuple(ExportedInterface(**one) for one in each["carried"]),
         )
         for each in json.loads(text)
     )
 
 
-def _papers(text: str | None) -> Papers | None:
+def _papers(text: str | None) -> IssuedCredentials | None:
     if text is None:
         return None
     told = json.loads(text)
-    return Papers(told["proxy"], told["until_unix_s"], tuple(told["fingerprints"]))
+    return IssuedCredentials(told["proxy"], told["until_unix_s"], tuple(told["fingerprints"]))

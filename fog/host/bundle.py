@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path, PurePosixPath
 from typing import Final
 
-from fog.machine import Boot, Program
+from fog.machine import MachineBundle, Program
 from gdp.errors import LocalError
 from gdp.stores.files import private, write_all
 
@@ -21,7 +21,7 @@ BOOT_FILE: Final = "boot.json"
 TICKET_FILE: Final = "enrolment.json"  # until the machine has enrolled
 
 
-def pack(boot: Boot) -> dict[str, bytes]:
+def pack(boot: MachineBundle) -> dict[str, bytes]:
     """Return all files below the machine's folder: the boot's own, and ``boot.json``, which tells its programs.
 
     Raises:
@@ -38,7 +38,7 @@ def pack(boot: Boot) -> dict[str, bytes]:
     return {**boot.files, BOOT_FILE: json.dumps(told, indent=1).encode()}
 
 
-def unpack(files: Mapping[str, bytes]) -> Boot:
+def unpack(files: Mapping[str, bytes]) -> MachineBundle:
     """Return the boot that was packed.
 
     Raises:
@@ -47,7 +47,7 @@ def unpack(files: Mapping[str, bytes]) -> Boot:
     if BOOT_FILE not in files:
         raise LocalError(f"no {BOOT_FILE}")
     others = {path: content for path, content in files.items() if path != BOOT_FILE}
-    return Boot(others, read_programs(files[BOOT_FILE]))
+    return MachineBundle(others, read_programs(files[BOOT_FILE]))
 
 
 def read_programs(content: bytes) -> tuple[Program, ...]:
@@ -74,7 +74,7 @@ def _refuse_what_cannot_start(program: Program) -> None:
         raise LocalError(f"{BOOT_FILE} is none: program {program.name!r} has no words, or other things than text")
 
 
-def install(home: Path, boot: Boot) -> None:
+def install(home: Path, boot: MachineBundle) -> None:
     """Write all files of a boot into a machine's folder, for its owner's eyes.
 
     Raises:

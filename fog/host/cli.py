@@ -14,8 +14,8 @@ from typing import Annotated
 
 import typer
 
+from fog.host.agent import MachineAgent
 from fog.host.bundle import TICKET_FILE
-from fog.host.host import Host
 from gdp.cli.node import Verbose, emit, failing_clearly, set_up_logging
 from gdp.cli.version import Version
 
@@ -48,7 +48,7 @@ def machine(
     del version  # it ends the command by itself
     set_up_logging(verbose=verbose)
     with failing_clearly():
-        host = Host(home.resolve())
+        host = MachineAgent(home.resolve())
         if await_go and not sys.stdin.readline():
             log.warning("nobody says go, so nobody has a record of this machine")
             raise typer.Exit(1)

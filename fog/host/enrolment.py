@@ -26,8 +26,8 @@ from gdp.trust.enrolment import (
     ANSWER_HEAD_BYTES,
     ANSWER_SECRET_BYTES,
     REFUSED,
-    Answer,
     Application,
+    EnrolmentResponse,
     Ticket,
     answer_bytes,
     apply,
@@ -83,7 +83,7 @@ def _application(home: Path, ticket: Ticket, index: int) -> Application:
     return apply(ticket.token, keys.key, read_public(folder / REQUEST), keys.kem.public)
 
 
-def _ask(ticket: Ticket, applications: list[Application], patience_s: float) -> Answer:
+def _ask(ticket: Ticket, applications: list[Application], patience_s: float) -> EnrolmentResponse:
     """Ask until somebody answers."""
     end_s, pause_s, reason = time.monotonic() + patience_s, _PAUSE_MIN_S, ""
     secret = secrets.token_bytes(ANSWER_SECRET_BYTES)

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from fog.launch.carried import Offered, SomeReplication
+from fog.launch.cluster_spec import ClusterSpec
+from fog.launch.interfaces import Offered, SomeReplication
 from fog.launch.machines import CloudMachine
 from fog.launch.unreturned import note
-from fog.launch.wish import Wish
 
 __all__ = ["FogCluster"]
 
@@ -59,7 +59,7 @@ class FogCluster:
     ) -> None:
         super().__init__()
         self.cloud_nodes = tuple(cloud_nodes)
-        self.wish = Wish.checked(
+        self.cluster_spec = ClusterSpec.checked(
             tuple(deployments),
             name=name,
             replicas=replicas,

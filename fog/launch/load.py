@@ -15,14 +15,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Final, TypeAlias
 
-from fog.cluster import Carried, CloudNode, ClusterPlan
+from fog.cluster import CloudNode, ClusterPlan, ExportedInterface
 from fog.launch.cloud_node import cloud_node
+from fog.launch.cluster_spec import ClusterSpec
 from fog.launch.description import DeclareLaunchArgument, LaunchDescription, Node
 from fog.launch.entity import FogCluster
+from fog.launch.lazy_names import has_ros_launch
 from fog.launch.robot_node import RobotNode
 from fog.launch.unreturned import watch
-from fog.launch.wish import Wish
-from fog.launch.words import has_ros_launch
 from gdp.errors import ConfigError, GdpError, LocalError
 
 __all__ = ["Loaded", "Probe", "key_values", "load"]
@@ -68,7 +68,8 @@ def load(path: Path, arguments: Mapping[str, str], probe: Probe | None = None) -
     """Run a launch file, or read the plan (``.json``) that one came to.
 
     Args:
-        probe: finds out what nodes offer (``fog.launch.probe.offered``) where the file does not say; None: left open.
+        probe: finds out what nodes offer (``fog.launch.interface_discovery.offered``) where the file does not say;
+        None: left open.
 
     Raises:
         ConfigError: the file is not there, not Python, or fails; the text names the line.
@@ -93,29 +94,29 @@ def load(path: Path, arguments: Mapping[str, str], probe: Probe | None = None) -
 
 
 def _planned(
-    clusters: Sequence[tuple[Wish, Sequence[CloudNode]]], robot: Sequence[RobotNode], probe: Probe | None
+    clusters: Sequence[tuple[ClusterSpec, Sequence[CloudNode]]], robot: Sequence[RobotNode], probe: Probe | None
 ) -> Loaded:
     if len(clusters) != 1:
         raise LocalError(f"the launch description has {len(clusters)} FogClusters: expected one")
-    wish, nodes = clusters[0]
-    found: Sequence[Carried] = ()
-    if wish.carried is None and probe is not None:
-        wish.plan(nodes)  # complains before anything is started
-        found = wish.carry(probe(nodes))
-    is_known = wish.carried is not None or probe is not None
-    return Loaded(wish.plan(nodes, found), tuple(robot), wish.keep, wish.notes, is_known)
+    cluster_spec, nodes = clusters[0]
+    found: Sequence[ExportedInterface] = ()
+    if cluster_spec.carried is None and probe is not None:
+        cluster_spec.plan(nodes)  # complains before anything is started
+        found = cluster_spec.carry(probe(nodes))
+    is_known = cluster_spec.carried is not None or probe is not None
+    return Loaded(cluster_spec.plan(nodes, found), tuple(robot), cluster_spec.keep, cluster_spec.notes, is_known)
 
 
 def _gathered(
     description: object, arguments: Mapping[str, str]
-) -> tuple[list[tuple[Wish, list[CloudNode]]], list[RobotNode]]:
+) -> tuple[list[tuple[ClusterSpec, list[CloudNode]]], list[RobotNode]]:
     if not isinstance(description, LaunchDescription):
         raise LocalError(f"{_ENTRY} returned {type(description).__name__}: expected a LaunchDescription")
     given = _arguments(description.entities, arguments)
     clusters, robot = [], []
     for entity in description.entities:
         if isinstance(entity, FogCluster):
-            clusters.append((entity.wish, [_node(each, given) for each in entity.cloud_nodes]))
+            clusters.append((entity.cluster_spec, [_node(each, given) for each in entity.cloud_nodes]))
         elif isinstance(entity, Node):
             robot.append(RobotNode(cloud_node(entity, given), entity.output))
         elif not isinstance(entity, DeclareLaunchArgument):

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Final
 
-from fog.cluster import Wanted
+from fog.cluster import MachineRequest
 from fog.hardware import Hardware
 from gdp.errors import LocalError
 
@@ -40,9 +40,9 @@ class CloudMachine:
     def __post_init__(self) -> None:
         object.__setattr__(self, "_read", Hardware.from_text(self.hardware))
 
-    def wanted(self) -> Wanted:
+    def wanted(self) -> MachineRequest:
         """Return it as a plan says it."""
-        return Wanted(self._read, self.region, self.is_spot)
+        return MachineRequest(self._read, self.region, self.is_spot)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,9 @@ class SpotMachine(CloudMachine):
     is_spot: ClassVar[bool] = True
 
 
-def filled(deployments: Sequence[CloudMachine], replicas: int | None) -> tuple[tuple[Wanted, ...], tuple[str, ...]]:
+def filled(
+    deployments: Sequence[CloudMachine], replicas: int | None
+) -> tuple[tuple[MachineRequest, ...], tuple[str, ...]]:
     """Return the machines of a cluster, and what people should be told about them.
 
     Too short a list is filled up with copies of its machines, in other regions.

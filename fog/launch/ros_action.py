@@ -26,12 +26,12 @@ from launch.event_handlers import OnShutdown
 
 from fog.cluster import CloudNode, ClusterPlan
 from fog.launch import entity
-from fog.launch.hold import Gate
-from fog.launch.probe import offered
-from fog.launch.real_node import cloud_node
+from fog.launch.interface_discovery import offered
+from fog.launch.launch_ros_adapter import cloud_node
+from fog.launch.start_gate import StartGate
 from fog.launch.unreturned import watch_ros_launch
 from gdp.errors import GdpError, LocalError
-from gdp.host.run_registry import Run, Runs
+from gdp.host.run_registry import Run, RunRegistry
 
 __all__ = ["FogCluster"]
 
@@ -57,11 +57,11 @@ class FogCluster(entity.FogCluster, Action):  # type: ignore[misc]  # launch has
         if self._starting is not None:
             return  # it stands twice in the description
         nodes = tuple(cloud_node(node, context) for node in self.cloud_nodes)
-        name = self.wish.plan(nodes).name
-        for note in self.wish.notes:
+        name = self.cluster_spec.plan(nodes).name
+        for note in self.cluster_spec.notes:
             log.warning("cluster %s: %s", name, note)
-        run = Runs().start()
-        gate = Gate.shut(run.directory / "gate")
+        run = RunRegistry().start()
+        gate = StartGate.remove_entity(run.directory / "gate")
         _hold(context, shlex.join(gate.prefix()))
         context.register_event_handler(_Fails(lambda event: isinstance(event, _Failed) and event.cluster is self))
         self._starting = context.asyncio_loop.create_task(self._start(context, nodes, run.directory, gate))
@@ -71,20 +71,20 @@ class FogCluster(entity.FogCluster, Action):  # type: ignore[misc]  # launch has
         """Return what is done when the cluster serves, or cannot."""
         return self._starting
 
-    async def end(self, name: str, run: Run, gate: Gate) -> None:
+    async def end(self, name: str, run: Run, gate: StartGate) -> None:
         """Break off what is being started, let go of those who wait, and give the machines back unless kept."""
         if self._starting is not None:
             self._starting.cancel()
             await asyncio.wait([self._starting])
         gate.open(serving=False)
-        if self._is_begun and not self.wish.keep:
+        if self._is_begun and not self.cluster_spec.keep:
             # In a session of its own: a second Ctrl-C must not leave machines running.
             process = await asyncio.create_subprocess_exec(*FOG, "down", name, "--if-up", start_new_session=True)
             if await process.wait():
                 log.error("cluster not ended name=%s; try: fog down %s", name, name)
         run.end()
 
-    async def _start(self, context: LaunchContext, nodes: tuple[CloudNode, ...], folder: Path, gate: Gate) -> None:
+    async def _start(self, context: LaunchContext, nodes: tuple[CloudNode, ...], folder: Path, gate: StartGate) -> None:
         try:
             await self._begin(context, nodes, folder / "plan.json")
         except asyncio.CancelledError:
@@ -102,7 +102,7 @@ class FogCluster(entity.FogCluster, Action):  # type: ignore[misc]  # launch has
         """
         plan = await self._plan(context, nodes)
         file.write_text(plan.to_json(), encoding="utf-8")
-        ends = () if self.wish.keep else ("--ends-with", "this launch")
+        ends = () if self.cluster_spec.keep else ("--ends-with", "this launch")
         self._is_begun = True
         process = await asyncio.create_subprocess_exec(
             *FOG, "launch", str(file), "--detach", *ends, stderr=asyncio.subprocess.PIPE
@@ -118,10 +118,10 @@ class FogCluster(entity.FogCluster, Action):  # type: ignore[misc]  # launch has
             raise LocalError(f"cluster {plan.name} did not start: {reason or f'exit code {code}'}")
 
     async def _plan(self, context: LaunchContext, nodes: tuple[CloudNode, ...]) -> ClusterPlan:
-        if self.wish.carried is not None:
-            return self.wish.plan(nodes)
+        if self.cluster_spec.carried is not None:
+            return self.cluster_spec.plan(nodes)
         found = await context.asyncio_loop.run_in_executor(None, offered, nodes)
-        return self.wish.plan(nodes, self.wish.carry(found))
+        return self.cluster_spec.plan(nodes, self.cluster_spec.carry(found))
 
 
 class _Ending(Action):  # type: ignore[misc]  # launch has no types
@@ -129,7 +129,7 @@ class _Ending(Action):  # type: ignore[misc]  # launch has no types
 
     _ending: asyncio.Task[None] | None = None
 
-    def __init__(self, cluster: FogCluster, name: str, run: Run, gate: Gate) -> None:
+    def __init__(self, cluster: FogCluster, name: str, run: Run, gate: StartGate) -> None:
         super().__init__()
         self._cluster, self._name, self._run, self._gate = cluster, name, run, gate
 

@@ -14,10 +14,10 @@ from launch.utilities import perform_substitutions
 from launch_ros.actions import Node
 
 from fog.cluster import CloudNode
-from fog.launch.real_node import cloud_node
+from fog.launch.cluster_spec import ClusterSpec
+from fog.launch.launch_ros_adapter import cloud_node
 from fog.launch.robot_node import RobotNode
 from fog.launch.ros_action import FogCluster
-from fog.launch.wish import Wish
 from gdp.errors import LocalError
 
 __all__ = ["gathered"]
@@ -25,7 +25,7 @@ __all__ = ["gathered"]
 
 def gathered(
     description: object, arguments: Mapping[str, str]
-) -> tuple[list[tuple[Wish, list[CloudNode]]], list[RobotNode]]:
+) -> tuple[list[tuple[ClusterSpec, list[CloudNode]]], list[RobotNode]]:
     """Return the clusters of a description and the nodes of the robot's side, includes and groups followed.
 
     Raises:
@@ -35,7 +35,7 @@ def gathered(
         raise LocalError(f"expected a LaunchDescription, not {type(description).__name__}")
     context = LaunchContext(noninteractive=True)
     context.launch_configurations.update(arguments)
-    clusters: list[tuple[Wish, list[CloudNode]]] = []
+    clusters: list[tuple[ClusterSpec, list[CloudNode]]] = []
     robot: list[RobotNode] = []
     waiting: list[object] = [description]
     while waiting:
@@ -44,7 +44,7 @@ def gathered(
         if condition is not None and not condition.evaluate(context):
             continue
         if isinstance(entity, FogCluster):
-            clusters.append((entity.wish, [cloud_node(each, context) for each in entity.cloud_nodes]))
+            clusters.append((entity.cluster_spec, [cloud_node(each, context) for each in entity.cloud_nodes]))
         elif isinstance(entity, Node):
             robot.append(RobotNode(cloud_node(entity, context), _output(entity, context)))
         elif isinstance(entity, ExecuteProcess):

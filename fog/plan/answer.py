@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from fog.cluster import Wanted
+from fog.cluster import MachineRequest
 from fog.hardware import Hardware
 from fog.offer import Offer
 from fog.plan.choice import BY_BOTH, Choice, Weights, choose
@@ -118,8 +118,8 @@ def _placed(
     steady = joint([down] * question.spot + [ON_DEMAND_DOWN] * (question.on_demand + more.get("on-demand", 0)))
 
     def place(spots: int) -> tuple[list[Choice], float]:
-        wanted = [Wanted(question.hardware, is_spot=True)] * spots
-        wanted += [Wanted(question.hardware)] * more.get("on-demand", 0)
+        wanted = [MachineRequest(question.hardware, is_spot=True)] * spots
+        wanted += [MachineRequest(question.hardware)] * more.get("on-demand", 0)
         choices = choose(offers, wanted, question.latency_ms, question.weights)
         regions: dict[str, list[float]] = {}
         for choice in choices[:spots]:
@@ -149,7 +149,7 @@ def _pool(question: Question, offers: Sequence[Offer], down: float, factor: floa
 
 
 def _cheapest(question: Question, offers: Sequence[Offer], *, spot: bool) -> float:
-    wanted = Wanted(question.hardware, is_spot=spot)
+    wanted = MachineRequest(question.hardware, is_spot=spot)
     return choose(offers, [wanted], question.latency_ms, question.weights)[0].offer.usd_per_hour
 
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from fog.cluster import Wanted
+from fog.cluster import MachineRequest
 from fog.hardware import Hardware
 from fog.offer import Offer
 from gdp.errors import LocalError
@@ -51,7 +51,7 @@ class Choice:
 
 def choose(
     offers: Sequence[Offer],
-    wanted: Sequence[Wanted],
+    wanted: Sequence[MachineRequest],
     latency_ms: Mapping[str, float] | None = None,
     weights: Weights = BY_BOTH,
     used: Sequence[str] = (),
@@ -79,7 +79,7 @@ def choose(
 
 def _best(
     offers: Sequence[Offer],
-    wanted: Wanted,
+    wanted: MachineRequest,
     latency_ms: Mapping[str, float],
     weights: Weights,
     regions: Counter[str],
@@ -105,7 +105,7 @@ def _best(
 def _why(
     best: Offer,
     fitting: Sequence[Offer],
-    wanted: Wanted,
+    wanted: MachineRequest,
     latency_ms: Mapping[str, float],
     regions: Counter[str],
     avoid: frozenset[str],
@@ -129,7 +129,7 @@ def _why(
     return "; ".join(words)
 
 
-def _nearest(wanted: Wanted, allowed: Sequence[Offer], offers: Sequence[Offer]) -> str:
+def _nearest(wanted: MachineRequest, allowed: Sequence[Offer], offers: Sequence[Offer]) -> str:
     kind = "spot" if wanted.is_spot else "on-demand"
     asked = f"no {kind} machine with {wanted.hardware.to_text()}" + (f" in {wanted.region}" if wanted.region else "")
     if elsewhere := sorted(

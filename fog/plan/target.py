@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-from fog.cluster import Wanted
+from fog.cluster import MachineRequest
 from fog.offer import Offer
 from fog.plan.answer import assumptions
 from fog.plan.choice import BY_BOTH, Choice, Weights, choose
@@ -38,7 +38,7 @@ class Target:
     """
 
     availability: float
-    machines: tuple[Wanted, ...]
+    machines: tuple[MachineRequest, ...]
     p_vm: float
     p_system: float
     assumptions: tuple[str, ...]
@@ -46,7 +46,7 @@ class Target:
 
 def machines_for(
     availability: float,
-    listed: Sequence[Wanted],
+    listed: Sequence[MachineRequest],
     offers: Sequence[Offer],
     seen: Measured,
     latency_ms: Mapping[str, float] | None = None,

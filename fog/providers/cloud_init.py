@@ -27,7 +27,7 @@ import yaml
 from pydantic import AfterValidator, Field
 
 from fog.host.bundle import BOOT_FILE, read_programs
-from fog.host.life import NODE_USER
+from fog.host.managed_process import NODE_USER
 from fog.providers.requirements import pinned, read_requirements
 from gdp.errors import LocalError
 from gdp.nodes.schema import ExistingFile, Section

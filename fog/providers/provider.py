@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 from fog.hardware import Hardware
-from fog.machine import Boot, Machine, MachineSpec
+from fog.machine import Machine, MachineBundle, MachineSpec
 from fog.offer import Offer
 
 __all__ = ["GatewayProvider", "Provider"]
@@ -34,7 +34,7 @@ class Provider(Protocol):
         """
         ...
 
-    def create(self, spec: MachineSpec, boot: Boot) -> str:
+    def create(self, spec: MachineSpec, boot: MachineBundle) -> str:
         """Ask for a machine; return its id as soon as the provider has taken the request.
 
         Raises:

@@ -23,7 +23,7 @@ __all__ = ["LOG", "ensure", "held", "is_running", "pid_of"]
 _LOCK: Final = "supervisor.lock"
 LOG: Final = "supervisor.log"
 _LOG_MAX_BYTES: Final = 4 << 20
-_RIVAL_S: Final = 1.0  # the lock is held by whoever looks, or by another supervisor
+_CONFLICT_S: Final = 1.0  # the lock is held by whoever looks, or by another supervisor
 _STEP_S: Final = 0.05
 
 
@@ -89,7 +89,7 @@ def held(site: Site, descriptor: int | None) -> Iterator[None]:
             yield
         return
     with (site.state / _LOCK).open("a") as file:
-        end_s = time.monotonic() + _RIVAL_S
+        end_s = time.monotonic() + _CONFLICT_S
         while True:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

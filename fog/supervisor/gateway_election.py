@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from fog.supervisor.decide import Patience
+from fog.supervisor.reconcile import Timeouts
 from fog.supervisor.record import Record
 
 __all__ = ["Election", "elect", "is_settling"]
@@ -33,7 +33,7 @@ class Election:
     reason: str
 
 
-def elect(group: Sequence[Record], label: str, now_s: float, patience: Patience) -> Election | None:
+def elect(group: Sequence[Record], label: str, now_s: float, patience: Timeouts) -> Election | None:
     """Return the change of a group's gateway that is due; None: it stays as it is, or no machine can be the gateway.
 
     Preferred are, in this order: machines that are up, that are heard, that were not the gateway before, that are not
@@ -54,28 +54,28 @@ def elect(group: Sequence[Record], label: str, now_s: float, patience: Patience)
         return Election(best, None, "the first machine" if lost is None else f"{lost.name} is gone: {lost.reason}")
     if old.up_unix_s is None:
         is_cut_off = best.up_unix_s is not None and not best.is_serving  # else its switch may forward already
-        is_late = now_s - _last_s(old) >= (patience.gateway_s if is_cut_off else patience.lonely_s)
+        is_late = now_s - _last_s(old) >= (patience.gateway_s if is_cut_off else patience.partition_timeout_s)
         return Election(best, old, f"{old.name} does not come up") if is_late else None
     if best.up_unix_s is None:
         return None  # it would forward nothing yet
     if old.is_outgoing:
         return Election(best, old, f"{old.name} leaves: {old.reason}")
-    if _is_suspect(old, there, now_s, patience) and _last_s(best) < (old.unheard_unix_s or 0.0):
+    if _is_suspect(old, there, now_s, patience) and _last_s(best) < (old.unreachable_unix_s or 0.0):
         return Election(best, old, f"behind {old.name} no replica is heard")
     return None
 
 
-def is_settling(group: Sequence[Record], label: str, now_s: float, patience: Patience) -> bool:
+def is_settling(group: Sequence[Record], label: str, now_s: float, patience: Timeouts) -> bool:
     """Return whether the gateway is so new that the silence of the machines behind it means nothing yet."""
     since_s = max((_last_s(each) for each in group if each.gateway == label), default=0.0)
     return now_s - since_s < patience.gateway_s
 
 
-def _is_suspect(gateway: Record, there: Sequence[Record], now_s: float, patience: Patience) -> bool:
+def _is_suspect(gateway: Record, there: Sequence[Record], now_s: float, patience: Timeouts) -> bool:
     """Return whether a gateway that runs seems to forward nothing: no replica of the group is heard."""
-    if gateway.unheard_unix_s is None or any(each.is_serving for each in there):
+    if gateway.unreachable_unix_s is None or any(each.is_serving for each in there):
         return False
-    since_s = max(gateway.unheard_unix_s + patience.unheard_s, _last_s(gateway) + patience.gateway_s)
+    since_s = max(gateway.unreachable_unix_s + patience.unreachable_s, _last_s(gateway) + patience.gateway_s)
     return now_s >= since_s
 
 

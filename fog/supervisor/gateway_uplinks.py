@@ -11,11 +11,11 @@ from functools import partial
 
 from fog.machine import Machine, MachineState
 from fog.providers.provider import GatewayProvider
-from fog.supervisor.decide import Patience
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.gateway_election import elect, is_settling
 from fog.supervisor.journal import Journal
 from fog.supervisor.machine_actions import ATTACH, DETACH, MachineActions
+from fog.supervisor.reconcile import Timeouts
 from fog.supervisor.record import Record
 
 __all__ = ["GatewayUplinks"]
@@ -24,7 +24,7 @@ __all__ = ["GatewayUplinks"]
 class GatewayUplinks:
     """Keeps one gateway in each group of machines."""
 
-    def __init__(self, journal: Journal, events: EventLog, actions: MachineActions, patience: Patience) -> None:
+    def __init__(self, journal: Journal, events: EventLog, actions: MachineActions, patience: Timeouts) -> None:
         self._journal = journal
         self._events = events
         self._actions = actions

@@ -15,12 +15,12 @@ from enum import Enum
 from pathlib import Path
 from typing import Final
 
-from fog.cluster import ClusterPlan, Wanted
-from fog.enrolment.papers import Papers
+from fog.cluster import ClusterPlan, MachineRequest
+from fog.enrolment.credentials import IssuedCredentials
 from fog.hardware import Hardware
 from fog.machine import MachineSpec, MachineState
 from fog.offer import Offer
-from fog.supervisor.record import Ending, Record
+from fog.supervisor.record import Outcome, Record
 from gdp.errors import LocalError, StoreError
 
 __all__ = ["LAST_WORDS", "Cluster", "Entry", "Journal"]
@@ -276,10 +276,10 @@ def _record(items: dict[str, object]) -> Record:
                 spec=MachineSpec(
                     spec["cluster"], spec["name"], Offer(**{**offer, "hardware": Hardware(**offer["hardware"])})
                 ),
-                wanted=Wanted(Hardware(**wanted["hardware"]), wanted["region"], wanted["is_spot"]),
-                papers=Papers(papers["proxy"], papers["until_unix_s"], tuple(papers["fingerprints"])),
+                wanted=MachineRequest(Hardware(**wanted["hardware"]), wanted["region"], wanted["is_spot"]),
+                papers=IssuedCredentials(papers["proxy"], papers["until_unix_s"], tuple(papers["fingerprints"])),
                 state=MachineState(rest["state"]),
-                ending=None if rest["ending"] is None else Ending(rest["ending"]),
+                ending=None if rest["ending"] is None else Outcome(rest["ending"]),
             )
     raise ValueError("a part is missing")
 

@@ -10,21 +10,21 @@ from dataclasses import replace
 from functools import partial
 from typing import Final
 
-from fog.cluster import CloudNode, ClusterPlan, Wanted
-from fog.enrolment.boots import machine_boot, node_names
-from fog.enrolment.papers import Papers
+from fog.cluster import CloudNode, ClusterPlan, MachineRequest
+from fog.enrolment.bootstrap import machine_boot, node_names
+from fog.enrolment.credentials import IssuedCredentials
 from fog.machine import Machine, MachineSpec, MachineState
 from fog.providers.provider import GatewayProvider, Provider
 from fog.site import Site
-from fog.supervisor.acts import Acts
-from fog.supervisor.decide import Action, Drain, Launch
+from fog.supervisor.actions import ActionRunner
 from fog.supervisor.event_log import EventLog
+from fog.supervisor.final_logs import keep, kept
 from fog.supervisor.journal import LAST_WORDS, Journal
-from fog.supervisor.last_words import keep, kept
 from fog.supervisor.machine_credentials import MachineCredentials
 from fog.supervisor.offer_cache import OfferCache
-from fog.supervisor.place import place
-from fog.supervisor.record import Ending, Record
+from fog.supervisor.placement import place
+from fog.supervisor.reconcile import Action, Drain, Launch
+from fog.supervisor.record import Outcome, Record
 
 __all__ = ["ATTACH", "DETACH", "MachineActions"]
 
@@ -58,7 +58,7 @@ class MachineActions:
         self._events = events
         self._credentials = credentials
         self._command = command
-        self._acts = Acts(wake)
+        self._acts = ActionRunner(wake)
         self._offers = OfferCache(site.latencies)
         self._swept: set[str] = set()  # machines of which nothing is left
 
@@ -104,16 +104,16 @@ class MachineActions:
             known = replace(record, released_unix_s=now_s, ending=action.ending, reason=action.reason)
             self._events.put(known, "leaving", action.reason, now_s)
             self._credentials.revoke(known, now_s)
-            self.release(plan, record.name, record.id, is_lost=action.ending is not Ending.RELEASED)
+            self.release(plan, record.name, record.id, is_lost=action.ending is not Outcome.RELEASED)
 
     def collect_results(self, now_s: float) -> None:
         """Write the results of finished actions into the journal."""
-        for done in self._acts.take_done():
+        for done in self._acts.poll_done():
             if done.what == "create":
                 record = next(each for each in self._journal.machines(done.cluster) if each.name == done.machine)
                 if done.error is not None:
                     reason = str(done.error)
-                    self._events.put(record.ended(Ending.FAILED, reason, now_s), "refused", reason, now_s)
+                    self._events.put(record.ended(Outcome.FAILED, reason, now_s), "refused", reason, now_s)
                 elif not record.is_gone:
                     self._events.put(replace(record, id=done.result), "", "", now_s)
             elif done.what in (ATTACH, DETACH) and done.error is not None:  # tried again at the next look
@@ -142,7 +142,7 @@ class MachineActions:
         """Give back what the journal does not know, or thought gone; and what is left of a machine that is gone."""
         cluster = plan.name
         known = {each.name for each in records if not each.is_gone}
-        lost = {each.name for each in records if each.is_gone and each.ending is not Ending.RELEASED}
+        lost = {each.name for each in records if each.is_gone and each.ending is not Outcome.RELEASED}
         for name, machine in seen.items():
             if name in known or machine.id in self._swept or self.is_busy(cluster, name):
                 continue
@@ -152,7 +152,7 @@ class MachineActions:
                 self._journal.tell(now_s, cluster, name, "orphan", "nobody wants it: given back")
             self.release(plan, name, machine.id, is_lost=name in lost)
 
-    def _launch(self, plan: ClusterPlan, wanted: Wanted, records: list[Record], now_s: float) -> None:
+    def _launch(self, plan: ClusterPlan, wanted: MachineRequest, records: list[Record], now_s: float) -> None:
         begun_s = self._journal.cluster(plan.name).begun_unix_s
         past = [each for each in self._journal.machines(plan.name) if each.is_gone and each.asked_unix_s >= begun_s]
         offers = self._offers.get(self.provider, wanted, now_s)
@@ -180,7 +180,7 @@ class MachineActions:
             shares_host=self.provider.name == "local",
             uplink=uplink,
         )
-        record = Record(spec, wanted, Papers("", until_unix_s), now_s)
+        record = Record(spec, wanted, IssuedCredentials("", until_unix_s), now_s)
         records.append(record)
         detail = f"{offer.region} {offer.type_name}, {offer.usd_per_hour:.4f} USD an hour: {choice.why}"
         self._events.put(record, "asked", detail, now_s)

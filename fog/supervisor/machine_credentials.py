@@ -12,14 +12,14 @@ from dataclasses import replace
 from typing import TypeAlias
 
 from fog.cluster import ClusterPlan
-from fog.enrolment.boots import machine_seats
-from fog.enrolment.revoking import take_back
-from fog.enrolment.robot_side import reload
+from fog.enrolment.bootstrap import machine_seats
+from fog.enrolment.revoking import revoke_credentials
+from fog.enrolment.robot_config import reload
 from fog.enrolment.tickets import News, Report, Tickets
 from fog.site import Site
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.journal import Journal
-from fog.supervisor.record import Ending, Record
+from fog.supervisor.record import Outcome, Record
 from gdp.errors import LocalError
 from gdp.nodes.config import SwitchConfig
 from gdp.stores.issue import DAY_S
@@ -57,7 +57,7 @@ class MachineCredentials:
             LocalError: no domain there, or its root has run out.
         """
         root = load_domain(self._site.authority.domain).root
-        until_s = min(now_s + self._site.papers_days * DAY_S, float(root.validity.not_after_unix_s))
+        until_s = min(now_s + self._site.credential_days * DAY_S, float(root.validity.not_after_unix_s))
         if until_s <= now_s:
             raise LocalError("the root of the domain has run out")
         ticket = self._tickets.issue(
@@ -96,7 +96,7 @@ class MachineCredentials:
         papers = record.papers
         domain = self._site.authority.domain
         try:
-            if take_back(domain, folder, papers.fingerprints, until_unix_s=papers.until_unix_s, unix_s=now_s):
+            if revoke_credentials(domain, folder, papers.fingerprints, until_unix_s=papers.until_unix_s, unix_s=now_s):
                 config = SwitchConfig.load(switch)
                 reload(config.identity, config.control_socket)
         except LocalError as error:
@@ -107,7 +107,7 @@ class MachineCredentials:
         if not self._site.enrolment.revoke_misused or record.is_gone:
             self._events.put(record, "alarm", news.detail, now_s)
             return
-        ending = Ending.FAILED if record.served_unix_s is None else Ending.TAKEN
+        ending = Outcome.FAILED if record.served_unix_s is None else Outcome.TAKEN
         known = replace(record, released_unix_s=now_s, ending=ending, reason="its enrolment token was misused")
         self._events.put(known, "alarm", f"{news.detail}; it is revoked and replaced", now_s)
         self.revoke(known, now_s)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from fog.cluster import Wanted
+from fog.cluster import MachineRequest
 from fog.latency.known import Latencies
 from fog.offer import Offer
 from fog.providers.provider import Provider
@@ -26,13 +26,13 @@ class OfferCache:
 
     def __init__(self, latencies: Latencies) -> None:
         self.latencies = latencies
-        self._offers: dict[Wanted, tuple[float, list[Offer]]] = {}
+        self._offers: dict[MachineRequest, tuple[float, list[Offer]]] = {}
 
     def clear(self) -> None:
         """Drop all offers."""
         self._offers.clear()
 
-    def get(self, provider: Provider, wanted: Wanted, now_s: float) -> list[Offer]:
+    def get(self, provider: Provider, wanted: MachineRequest, now_s: float) -> list[Offer]:
         """Return what the provider offers of what is wanted, at most a minute old."""
         at_s, offers = self._offers.get(wanted, (0.0, []))
         if now_s - at_s >= _OFFERS_S or not offers:

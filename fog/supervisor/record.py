@@ -8,14 +8,14 @@ from __future__ import annotations
 from dataclasses import KW_ONLY, dataclass, replace
 from enum import Enum
 
-from fog.cluster import Wanted
-from fog.enrolment.papers import Papers
+from fog.cluster import MachineRequest
+from fog.enrolment.credentials import IssuedCredentials
 from fog.machine import Machine, MachineSpec, MachineState
 
-__all__ = ["Ending", "Record", "cost_usd", "learn"]
+__all__ = ["Outcome", "Record", "cost_usd", "learn"]
 
 
-class Ending(Enum):
+class Outcome(Enum):
     """How a machine ended."""
 
     RELEASED = "released"  # we gave it back
@@ -41,8 +41,8 @@ class Record:
     """
 
     spec: MachineSpec
-    wanted: Wanted
-    papers: Papers
+    wanted: MachineRequest
+    papers: IssuedCredentials
     asked_unix_s: float
     _: KW_ONLY
     id: str = ""
@@ -50,13 +50,13 @@ class Record:
     address: str = ""
     up_unix_s: float | None = None
     served_unix_s: float | None = None
-    unheard_unix_s: float | None = None
+    unreachable_unix_s: float | None = None
     noticed_unix_s: float | None = None
     leaves_at_unix_s: float | None = None
     drained_unix_s: float | None = None
     released_unix_s: float | None = None
     gone_unix_s: float | None = None
-    ending: Ending | None = None
+    ending: Outcome | None = None
     reason: str = ""
     gateway: str = ""
     gateway_unix_s: float | None = None
@@ -74,7 +74,7 @@ class Record:
     @property
     def is_serving(self) -> bool:
         """Return whether its replica takes calls, as far as is known."""
-        return not self.is_gone and self.served_unix_s is not None and self.unheard_unix_s is None
+        return not self.is_gone and self.served_unix_s is not None and self.unreachable_unix_s is None
 
     @property
     def is_outgoing(self) -> bool:
@@ -86,10 +86,10 @@ class Record:
         """Return whether it was given back."""
         return self.released_unix_s is not None
 
-    def ended(self, ending: Ending, reason: str, now_s: float) -> Record:
+    def ended(self, ending: Outcome, reason: str, now_s: float) -> Record:
         """Return it as gone."""
         return replace(
-            self, state=MachineState.GONE, gone_unix_s=now_s, ending=ending, reason=reason, unheard_unix_s=None
+            self, state=MachineState.GONE, gone_unix_s=now_s, ending=ending, reason=reason, unreachable_unix_s=None
         )
 
 
@@ -127,18 +127,18 @@ def learn(record: Record, seen: Machine | None, serves: bool | None, now_s: floa
 def _heard(record: Record, *, serves: bool, now_s: float) -> Record:
     if serves:
         first_s = now_s if record.served_unix_s is None else record.served_unix_s
-        return replace(record, served_unix_s=first_s, unheard_unix_s=None)
-    if record.up_unix_s is None or record.unheard_unix_s is not None:
+        return replace(record, served_unix_s=first_s, unreachable_unix_s=None)
+    if record.up_unix_s is None or record.unreachable_unix_s is not None:
         return record
-    return replace(record, unheard_unix_s=now_s)
+    return replace(record, unreachable_unix_s=now_s)
 
 
 def _missed(record: Record, seen: Machine | None, now_s: float, grace_s: float) -> Record:
     if seen is None and record.up_unix_s is None and now_s - record.asked_unix_s < grace_s:
         return record
     if record.is_released or record.drained_unix_s is not None:
-        return record.ended(record.ending or Ending.RELEASED, record.reason, now_s)
+        return record.ended(record.ending or Outcome.RELEASED, record.reason, now_s)
     said = seen.reason if seen is not None else ""
     if record.up_unix_s is None:
-        return record.ended(Ending.FAILED, said or "never came up", now_s)
-    return record.ended(Ending.TAKEN, record.reason or said or "gone without a word", now_s)
+        return record.ended(Outcome.FAILED, said or "never came up", now_s)
+    return record.ended(Outcome.TAKEN, record.reason or said or "gone without a word", now_s)

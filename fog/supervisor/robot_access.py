@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Final
 
 from fog.cluster import ClusterPlan
-from fog.enrolment.robot_side import forget_rules, introduce, reload_proxy
+from fog.enrolment.robot_config import add_rules, reload_proxy, remove_rules
 from fog.site import Site
 
 __all__ = ["RobotAccess"]
@@ -41,12 +41,12 @@ class RobotAccess:
         """
         authority = self._site.authority
         for path in self._site.robots:
-            introduce(path, authority, plan.name, plan.carried, days=_ROBOT_DAYS)
+            add_rules(path, authority, plan.name, plan.carried, days=_ROBOT_DAYS)
             reload_proxy(path)
         if self._site.watch is not None:
             keys, _ = self._site.watch
             services = [each for each in plan.carried if each.kind != "topic"]
-            authority.let(keys, keys / "delegations", services, days=_ROBOT_DAYS)
+            authority.grant_access(keys, keys / "delegations", services, days=_ROBOT_DAYS)
             self._on_names()
         self._plans[plan.name] = plan
 
@@ -54,7 +54,7 @@ class RobotAccess:
         """Remove the rules of a cluster; other clusters may serve the same names."""
         self._plans.pop(name, None)
         for path in self._site.robots:
-            if forget_rules(path, name):
+            if remove_rules(path, name):
                 for plan in self._plans.values():
-                    introduce(path, self._site.authority, plan.name, plan.carried, days=_ROBOT_DAYS)
+                    add_rules(path, self._site.authority, plan.name, plan.carried, days=_ROBOT_DAYS)
                 reload_proxy(path)

@@ -17,15 +17,15 @@ from fog.enrolment.tickets import Tickets
 from fog.machine import Machine, MachineState
 from fog.providers.provider import Provider
 from fog.site import Site
-from fog.supervisor.decide import Patience, decide
 from fog.supervisor.event_log import EventLog
+from fog.supervisor.events import changes
 from fog.supervisor.gateway_uplinks import GatewayUplinks
 from fog.supervisor.journal import Cluster, Journal
 from fog.supervisor.machine_actions import MachineActions
 from fog.supervisor.machine_credentials import MachineCredentials
+from fog.supervisor.reconcile import Timeouts, decide
 from fog.supervisor.record import Record, learn
 from fog.supervisor.robot_access import RobotAccess
-from fog.supervisor.story import changes
 from fog.supervisor.usage_limits import UsageLimits
 from gdp.errors import GdpError
 from gdp.stores.keyring import load_public_key
@@ -36,7 +36,7 @@ Heard: TypeAlias = "Mapping[str, frozenset[str]]"  # service -> proxies that ser
 
 _GRACE_POLLS: Final = 5  # looks in which a new machine may be missing
 _GRACE_MIN_S: Final = 2.0
-PATIENCE: Final = Patience()
+PATIENCE: Final = Timeouts()
 
 
 class Supervisor:
@@ -59,7 +59,7 @@ class Supervisor:
         command: Callable[[CloudNode], Sequence[str]],
         heard: Callable[[], Heard | None],
         on_names: Callable[[], None] = lambda: None,
-        patience: Patience = PATIENCE,
+        patience: Timeouts = PATIENCE,
     ) -> None:
         self._site = site
         self._journal = journal
@@ -112,7 +112,7 @@ class Supervisor:
         self._actions.close()
         self._actions.collect_results(time.time())
 
-    def look(self) -> None:
+    def reconcile(self) -> None:
         """Look at every cluster once, and do what is to be done.
 
         Raises:

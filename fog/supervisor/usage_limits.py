@@ -12,8 +12,8 @@ from typing import Final
 from fog.site import Site
 from fog.supervisor.activity import Activity
 from fog.supervisor.journal import Cluster, Journal
+from fog.supervisor.proxy_metrics import received_by, sent_by
 from fog.supervisor.record import Record, cost_usd
-from fog.supervisor.robot_calls import received_by, sent_by
 
 __all__ = ["UsageLimits"]
 

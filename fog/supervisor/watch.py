@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
-from gdp.client.member import Member
+from gdp.client.participant import Participant
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.errors import GdpError
@@ -86,7 +86,7 @@ class Watch:
     def _look(self) -> None:
         domain = Domain(root=self._identity / ROOT_CERTIFICATE, transit=None)
         identity, policy = load_member(self._identity, domain, Role.PROXY)
-        member = Member(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), fresh_bytes))
+        member = Participant(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), fresh_bytes))
         plane = RawPlane([self._iface])
         try:
             runtime = Runtime(member, plane)
@@ -98,7 +98,7 @@ class Watch:
                     self._again.clear()
                     called = self._call(member, DelegationStore(self._identity / DELEGATIONS, identity), called)
                 runtime.step(time.monotonic() + _STEP_S)
-                member.take_messages()
+                member.poll_messages()
                 if not member.attachment.is_attached:
                     attached_s = None
                 elif attached_s is None:
@@ -113,7 +113,7 @@ class Watch:
         finally:
             plane.close()
 
-    def _call(self, member: Member, held: DelegationStore, before: Iterable[Name]) -> list[Name]:
+    def _call(self, member: Participant, held: DelegationStore, before: Iterable[Name]) -> list[Name]:
         topics = {topic.name: topic for topic in held if Right.CALL in topic.delegation.rights}
         for name in before:
             if name not in topics:

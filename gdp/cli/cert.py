@@ -20,7 +20,7 @@ from gdp.cli.key import asked_passphrase, token_key
 from gdp.cli.output import moment, show, span
 from gdp.cli.rollover import described_root
 from gdp.crypto.certificates import Membership, Role
-from gdp.crypto.x509_form import read_request, to_pem
+from gdp.crypto.x509_profile import read_request, to_pem
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.stores.audit_log import note_once

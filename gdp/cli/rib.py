@@ -11,10 +11,10 @@ from gdp.cli.node import AwaitIface, Check, Config, Json, Verbose, emit, emit_wa
 from gdp.cli.version import Version
 from gdp.crypto.certificates import Role
 from gdp.names import Name
-from gdp.nodes.awaiting import await_device
 from gdp.nodes.config import RibConfig
 from gdp.nodes.membership import load_member
 from gdp.nodes.rib import run_rib
+from gdp.nodes.wait_for_device import wait_for_device
 
 __all__ = ["main"]
 
@@ -39,7 +39,7 @@ def rib(
             identity, _ = load_member(settings.identity, settings.domain, Role.RIB)
             _report("checked", f"configuration good: RIB {identity.name.short}", identity.name, json=json)
             return
-        await_device(settings.iface, await_iface)
+        wait_for_device(settings.iface, await_iface)
         run_rib(
             settings,
             lambda name: _report("ready", f"RIB {name.short} is up; Ctrl-C ends it", name, json=json),

@@ -11,14 +11,14 @@ from __future__ import annotations
 
 from typing import Final
 
-from gdp.client.readers import Readers, Reading
+from gdp.client.heartbeat_schedule import HeartbeatSchedule
+from gdp.client.reader_proxies import ReaderProxies, ReaderProxy
 from gdp.client.send_queue import SendQueue
-from gdp.client.statuses import Statuses
+from gdp.message.acknack import AckNack, AckNackFlag
+from gdp.message.heartbeat import StreamStart
 from gdp.message.loss import LossReason
-from gdp.message.move import Move
-from gdp.message.report import Report, ReportFlag
-from gdp.message.status import Start
-from gdp.message.window import SendWindow
+from gdp.message.renumbering import Renumbering
+from gdp.message.send_window import SendWindow
 
 __all__ = ["AckNackHandler"]
 
@@ -36,14 +36,16 @@ class AckNackHandler:
         last_sent_s: when frames were last sent.
     """
 
-    def __init__(self, *, readers: Readers, queue: SendQueue, window: SendWindow, statuses: Statuses) -> None:
+    def __init__(
+        self, *, readers: ReaderProxies, queue: SendQueue, window: SendWindow, heartbeats: HeartbeatSchedule
+    ) -> None:
         self._readers = readers
         self._queue = queue
         self._window = window
-        self._statuses = statuses
+        self._heartbeats = heartbeats
         self.last_sent_s = float("-inf")
 
-    def handle_report(self, name: bytes, report: Report, *, is_new: bool, now_s: float) -> None:
+    def handle_acknack(self, name: bytes, report: AckNack, *, is_new: bool, now_s: float) -> None:
         """Process a report that was opened.
 
         Args:
@@ -54,13 +56,13 @@ class AckNackHandler:
         if is_new:
             self._drop(name)
             reader.sequence = sequence or queue.first_waiting
-        if ReportFlag.BYE in report.flags:
+        if AckNackFlag.BYE in report.flags:
             self.forget(name)
             if not self._readers.all():
                 ledger.give_up(max(sequence, reader.sequence), ledger.last, LossReason.NO_READER)
             return
         report = self._translate(report)
-        if ReportFlag.NEW in report.flags:
+        if AckNackFlag.NEW in report.flags:
             self._start(name, report, now_s)
             return
         reader.start = None
@@ -72,22 +74,22 @@ class AckNackHandler:
         (sent, _), (sequence, _) = queue.sent, queue.sequences
         is_settled = queue.is_acknowledged or now_s - self.last_sent_s > _SETTLED_S
         if report.sequence < sequence and is_settled and (report.next_number >= sent or not queue.is_acknowledged):
-            self._statuses.wanted = True  # it does not know what it has lost behind the last message that it has
+            self._heartbeats.wanted = True  # it does not know what it has lost behind the last message that it has
 
-    def timeout(self, now_s: float) -> None:
+    def handle_timer(self, now_s: float) -> None:
         """Suspend silent readers, drop slow ones from the window, and give up what was suspended for too long."""
         for name in self._readers.silent(now_s):
             self._window.suspend(name)
             self._readers.suspend(name, now_s)
-            self._statuses.starts.pop(name, None)
+            self._heartbeats.starts.pop(name, None)
         for name in self._window.slow_readers(now_s):
             if self._readers.is_quiet(name, now_s):
                 self._window.suspend(name)
                 self._readers[name].behind_s = now_s
             else:
-                self._readers.do_penance(name, now_s)
+                self._readers.suspend_again(name, now_s)
                 self._window.drop_reader(name)
-                self._statuses.wanted = True
+                self._heartbeats.wanted = True
         for name, reader in self._readers.overdue(now_s):
             self._give_up(name, reader, now_s)
 
@@ -111,15 +113,15 @@ class AckNackHandler:
         else:
             self._window.add_reader(name, self._queue.next_number, now_s)
 
-    def renumber(self, move: Move) -> None:
+    def renumber(self, move: Renumbering) -> None:
         """Translate where new readers begin, after all that is cached got new numbers."""
-        starts = self._statuses.starts
+        starts = self._heartbeats.starts
         for name, start in starts.items():
             starts[name] = start._replace(number=move.of(start.number))
         for reader in self._readers.all():
             if reader.start is not None:
                 reader.start = reader.start._replace(number=move.of(reader.start.number))
-        self._statuses.wanted = True
+        self._heartbeats.wanted = True
 
     def release_window(self) -> None:
         """Drop every reader from the window: it is no longer used."""
@@ -140,10 +142,10 @@ class AckNackHandler:
             self.forget(name)
 
     def _drop(self, name: bytes) -> None:
-        self._statuses.starts.pop(name, None)
+        self._heartbeats.starts.pop(name, None)
         self._window.drop_reader(name)
 
-    def _give_up(self, name: bytes, reader: Reading, now_s: float) -> None:
+    def _give_up(self, name: bytes, reader: ReaderProxy, now_s: float) -> None:
         """Cache nothing any more for a reader whose window has been suspended for too long."""
         self._queue.seal_gathered()  # it is given up, too
         self._queue.ledger.give_up(reader.sequence, self._queue.ledger.last)
@@ -151,39 +153,39 @@ class AckNackHandler:
             self.forget(name)
         else:  # it is alive, and cannot catch up
             self._window.drop_reader(name)
-            self._readers.do_penance(name, now_s)
+            self._readers.suspend_again(name, now_s)
             reader.behind_s = None
-        self._statuses.wanted = True
+        self._heartbeats.wanted = True
 
-    def _translate(self, report: Report) -> Report:
+    def _translate(self, report: AckNack) -> AckNack:
         """Return a report under the present numbers; a status tells them to a reader that does not know them."""
         for move in self._queue.moves:
             if move.is_before(report.next_number):
                 report = report._replace(next_number=move.of(report.next_number), next_part=0, missing=())
-                self._statuses.wanted = True
+                self._heartbeats.wanted = True
         return report
 
-    def _start(self, name: bytes, report: Report, now_s: float) -> None:
+    def _start(self, name: bytes, report: AckNack, now_s: float) -> None:
         """Choose the first message of a new reader; one that asks again gets the same response."""
         reader, queue = self._readers[name], self._queue
-        if name not in self._statuses.starts and not self._statuses.is_full:
+        if name not in self._heartbeats.starts and not self._heartbeats.is_full:
             queue.seal_gathered()  # it was published before this reader came
             oldest = self._window.oldest
             is_gone = oldest is not None and reader.start is not None and reader.start.number < oldest
             if reader.start is None or is_gone or not queue.is_acknowledged:
                 number = self._first_of(report)
                 begin = queue.ledger.begin_of(number, queue.first_waiting)
-                reader.start = Start(reader.incarnation, number, begin, reader.confirmed)
+                reader.start = StreamStart(reader.incarnation, number, begin, reader.confirmed)
                 reader.sequence = min(report.sequence, queue.ledger.last + 1) or begin
                 if queue.is_acknowledged and now_s >= reader.out_until_s:
                     self._window.add_reader(name, number, now_s)
                     if number < queue.next_number and report.next_number and self._window.readers > 1:
                         self._window.suspend(name)  # the others must not wait for what it missed
                         reader.behind_s = now_s
-            self._statuses.starts[name] = reader.start
-        self._statuses.wanted = True
+            self._heartbeats.starts[name] = reader.start
+        self._heartbeats.wanted = True
 
-    def _first_of(self, report: Report) -> int:
+    def _first_of(self, report: AckNack) -> int:
         """Return the message number at which a reader begins: where it was before, or with what is new."""
         queue = self._queue
         if report.next_number and queue.is_acknowledged:
@@ -192,7 +194,7 @@ class AckNackHandler:
             return queue.next_number
         return max(queue.oldest, queue.next_number + queue.deferred - queue.depth)
 
-    def _acknowledge(self, name: bytes, report: Report, *, is_new: bool, now_s: float) -> None:
+    def _acknowledge(self, name: bytes, report: AckNack, *, is_new: bool, now_s: float) -> None:
         reader, window, queue = self._readers[name], self._window, self._queue
         oldest = queue.oldest
         if not (window.has_reader(name) or window.is_suspended(name)) and now_s >= reader.out_until_s:
@@ -201,7 +203,7 @@ class AckNackHandler:
                 queue.ledger.give_up(report.sequence, end - 1)
             window.add_reader(name, min(max(report.next_number, oldest), queue.next_number), now_s)
         if window.has_reader(name) or window.is_suspended(name):
-            window.handle_report(name, report, now_s)
+            window.handle_acknack(name, report, now_s)
         is_gone = report.next_number < oldest if is_new else report.missing and report.missing[0].number < oldest
         if is_gone or (window.is_suspended(name) and not report.missing):
-            self._statuses.wanted = True  # it asks for what is gone, or does not know what it lacks
+            self._heartbeats.wanted = True  # it asks for what is gone, or does not know what it lacks

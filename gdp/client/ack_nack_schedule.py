@@ -14,7 +14,7 @@ from gdp.limits import (
     REPORT_IDLE_S,
     REPORT_PAUSE_S,
 )
-from gdp.message.join import Joiner
+from gdp.message.reassembly import Reassembler
 
 __all__ = ["AckNackSchedule"]
 
@@ -31,7 +31,7 @@ class AckNackSchedule:
         idle_s: longest time between two reports.
     """
 
-    def __init__(self, data: Joiner, due_s: float) -> None:
+    def __init__(self, data: Reassembler, due_s: float) -> None:
         self._data = data
         self.due_s = due_s
         self.idle_s = REPORT_IDLE_S

@@ -12,10 +12,10 @@ from typing import Final
 
 from gdp.client.identities import ReaderIdentity
 from gdp.client.key_epochs import Secrets
+from gdp.crypto.control_seal import ControlSealer, note_key
 from gdp.crypto.envelope import seal_key
-from gdp.crypto.note import NoteSealer, note_key
 from gdp.frame.kinds import Kind
-from gdp.message.report import Report
+from gdp.message.acknack import AckNack
 from gdp.names import Name
 
 __all__ = ["AckNackSealer"]
@@ -58,7 +58,7 @@ class AckNackSealer:
         self._introduces = introduces
         self._secrets = secrets
         self._shared = reader.notes.shared(exchange)
-        self._sealers: dict[int, NoteSealer] = {}
+        self._sealers: dict[int, ControlSealer] = {}
         self._tried = 0
         self._epoch_at = -1  # number of the message that says so
         self._silent_s = now_s  # since when the writer is silent, or was last introduced to
@@ -83,16 +83,16 @@ class AckNackSealer:
         if self.epoch not in secrets:
             self.epoch = max(secrets)
 
-    def seal(self, report: Report) -> bytes:
+    def seal(self, report: AckNack) -> bytes:
         """Return the frame of a report."""
         return self.sealer(self.epoch).seal(report.to_wire())
 
-    def seal_first(self, report: Report) -> list[bytes]:
+    def seal_first(self, report: AckNack) -> list[bytes]:
         """Return the frames of an introduction and a report to a writer that has not responded yet."""
         self.epoch = self._epoch_to_try()
         return [*self._introduction(self.epoch), self.seal(report)]
 
-    def seal_all(self, report: Report, now_s: float) -> list[bytes]:
+    def seal_all(self, report: AckNack, now_s: float) -> list[bytes]:
         """Return the frames of a report; to a silent writer also an introduction, in turn under every epoch."""
         frames = [self.seal(report)]
         if now_s - self._silent_s >= _SILENT_S:
@@ -103,7 +103,7 @@ class AckNackSealer:
                 frames.append(self.sealer(epoch).seal(report.to_wire()))
         return frames
 
-    def sealer(self, epoch: int) -> NoteSealer:
+    def sealer(self, epoch: int) -> ControlSealer:
         """Return what seals reports under an epoch.
 
         Raises:
@@ -113,8 +113,8 @@ class AckNackSealer:
         if sealer is None:
             reader = self._reader
             ends = reader.name, reader.incarnation, self._publisher, self._incarnation
-            key = note_key(self._shared, self._secrets[epoch], Kind.REPORT, *ends, self._topic)
-            sealer = self._sealers[epoch] = self._note_sealer(key, epoch, Kind.REPORT)
+            key = note_key(self._shared, self._secrets[epoch], Kind.ACKNACK, *ends, self._topic)
+            sealer = self._sealers[epoch] = self._note_sealer(key, epoch, Kind.ACKNACK)
         return sealer
 
     def _introduction(self, epoch: int) -> list[bytes]:
@@ -125,9 +125,9 @@ class AckNackSealer:
         key = seal_key(self._secrets[epoch], Kind.INTRODUCTION, reader.name, reader.incarnation, self._publisher)
         return [self._note_sealer(key, epoch, Kind.INTRODUCTION).seal(reader.introduction())]
 
-    def _note_sealer(self, key: bytes, epoch: int, kind: Kind) -> NoteSealer:
+    def _note_sealer(self, key: bytes, epoch: int, kind: Kind) -> ControlSealer:
         reader, to = self._reader, (self._publisher, self._topic, self._incarnation)
-        return NoteSealer(key, epoch, kind, reader.name, reader.incarnation, *to, reader.note_numbers)
+        return ControlSealer(key, epoch, kind, reader.name, reader.incarnation, *to, reader.note_numbers)
 
     def _epoch_to_try(self) -> int:
         """Return the newest epoch, and in turn the others, for the writer may not have the newest yet."""

@@ -15,14 +15,14 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
-from gdp.control.frames import ControlJoiner, ControlSplitter
-from gdp.control.greeter import Greeter
+from gdp.control.advertise_ack import AdvertiseAck
+from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.control.join import Join
+from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import Neighbour
 from gdp.control.presence import Presence
 from gdp.control.revocation_sync import RevocationSync
 from gdp.control.settings import NodeSettings
-from gdp.control.verdict import Verdict
 from gdp.control.waiting import Wait, WaitReason, port_waits, stranger_waits
 from gdp.crypto.certificates import Role
 from gdp.crypto.fields import check_sequence
@@ -30,21 +30,21 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse, sign
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
-from gdp.effects import Arrival, Instant, Transmit
 from gdp.errors import DropReason, FrameError, StatementError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Kind
 from gdp.names import ZERO, Name
-from gdp.trust.claim import make_claim
+from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
+from gdp.trust.advertisement import sign_advertisement
 from gdp.trust.domain import Policy
 from gdp.trust.revocation import Revocation
 from gdp.trust.revocations import hash_of
 from gdp.trust.right import HEARS, Right
 from gdp.trust.rtcert import RtCert
 
-__all__ = ["Attachment", "Claimed", "attachment_waits"]
+__all__ = ["Attachment", "PendingAdvertisement", "attachment_waits"]
 
-_CLAIM_AGAIN_S: Final = 0.5  # until it is judged
+_ADVERTISEMENT_AGAIN_S: Final = 0.5  # until it is judged
 _OWN_FIRST_S: Final = 0.5  # that other claims wait for the node's own; without a RIB they are good on this switch only
 _MOVED_S: Final = 5.0  # claims name the former switch for so long after a move
 _ECHO_S: Final = 0.02  # the greeter answers a new session within this time
@@ -57,20 +57,20 @@ _RTCERT_BEFORE_S: Final = 4_500  # it is dated back by so much: CLOCK_EARLY_S is
 
 
 @dataclass(slots=True)
-class Claimed:
+class PendingAdvertisement:
     """A name that this node claims, and what became of it."""
 
     subject: Subject
     right: Right
     chain: tuple[bytes, ...]
     is_global: bool
-    claim_at_s: float = 0.0
+    advertisement_at_s: float = 0.0
     is_taken: bool = False
     refused: DropReason | None = None
     join_sequence: int = -1  # of the newest join for it that came from this switch
 
     @property
-    def is_judged(self) -> bool:
+    def is_acknowledged(self) -> bool:
         """Return whether the overlay has said yes or no."""
         return self.is_taken or self.refused is not None
 
@@ -90,25 +90,27 @@ class Attachment:
         self._lease_s = settings.lease_s
         self._sequence = settings.first_sequence
         self.started = settings.first_sequence  # above what earlier lives said here, as far as is known
-        self.splitter = ControlSplitter(identity.name, settings.incarnation)
-        self.joiner = ControlJoiner()
+        self.fragmenter = ControlFragmenter(identity.name, settings.incarnation)
+        self.reassembler = ControlReassembler()
         is_rib = identity.member.role is Role.RIB
-        self.greeter = Greeter.of_node(
-            identity, policy, self.splitter, settings, rtcert_for=self._rtcert_for if is_rib else None
+        self.hello_protocol = HelloProtocol.of_node(
+            identity, policy, self.fragmenter, settings, rtcert_for=self._rtcert_for if is_rib else None
         )
-        self._claims: dict[tuple[Name, Right], Claimed] = {}
+        self._advertisements: dict[tuple[Name, Right], PendingAdvertisement] = {}
         self._switch: Neighbour | None = None
         self._switch_nonce = b""  # of the session with it
         self._last = ZERO  # the switch of the newest attachment, the present one too
         self._former = ZERO  # the one before
         self._moved_s = float("-inf")
         self._rtcerts: dict[Name, tuple[bytes, float]] = {}  # by switch, with the monotonic second of the next one
-        self._sync = RevocationSync(identity, policy.revoked, self.greeter, self._say_revoked, settings.first_sequence)
-        self._now = Instant(0.0, 0.0)
-        self._out: list[Transmit] = []
+        self._sync = RevocationSync(
+            identity, policy.revoked, self.hello_protocol, self._say_revoked, settings.first_sequence
+        )
+        self._now = Timestamps(0.0, 0.0)
+        self._out: list[OutgoingFrames] = []
         self._in_use_s = 0.0  # since when another node with this identity keeps its place
         self.clashes = 0  # signs of another node with this identity
-        self.rival_at: Name | None = None  # switch of a newer node with this identity, once it was reported
+        self.conflict_at: Name | None = None  # switch of a newer node with this identity, once it was reported
         self.refusals: Counter[DropReason] = Counter()
 
     @property
@@ -119,97 +121,101 @@ class Attachment:
     @property
     def is_attached(self) -> bool:
         """Return whether a switch is there and has judged every claim, and no other node has this identity."""
-        is_judged = all(each.is_judged for each in self._claims.values())
+        is_judged = all(each.is_acknowledged for each in self._advertisements.values())
         return self._switch is not None and is_judged and not self.is_in_use
 
     @property
     def is_in_use(self) -> bool:
         """Return whether this node is refused because an older one with its identity is there."""
-        own = self._own_claim
+        own = self._own_advertisement
         return own is not None and own.refused is DropReason.IN_USE
 
     @property
-    def _own_claim(self) -> Claimed | None:
-        return next((each for each in self._claims.values() if each.right is Right.ATTACH), None)
+    def _own_advertisement(self) -> PendingAdvertisement | None:
+        return next((each for each in self._advertisements.values() if each.right is Right.ATTACH), None)
 
     @property
-    def claims(self) -> list[Claimed]:
+    def advertisements(self) -> list[PendingAdvertisement]:
         """Return what is claimed."""
-        return list(self._claims.values())
+        return list(self._advertisements.values())
 
     @property
     def drops(self) -> Counter[DropReason]:
         """Return which unfinished statements were given up."""
-        return self.joiner.drops + self.greeter.drops
+        return self.reassembler.drops + self.hello_protocol.drops
 
     @property
     def mtu(self) -> int:
         """Return the MTU of the port to the switch, in bytes after the Ethernet header."""
         assert self._switch is not None
-        return self.greeter.ports[self._switch.port].mtu
+        return self.hello_protocol.ports[self._switch.port].mtu
 
-    def claim(self, subject: Subject, right: Right, chain: tuple[bytes, ...], *, is_global: bool) -> None:
+    def advertisement(self, subject: Subject, right: Right, chain: tuple[bytes, ...], *, is_global: bool) -> None:
         """Claim a name from now on."""
-        self._claims[subject.name, right] = Claimed(subject, right, chain, is_global)
+        self._advertisements[subject.name, right] = PendingAdvertisement(subject, right, chain, is_global)
 
     def renew(self, name: Name, chain: tuple[bytes, ...]) -> None:
         """Claim what is claimed of a name already by a newer delegation, at once."""
-        for (its, _), claimed in self._claims.items():
+        for (its, _), pending_advertisement in self._advertisements.items():
             if its == name:
-                claimed.chain, claimed.claim_at_s, claimed.refused = chain, 0.0, None
+                pending_advertisement.chain, pending_advertisement.advertisement_at_s, pending_advertisement.refused = (
+                    chain,
+                    0.0,
+                    None,
+                )
 
     def withdraw(self, name: Name, right: Right) -> None:
         """Claim a name no more, and say so."""
-        if self._claims.pop((name, right), None) is not None and self._switch is not None:
+        if self._advertisements.pop((name, right), None) is not None and self._switch is not None:
             body = {"n": name, "right": right.value, "s": self._next_sequence()}
             wire = sign(StatementType.WITHDRAW, body, self._identity.name, self._identity.key)
             self._say(Kind.WITHDRAW, wire)
 
     def withdraw_all(self) -> None:
         """Leave: claim nothing any more."""
-        for name, right in list(self._claims):
+        for name, right in list(self._advertisements):
             self.withdraw(name, right)
 
     def send(self, frames: list[bytes]) -> None:
         """Send frames to the switch; without one they are counted as lost."""
         if self._switch is not None:
-            self._out.append(Transmit(self._switch.port, self._switch.mac, frames))
+            self._out.append(OutgoingFrames(self._switch.port, self._switch.mac, frames))
         else:
             self.refusals[DropReason.PORT_DOWN] += len(frames)
 
-    def receive_control(self, arrival: Arrival, header: Header, now: Instant) -> Statement | None:
+    def receive_control(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> Statement | None:
         """Take a frame of a kind that is for neighbours; return a statement that is for the node above.
 
         Raises:
             RemoteError: it does not hold.
         """
         if header.kind == Kind.KEEPALIVE:
-            self.greeter.receive_keepalive(arrival, header, now)
+            self.hello_protocol.receive_keepalive(arrival, header, now)
             return None
         if header.kind == Kind.COOKIE:
-            self.greeter.receive_cookie(arrival, header)
+            self.hello_protocol.receive_cookie(arrival, header)
             return None
         switch = self._switch
         if header.kind == Kind.HELLO:
-            wire = self.greeter.join(arrival, header, now.mono_s)
+            wire = self.hello_protocol.join(arrival, header, now.mono_s)
         elif switch is None or (arrival.port, arrival.mac) != (switch.port, switch.mac):
             raise FrameError(DropReason.UNKNOWN_SENDER, "not our switch")
         else:
-            wire = self.joiner.add(header, arrival.frame, now.mono_s, arrival.via)
+            wire = self.reassembler.add(header, arrival.frame, now.mono_s, arrival.via)
         if wire is None:
             return None
         statement = parse(wire)
         if header.kind == Kind.HELLO:
-            if self.greeter.receive(arrival, statement, now) is not None:
+            if self.hello_protocol.receive(arrival, statement, now) is not None:
                 self._choose_switch(now.mono_s)
             return None
         assert switch is not None  # seen above
-        if header.kind == Kind.VERDICT:
-            return self._take_verdict(statement, switch, now)
+        if header.kind == Kind.ADVERTISE_ACK:
+            return self._take_ack(statement, switch, now)
         if header.kind in (Kind.JOIN, Kind.LEAVE):
             join = Join.from_fields(statement.expect(StatementType.JOIN))
             statement.verify(switch.key)
-            self.greeter.ports[switch.port].take_join(join, switch)
+            self.hello_protocol.ports[switch.port].receive_join(join, switch)
             self._note_newest(join)
             return statement
         if header.kind == Kind.REVOKE:
@@ -222,7 +228,9 @@ class Attachment:
             return None
         raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
 
-    def take_revocation(self, statement: Statement, now: Instant, holds: Callable[[bytes], bool]) -> Revocation | None:
+    def receive_revocation(
+        self, statement: Statement, now: Timestamps, holds: Callable[[bytes], bool]
+    ) -> Revocation | None:
         """Take a revocation that our switch passed on; return it if it is news.
 
         Args:
@@ -233,52 +241,54 @@ class Attachment:
         """
         if self._switch is None:
             return None
-        revocation = self._policy.revoked.take(statement, self._switch.name, now, holds)
+        revocation = self._policy.revoked.receive_revocation(statement, self._switch.name, now, holds)
         if revocation is not None:
-            self.greeter.recheck(revocation.fingerprint, now)
+            self.hello_protocol.recheck(revocation.fingerprint, now)
         return revocation
 
-    def port_changed(self, port: int, up: bool, now: Instant) -> None:
+    def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
         """Learn that a port's link came or went."""
-        self.greeter.port_changed(port, up, now.mono_s)
+        self.hello_protocol.port_changed(port, up, now.mono_s)
         self._choose_switch(now.mono_s)
 
-    def timeout(self, now: Instant) -> None:
+    def handle_timer(self, now: Timestamps) -> None:
         """Renew what is due."""
         self._now = now
-        if self.greeter.expire(now.mono_s):
+        if self.hello_protocol.drop_silent(now.mono_s):
             self._choose_switch(now.mono_s)
-        self.joiner.expire(now.mono_s)
-        self._out += self.greeter.take(now.mono_s)
-        self._sync.timeout(now.mono_s)
+        self.reassembler.drop_expired(now.mono_s)
+        self._out += self.hello_protocol.hellos_to_send(now.mono_s)
+        self._sync.handle_timer(now.mono_s)
         if self._switch is None:
             return
-        for each in self._due_claims():
-            if each.claim_at_s <= now.mono_s:
-                each.claim_at_s = now.mono_s + (self._lease_s / 3 if each.is_judged else _CLAIM_AGAIN_S)
-                self._say(Kind.ADVERTISE, self._claim_wire(each, now))
+        for each in self._due_advertisements():
+            if each.advertisement_at_s <= now.mono_s:
+                each.advertisement_at_s = now.mono_s + (
+                    self._lease_s / 3 if each.is_acknowledged else _ADVERTISEMENT_AGAIN_S
+                )
+                self._say(Kind.ADVERTISE, self._advertisement_wire(each, now))
 
-    def next_timeout(self) -> float | None:
+    def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self.greeter.next_timeout(), self._sync.next_timeout()]
+        times = [self.hello_protocol.get_timer(), self._sync.get_timer()]
         if self._switch is not None:
-            times += [each.claim_at_s for each in self._due_claims()]
+            times += [each.advertisement_at_s for each in self._due_advertisements()]
         return min((time for time in times if time is not None), default=None)
 
-    def _due_claims(self) -> Iterable[Claimed]:
+    def _due_advertisements(self) -> Iterable[PendingAdvertisement]:
         """Return what may be claimed: while another node has this identity, the node's own name alone."""
-        own = self._own_claim
-        return (own,) if own is not None and self.is_in_use else self._claims.values()
+        own = self._own_advertisement
+        return (own,) if own is not None and self.is_in_use else self._advertisements.values()
 
-    def take(self) -> list[Transmit]:
+    def frames_to_send(self) -> list[OutgoingFrames]:
         """Return, once, what is to be sent."""
         out, self._out = self._out, []
         return out
 
     def _choose_switch(self, now_s: float) -> None:
         """Attach to the switch over the cheapest port; a new or restarted one hears every claim."""
-        switches = [each for each in self.greeter.all_up() if each.role.is_switch]
-        best = min(switches, key=lambda each: (self.greeter.ports[each.port].cost, each.port), default=None)
+        switches = [each for each in self.hello_protocol.all_up() if each.role.is_switch]
+        best = min(switches, key=lambda each: (self.hello_protocol.ports[each.port].cost, each.port), default=None)
         is_same = best is not None and best is self._switch and best.nonce == self._switch_nonce
         if not is_same:
             if self._switch is not None:
@@ -290,16 +300,18 @@ class Attachment:
         if best is not None and not is_same:
             if best.name != self._last:
                 self._former, self._last, self._moved_s = self._last, best.name, now_s
-            echo_at_s = self.greeter.ports[best.port].hello_at_s
-            claim_at_s = echo_at_s if echo_at_s <= now_s + _ECHO_S else now_s  # what comes before our echo is dropped
-            for each in self._claims.values():
+            echo_at_s = self.hello_protocol.ports[best.port].hello_at_s
+            advertisement_at_s = (
+                echo_at_s if echo_at_s <= now_s + _ECHO_S else now_s
+            )  # what comes before our echo is dropped
+            for each in self._advertisements.values():
                 # Who hears of a name asks for its node at once: that one is claimed first.
-                at_s = claim_at_s if each.right is Right.ATTACH else claim_at_s + _OWN_FIRST_S
-                each.claim_at_s, each.is_taken, each.refused, each.join_sequence = at_s, False, None, -1
+                at_s = advertisement_at_s if each.right is Right.ATTACH else advertisement_at_s + _OWN_FIRST_S
+                each.advertisement_at_s, each.is_taken, each.refused, each.join_sequence = at_s, False, None, -1
 
-    def _claim_wire(self, each: Claimed, now: Instant) -> bytes:
+    def _advertisement_wire(self, each: PendingAdvertisement, now: Timestamps) -> bytes:
         assert self._switch is not None
-        return make_claim(
+        return sign_advertisement(
             self._identity,
             each.right,
             each.subject,
@@ -332,14 +344,14 @@ class Attachment:
             StatementError: REPLAYED: a newer one overtook it, and what it says of the tree is no longer so.
         """
         for right in HEARS.values():
-            claimed = self._claims.get((join.topic, right))
-            if claimed is None:
+            pending_advertisement = self._advertisements.get((join.topic, right))
+            if pending_advertisement is None:
                 continue
-            if join.sequence < claimed.join_sequence:
+            if join.sequence < pending_advertisement.join_sequence:
                 raise StatementError(DropReason.REPLAYED, "a newer join overtook it")
-            claimed.join_sequence = join.sequence
+            pending_advertisement.join_sequence = join.sequence
 
-    def _take_verdict(self, statement: Statement, switch: Neighbour, now: Instant) -> Statement | None:
+    def _take_ack(self, statement: Statement, switch: Neighbour, now: Timestamps) -> Statement | None:
         """Take what became of a claim, or pass a publisher's place on."""
         fields = statement.fields
         member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
@@ -352,39 +364,39 @@ class Attachment:
             presence = Presence.from_fields(statement.fields)
             if (presence.node, presence.incarnation) == (self._identity.name, self._incarnation):
                 self.clashes += 1
-                self.rival_at = presence.other
+                self.conflict_at = presence.other
             return None
-        verdict = Verdict.from_fields(statement.expect(StatementType.VERDICT))
-        check_sequence(verdict.sequence, now.unix_s)
-        for (name, _), each in self._claims.items():
-            if name == verdict.name and verdict.advertiser == self._identity.name:
-                self._judge(each, verdict, now.mono_s)
+        ack = AdvertiseAck.from_fields(statement.expect(StatementType.ADVERTISE_ACK))
+        check_sequence(ack.sequence, now.unix_s)
+        for (name, _), each in self._advertisements.items():
+            if name == ack.name and ack.advertiser == self._identity.name:
+                self._judge(each, ack, now.mono_s)
         return None
 
-    def _judge(self, each: Claimed, verdict: Verdict, now_s: float) -> None:
-        if verdict.refused is None:
+    def _judge(self, each: PendingAdvertisement, ack: AdvertiseAck, now_s: float) -> None:
+        if ack.refused is None:
             if not each.is_taken:
-                each.claim_at_s = now_s + self._lease_s / 3
+                each.advertisement_at_s = now_s + self._lease_s / 3
             each.is_taken, each.refused = True, None
             if each.right is Right.ATTACH:
-                for other in self._claims.values():
-                    if not other.is_judged:
-                        other.claim_at_s = min(other.claim_at_s, now_s)
+                for other in self._advertisements.values():
+                    if not other.is_acknowledged:
+                        other.advertisement_at_s = min(other.advertisement_at_s, now_s)
             return
-        self.refusals[verdict.refused] += 1
+        self.refusals[ack.refused] += 1
         each.is_taken = False
-        if verdict.refused is DropReason.STALE:
-            self._sequence = self.started = max(self._sequence, verdict.sequence)
-            each.claim_at_s = now_s  # an earlier life of ours was ahead: try again above it
-        elif verdict.refused is DropReason.IN_USE and each.right is Right.ATTACH:
-            if each.refused is not verdict.refused:
+        if ack.refused is DropReason.STALE:
+            self._sequence = self.started = max(self._sequence, ack.sequence)
+            each.advertisement_at_s = now_s  # an earlier life of ours was ahead: try again above it
+        elif ack.refused is DropReason.IN_USE and each.right is Right.ATTACH:
+            if each.refused is not ack.refused:
                 self._in_use_s = now_s
-            each.refused = verdict.refused
-            each.claim_at_s = now_s + (_IN_USE_SOON_S if now_s < self._in_use_s + _IN_USE_S else _IN_USE_S)
+            each.refused = ack.refused
+            each.advertisement_at_s = now_s + (_IN_USE_SOON_S if now_s < self._in_use_s + _IN_USE_S else _IN_USE_S)
             self.clashes += 1
         else:
-            each.refused = verdict.refused
-            each.claim_at_s = now_s + self._lease_s / 3  # it may be taken later, but not for asking often
+            each.refused = ack.refused
+            each.advertisement_at_s = now_s + self._lease_s / 3  # it may be taken later, but not for asking often
 
     def _say_revoked(self, neighbour: Neighbour, wire: bytes) -> None:
         if neighbour is self._switch:
@@ -392,7 +404,7 @@ class Attachment:
 
     def _say(self, kind: Kind, wire: bytes) -> None:
         assert self._switch is not None
-        self.send(self.splitter.split(kind, wire, self.mtu))
+        self.send(self.fragmenter.split(kind, wire, self.mtu))
 
     def _next_sequence(self) -> int:
         self._sequence += 1
@@ -402,21 +414,21 @@ class Attachment:
 def attachment_waits(attachment: Attachment, now_s: float) -> list[Wait]:
     """Return what keeps a node from being attached with all it advertises; empty when nothing does."""
     if attachment.switch is None:
-        ports = attachment.greeter.ports.values()
+        ports = attachment.hello_protocol.ports.values()
         of_ports = [wait for port in ports for wait in port_waits(port, (Role.SWITCH, Role.LEAF))]
-        strangers = list(stranger_waits(attachment.greeter, now_s))
+        strangers = list(stranger_waits(attachment.hello_protocol, now_s))
         refusing = {wait.port for wait in strangers}
         return [*strangers, *(w for w in of_ports if w.port not in refusing or w.reason is WaitReason.LINK_DOWN)]
-    return list(_claim_waits(attachment))
+    return list(_advertisement_waits(attachment))
 
 
-def _claim_waits(attachment: Attachment) -> Iterator[Wait]:
-    claims = attachment.claims
+def _advertisement_waits(attachment: Attachment) -> Iterator[Wait]:
+    advertisements = attachment.advertisements
     if attachment.is_in_use:
         yield Wait(WaitReason.IN_USE)
         return
-    if any(not each.is_judged for each in claims):
+    if any(not each.is_acknowledged for each in advertisements):
         yield Wait(WaitReason.NO_RIB)
-    for each in claims:
+    for each in advertisements:
         if each.refused is not None:
             yield Wait(WaitReason.REFUSED, name=each.subject.name, refused=each.refused)

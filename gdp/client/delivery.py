@@ -13,8 +13,8 @@ from gdp.errors import DropReason, RemoteError
 from gdp.frame.kinds import Flag
 from gdp.limits import NUMBER_MAX, SEQUENCE_BYTES
 from gdp.message.bundle import unpack
-from gdp.message.join import Joined
 from gdp.message.loss import Losses, LossReason, LostRange, explain
+from gdp.message.reassembly import ReassembledMessage
 
 __all__ = ["Delivered", "DeliveryQueue"]
 
@@ -84,7 +84,7 @@ class DeliveryQueue:
                 self.losses.add(lost)
             self.sequence = sequence
 
-    def deliver(self, joined: Joined) -> None:
+    def deliver(self, joined: ReassembledMessage) -> None:
         """Queue the messages of a number, and count what lies before them as lost; a malformed one is dropped."""
         sequence, messages = int.from_bytes(joined.head, "big"), [joined.message]
         self.delivered_bytes += len(joined.message)

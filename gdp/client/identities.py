@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import count
 
-from gdp.client.note_keys import NoteKeys
+from gdp.client.control_keys import ControlKeys
 from gdp.crypto.envelope import Signer
 from gdp.names import Name
 
@@ -29,7 +29,7 @@ class WriterIdentity:
     incarnation: int
     signer: Signer
     random_bytes: Callable[[int], bytes]
-    notes: NoteKeys
+    notes: ControlKeys
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +44,6 @@ class ReaderIdentity:
 
     name: Name
     incarnation: int
-    notes: NoteKeys = field(compare=False)
+    notes: ControlKeys = field(compare=False)
     introduction: Callable[[], bytes] = field(compare=False)
     note_numbers: Iterator[int] = field(default_factory=lambda: count(1), compare=False)

@@ -81,7 +81,7 @@ class KeyEpochs:
     def _use(self, epoch: int) -> None:
         self.epoch = epoch
         self.data = self._sealer(Kind.DATA)
-        self.status = self._sealer(Kind.STATUS)
+        self.status = self._sealer(Kind.HEARTBEAT)
 
     def _sealer(self, kind: Kind) -> Sealer:
         writer = self._writer

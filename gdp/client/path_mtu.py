@@ -24,7 +24,7 @@ class PathMtu:
         self._narrowings = float(MTU_NARROWINGS)  # with something sealed anew, that may still come
         self._counted_s = 0.0
 
-    def take(self, mtu: int, now_s: float) -> int:
+    def receive_mtu(self, mtu: int, now_s: float) -> int:
         """Take what a join says; return what holds."""
         more = max(now_s - self._counted_s, 0.0) / MTU_HOLD_S
         self._narrowings, self._counted_s = min(self._narrowings + more, MTU_NARROWINGS), now_s

@@ -8,18 +8,18 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 
-from gdp.client.agenda import Agenda
 from gdp.client.identities import WriterIdentity
 from gdp.client.key_epochs import Secrets
-from gdp.client.pasts import Pasts
 from gdp.client.path_mtu import PathMtu
-from gdp.client.private import Life, Party
-from gdp.client.private_streams import PrivateStreams
 from gdp.client.publisher import Publisher
-from gdp.client.readers import TOPICS, Patience
-from gdp.client.turns import Turns
+from gdp.client.reader_proxies import TOPICS, ReaderTimeouts
+from gdp.client.send_scheduler import SendScheduler
+from gdp.client.sequence_numbers import SequenceRegistry
+from gdp.client.timer_queue import TimerQueue
+from gdp.client.unicast_stream import Party, PeerIncarnation
+from gdp.client.unicast_streams import UnicastStreams
 from gdp.control.join import Join
-from gdp.crypto.note import topic_of
+from gdp.crypto.control_seal import topic_of
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.frame.codec import Header
 from gdp.message.loss import LossReason
@@ -40,11 +40,11 @@ class Publications:
         self._source = source
         self._heard = heard
         self._publishers: dict[Name, Publisher] = {}
-        self._private: dict[Name, PrivateStreams] = {}  # by service
+        self._private: dict[Name, UnicastStreams] = {}  # by service
         self._paths: dict[Name, PathMtu] = {}
-        self._pasts = Pasts()
-        self._agenda = Agenda[Publisher]()
-        self.turns = Turns(self._agenda.touch)
+        self._sequence_registry = SequenceRegistry()
+        self._timers = TimerQueue[Publisher]()
+        self.turns = SendScheduler(self._timers.reschedule)
         self._drops: Counter[DropReason] = Counter()  # of what is gone
         self._losses: Counter[LossReason] = Counter()
 
@@ -69,7 +69,7 @@ class Publications:
         """Return the publisher of a name, or None."""
         return self._publishers.get(name)
 
-    def begin(
+    def add(
         self,
         name: Name,
         secrets: Secrets,
@@ -78,7 +78,7 @@ class Publications:
         reliable: bool,
         depth: int = 0,
         urgent: bool,
-        patience: Patience = TOPICS,
+        patience: ReaderTimeouts = TOPICS,
     ) -> Publisher:
         """Publish a name from now on, above all numbers that were used for it before."""
         publisher = Publisher(
@@ -89,31 +89,31 @@ class Publications:
             reliable=reliable,
             depth=depth,
             urgent=urgent,
-            past=self._pasts.of(name),
+            past=self._sequence_registry.of(name),
             patience=patience,
         )
         publisher.published = self.turns.add
         self._publishers[name] = publisher
         return publisher
 
-    def begin_private(self, name: Name, secrets: Secrets, *, urgent: bool) -> None:
+    def enable_unicast(self, name: Name, secrets: Secrets, *, urgent: bool) -> None:
         """Have private streams on a published name from now on."""
-        self._private[name] = PrivateStreams(
+        self._private[name] = UnicastStreams(
             service=name,
             writer=self._source,
             secrets=secrets,
-            pasts=self._pasts,
+            sequence_registry=self._sequence_registry,
             published=self.turns.add,
             urgent=urgent,
         )
 
-    def end(self, name: Name) -> bool:
+    def remove(self, name: Name) -> bool:
         """Say nothing on a name any more; return whether it was published."""
         publisher, streams = self._publishers.pop(name, None), self._private.pop(name, None)
         self._paths.pop(name, None)
         if publisher is None:
             return False
-        self._pasts.put(name, publisher.past)
+        self._sequence_registry.put(name, publisher.past)
         publisher.close()
         self._drops += publisher.drops
         self._losses += publisher.losses.counts
@@ -129,7 +129,7 @@ class Publications:
             if each is not None:
                 each.renew(secrets, now_s)
 
-    def tell(self, service: Name, party: Name, message: bytes, now_s: float) -> None:
+    def send_to(self, service: Name, party: Name, message: bytes, now_s: float) -> None:
         """Send a message to one other party of a service alone.
 
         Raises:
@@ -140,13 +140,13 @@ class Publications:
             raise LocalError(f"{party.short} is not heard on {service.short}")
         streams.stream(heard, self._publishers[service].mtu, now_s).publish(message)
 
-    def forget(self, service: Name, party: Life) -> None:
+    def forget(self, service: Name, party: PeerIncarnation) -> None:
         """Let go of what waits for a party of a service that is gone."""
         streams = self._private.get(service)
         if streams is not None:
             streams.forget(party)
 
-    def take_introduction(self, header: Header, frame: bytes) -> None:
+    def receive_introduction(self, header: Header, frame: bytes) -> None:
         """Take a reader's introduction.
 
         Raises:
@@ -157,7 +157,7 @@ class Publications:
             raise StatementError(DropReason.NOT_FOR_US)
         publisher.receive_introduction(header, frame)
 
-    def take_report(self, header: Header, frame: bytes, now_s: float) -> None:
+    def receive_acknack(self, header: Header, frame: bytes, now_s: float) -> None:
         """Take a reader's note.
 
         Raises:
@@ -165,32 +165,32 @@ class Publications:
         """
         topic = topic_of(header, frame)
         publisher = self._publishers.get(topic) or self._stream(topic, header.source, now_s)  # type: ignore[call-overload]
-        publisher.receive_report(header, frame, now_s)
+        publisher.receive_acknack(header, frame, now_s)
         self.turns.add(publisher)
 
-    def take_join(self, join: Join, now_s: float) -> None:
+    def receive_join(self, join: Join, now_s: float) -> None:
         """Learn that a tree stands, and how wide it is."""
         publisher = self._publishers.get(join.topic)
         if publisher is not None and join.publisher == self._source.name and join.lease_s > 0:
             path = self._paths.setdefault(join.topic, PathMtu())
-            mtu, is_split = path.take(join.mtu, now_s), False
+            mtu, is_split = path.receive_mtu(join.mtu, now_s), False
             for each in (publisher, *self._private.get(join.topic, ())):
                 is_split |= each.tree_stands(mtu)
                 self.turns.add(each)
             if is_split:
                 path.count()
 
-    def timeout(self, now_s: float) -> None:
+    def handle_timer(self, now_s: float) -> None:
         """Do what is due."""
-        for publisher in self._agenda.take_due(now_s):
-            publisher.timeout(now_s)
+        for publisher in self._timers.poll_due(now_s):
+            publisher.handle_timer(now_s)
             self.turns.add(publisher)
         for streams in self._private.values():
             streams.forget_idle(now_s)
 
     def next_due(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        return self._agenda.next_due()
+        return self._timers.next_due()
 
     def _stream(self, stream: bytes, reader: bytes, now_s: float) -> Publisher:
         """Return the private stream that a note is about."""

@@ -2,8 +2,9 @@
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Frames come out of ``take`` and go to the switch.
 
-The writer joins ``send_queue.py`` (numbers, bundles and seals), ``gdp/message/window.py`` (caches and repairs),
-``ack_nack_handler.py`` (readers and what they confirm), ``key_epochs.py`` (secrets) and ``statuses.py``. Small messages
+The writer joins ``send_queue.py`` (numbers, bundles and seals), ``gdp/message/send_window.py`` (caches and repairs),
+``ack_nack_handler.py`` (readers and what they confirm), ``key_epochs.py`` (secrets) and ``heartbeat_schedule.py``.
+Small messages
 wait until frames are polled, and become one bundle, sealed and signed once; except on a latched topic, whose late
 joiners get a fixed number of messages. Without a reader nothing is sealed; the last ``depth`` messages of a latched
 topic wait for late joiners.
@@ -16,20 +17,20 @@ from collections.abc import Callable
 from typing import Final
 
 from gdp.client.ack_nack_handler import AckNackHandler
+from gdp.client.heartbeat_schedule import HeartbeatSchedule
 from gdp.client.identities import WriterIdentity
 from gdp.client.key_epochs import KeyEpochs, Secrets
-from gdp.client.pasts import FIRST, Past
-from gdp.client.readers import TOPICS, Patience, Readers
+from gdp.client.reader_proxies import TOPICS, ReaderProxies, ReaderTimeouts
 from gdp.client.send_queue import SendQueue
-from gdp.client.statuses import Statuses
+from gdp.client.sequence_numbers import FIRST, SequenceState
 from gdp.errors import DropReason, EnvelopeError, RemoteError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Flag
 from gdp.limits import MTU_MIN_BYTES, WINDOW_BYTES
 from gdp.message.bundle import BUNDLE_BYTES
+from gdp.message.heartbeat import Heartbeat
 from gdp.message.loss import Losses, LossReason
-from gdp.message.status import Status
-from gdp.message.window import SendWindow
+from gdp.message.send_window import SendWindow
 from gdp.names import Name
 
 __all__ = ["Publisher"]
@@ -68,8 +69,8 @@ class Publisher:
         reliable: bool,
         depth: int = 0,
         urgent: bool = False,
-        past: Past = FIRST,
-        patience: Patience = TOPICS,
+        past: SequenceState = FIRST,
+        patience: ReaderTimeouts = TOPICS,
         address: Name | None = None,
     ) -> None:
         self.topic = topic
@@ -83,10 +84,10 @@ class Publisher:
         self._queue = SendQueue(
             keys=self._keys, window=self._window, next_number=past.next_number, last_sequence=past.sequence
         )
-        self._readers = Readers(topic, source, patience)
-        self._statuses = Statuses(description, past.status_number)
+        self._readers = ReaderProxies(topic, source, patience)
+        self._heartbeats = HeartbeatSchedule(description, past.status_number)
         self._acknowledgements = AckNackHandler(
-            readers=self._readers, queue=self._queue, window=self._window, statuses=self._statuses
+            readers=self._readers, queue=self._queue, window=self._window, heartbeats=self._heartbeats
         )
         self._queue.depth = depth
         self._set_flags()
@@ -119,7 +120,7 @@ class Publisher:
     def is_followed_by(self, name: Name, now_s: float, awake_s: float) -> bool:
         """Return whether a tree stands, and a reader is alive and keeps up; ``awake_s``: since when we receive."""
         keeps_up = self._window.has_reader(name) or not self.confirms
-        return self.mtu is not None and keeps_up and self._readers.is_heard(name, now_s, awake_s)
+        return self.mtu is not None and keeps_up and self._readers.is_alive(name, now_s, awake_s)
 
     def is_read_by(self, name: Name) -> bool:
         """Return whether a tree stands, and ``name`` is a reader, keeping up or not."""
@@ -136,9 +137,9 @@ class Publisher:
         return self._queue.is_acknowledged
 
     @property
-    def past(self) -> Past:
+    def past(self) -> SequenceState:
         """Return where it is, for another one that goes on with the same."""
-        return Past(self._queue.next_number, self._statuses.number, self._queue.ledger.last)
+        return SequenceState(self._queue.next_number, self._heartbeats.number, self._queue.ledger.last)
 
     @property
     def messages(self) -> int:
@@ -180,7 +181,7 @@ class Publisher:
             LocalError: there is no secret.
         """
         if self._keys.renew(secrets, now_s):
-            self._statuses.wanted = True
+            self._heartbeats.wanted = True
             self.published(self)
 
     def describe(self, description: bytes) -> None:
@@ -188,7 +189,7 @@ class Publisher:
 
         What is published right behind it may overtake the status, where a frame is lost.
         """
-        if self._statuses.describe(description):
+        if self._heartbeats.describe(description):
             self.published(self)
 
     def set_depth(self, depth: int) -> None:
@@ -199,7 +200,7 @@ class Publisher:
         self._set_flags()
         if not self.confirms:
             self._acknowledgements.release_window()
-        self._statuses.wanted = True
+        self._heartbeats.wanted = True
         self.published(self)
 
     def close(self) -> None:
@@ -246,7 +247,7 @@ class Publisher:
         """Count a message that is published to no reader: readers find it missing, and a status says why."""
         self._queue.skip(reason)
         if self._readers:
-            self._statuses.wanted = True
+            self._heartbeats.wanted = True
             self.published(self)
 
     def receive_introduction(self, header: Header, frame: bytes) -> None:
@@ -258,7 +259,7 @@ class Publisher:
         except RemoteError as error:
             self.drops[error.reason] += 1
 
-    def receive_report(self, header: Header, frame: bytes, now_s: float) -> bool:
+    def receive_acknack(self, header: Header, frame: bytes, now_s: float) -> bool:
         """Process a reader's sealed report; return whether it is one. Errors are counted."""
         is_old = header.epoch != self._keys.epoch
         try:
@@ -267,8 +268,8 @@ class Publisher:
         except RemoteError as error:
             self.drops[error.reason] += 1
             return False
-        self._acknowledgements.handle_report(header.source, report, is_new=is_new, now_s=now_s)
-        self._statuses.wanted |= is_old  # it has not received the new epoch yet
+        self._acknowledgements.handle_acknack(header.source, report, is_new=is_new, now_s=now_s)
+        self._heartbeats.wanted |= is_old  # it has not received the new epoch yet
         return True
 
     def connect(self, name: Name, incarnation: int, exchange: bytes, now_s: float) -> None:
@@ -282,20 +283,20 @@ class Publisher:
         """
         self._acknowledgements.connect(name, incarnation, exchange, now_s)
 
-    def timeout(self, now_s: float) -> None:
+    def handle_timer(self, now_s: float) -> None:
         """Suspend silent readers, drop slow ones from the window, and ask those that owe a report."""
-        self._acknowledgements.timeout(now_s)
-        self._statuses.wanted |= self._window.probe_due(now_s)
-        self._statuses.timeout(now_s)
+        self._acknowledgements.handle_timer(now_s)
+        self._heartbeats.wanted |= self._window.probe_due(now_s)
+        self._heartbeats.handle_timer(now_s)
 
-    def next_timeout(self) -> float | None:
+    def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         times = [self._window.next_probe(), self._window.next_slow_reader(), self._readers.next_silent()]
         if self._readers and self.mtu is not None:
-            times.append(self._statuses.next_timeout())
+            times.append(self._heartbeats.get_timer())
         return min((time for time in times if time is not None), default=None)
 
-    def take(self, now_s: float, limit_bytes: int = _ALL) -> list[bytes]:
+    def poll_frames(self, now_s: float, limit_bytes: int = _ALL) -> list[bytes]:
         """Return frames that may be sent now, about ``limit_bytes`` at a time; the rest is sealed when it is polled."""
         self.has_more = False
         mtu = self._queue.mtu
@@ -303,7 +304,7 @@ class Publisher:
             return []
         self._queue.seal_deferred()
         limit = max(limit_bytes // mtu, 1)
-        frames = self._seal_status(now_s, mtu) if self._statuses.is_due(now_s) else []
+        frames = self._seal_status(now_s, mtu) if self._heartbeats.is_due(now_s) else []
         frames += self._queue.frames_to_send(now_s, limit - len(frames))
         self.has_more = len(frames) >= limit
         if frames:
@@ -319,7 +320,7 @@ class Publisher:
     def _seal_status(self, now_s: float, mtu: int) -> list[bytes]:
         queue, oldest = self._queue, self._window.oldest
         (sent_number, sent_part), (sent_sequence, oldest_sequence) = queue.sent, queue.sequences
-        state = Status(
+        state = Heartbeat(
             oldest=sent_number if oldest is None else oldest,
             sent_number=sent_number,
             sent_part=sent_part,
@@ -330,5 +331,5 @@ class Publisher:
             sent_sequence=sent_sequence,
             gone=tuple(queue.ledger.gone),
         )
-        wire = self._statuses.take(state, now_s)
-        return list(self._keys.status.seal(self._statuses.number, queue.flags, wire, mtu))
+        wire = self._heartbeats.poll_heartbeat(state, now_s)
+        return list(self._keys.status.seal(self._heartbeats.number, queue.flags, wire, mtu))

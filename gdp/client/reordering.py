@@ -10,9 +10,9 @@ from dataclasses import replace
 from typing import Final
 
 from gdp.limits import REPLAY_WINDOW_MESSAGES
-from gdp.message.join import Joined
-from gdp.message.memory import Budget
-from gdp.message.move import Move
+from gdp.message.reassembly import ReassembledMessage
+from gdp.message.reassembly_quota import ReassemblyQuota
+from gdp.message.renumbering import Renumbering
 from gdp.names import Name
 
 __all__ = ["ReorderingBuffer"]
@@ -30,10 +30,10 @@ class ReorderingBuffer:
         expected: the number that is delivered next.
     """
 
-    def __init__(self, publisher: Name, budget: Budget) -> None:
+    def __init__(self, publisher: Name, budget: ReassemblyQuota) -> None:
         self._publisher = publisher
         self._budget = budget
-        self._waiting: dict[int, Joined] = {}
+        self._waiting: dict[int, ReassembledMessage] = {}
         self.expected = 0
 
     def __len__(self) -> int:
@@ -47,33 +47,33 @@ class ReorderingBuffer:
         """Return the numbers that wait, lowest first."""
         return sorted(self._waiting)
 
-    def put(self, joined: Joined) -> bool:
+    def put(self, joined: ReassembledMessage) -> bool:
         """Let a message wait; return False where the budget has no room for it."""
         if not self._budget.reserve(self._publisher, len(joined.message) + _OVERHEAD_BYTES):
             return False
         self._waiting[joined.number] = joined
         return True
 
-    def consecutive(self) -> Iterator[Joined]:
+    def consecutive(self) -> Iterator[ReassembledMessage]:
         """Remove and yield the messages from ``expected`` on, up to the next gap."""
         while self.expected in self._waiting:
             joined = self._pop(self.expected)
             self.expected += 1
             yield joined
 
-    def skip_to(self, number: int) -> Iterator[Joined]:
+    def skip_to(self, number: int) -> Iterator[ReassembledMessage]:
         """Move on to a number; remove and yield what waited before it."""
         before = sorted(each for each in self._waiting if each < number)
         self.expected = number
         return iter([self._pop(each) for each in before])
 
-    def begin(self, number: int) -> None:
+    def start_at(self, number: int) -> None:
         """Expect a first number; what waits too far from it is dropped."""
         self.expected = number
         for each in [each for each in self._waiting if not 0 <= each - number < REPLAY_WINDOW_MESSAGES]:
             self._pop(each)
 
-    def renumber(self, move: Move) -> list[Joined]:
+    def renumber(self, move: Renumbering) -> list[ReassembledMessage]:
         """Expect the new numbers of a renumbering; remove and return what waited, under its new numbers."""
         self.expected = move.of(self.expected)
         early = {number: self._pop(number) for number in list(self._waiting) if move.is_before(number)}
@@ -81,11 +81,11 @@ class ReorderingBuffer:
             self._pop(number)  # it was delivered under its old number
         return [replace(joined, number=move.of(old)) for old, joined in early.items()]
 
-    def drain(self) -> list[Joined]:
+    def drain(self) -> list[ReassembledMessage]:
         """Remove and return what waits, in order."""
         return [self._pop(number) for number in self.numbers]
 
-    def _pop(self, number: int) -> Joined:
+    def _pop(self, number: int) -> ReassembledMessage:
         joined = self._waiting.pop(number)
         self._budget.release(self._publisher, len(joined.message) + _OVERHEAD_BYTES)
         return joined

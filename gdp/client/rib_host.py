@@ -11,16 +11,16 @@ from collections.abc import Mapping, Sequence
 
 from gdp.client.attachment import Attachment
 from gdp.control.channel import Channels
-from gdp.control.frames import ControlJoiner
+from gdp.control.fragments import ControlReassembler
 from gdp.control.settings import NodeSettings
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
-from gdp.effects import Arrival, Instant, Transmit
 from gdp.errors import DropReason, FrameError, RemoteError
 from gdp.frame.codec import decode
 from gdp.frame.kinds import CONTROL_FROM, Kind
 from gdp.names import Name
-from gdp.rib.machine import Rib
+from gdp.rib.core import RibCore
+from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.trust.domain import Policy
 
 __all__ = ["RibHost"]
@@ -29,9 +29,9 @@ __all__ = ["RibHost"]
 class RibHost:
     """The machine of a RIB node."""
 
-    def __init__(self, identity: Identity, policy: Policy, rib: Rib, settings: NodeSettings) -> None:
+    def __init__(self, identity: Identity, policy: Policy, rib: RibCore, settings: NodeSettings) -> None:
         self._identity = identity
-        self._joiner = ControlJoiner()
+        self._reassembler = ControlReassembler()
         self._drops: Counter[DropReason] = Counter()
         self._is_connected = False
         self._now_s = 0.0  # of the last call
@@ -46,14 +46,14 @@ class RibHost:
 
     def drops(self) -> Mapping[DropReason, int]:
         """Return what was dropped or refused, by reason."""
-        own = self._drops + self._joiner.drops + self._channels.drops
+        own = self._drops + self._reassembler.drops + self._channels.drops
         return own + self.attachment.drops + self.rib.refusals
 
-    def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Instant) -> None:
+    def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Timestamps) -> None:
         """Begin to look for a switch on a port."""
-        self.attachment.greeter.add_port(index, mac, mtu, cost, now.mono_s)
+        self.attachment.hello_protocol.add_port(index, mac, mtu, cost, now.mono_s)
 
-    def receive(self, arrivals: Sequence[Arrival], now: Instant) -> None:
+    def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
         """Take frames in."""
         self._now_s = now.mono_s
         statements: list[tuple[bytes, Name]] = []
@@ -69,34 +69,34 @@ class RibHost:
         self._note_connection(now)
         self._post()
 
-    def port_changed(self, port: int, up: bool, now: Instant) -> None:
+    def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
         """Learn that a port's link came or went."""
         self.attachment.port_changed(port, up, now)
 
-    def timeout(self, now: Instant) -> None:
+    def handle_timer(self, now: Timestamps) -> None:
         """Do what is due."""
         self._now_s = now.mono_s
-        self.attachment.timeout(now)
+        self.attachment.handle_timer(now)
         self._note_connection(now)
-        self._joiner.expire(now.mono_s)
-        self.rib.timeout(now)
-        self._channels.timeout(now.mono_s)
+        self._reassembler.drop_expired(now.mono_s)
+        self.rib.handle_timer(now)
+        self._channels.handle_timer(now.mono_s)
         self._post()
 
-    def next_timeout(self) -> float | None:
+    def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self.attachment.next_timeout(), self.rib.next_timeout(), self._channels.next_timeout()]
+        times = [self.attachment.get_timer(), self.rib.get_timer(), self._channels.get_timer()]
         return min((time for time in times if time is not None), default=None)
 
-    def take_neighbours(self) -> Mapping[int, frozenset[bytes]]:
+    def poll_neighbours(self) -> Mapping[int, frozenset[bytes]]:
         """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
-        return self.attachment.greeter.take_addresses()
+        return self.attachment.hello_protocol.poll_addresses()
 
-    def take(self) -> list[Transmit]:
+    def frames_to_send(self) -> list[OutgoingFrames]:
         """Return, once, what is to be sent."""
-        return self.attachment.take()
+        return self.attachment.frames_to_send()
 
-    def _take(self, arrival: Arrival, now: Instant) -> list[tuple[bytes, Name]]:
+    def _take(self, arrival: ReceivedFrame, now: Timestamps) -> list[tuple[bytes, Name]]:
         """Return the statement for the RIB that a frame completes, with its sender."""
         header = decode(arrival.frame)
         if header.kind >= CONTROL_FROM:
@@ -108,7 +108,7 @@ class RibHost:
             raise FrameError(DropReason.NOT_FOR_US)
         if header.kind not in (Kind.RIB_REQUEST, Kind.RIB_ANSWER):
             raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
-        wire = self._joiner.add(header, arrival.frame, now.mono_s, arrival.via)
+        wire = self._reassembler.add(header, arrival.frame, now.mono_s, arrival.via)
         if wire is None:
             return []
         sender = Name(header.source)
@@ -119,30 +119,30 @@ class RibHost:
             raise FrameError(DropReason.NO_CHANNEL, "a statement that may be a recorded one")
         return [(opened.wire, sender)]
 
-    def _take_revocation(self, statement: Statement, now: Instant) -> None:
+    def _take_revocation(self, statement: Statement, now: Timestamps) -> None:
         switch = self.attachment.switch
         if switch is not None:
             self.rib.revoke(statement.wire, switch.name, now)
-            self.attachment.greeter.recheck(statement.fields.bytes_("cert"), now)
+            self.attachment.hello_protocol.recheck(statement.fields.bytes_("cert"), now)
 
-    def _note_connection(self, now: Instant) -> None:
+    def _note_connection(self, now: Timestamps) -> None:
         is_connected = self.attachment.switch is not None
         if is_connected and not self._is_connected:
             self.rib.connected(now)
         self._is_connected = is_connected
 
     def _post(self) -> None:
-        letters = self.rib.take()
+        letters = self.rib.statements_to_send()
         if self.attachment.switch is None:
             return  # nobody to carry them: whoever asked will ask again
-        for letter in letters:
-            if letter.kind is Kind.RIB_REQUEST:
-                self._channels.ask(letter.to, letter.statement, self._now_s)
-            elif not self._channels.answer(letter.to, letter.statement):
-                self._send(letter.kind, letter.statement, letter.to)  # a question about presence, to any switch
-        for each in self._channels.take():
+        for outgoing in letters:
+            if outgoing.kind is Kind.RIB_REQUEST:
+                self._channels.ask(outgoing.to, outgoing.statement, self._now_s)
+            elif not self._channels.send_response(outgoing.to, outgoing.statement):
+                self._send(outgoing.kind, outgoing.statement, outgoing.to)  # a question about presence, to any switch
+        for each in self._channels.records_to_send():
             self._send(Kind.RIB_ANSWER if each.is_answer else Kind.RIB_REQUEST, each.wire, each.to)
 
     def _send(self, kind: Kind, statement: bytes, to: Name) -> None:
         attachment = self.attachment
-        attachment.send(attachment.splitter.split(kind, statement, attachment.mtu, to))
+        attachment.send(attachment.fragmenter.split(kind, statement, attachment.mtu, to))

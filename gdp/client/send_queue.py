@@ -7,7 +7,8 @@ A message passes up to three stages::
     deferred (latched, before the first reader) -> gathered (small, waits for its bundle) -> sealed (window or queue)
 
 A message is sealed once. Where the path has become too narrow for what is cached, that is refragmented, and all that is
-cached gets new numbers; statuses announce which (``gdp/message/move.py``). Each message has a sequence number under its
+cached gets new numbers; statuses announce which (``gdp/message/renumbering.py``). Each message has a sequence number
+under its
 seal, sent or not (``gdp/message/ledger.py``).
 """
 
@@ -16,7 +17,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from typing import Final
 
-from gdp.client.best_effort import Carried, Unsent
+from gdp.client.best_effort_queue import BestEffortQueue, Carried
 from gdp.client.key_epochs import KeyEpochs
 from gdp.crypto.envelope import SIGNATURE_BYTES, Sealed, part_room
 from gdp.errors import DropReason
@@ -25,8 +26,8 @@ from gdp.limits import SEQUENCE_BYTES, WINDOW_BYTES
 from gdp.message.bundle import BUNDLE_BYTES, Gathered, pack
 from gdp.message.ledger import Ledger
 from gdp.message.loss import LossReason
-from gdp.message.move import MOVES_MAX, Move
-from gdp.message.window import SendWindow
+from gdp.message.renumbering import MOVES_MAX, Renumbering
+from gdp.message.send_window import SendWindow
 
 __all__ = ["SendQueue"]
 
@@ -63,11 +64,11 @@ class SendQueue:
         self.flags = 0
         self.mtu: int | None = None
         self.bundle_bytes = BUNDLE_BYTES
-        self.moves: deque[Move] = deque(maxlen=MOVES_MAX)
+        self.moves: deque[Renumbering] = deque(maxlen=MOVES_MAX)
         self.drops: Counter[DropReason] = Counter()
         self._deferred = deque[tuple[int, bytes]]()  # (sequence number, message)
         self._gathered = Gathered()
-        self._best_effort = Unsent()
+        self._best_effort = BestEffortQueue()
 
     @property
     def is_empty(self) -> bool:
@@ -101,15 +102,15 @@ class SendQueue:
         """Return the message number and the part before which everything has been sent."""
         if self.is_acknowledged:
             return self._window.sent
-        unsent = self._best_effort.oldest
-        return (self.next_number if unsent is None else unsent.number), 0
+        best_effort_queue = self._best_effort.oldest
+        return (self.next_number if best_effort_queue is None else best_effort_queue.number), 0
 
     @property
     def sequences(self) -> tuple[int, int]:
         """Return the sequence numbers of what is sent next, and of what is cached first."""
-        unsent, oldest = self._best_effort.oldest, self._window.oldest
+        best_effort_queue, oldest = self._best_effort.oldest, self._window.oldest
         if not self.is_acknowledged:
-            sent = self.first_waiting if unsent is None else unsent.sequence
+            sent = self.first_waiting if best_effort_queue is None else best_effort_queue.sequence
         else:
             sent = self.ledger.begin_of(self._window.sent[0], self.first_waiting)
         return sent, sent if oldest is None else self.ledger.begin_of(oldest, sent)
@@ -161,23 +162,23 @@ class SendQueue:
 
     def frames_to_send(self, now_s: float, limit: int) -> list[bytes]:
         """Return about ``limit`` frames that may be sent now, at least one; the rest is sealed when it is polled."""
-        frames = self._best_effort.take(max(limit, 1))
+        frames = self._best_effort.poll_frames(max(limit, 1))
         frames += self._window.frames_to_send(now_s, max(limit - len(frames), 1))
-        while self._gathered and len(frames) < limit and not self._has_unsent():
+        while self._gathered and len(frames) < limit and not self._has_best_effort_queue():
             self._seal_next()
             left = limit - len(frames)
             sends_window = self.is_acknowledged
-            frames += self._window.frames_to_send(now_s, left) if sends_window else self._best_effort.take(left)
+            frames += self._window.frames_to_send(now_s, left) if sends_window else self._best_effort.poll_frames(left)
         return frames
 
     def refragment_best_effort(self, mtu: int) -> bool:
         """Seal unsent best-effort messages again if one is too large for the path; return whether any was."""
-        unsent = self._best_effort.take_back(mtu)
-        for body, carried in unsent:
+        best_effort_queue = self._best_effort.requeue(mtu)
+        for body, carried in best_effort_queue:
             self._seal_message(body, carried.sequence, carried.messages)
-        return bool(unsent)
+        return bool(best_effort_queue)
 
-    def refragment(self, mtu: int) -> Move | None:
+    def refragment(self, mtu: int) -> Renumbering | None:
         """Seal all that is cached again, under new numbers, if something is too large for the path.
 
         Returns:
@@ -187,7 +188,7 @@ class SendQueue:
         if not any(each.largest > mtu for _, each in cached):
             return None
         first, end = cached[0][0], self.next_number
-        move = Move(first, end - first, end + 1)
+        move = Renumbering(first, end - first, end + 1)
         is_bundle = self.ledger.is_bundle
         sealed = [
             (move.of(number), self._seal(move.of(number), each, mtu, is_bundle=is_bundle(number)))
@@ -203,9 +204,9 @@ class SendQueue:
     def close(self) -> None:
         """Drop what waits; nothing is sent any more."""
         self.drops[DropReason.NO_READER] += len(self._gathered) + self._drop_deferred(0)
-        self._gathered, self._best_effort = Gathered(), Unsent()
+        self._gathered, self._best_effort = Gathered(), BestEffortQueue()
 
-    def _has_unsent(self) -> bool:
+    def _has_best_effort_queue(self) -> bool:
         return self._window.sent[0] < self.next_number if self.is_acknowledged else bool(self._best_effort)
 
     def _bundle_room(self) -> int:
@@ -216,7 +217,7 @@ class SendQueue:
 
     def _seal_next(self) -> None:
         """Seal as much of what was gathered as fits into one bundle."""
-        first, together = self._gathered.first, self._gathered.take(self._bundle_room())
+        first, together = self._gathered.first, self._gathered.poll_batch(self._bundle_room())
         self._seal_message(together[0] if len(together) == 1 else pack(together), first, len(together))
 
     def _seal_message(self, body: bytes, sequence: int, messages: int = 1) -> None:

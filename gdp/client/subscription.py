@@ -15,26 +15,26 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from gdp.client.delivery import Delivered
-from gdp.client.feed import Ended, Feed, FeedState
 from gdp.client.identities import ReaderIdentity
 from gdp.client.key_epochs import Secrets
-from gdp.client.private import Life, PrivateFeed, private_incarnation, private_name
-from gdp.control.query import Answer
-from gdp.effects import Instant
+from gdp.client.unicast_stream import PeerIncarnation, UnicastReceiver, private_incarnation, private_name
+from gdp.client.writer_proxy import Ended, WriterProxy, WriterProxyState
+from gdp.control.query import Response
 from gdp.errors import DropReason, StatementError
 from gdp.frame.codec import Header
 from gdp.limits import CALL_IDLE_S
-from gdp.message.join import VerifiesDigest
 from gdp.message.loss import Losses, LossReason, LostRange
-from gdp.message.memory import Budget
+from gdp.message.reassembly import VerifiesDigest
+from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.names import Name
-from gdp.trust.claim import Claim
+from gdp.sansio import Timestamps
+from gdp.trust.advertisement import Advertisement
 from gdp.trust.delegation import Delegation
 from gdp.trust.lru import Lru
 from gdp.trust.right import HEARS, Right
-from gdp.trust.verifier import ClaimVerifier
+from gdp.trust.verifier import AdvertisementVerifier
 
-__all__ = ["Change", "Message", "Subscription", "Subscriptions", "Topic"]
+__all__ = ["Message", "StreamChanges", "Subscription", "Subscriptions", "Topic"]
 
 ENDED_MAX: Final = 4_096  # closed feeds whose end is remembered
 ABSENT_MAX: Final = 1_024  # publishers of one topic that went, and may come back
@@ -78,8 +78,8 @@ class Subscription:
 
     topic: Topic
     right: Right
-    feeds: dict[Name, Feed] = field(default_factory=dict)
-    private: dict[Name, PrivateFeed] = field(default_factory=dict)
+    writer_proxies: dict[Name, WriterProxy] = field(default_factory=dict)
+    private: dict[Name, UnicastReceiver] = field(default_factory=dict)
     absent: dict[Name, tuple[int, Ended]] = field(default_factory=dict)
     past_losses: Losses = field(default_factory=Losses)
 
@@ -87,8 +87,8 @@ class Subscription:
         """Return what was lost of everything that is heard on this name."""
         losses = Losses()
         losses.update(self.past_losses)
-        for feed in self.all():
-            losses.update(feed.losses)
+        for writer_proxy in self.all():
+            losses.update(writer_proxy.losses)
         return losses
 
     def forget_absent(self, party: Name, why: LossReason) -> None:
@@ -97,23 +97,23 @@ class Subscription:
         if ended.sequence < ended.known:
             self.past_losses.add(LostRange(ended.sequence, ended.known - 1, why))
 
-    def all(self) -> list[Feed]:
+    def all(self) -> list[WriterProxy]:
         """Return every feed."""
-        return [*self.feeds.values(), *self.private.values()]
+        return [*self.writer_proxies.values(), *self.private.values()]
 
-    def take(self, source: Name) -> list[Message]:
+    def poll_messages(self, source: Name) -> list[Message]:
         """Return, once, the messages of one source; private ones not before it has said what they are."""
-        feed, topic = self.feeds.get(source), self.topic.name
-        if feed is None:
+        writer_proxy, topic = self.writer_proxies.get(source), self.topic.name
+        if writer_proxy is None:
             return []
-        messages = [Message(topic, each, feed.description) for each in feed.take_delivered()]
+        messages = [Message(topic, each, writer_proxy.description) for each in writer_proxy.poll_delivered()]
         private = self.private.get(source)
-        if private is not None and feed.state is FeedState.LIVE:
-            messages += [Message(topic, each, feed.description, True) for each in private.take_delivered()]
+        if private is not None and writer_proxy.state is WriterProxyState.LIVE:
+            messages += [Message(topic, each, writer_proxy.description, True) for each in private.poll_delivered()]
         return messages
 
 
-class _Way(NamedTuple):
+class _UnicastRoute(NamedTuple):
     """By which a party may say something to us alone."""
 
     subscription: Subscription
@@ -121,11 +121,11 @@ class _Way(NamedTuple):
     verifier: VerifiesDigest
 
 
-class Change(NamedTuple):
+class StreamChanges(NamedTuple):
     """Feeds that began, and that are to be closed: no frame finds them any more; and the last messages of these."""
 
-    opened: list[Feed]
-    ended: list[Feed]
+    opened: list[WriterProxy]
+    ended: list[WriterProxy]
     rest: list[Message]
 
 
@@ -136,12 +136,12 @@ class Subscriptions:
         reader: the member.
     """
 
-    def __init__(self, reader: ReaderIdentity, verifier: ClaimVerifier) -> None:
+    def __init__(self, reader: ReaderIdentity, verifier: AdvertisementVerifier) -> None:
         self._reader = reader
         self._verifier = verifier
-        self._budget = Budget()
+        self._budget = ReassemblyQuota()
         self._by_name: dict[Name, Subscription] = {}
-        self._ways: dict[tuple[bytes, int], _Way] = {}  # by writer and incarnation, as headers have them
+        self._ways: dict[tuple[bytes, int], _UnicastRoute] = {}  # by writer and incarnation, as headers have them
         self._ended: Lru[Ended] = Lru(ENDED_MAX)
         self.drops: Counter[DropReason] = Counter()  # of feeds that are gone, and of claims
         self._past_losses: Counter[LossReason] = Counter()  # on names that are heard no more
@@ -166,7 +166,7 @@ class Subscriptions:
         """Hear others on a name from now on."""
         self._by_name[topic.name] = Subscription(topic, right)
 
-    def remove(self, name: Name) -> list[Feed]:
+    def remove(self, name: Name) -> list[WriterProxy]:
         """Hear nobody on a name any more; return the feeds that are to be closed."""
         subscription = self._by_name.pop(name, None)
         if subscription is None:
@@ -175,108 +175,119 @@ class Subscriptions:
         self._past_losses += subscription.losses().counts
         return ended
 
-    def find(self, header: Header, now_s: float) -> tuple[Subscription, Feed] | None:
+    def find(self, header: Header, now_s: float) -> tuple[Subscription, WriterProxy] | None:
         """Return whose frame this is, if it is anybody's."""
         subscription = self._by_name.get(header.destination)  # type: ignore[call-overload]
         if subscription is not None:
-            feed = subscription.feeds.get(header.source)
-            return None if feed is None else (subscription, feed)
+            writer_proxy = subscription.writer_proxies.get(header.source)
+            return None if writer_proxy is None else (subscription, writer_proxy)
         if header.destination != self._reader.name:
             return None
         way = self._ways.get((header.source, header.incarnation))
-        return None if way is None else (way.subscription, self._private_feed(way, Name(header.source), now_s))
+        return None if way is None else (way.subscription, self._private_writer_proxy(way, Name(header.source), now_s))
 
-    def take(self, answer: Answer, now: Instant) -> Change:
+    def receive_response(self, answer: Response, now: Timestamps) -> StreamChanges:
         """Take what the switch says of somebody: its claim, or that it is gone.
 
         Raises:
             StatementError: the claim does not hold, is about something else, or newer than what is gone.
         """
-        subscription, change = self._by_name.get(answer.name), Change([], [], [])
+        subscription, change = self._by_name.get(answer.name), StreamChanges([], [], [])
         if subscription is None or answer.advertiser == self._reader.name:
             return change
-        feed = subscription.feeds.get(answer.advertiser)
-        if not answer.claim:
-            if feed is not None and feed.claim_sequence > answer.sequence:
+        writer_proxy = subscription.writer_proxies.get(answer.advertiser)
+        if not answer.advertisement:
+            if writer_proxy is not None and writer_proxy.advertisement_sequence > answer.sequence:
                 raise StatementError(DropReason.STALE, "gone, of an earlier claim")
-            return change if feed is None else Change([], self._detach(subscription, answer.advertiser), [])
-        claim = self._verifier.verify(answer.claim, now.unix_s)
-        is_heard = HEARS[subscription.right] is claim.right
-        if not is_heard or claim.name != answer.name or claim.node != answer.advertiser:
+            return (
+                change if writer_proxy is None else StreamChanges([], self._detach(subscription, answer.advertiser), [])
+            )
+        advertisement = self._verifier.verify(answer.advertisement, now.unix_s)
+        is_heard = HEARS[subscription.right] is advertisement.right
+        if not is_heard or advertisement.name != answer.name or advertisement.node != answer.advertiser:
             raise StatementError(DropReason.WRONG_NAME, "a claim about something else")
-        self._reader.notes.shared(claim.exchange)  # or it is refused before anything changes
-        if feed is not None:
-            if claim.sequence <= feed.claim_sequence:
+        self._reader.notes.shared(advertisement.exchange)  # or it is refused before anything changes
+        if writer_proxy is not None:
+            if advertisement.sequence <= writer_proxy.advertisement_sequence:
                 return change
-            if feed.incarnation == claim.incarnation:
-                feed.claim_sequence, feed.claim = claim.sequence, claim
+            if writer_proxy.incarnation == advertisement.incarnation:
+                writer_proxy.advertisement_sequence, writer_proxy.advertisement = advertisement.sequence, advertisement
                 return change
-            feed.finish()
-            rest = [Message(answer.name, each, feed.description) for each in feed.take_delivered()]
-            change = Change([], self._detach(subscription, claim.node), rest)
-        return change._replace(opened=self._open(subscription, claim, now.mono_s))
+            writer_proxy.finish()
+            rest = [Message(answer.name, each, writer_proxy.description) for each in writer_proxy.poll_delivered()]
+            change = StreamChanges([], self._detach(subscription, advertisement.node), rest)
+        return change._replace(opened=self._open(subscription, advertisement, now.mono_s))
 
     def has_issuer(self, key: bytes) -> bool:
         """Return whether a claim that is heard rests on a certificate that this key, 33 bytes, issued."""
-        feeds = (feed for subscription in self._by_name.values() for feed in subscription.feeds.values())
-        return any(feed.claim is not None and key in feed.claim.issuers for feed in feeds)
+        writer_proxies = (
+            writer_proxy
+            for subscription in self._by_name.values()
+            for writer_proxy in subscription.writer_proxies.values()
+        )
+        return any(
+            writer_proxy.advertisement is not None and key in writer_proxy.advertisement.issuers
+            for writer_proxy in writer_proxies
+        )
 
-    def recheck(self, fingerprint: bytes, unix_s: float) -> list[Feed]:
+    def recheck(self, fingerprint: bytes, unix_s: float) -> list[WriterProxy]:
         """Return the feeds that are to be closed, for their party's claim rested on what was revoked."""
-        ended: list[Feed] = []
+        ended: list[WriterProxy] = []
         for subscription in self._by_name.values():
-            for feed in list(subscription.feeds.values()):
-                if feed.claim is None or fingerprint not in feed.claim.fingerprints:
+            for writer_proxy in list(subscription.writer_proxies.values()):
+                if writer_proxy.advertisement is None or fingerprint not in writer_proxy.advertisement.fingerprints:
                     continue
                 try:
-                    self._verifier.recheck(feed.claim, unix_s)
+                    self._verifier.recheck(writer_proxy.advertisement, unix_s)
                 except StatementError as error:
                     self.drops[error.reason] += 1
-                    ended += self._detach(subscription, feed.publisher)
+                    ended += self._detach(subscription, writer_proxy.publisher)
         return ended
 
-    def leave(self) -> list[Feed]:
+    def leave(self) -> list[WriterProxy]:
         """Return all feeds, which are to be closed."""
-        return [feed for subscription in self._by_name.values() for feed in self._end_all(subscription)]
+        return [writer_proxy for subscription in self._by_name.values() for writer_proxy in self._end_all(subscription)]
 
-    def _open(self, subscription: Subscription, claim: Claim, now_s: float) -> list[Feed]:
-        topic, reader, party = subscription.topic, self._reader, claim.node
-        ended = self._ended.get(topic.name + _key(party, claim.incarnation)) or _NOWHERE
-        life, before = subscription.absent.get(party, (claim.incarnation, ended))
-        if life == claim.incarnation:
+    def _open(self, subscription: Subscription, advertisement: Advertisement, now_s: float) -> list[WriterProxy]:
+        topic, reader, party = subscription.topic, self._reader, advertisement.node
+        ended = self._ended.get(topic.name + _key(party, advertisement.incarnation)) or _NOWHERE
+        life, before = subscription.absent.get(party, (advertisement.incarnation, ended))
+        if life == advertisement.incarnation:
             ended = before
             subscription.absent.pop(party, None)
         else:
             subscription.forget_absent(party, LossReason.PUBLISHER_RESTARTED)
-        feed = Feed(
+        writer_proxy = WriterProxy(
             topic=topic.name,
             reader=reader,
             publisher=party,
-            incarnation=claim.incarnation,
-            writer=claim.member.key,
-            exchange=claim.exchange,
+            incarnation=advertisement.incarnation,
+            writer=advertisement.member.key,
+            exchange=advertisement.exchange,
             secrets=topic.secrets,
             budget=self._budget,
             now_s=now_s,
             ended=ended,
-            restarted=life != claim.incarnation,
+            restarted=life != advertisement.incarnation,
         )
-        feed.claim_sequence, feed.claim = claim.sequence, claim
-        subscription.feeds[party] = feed
+        writer_proxy.advertisement_sequence, writer_proxy.advertisement = advertisement.sequence, advertisement
+        subscription.writer_proxies[party] = writer_proxy
         if subscription.right is Right.SERVE:
-            feed.idle_s = CALL_IDLE_S
+            writer_proxy.idle_s = CALL_IDLE_S
         if subscription.right is not Right.READ:
-            stream = self._stream_from(topic.name, feed)
-            self._ways[party, private_incarnation(stream)] = _Way(subscription, stream, claim.member.key)
-        return [feed]
+            stream = self._stream_from(topic.name, writer_proxy)
+            self._ways[party, private_incarnation(stream)] = _UnicastRoute(
+                subscription, stream, advertisement.member.key
+            )
+        return [writer_proxy]
 
-    def _private_feed(self, way: _Way, writer: Name, now_s: float) -> PrivateFeed:
+    def _private_writer_proxy(self, way: _UnicastRoute, writer: Name, now_s: float) -> UnicastReceiver:
         """Return what a party says to us alone."""
         subscription = way.subscription
-        feed = subscription.private.get(writer)
-        if feed is None:
-            public, ended = subscription.feeds[writer], self._ended.get(way.stream) or _NOWHERE
-            feed = subscription.private[writer] = PrivateFeed(
+        writer_proxy = subscription.private.get(writer)
+        if writer_proxy is None:
+            public, ended = subscription.writer_proxies[writer], self._ended.get(way.stream) or _NOWHERE
+            writer_proxy = subscription.private[writer] = UnicastReceiver(
                 name=way.stream,
                 reader=self._reader,
                 public=public,
@@ -286,42 +297,46 @@ class Subscriptions:
                 now_s=now_s,
                 ended=ended,
             )
-        return feed
+        return writer_proxy
 
-    def _stream_from(self, topic: Name, feed: Feed) -> Name:
+    def _stream_from(self, topic: Name, writer_proxy: WriterProxy) -> Name:
         """Return the name of the stream by which the publisher of a feed says something to us alone."""
-        reader = Life(self._reader.name, self._reader.incarnation)
-        return private_name(topic, Life(feed.publisher, feed.incarnation), reader)
+        reader = PeerIncarnation(self._reader.name, self._reader.incarnation)
+        return private_name(topic, PeerIncarnation(writer_proxy.publisher, writer_proxy.incarnation), reader)
 
-    def _end_all(self, subscription: Subscription) -> list[Feed]:
+    def _end_all(self, subscription: Subscription) -> list[WriterProxy]:
         for party in list(subscription.absent):
             subscription.forget_absent(party, LossReason.DETACHED)
-        return [feed for party in list(subscription.feeds) for feed in self._end(subscription, party)]
+        return [
+            writer_proxy
+            for party in list(subscription.writer_proxies)
+            for writer_proxy in self._end(subscription, party)
+        ]
 
-    def _detach(self, subscription: Subscription, party: Name) -> list[Feed]:
+    def _detach(self, subscription: Subscription, party: Name) -> list[WriterProxy]:
         """End the feeds of a party that may come back, in this life or another."""
-        feed = subscription.feeds[party]
-        if feed.ended.sequence:
-            subscription.absent[party] = feed.incarnation, feed.ended._replace(resumes=True)
+        writer_proxy = subscription.writer_proxies[party]
+        if writer_proxy.ended.sequence:
+            subscription.absent[party] = writer_proxy.incarnation, writer_proxy.ended._replace(resumes=True)
         if len(subscription.absent) > ABSENT_MAX:
             subscription.forget_absent(next(iter(subscription.absent)), LossReason.DETACHED)
         return self._end(subscription, party)
 
-    def _end(self, subscription: Subscription, party: Name) -> list[Feed]:
-        feed = subscription.feeds.pop(party)
-        subscription.past_losses.update(feed.losses)
-        self._remember(subscription.topic.name + _key(party, feed.incarnation), feed)
-        self._ways.pop((party, private_incarnation(self._stream_from(subscription.topic.name, feed))), None)
+    def _end(self, subscription: Subscription, party: Name) -> list[WriterProxy]:
+        writer_proxy = subscription.writer_proxies.pop(party)
+        subscription.past_losses.update(writer_proxy.losses)
+        self._remember(subscription.topic.name + _key(party, writer_proxy.incarnation), writer_proxy)
+        self._ways.pop((party, private_incarnation(self._stream_from(subscription.topic.name, writer_proxy))), None)
         private = subscription.private.pop(party, None)
         if private is None:
-            return [feed]
+            return [writer_proxy]
         subscription.past_losses.update(private.losses)
         self._remember(private.topic, private)
-        return [feed, private]
+        return [writer_proxy, private]
 
-    def _remember(self, key: bytes, feed: Feed) -> None:
-        self._ended.put(key, feed.ended)
-        self.drops += feed.drops
+    def _remember(self, key: bytes, writer_proxy: WriterProxy) -> None:
+        self._ended.put(key, writer_proxy.ended)
+        self.drops += writer_proxy.drops
 
 
 def _key(name: Name, incarnation: int) -> bytes:

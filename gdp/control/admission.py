@@ -58,7 +58,7 @@ class TokenBucket:
             self._at_s = now_s
         return self._tokens >= 1.0
 
-    def take(self, now_s: float) -> bool:
+    def spend(self, now_s: float) -> bool:
         """Take a token; return whether there was one."""
         is_there = self.has(now_s)
         if is_there:
@@ -178,7 +178,7 @@ class Admission:
 
     def refused(self, now_s: float) -> None:
         """Note a hello that was refused unverified; many of them are a flood."""
-        if not self._refusals.take(now_s):
+        if not self._refusals.spend(now_s):
             self.flooded_until_s = now_s + _LOADED_S
 
     def admit_neighbour(self, bucket: TokenBucket, now_s: float) -> None:
@@ -187,7 +187,7 @@ class Admission:
         Raises:
             StatementError: RATE_LIMITED.
         """
-        if not bucket.take(now_s):
+        if not bucket.spend(now_s):
             self.flooded_until_s = now_s + _LOADED_S
             raise StatementError(DropReason.RATE_LIMITED, "hellos of one neighbour")
 
@@ -200,23 +200,23 @@ class Admission:
         Raises:
             StatementError: RATE_LIMITED, or COOKIE_REQUIRED.
         """
-        if not self._address(mac, now_s).take(now_s):
+        if not self._address(mac, now_s).spend(now_s):
             self.refused(now_s)
             raise StatementError(DropReason.RATE_LIMITED, "hellos of one address")
         if not self.is_loaded(now_s):
-            if self._strangers.take(now_s):
+            if self._strangers.spend(now_s):
                 return
             self._load(now_s)
         if not has_cookie():
-            if not self._strangers.take(now_s):  # what comes without a cookie keeps the port loaded
+            if not self._strangers.spend(now_s):  # what comes without a cookie keeps the port loaded
                 self._load(now_s)
             raise StatementError(DropReason.COOKIE_REQUIRED, "hello")
-        if not self._proven.take(now_s):
+        if not self._proven.spend(now_s):
             raise StatementError(DropReason.RATE_LIMITED, "hellos of strangers")
 
     def may_send_cookie(self, now_s: float) -> bool:
         """Take a token for a cookie; return whether there was one."""
-        return self._cookies.take(now_s)
+        return self._cookies.spend(now_s)
 
     def _load(self, now_s: float) -> None:
         self.loaded_until_s = self.flooded_until_s = now_s + _LOADED_S

@@ -69,7 +69,7 @@ class ErrorBoundary:
             self._places.add(place)
             self._texts.append("".join(traceback.format_exception(error)).rstrip())
 
-    def take(self) -> list[str]:
+    def poll_tracebacks(self) -> list[str]:
         """Return, once, the tracebacks that are to be logged."""
         texts, self._texts = self._texts, []
         return texts

@@ -1,6 +1,6 @@
 """Channels: what a switch and a RIB, or two RIBs, say to each other is fresh, and from whom it says.
 
-Sans-I/O; time comes in as ``Instant``. Source: the handshake is SIGMA's (signed ephemeral X25519 keys, RFC 7296 in
+Sans-I/O; time comes in as ``Timestamps``. Source: the handshake is SIGMA's (signed ephemeral X25519 keys, RFC 7296 in
 spirit), the records are those of RFC 9147. A signed statement alone proves who wrote it, not when. A recorded one could
 be played again after any restart. A record belongs to one channel, a channel to one life of both ends::
 
@@ -26,12 +26,12 @@ from gdp.crypto.fields import Fields
 from gdp.crypto.identity import Identity
 from gdp.crypto.records import RecordKey
 from gdp.crypto.statements import Statement, StatementType, parse, sign
-from gdp.effects import Instant
 from gdp.errors import DropReason, FrameError, StatementError
 from gdp.limits import CONTROL_MAX_BYTES, RECORD_OVERHEAD_BYTES
 from gdp.message.replay import ReplayWindow
 from gdp.message.token_bucket import TokenBucket
 from gdp.names import Name
+from gdp.sansio import Timestamps
 from gdp.trust.domain import Policy
 
 __all__ = ["Channels", "Opened", "Outgoing"]
@@ -159,7 +159,7 @@ class Channels:
             self._open(peer, asked, now_s)
         self._out.append(Outgoing(peer, asked.channel.seal(statement)))
 
-    def answer(self, peer: Name, statement: bytes) -> bool:
+    def send_response(self, peer: Name, statement: bytes) -> bool:
         """Send a statement over the channel that a peer opened; return whether there is one."""
         asker = self._askers.get(peer)
         if asker is None or not asker.channels:
@@ -179,7 +179,7 @@ class Channels:
         self._asked.pop(peer, None)
         self._askers.pop(peer, None)
 
-    def receive(self, wire: bytes, sender: Name, now: Instant) -> Opened | None:
+    def receive(self, wire: bytes, sender: Name, now: Timestamps) -> Opened | None:
         """Take what came for us; return the statement in it, if it is for more than the channel.
 
         Raises:
@@ -201,7 +201,7 @@ class Channels:
             self._take_accept(statement, now)
         return None
 
-    def timeout(self, now_s: float) -> None:
+    def handle_timer(self, now_s: float) -> None:
         """Repeat what was not accepted yet."""
         for peer, asked in list(self._asked.items()):
             offer = asked.offer
@@ -218,11 +218,11 @@ class Channels:
             offer.again_s = now_s + _AGAIN_S[offer.tries]
             offer.tries += 1
 
-    def next_timeout(self) -> float | None:
+    def get_timer(self) -> float | None:
         """Return the monotonic second of the next repetition, or None."""
         return min((asked.offer.again_s for asked in self._asked.values() if asked.offer is not None), default=None)
 
-    def take(self) -> list[Outgoing]:
+    def records_to_send(self) -> list[Outgoing]:
         """Return, once, what is to be sent."""
         out, self._out = self._out, []
         return out
@@ -242,7 +242,7 @@ class Channels:
         asked.reopened_s = now_s
         self._out.append(Outgoing(peer, wire))
 
-    def _take_accept(self, statement: Statement, now: Instant) -> None:
+    def _take_accept(self, statement: Statement, now: Timestamps) -> None:
         fields = statement.fields
         asked = self._asked.get(statement.signer)
         offer = None if asked is None else asked.offer
@@ -267,7 +267,7 @@ class Channels:
 
     # -- the side that is asked
 
-    def _take_offer(self, statement: Statement, now: Instant) -> None:
+    def _take_offer(self, statement: Statement, now: Timestamps) -> None:
         fields = statement.fields
         if not self._accepts or fields.name("w") != self._identity.name:
             raise StatementError(DropReason.NOT_FOR_US, "an offer of a channel")
@@ -276,7 +276,7 @@ class Channels:
         if known is not None and fingerprint in known.offers:
             self._out.append(Outgoing(statement.signer, known.offers[fingerprint].accept, is_answer=True))
             return
-        if known is not None and not known.pace.take(now.mono_s):
+        if known is not None and not known.pace.spend(now.mono_s):
             raise StatementError(DropReason.QUOTA, "offers of channels")
         if self._verified(statement, now) not in _PEER_ROLES:
             raise StatementError(DropReason.NOT_DELEGATED, "only switches and RIBs ask")
@@ -318,11 +318,11 @@ class Channels:
                     if len(asker.channels) > _CHANNELS_PER_PEER:
                         asker.channels.popitem(last=False)
                     return plaintext
-        if self._accepts and self._hints.take(now_s):
+        if self._accepts and self._hints.spend(now_s):
             self._out.append(Outgoing(sender, bytes([_UNKNOWN]) + id_, is_answer=True))
         raise FrameError(DropReason.NO_CHANNEL, "a record of a channel that is not known")
 
-    def _verified(self, statement: Statement, now: Instant) -> Role:
+    def _verified(self, statement: Statement, now: Timestamps) -> Role:
         """Return the role of who signed.
 
         Raises:

@@ -41,7 +41,7 @@ DIGEST_BYTES: Final = 8
 LIFE_BYTES: Final = 16  # first sequence number (wall-clock milliseconds of the start), incarnation; big-endian
 COOKIE_BYTES: Final = 16
 HEARD_MAX: Final = 128  # NEIGHBOURS_MAX of a port, and as many that have not proved themselves yet
-RIVALS_MAX: Final = 32
+CONFLICTS_MAX: Final = 32
 COOKIES_MAX: Final = 16
 HELLO_MAX_BYTES: Final = 10 << 10  # a certificate, ``RTCERTS_MAX`` RtCerts and all nonces fit
 RTCERTS_MAX: Final = 8
@@ -106,7 +106,7 @@ class Hello:
     timing: Timing = NO_KEEPALIVES
     exchange_key: bytes = b""
     life: bytes = bytes(LIFE_BYTES)
-    rivals: tuple[bytes, ...] = ()
+    conflicts: tuple[bytes, ...] = ()
     rtcerts: tuple[bytes, ...] = ()
     cookies: tuple[tuple[bytes, bytes], ...] = ()
 
@@ -122,7 +122,7 @@ class Hello:
             "k": list(self.timing),
             "x": self.exchange_key,
             "b": self.life,
-            "u": list(self.rivals[:RIVALS_MAX]),
+            "u": list(self.conflicts[:CONFLICTS_MAX]),
             "r": list(self.rtcerts[:RTCERTS_MAX]),
             "y": [asker + tag for asker, tag in self.cookies[:COOKIES_MAX]],
         }
@@ -145,7 +145,7 @@ class Hello:
             _timing(fields),
             fields.bytes_("x", EXCHANGE_KEY_BYTES) if fields.get("x") != b"" else b"",
             fields.bytes_("b", LIFE_BYTES),
-            tuple(fields.byte_strings("u", RIVALS_MAX, ECHO_BYTES)),
+            tuple(fields.byte_strings("u", CONFLICTS_MAX, ECHO_BYTES)),
             tuple(fields.byte_strings("r", RTCERTS_MAX)),
             tuple(
                 (each[:NONCE_BYTES], each[NONCE_BYTES:])

@@ -124,7 +124,7 @@ class KeepaliveSession:
     send_at_s: float
     poll_at_s: float = 0.0
     is_final_due: bool = False
-    is_heard: bool = False
+    is_alive: bool = False
     hears_us: bool = False
 
     @classmethod
@@ -170,7 +170,7 @@ class KeepaliveSession:
         Args:
             source: our name and incarnation.
         """
-        flags = _POLL * poll | _FINAL * self.is_final_due | _HEARD * self.is_heard
+        flags = _POLL * poll | _FINAL * self.is_final_due | _HEARD * self.is_alive
         self.is_final_due = False
         length = _FRAME_BYTES - HEADER_BYTES
         name, incarnation = source
@@ -190,7 +190,7 @@ class KeepaliveSession:
             raise FrameError(DropReason.REPLAYED, "keepalive")
         flags, multiplier, digest = open_keepalive(self.in_key, frame)
         self.detect_s = self.in_interval_s * max(multiplier, 1)
-        self.received, self.is_heard = header.number, True
+        self.received, self.is_alive = header.number, True
         self.hears_us = bool(flags & _HEARD)
         if flags & _POLL:
             self.is_final_due, self.send_at_s = True, now_s
@@ -198,6 +198,6 @@ class KeepaliveSession:
 
     def suspect_at_s(self, heard_s: float) -> float:
         """Return when a neighbour last heard at ``heard_s`` is polled next; never before its first keepalive."""
-        if not self.is_heard:
+        if not self.is_alive:
             return float("inf")
         return max(heard_s + _SUSPECT_AFTER * self.in_interval_s, self.poll_at_s)

@@ -15,7 +15,7 @@ from gdp.limits import LEASE_MAX_S
 from gdp.names import Name
 from gdp.trust.revocations import ID_BYTES
 
-__all__ = ["Answer", "Query"]
+__all__ = ["Query", "Response"]
 
 TRANSIT_MAX: Final = 64
 
@@ -50,7 +50,7 @@ class Query:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class Response:
     """One advertiser of a name, or none.
 
     Args:
@@ -65,7 +65,7 @@ class Answer:
 
     name: Name
     advertiser: Name
-    claim: bytes
+    advertisement: bytes
     domain: Name
     transit: tuple[Name, ...]
     lease_s: float
@@ -74,14 +74,14 @@ class Answer:
     @property
     def is_nobody(self) -> bool:
         """Return whether this says that no one advertises the name."""
-        return not self.claim and self.advertiser == self.name
+        return not self.advertisement and self.advertiser == self.name
 
     def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:
         """Return the signed statement."""
         body = {
             "n": self.name,
             "a": self.advertiser,
-            "q": self.claim,
+            "q": self.advertisement,
             "d": self.domain,
             "x": list(self.transit[:TRANSIT_MAX]),
             "l": float(self.lease_s),
@@ -91,7 +91,7 @@ class Answer:
         return sign(StatementType.ANSWER, body, signer, key)
 
     @classmethod
-    def from_fields(cls, fields: Fields) -> Answer:
+    def from_fields(cls, fields: Fields) -> Response:
         """Read a parsed statement's body.
 
         Raises:

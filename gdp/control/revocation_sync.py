@@ -22,14 +22,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from gdp.control.greeter import Greeter
+from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import Neighbour
 from gdp.control.revoked import IDS_MAX, Lacking, Revoked
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType
-from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
+from gdp.sansio import Timestamps
 from gdp.trust.revocations import BUCKETS, KeptKey, Revocations
 from gdp.trust.token_buckets import TokenBuckets
 
@@ -79,11 +79,11 @@ class RevocationSync:
     """
 
     def __init__(
-        self, identity: Identity, revoked: Revocations, greeter: Greeter, say: Say, first_sequence: int
+        self, identity: Identity, revoked: Revocations, hello_protocol: HelloProtocol, say: Say, first_sequence: int
     ) -> None:
         self._identity = identity
         self._revoked = revoked
-        self._greeter = greeter
+        self._hello_protocol = hello_protocol
         self._say = say
         self._sequence = first_sequence
         self._peers: dict[tuple[int, Name], _Peer] = {}
@@ -102,7 +102,7 @@ class RevocationSync:
         """Forget a neighbour that is gone."""
         self._peers.pop((neighbour.port, neighbour.name), None)
 
-    def receive(self, neighbour: Neighbour, statement: Statement, now: Instant) -> None:
+    def receive(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
         """Take a neighbour's digests, or what it lacks.
 
         Raises:
@@ -116,11 +116,11 @@ class RevocationSync:
             said = Revoked.from_fields(statement.fields)
         else:
             said = Lacking.from_fields(statement.expect(StatementType.LACKING))
-        session = self._greeter.ports[neighbour.port].echo
+        session = self._hello_protocol.ports[neighbour.port].echo
         key = session, neighbour.name
         if said.session != session or said.sequence <= self._received.get(key, -1):
             raise StatementError(DropReason.REPLAYED, "digests of revocations")
-        if not self._taken.take(neighbour.name, now.mono_s):
+        if not self._taken.spend(neighbour.name, now.mono_s):
             raise StatementError(DropReason.QUOTA, "digests of revocations")
         statement.verify(neighbour.key)
         self._note_sequence(key, said.sequence)
@@ -139,7 +139,7 @@ class RevocationSync:
             if other != key:
                 peer.summary_at_s = min(max(peer.summary_at_s, now_s), now_s + _FETCH_S)
 
-    def timeout(self, now_s: float) -> None:
+    def handle_timer(self, now_s: float) -> None:
         """Say what is due."""
         for peer in list(self._peers.values()):
             if peer.tick_at_s <= now_s and (peer.asks or peer.sends):
@@ -147,7 +147,7 @@ class RevocationSync:
             if peer.summary_at_s <= now_s:
                 self._tell(peer, now_s)
 
-    def next_timeout(self) -> float | None:
+    def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         times = [peer.summary_at_s for peer in self._peers.values()]
         times += [peer.tick_at_s for peer in self._peers.values() if peer.asks or peer.sends]
@@ -169,7 +169,7 @@ class RevocationSync:
             del self._said_s[next(iter(self._said_s))]
         self._send(peer, Revoked(peer.neighbour.echo, self._next(), tuple(self._revoked.summary())))
 
-    def _compare(self, peer: _Peer, said: Revoked, now: Instant) -> None:
+    def _compare(self, peer: _Peer, said: Revoked, now: Timestamps) -> None:
         """Ask for what is lacking here, or say more exactly what is here."""
         self._revoked.expire(now.unix_s)
         own = {domain: (count, digest) for domain, count, digest in self._revoked.summary()}

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gdp.control.hello import Timing
-from gdp.limits import CLAIM_LEASE_S, DEAD_S, DETECT_MULTIPLIER, HELLO_S, KEEPALIVE_MS
+from gdp.limits import ADVERTISEMENT_LEASE_S, DEAD_S, DETECT_MULTIPLIER, HELLO_S, KEEPALIVE_MS
 
 __all__ = ["NodeSettings"]
 
@@ -34,7 +34,7 @@ class NodeSettings:
     random_bytes: Callable[[int], bytes]
     hello_s: float = HELLO_S
     dead_s: float = DEAD_S
-    lease_s: float = CLAIM_LEASE_S
+    lease_s: float = ADVERTISEMENT_LEASE_S
     keepalive_ms: int | None = None
     detect_multiplier: int = DETECT_MULTIPLIER
 

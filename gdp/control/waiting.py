@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-from gdp.control.greeter import Greeter, LinkPort
+from gdp.control.neighbor_discovery import HelloPort, HelloProtocol
 from gdp.control.neighbour import NeighbourState
 from gdp.crypto.certificates import Role
 from gdp.errors import DropReason
@@ -67,7 +67,7 @@ class Wait:
         return "port", self.port
 
 
-def port_waits(port: LinkPort, wanted: Collection[Role]) -> Iterator[Wait]:
+def port_waits(port: HelloPort, wanted: Collection[Role]) -> Iterator[Wait]:
     """Yield why a port has no neighbour of a wanted role; nothing where it has one."""
     if not port.is_up:
         yield Wait(WaitReason.LINK_DOWN, port.index)
@@ -86,9 +86,9 @@ def port_waits(port: LinkPort, wanted: Collection[Role]) -> Iterator[Wait]:
         yield Wait(WaitReason.NO_NEIGHBOUR, port.index)
 
 
-def stranger_waits(greeter: Greeter, now_s: float) -> Iterator[Wait]:
+def stranger_waits(hello_protocol: HelloProtocol, now_s: float) -> Iterator[Wait]:
     """Yield the neighbours that are refused at present, one for each port, domain and reason."""
-    for port in greeter.ports.values():
+    for port in hello_protocol.ports.values():
         for each in port.strangers.since(now_s - _STRANGER_S):
             yield Wait(WaitReason.STRANGER, port.index, each.domain, refused=each.reason)
 

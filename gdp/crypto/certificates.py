@@ -14,7 +14,7 @@ from typing import Final
 from gdp.crypto.keys import PublicKey
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
-from gdp.crypto.x509_form import DOMAIN_UNIT, Certificate, bad, issuer_common_name, read, to_pem
+from gdp.crypto.x509_profile import DOMAIN_UNIT, Certificate, bad, issuer_common_name, read, to_pem
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
 

@@ -31,12 +31,12 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from cryptography.hazmat.primitives.ciphers.algorithms import AES256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
-from gdp.crypto.heads import Heads
-from gdp.effects import Arrival
+from gdp.crypto.header_batch import HeaderBatch
 from gdp.errors import DropReason, EnvelopeError, LocalError
 from gdp.frame.codec import HEADER_BYTES, Header, authenticated, encode
 from gdp.frame.kinds import VERSION, Flag
 from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, PARTS_MAX, SEQUENCE_BYTES
+from gdp.sansio import ReceivedFrame
 
 __all__ = [
     "SALT_BYTES",
@@ -268,9 +268,9 @@ class Sealed(Sequence[bytes]):
         """Seal the parts before ``end``, all of full length, by the shortest way."""
         first, room, message = len(self._frames), self._room, self._message
         encrypt, update, append = self._encrypt, self._running.update, self._frames.append
-        heads = Heads(self._header._replace(length=room + SEAL_BYTES), first, end - first, self._salt)
+        headers = HeaderBatch(self._header._replace(length=room + SEAL_BYTES), first, end - first, self._salt)
         begins = range(first * room, end * room, room)
-        for begin, (header,), (additional,), (nonce,) in zip(begins, *heads.each(), strict=True):
+        for begin, (header,), (additional,), (nonce,) in zip(begins, *headers.each(), strict=True):
             sealed = encrypt(nonce, message[begin : begin + room], additional)
             update(sealed)
             append(header + sealed)
@@ -300,7 +300,7 @@ class Opener:
         self._known: dict[bytes, AESGCM] = {}  # by the salts of messages that parts have opened of
 
     def open_run(
-        self, heads: Heads, first: int, length: int, arrivals: Sequence[Arrival], at: int
+        self, headers: HeaderBatch, first: int, length: int, arrivals: Sequence[ReceivedFrame], at: int
     ) -> tuple[list[bytes], list[bytes]]:
         """Open the parts from ``first`` on, as far as ``arrivals[at:]`` brings them in order; the shortest way.
 
@@ -315,8 +315,8 @@ class Opener:
         """
         plains: list[bytes] = []
         payloads: list[bytes] = []
-        decrypt, end = self._aead_of(heads.salt).decrypt, HEADER_BYTES + length
-        expected = islice(zip(*heads.each(), strict=True), first - heads.first, None)
+        decrypt, end = self._aead_of(headers.salt).decrypt, HEADER_BYTES + length
+        expected = islice(zip(*headers.each(), strict=True), first - headers.first, None)
         for ((header,), (additional,), (nonce,)), arrival in zip(expected, islice(arrivals, at, None), strict=False):
             frame = arrival.frame
             if not frame.startswith(header):

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from gdp.crypto.ca import CertificateAuthority, request_membership
 from gdp.crypto.certificates import Membership, Role, Root
-from gdp.crypto.issuing import DomainAuthority, request_membership
 from gdp.crypto.kem import KemPrivateKey
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import StatementType, sign
@@ -64,9 +64,9 @@ class NodeKeys:
         """Return the request for a membership: PKCS #10, PEM."""
         return request_membership(self.key, self.role, self.label, self.digest)
 
-    def join(self, authority: DomainAuthority, validity: Validity) -> Identity:
+    def join(self, authority: CertificateAuthority, validity: Validity) -> Identity:
         """Return the node as a member of the authority's domain."""
-        return self.admitted(authority.admit(self.request(), validity), authority.root)
+        return self.admitted(authority.issue(self.request(), validity), authority.root)
 
     def admitted(self, membership: Membership, root: Root) -> Identity:
         """Return the node with a membership that was issued elsewhere.

@@ -46,7 +46,7 @@ class StatementType(str, Enum):
     REVOKE = "revoke"
     REVOKED = "revoked"  # between neighbours: digests of what each trusted domain has revoked
     LACKING = "lacking"  # ... and which of it the sender has, so that it is sent the rest
-    VERDICT = "verdict"
+    ADVERTISE_ACK = "advertise-ack"
     PRESENCE = "presence"  # RIB to switch and back: is the older of two nodes with one identity still there?
     DIGEST = "digest"  # between RIBs of one domain
     FETCH = "fetch"

@@ -20,8 +20,8 @@ class Kind(IntEnum):
     """What a frame carries. Unknown kinds below 0x80 are forwarded; at the end they are dropped and counted."""
 
     DATA = 0x01  # a sealed message part, publisher to readers
-    STATUS = 0x02  # sealed: what a publisher still holds, and the topic's description
-    REPORT = 0x03  # sealed: what a reader has and lacks, to the publisher
+    HEARTBEAT = 0x02  # sealed: what a publisher still holds, and the topic's description
+    ACKNACK = 0x03  # sealed: what a reader has and lacks, to the publisher
     INTRODUCTION = 0x04  # sealed: who a reader is and its key for reports, to the publisher
     RIB_REQUEST = 0x10  # a statement to a RIB
     RIB_ANSWER = 0x11  # a statement from a RIB
@@ -34,7 +34,7 @@ class Kind(IntEnum):
     LEAVE = 0x83
     ADVERTISE = 0x84  # an attached node's claim, to its switch
     WITHDRAW = 0x85
-    VERDICT = 0x86  # the switch's answer to an attached node: taken, or refused and why
+    ADVERTISE_ACK = 0x86  # the switch's answer to an attached node: taken, or refused and why
     REVOKE = 0x87  # to the neighbour, who passes it on: this certificate no longer counts
     KEEPALIVE = 0x88  # to a neighbour that is up: I am still here; no statement, but a tag by a key of both sessions
     REDIRECT = 0x89  # to the neighbour whose frames came here: where the node is now

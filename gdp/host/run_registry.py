@@ -24,7 +24,7 @@ from gdp.host.mounts import unmount
 from gdp.host.processes import Process, boot_id, end_all
 from gdp.stores.ownership import refuse_foreign_folder
 
-__all__ = ["Record", "Run", "Runs", "in_first_user_namespace", "outer_uid"]
+__all__ = ["Record", "Run", "RunRegistry", "in_first_user_namespace", "outer_uid"]
 
 log = logging.getLogger(__name__)
 
@@ -142,7 +142,7 @@ class Run:
             self._save()
 
     def keep(self, *, passive: bool = False) -> None:
-        """Let everything stand after this process ends, until ``Runs.take_down``.
+        """Let everything stand after this process ends, until ``RunRegistry.take_down``.
 
         Args:
             passive: the run has namespaces and devices only; it is dead after a reboot, and never before.
@@ -163,7 +163,7 @@ class Run:
         fresh.replace(self._path)
 
 
-class Runs:
+class RunRegistry:
     """The directory of records of one user.
 
     Args:

@@ -73,7 +73,7 @@ class Gathered:
         self._messages.append(message)
         self.held_bytes += len(message) + _ALONE_BYTES
 
-    def take(self, room: int) -> list[bytes]:
+    def poll_batch(self, room: int) -> list[bytes]:
         """Return the oldest, and what follows it as far as ``room`` bytes of wire form hold it."""
         together: list[bytes] = []
         while self._messages:

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Iterable
 
 from gdp.message.loss import GONE_MAX, Losses, LossReason, LostRange, RangeSet, append
-from gdp.message.move import Move
+from gdp.message.renumbering import Renumbering
 
 __all__ = ["Ledger"]
 
@@ -63,7 +63,7 @@ class Ledger:
         while self._of and (first := next(iter(self._of))) < below:
             del self._of[first]
 
-    def move(self, move: Move) -> None:
+    def move(self, move: Renumbering) -> None:
         """Go on under new message numbers."""
         self._of = {move.of(number): carried for number, carried in self._of.items()}
 

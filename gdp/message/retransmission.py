@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from gdp.limits import PROBE_MIN_S
+from gdp.message.acknack import MissingRange
 from gdp.message.history_cache import CachedMessage
-from gdp.message.report import Missing
 
 __all__ = ["RepairAllowance", "RetransmissionQueue"]
 
@@ -62,7 +62,7 @@ class RetransmissionQueue:
 
     def request(
         self,
-        missing: Iterable[Missing],
+        missing: Iterable[MissingRange],
         allowance: RepairAllowance,
         messages: Mapping[int, CachedMessage],
         *,

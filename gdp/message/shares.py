@@ -31,7 +31,7 @@ class Shares:
         """Return what an owner holds."""
         return self._of.get(owner, 0)
 
-    def take(self, *owners: bytes, size: int = 1) -> bool:
+    def reserve(self, *owners: bytes, size: int = 1) -> bool:
         """Take room for something in the name of all these owners (a member and its domain, say) and return True.
 
         Returns False, and takes none, where one of them would hold more than is left free.
@@ -44,7 +44,7 @@ class Shares:
             self._of[owner] = self.held_by(owner) + size
         return True
 
-    def give(self, *owners: bytes, size: int = 1) -> None:
+    def release(self, *owners: bytes, size: int = 1) -> None:
         """Give back what was taken in the name of the same owners."""
         self._held -= size
         for owner in owners:

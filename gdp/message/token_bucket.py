@@ -26,7 +26,7 @@ class TokenBucket:
         self._tokens = burst
         self._seen_s = float("-inf")
 
-    def take(self, now_s: float, tokens: float = 1.0) -> bool:
+    def spend(self, now_s: float, tokens: float = 1.0) -> bool:
         """Take tokens and return True, or return False and take none."""
         if now_s > self._seen_s:
             self._tokens = min(self._burst, self._tokens + (now_s - self._seen_s) * self._per_s)
@@ -52,7 +52,7 @@ class Paces:
         self._owners = owners
         self._buckets: OrderedDict[bytes, TokenBucket] = OrderedDict()
 
-    def take(self, owner: bytes, now_s: float, tokens: float = 1.0) -> bool:
+    def spend(self, owner: bytes, now_s: float, tokens: float = 1.0) -> bool:
         """Take an owner's tokens and return True, or return False and take none."""
         bucket = self._buckets.get(owner)
         if bucket is None:
@@ -60,4 +60,4 @@ class Paces:
             if len(self._buckets) > self._owners:
                 self._buckets.popitem(last=False)
         self._buckets.move_to_end(owner)
-        return bucket.take(now_s, tokens)
+        return bucket.spend(now_s, tokens)

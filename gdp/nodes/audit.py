@@ -13,10 +13,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
-from gdp.effects import Instant
 from gdp.errors import DropReason, LocalError
 from gdp.nodes.node_log import LOOK_S
 from gdp.nodes.runtime import Runtime, now
+from gdp.sansio import Timestamps
 from gdp.stores.audit_log import AuditLog
 from gdp.trust.audit import Action, AuditTrail
 
@@ -71,7 +71,7 @@ class NodeAudit:
         self._has_failed = False
         trail.begin()
 
-    def look(self, now: Instant) -> None:
+    def look(self, now: Timestamps) -> None:
         """Write what has happened since the last look."""
         drops = self._drops()
         for reason, before in self._known.items():

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, field_validator, mo
 
 from gdp.control.hello import INTERVAL_MAX_MS, Timing
 from gdp.limits import (
-    CLAIM_LEASE_S,
+    ADVERTISEMENT_LEASE_S,
     DEAD_S,
     DETECT_MULTIPLIER,
     HELLO_S,
@@ -36,7 +36,7 @@ from gdp.nodes.schema import (
     Unique,
     load,
 )
-from gdp.ports.kernel.shapes import ENTRIES_DEFAULT
+from gdp.ports.kernel.abi import ENTRIES_DEFAULT
 from gdp.stores.cluster_address import ClusterAddress
 from gdp.stores.files import read_private
 
@@ -110,7 +110,7 @@ class SwitchConfig(Section):
     token_folders: Annotated[tuple[Directory, ...], Unique] = ()
     hello_s: float = Field(default=HELLO_S, ge=0.01, le=60.0)
     dead_s: float = Field(default=DEAD_S, ge=0.02, le=600.0)
-    lease_s: LeaseSeconds = CLAIM_LEASE_S
+    lease_s: LeaseSeconds = ADVERTISEMENT_LEASE_S
     keepalive_ms: KeepaliveMs = KEEPALIVE_MS
     detect_multiplier: DetectMultiplier = DETECT_MULTIPLIER
     control_socket: NewFile | None = None
@@ -220,7 +220,7 @@ class RibConfig(Section):
     upper: Annotated[tuple[RequiredName, ...], Unique, BeforeValidator(_as_names)] = ()
     peers: Annotated[tuple[RequiredName, ...], Unique] = ()
     allow_unowned: bool = False
-    lease_s: LeaseSeconds = CLAIM_LEASE_S
+    lease_s: LeaseSeconds = ADVERTISEMENT_LEASE_S
     store: Literal["memory"] | SharedStore = "memory"
     snapshot: NewFile | None = None
     state: Directory | None = None

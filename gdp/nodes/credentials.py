@@ -14,9 +14,9 @@ from typing import Final
 
 from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
-from gdp.effects import Instant
 from gdp.errors import LocalError
 from gdp.nodes.schema import Domain
+from gdp.sansio import Timestamps
 from gdp.stores.files import read_public
 from gdp.stores.keyring import NODE_CERTIFICATE, ROOT_CERTIFICATE, load_root, parsed
 from gdp.trust.domain import Policy
@@ -50,7 +50,7 @@ class Credentials:
         self._failed = ""
         self._warned: bytes = b""
 
-    def look(self, now: Instant) -> None:
+    def look(self, now: Timestamps) -> None:
         """Take up what has changed since the last look, and warn of a membership that ends soon."""
         state = self._state()
         if state != self._seen:

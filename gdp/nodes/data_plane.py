@@ -12,7 +12,7 @@ from typing import Final
 
 from gdp.errors import LocalError
 from gdp.extras import require_extra
-from gdp.ports.linked import LinkedPlane
+from gdp.ports.netdev import NetdevPlane
 from gdp.ports.raw import RawPlane
 from gdp.switch.table import Table
 
@@ -33,7 +33,7 @@ class Chosen:
         entry_counts: frames and bytes by the busiest entries, where the plane counts them.
     """
 
-    plane: LinkedPlane
+    plane: NetdevPlane
     name: str
     reason: str = ""
     entry_counts: Callable[[], Mapping[bytes, tuple[int, int]]] | None = None

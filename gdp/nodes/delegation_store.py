@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from gdp.client.member import Topic
+from gdp.client.participant import Topic
 from gdp.crypto.identity import Identity
 from gdp.errors import GdpError, LocalError
 from gdp.metadata import Metadata

@@ -10,12 +10,12 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from gdp.control.boundary import ErrorBoundary
-from gdp.control.greeter import Greeter
+from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.waiting import Wait, WaitLog, WaitReason
-from gdp.effects import Instant
 from gdp.errors import DropReason
 from gdp.names import Name
 from gdp.ports.plane import MAC_BYTES, Plane
+from gdp.sansio import Timestamps
 from gdp.trust.audit import Action
 from gdp.trust.domain import Policy
 
@@ -46,44 +46,46 @@ class NodeLog:
 
     def __init__(
         self,
-        greeter: Greeter,
+        hello_protocol: HelloProtocol,
         policy: Policy,
         plane: Plane,
         boundary: ErrorBoundary,
         waits: Callable[[float], list[Wait]],
         *,
         rib: Callable[[], Name | None] | None = None,
-        rival: Callable[[], Name | None] = lambda: None,
+        conflict: Callable[[], Name | None] = lambda: None,
         local_name: Callable[[Name], str] = no_name,
         on_wait: OnWait | None = None,
     ) -> None:
-        self._greeter = greeter
+        self._hello_protocol = hello_protocol
         self._policy = policy
         self._plane = plane
         self._boundary = boundary
         self._waits = waits
         self._rib = rib
         self._known_rib: Name | None = None
-        self._rival = rival
-        self._known_rival: Name | None = None
+        self._conflict = conflict
+        self._known_conflict: Name | None = None
         self._known_clash: Name | None = None
         self._local_name = local_name
         self._on_wait = on_wait
         self._neighbours: set[tuple[int, Name]] = set()
         self._wait_log = WaitLog()
 
-    def look(self, now: Instant) -> None:
+    def look(self, now: Timestamps) -> None:
         """Log what changed since the last look."""
-        for text in self._boundary.take():
+        for text in self._boundary.poll_tracebacks():
             log.error("a statement drew an error of this program and was dropped; the node goes on\n%s", text)
         self._look_at_neighbours()
         if self._rib is not None and (rib := self._rib()) != self._known_rib:
             self._known_rib = rib
             log.info("RIB in use name=%s", "none" if rib is None else rib.short)
-        if (rival := self._rival()) is not None and rival != self._known_rival:
-            self._known_rival = rival
-            log.error("another node with this identity asked for its place at switch %s and was refused", rival.short)
-        told_by = self._greeter.clash_told_by
+        if (conflict := self._conflict()) is not None and conflict != self._known_conflict:
+            self._known_conflict = conflict
+            log.error(
+                "another node with this identity asked for its place at switch %s and was refused", conflict.short
+            )
+        told_by = self._hello_protocol.clash_told_by
         if told_by is not None and told_by != self._known_clash:
             self._known_clash = told_by
             log.error("another node with this identity is alive, says switch %s; the older one stays", told_by.short)
@@ -103,7 +105,7 @@ class NodeLog:
         return {reason.value: int(reason in lasting) for reason in WaitReason}
 
     def _look_at_neighbours(self) -> None:
-        now = {(each.port, each.name): each for each in self._greeter.all_up()}
+        now = {(each.port, each.name): each for each in self._hello_protocol.all_up()}
         for (port, name), each in now.items():
             if (port, name) not in self._neighbours:
                 ifname, domain = self._ifname(port), self._domain(each.domain)

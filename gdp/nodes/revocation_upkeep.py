@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Final
 
 from gdp.crypto.statements import parse
-from gdp.effects import Instant
 from gdp.errors import RemoteError
 from gdp.nodes.runtime import Runtime, now
+from gdp.sansio import Timestamps
 from gdp.stores.revocation_file import SLICE, RevocationFile
 from gdp.trust.revocations import Revocations
 
@@ -51,14 +51,14 @@ class RevocationUpkeep:
         self._file = None if folder is None else RevocationFile(folder)
         self._revoked = revoked
 
-    def load(self, at: Instant) -> None:
+    def load(self, at: Timestamps) -> None:
         """Take back what was kept in an earlier life, each statement verified."""
         if self._file is None:
             return
         refused = 0
         for row in self._file.load(at.unix_s):
             try:
-                self._revoked.restore(parse(row.statement), row.giver, at, of_root=row.is_root)
+                self._revoked.restore(parse(row.statement), row.origin, at, of_root=row.is_root)
             except RemoteError:
                 refused += 1
         self._revoked.changes = set()
@@ -75,7 +75,7 @@ class RevocationUpkeep:
             if runtime is not None:
                 runtime.every(WRITE_S, self.work)
 
-    def work(self, at: Instant) -> None:
+    def work(self, at: Timestamps) -> None:
         """Hand one slice of changes to the file, if it is not behind."""
         del at
         changes = self._revoked.changes
@@ -89,5 +89,5 @@ class RevocationUpkeep:
         if self._file is None:
             return
         while self._revoked.changes and self._file.is_ready:
-            self.work(Instant(0.0, 0.0))
+            self.work(Timestamps(0.0, 0.0))
         self._file.close()

@@ -30,7 +30,7 @@ from gdp.nodes.runtime import DRAIN_MAX_S, Runtime, now
 from gdp.nodes.single_instance import run_alone
 from gdp.nodes.uplink import open_uplink
 from gdp.ports.plane import Plane
-from gdp.rib.machine import Rib, RibSettings
+from gdp.rib.core import RibCore, RibSettings
 from gdp.stores.audit_log import AuditLog
 from gdp.telemetry.sources import Sources
 from gdp.trust.domain import Policy
@@ -71,7 +71,7 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
         revocations = load_revocations(config.state, policy.revoked, stack)
         upkeep = _upkeep(config, policy)
         stack.callback(upkeep.close)
-        rib = Rib(identity, policy, upkeep.store, settings)
+        rib = RibCore(identity, policy, upkeep.store, settings)
         host = RibHost(identity, policy, rib, attachment)
         upkeep.begin(rib, now())
         plane = stack.enter_context(open_uplink(config.iface))
@@ -80,7 +80,7 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
         revocations.start(runtime)
         keep_audit(config.audit, policy.audit, host.drops, runtime, stack)
         node_log = NodeLog(
-            host.attachment.greeter,
+            host.attachment.hello_protocol,
             policy,
             plane,
             rib.boundary,
@@ -126,7 +126,7 @@ def _upkeep(config: RibConfig, policy: Policy) -> Upkeep:
 def _sources(host: RibHost, plane: Plane, node_log: NodeLog) -> Sources:
     counters, rib = plane.counters, host.rib
     return Sources(
-        frames=lambda: {"in": counters.frames_in, "out": counters.frames_out, "handed-up": counters.handed_up},
+        frames=lambda: {"in": counters.frames_in, "out": counters.frames_out, "punted": counters.punted},
         drops=[lambda: counters.drops, lambda: count_list(host.drops())],
         table_entries=lambda: rib.names,
         rib_answers=lambda: {
@@ -136,5 +136,5 @@ def _sources(host: RibHost, plane: Plane, node_log: NodeLog) -> Sources:
         },
         rib_refusals=lambda: {reason.label: count for reason, count in list(rib.refusals.items())},
         waiting=node_log.metrics,
-        clashes=lambda: rib.identities.clashes + host.attachment.greeter.clashes,
+        clashes=lambda: rib.identities.clashes + host.attachment.hello_protocol.clashes,
     )

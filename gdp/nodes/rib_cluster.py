@@ -9,16 +9,16 @@ import logging
 from collections.abc import Sequence
 from typing import Final
 
-from gdp.effects import Instant
 from gdp.errors import LocalError
 from gdp.ports.plane import HasFileno
-from gdp.rib.machine import Rib
+from gdp.rib.core import RibCore
 from gdp.rib.store import Store
+from gdp.sansio import Timestamps
 from gdp.stores.cluster import ClusterStore, load_functions
 from gdp.stores.cluster_address import ClusterAddress
 from gdp.stores.cluster_link import ClusterLink
 from gdp.trust.domain import Policy
-from gdp.trust.verifier import ClaimVerifier
+from gdp.trust.verifier import AdvertisementVerifier
 
 __all__ = ["ClusterUpkeep"]
 
@@ -44,8 +44,8 @@ class ClusterUpkeep:
         self._load_at_s = float("-inf")
         if not self.is_complete:
             log.warning("cluster incomplete; the RIB starts without the primaries that do not answer")
-        self._cluster = ClusterStore(self._link, ClaimVerifier(policy, allow_unowned=allow_unowned))
-        self._rib: Rib | None = None
+        self._cluster = ClusterStore(self._link, AdvertisementVerifier(policy, allow_unowned=allow_unowned))
+        self._rib: RibCore | None = None
         self._failures = 0
 
     @property
@@ -58,7 +58,7 @@ class ClusterUpkeep:
         """Return how often the connections are looked after."""
         return KEEP_ALIVE_S
 
-    def begin(self, rib: Rib, now: Instant) -> None:
+    def begin(self, rib: RibCore, now: Timestamps) -> None:
         """Listen for changes."""
         self._rib = rib
         self.work(now)
@@ -67,7 +67,7 @@ class ClusterUpkeep:
         """Return the connections that listen, as one source."""
         return (self._link,)
 
-    def work(self, now: Instant) -> None:
+    def work(self, now: Timestamps) -> None:
         """Tell of what other RIBs changed; look after the connections."""
         self._link.keep_alive(now.mono_s)
         if not self.is_complete and now.mono_s >= self._load_at_s:

@@ -11,10 +11,10 @@ from itertools import islice
 from pathlib import Path
 from typing import Final, Protocol
 
-from gdp.effects import Instant
 from gdp.ports.plane import HasFileno
-from gdp.rib.machine import Rib
+from gdp.rib.core import RibCore
 from gdp.rib.store import MemoryStore, Store
+from gdp.sansio import Timestamps
 from gdp.stores.snapshot import SLICE, Snapshot
 
 __all__ = ["MemoryUpkeep", "Upkeep"]
@@ -36,13 +36,13 @@ class Upkeep(Protocol):
     def every_s(self) -> float:
         """Return how often ``work`` is due."""
 
-    def begin(self, rib: Rib, now: Instant) -> None:
+    def begin(self, rib: RibCore, now: Timestamps) -> None:
         """Fill the store with what is known from before."""
 
     def sources(self) -> Sequence[HasFileno]:
         """Return what makes ``work`` due when it can be read."""
 
-    def work(self, now: Instant) -> None:
+    def work(self, now: Timestamps) -> None:
         """Do what is due."""
 
     def close(self) -> None:
@@ -55,7 +55,7 @@ class MemoryUpkeep:
     def __init__(self, path: Path | None) -> None:
         self._memory = MemoryStore()
         self._snapshot = None if path is None else Snapshot(path)
-        self._rib: Rib | None = None
+        self._rib: RibCore | None = None
 
     @property
     def store(self) -> Store:
@@ -67,7 +67,7 @@ class MemoryUpkeep:
         """Return how often a slice of changes is handed over."""
         return SNAPSHOT_S
 
-    def begin(self, rib: Rib, now: Instant) -> None:
+    def begin(self, rib: RibCore, now: Timestamps) -> None:
         """Load the snapshot, whose entries are verified again."""
         self._rib = rib
         if self._snapshot is None:
@@ -83,7 +83,7 @@ class MemoryUpkeep:
         """Return nothing."""
         return ()
 
-    def work(self, now: Instant) -> None:
+    def work(self, now: Timestamps) -> None:
         """Hand one slice of changes to the snapshot, if it is not behind."""
         changes, snapshot, rib = self._memory.changes, self._snapshot, self._rib
         if changes is None or snapshot is None or rib is None or not changes:

@@ -17,11 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-from gdp.effects import Arrival, Instant, Machine
-from gdp.nodes.allocator import settle_memory
+from gdp.nodes.busy_poll import BusyPoll
 from gdp.nodes.control_socket import ControlHandlers, ControlServer
-from gdp.nodes.spin import Spin
+from gdp.nodes.memory_tuning import tune_memory
 from gdp.ports.plane import HasFileno, Plane
+from gdp.sansio import ProtocolCore, ReceivedFrame, Timestamps
 
 __all__ = ["DRAIN_MAX_S", "Runtime", "now"]
 
@@ -33,15 +33,15 @@ _STREAK_MAX = 8
 _DRAIN_LOOK_S = 0.05  # between looks at what is left, where nothing else wakes the loop
 
 
-def now() -> Instant:
+def now() -> Timestamps:
     """Return the present moment."""
-    return Instant(time.monotonic(), time.time())
+    return Timestamps(time.monotonic(), time.time())
 
 
 @dataclass(slots=True)
 class _Look:
     period_s: float
-    call: Callable[[Instant], None]
+    call: Callable[[Timestamps], None]
     due_s: float = float("-inf")
 
 
@@ -54,12 +54,12 @@ class Runtime:
     """
 
     def __init__(
-        self, machine: Machine, plane: Plane, costs: Mapping[str, int] | None = None, *, spin_s: float = 0.0
+        self, machine: ProtocolCore, plane: Plane, costs: Mapping[str, int] | None = None, *, spin_s: float = 0.0
     ) -> None:
         self._machine = machine
         self._plane = plane
         self._costs = dict(costs or {})
-        self._spin = Spin(spin_s)
+        self._spin = BusyPoll(spin_s)
         self._is_stopped = False
         self._is_woken = False  # by a watched source: whoever drives us has work
         self._streak = 0  # steps in a row that brought frames, without a look at the timers
@@ -135,7 +135,7 @@ class Runtime:
         """Return whether ``drain`` was called."""
         return self._drain_until_s is not None
 
-    def every(self, period_s: float, look: Callable[[Instant], None]) -> None:
+    def every(self, period_s: float, look: Callable[[Timestamps], None]) -> None:
         """Call ``look`` from within the loop each ``period_s``, the first time at once."""
         self._looks.append(_Look(period_s, look))
 
@@ -150,11 +150,11 @@ class Runtime:
         its way out holds up nobody.
         """
         self._is_woken = False
-        is_sending, arrivals = self.send(), list[Arrival]()
+        is_sending, arrivals = self.send(), list[ReceivedFrame]()
         if is_sending or self._streak:
             arrivals = self._plane.poll(0.0)
         if not is_sending and not arrivals and not self._is_woken:
-            self._deadline_s = self._machine.next_timeout()
+            self._deadline_s = self._machine.get_timer()
             times = [each for each in (self._deadline_s, latest_s) if each is not None]
             times += [look.due_s for look in self._looks]
             arrivals = self._wait(max(min(times) - time.monotonic(), 0.0) if times else None)
@@ -163,8 +163,8 @@ class Runtime:
         if arrivals:
             self._machine.receive(arrivals, moment)
         if self._deadline_s is not None and moment.mono_s >= self._deadline_s:
-            self._machine.timeout(moment)
-            self._deadline_s = self._machine.next_timeout()
+            self._machine.handle_timer(moment)
+            self._deadline_s = self._machine.get_timer()
         for look in self._looks:
             if moment.mono_s >= look.due_s:
                 look.due_s = moment.mono_s + look.period_s
@@ -179,10 +179,10 @@ class Runtime:
 
     def next_due_s(self) -> float | None:
         """Return the monotonic second at which a step has something to do without frames, or None."""
-        times = [self._machine.next_timeout(), *(look.due_s for look in self._looks)]
+        times = [self._machine.get_timer(), *(look.due_s for look in self._looks)]
         return min((time for time in times if time is not None), default=None)
 
-    def _wait(self, timeout_s: float | None) -> list[Arrival]:
+    def _wait(self, timeout_s: float | None) -> list[ReceivedFrame]:
         """Wait for frames; where they follow each other closely, look again for a moment before going to sleep."""
         begun_s = time.monotonic()
         if self._spin.pays:
@@ -202,9 +202,9 @@ class Runtime:
 
     def send(self) -> bool:
         """Send what the machine has to say next; return whether there may be more."""
-        for index, macs in self._machine.take_neighbours().items():
+        for index, macs in self._machine.poll_neighbours().items():
             self._plane.set_neighbours(index, macs)
-        transmits = self._machine.take()
+        transmits = self._machine.frames_to_send()
         for port, mac, frames in transmits:
             self._plane.transmit(port, mac, frames)
         return bool(transmits)
@@ -235,7 +235,7 @@ class Runtime:
                     if signal.SIGHUP in numbers and reload is not None:
                         reload()
 
-        settle_memory()
+        tune_memory()
         before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
         before[signal.SIGHUP] = signal.signal(signal.SIGHUP, hang_up)
         woken_before = signal.set_wakeup_fd(writing.fileno(), warn_on_full_buffer=False)
@@ -250,7 +250,7 @@ class Runtime:
             reading.close()
             writing.close()
 
-    def _add(self, index: int, moment: Instant) -> None:
+    def _add(self, index: int, moment: Timestamps) -> None:
         port = self._plane.ports[index]
         cost = self._costs.get(port.ifname, COST_DEFAULT)
         self._machine.add_port(index, port.mac, port.mtu, cost, moment)

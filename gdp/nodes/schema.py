@@ -1,6 +1,7 @@
 """What every configuration file shares: strict fields, paths relative to the file, errors that point into it.
 
-Place: shell; loading reads files and changes nothing. ``gdp/nodes/config.py`` and ``proxy/config.py`` state the keys.
+Place: shell; loading reads files and changes nothing. ``gdp/nodes/config.py`` and ``proxy/config/config.py`` state
+the keys.
 """
 
 from __future__ import annotations

@@ -24,15 +24,15 @@ from gdp.nodes.credentials import Credentials
 from gdp.nodes.data_plane import Chosen, choose_plane
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
-from gdp.nodes.pairs import attach_pairs, switch_end
 from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rights import confine_switch
 from gdp.nodes.runtime import DRAIN_MAX_S, Runtime, now
 from gdp.nodes.single_instance import own_devices, run_alone
 from gdp.nodes.uplink import refuse_loopback
-from gdp.ports.link import LinkWatch
+from gdp.nodes.veth import attach_pairs, switch_end
 from gdp.ports.plane import MAC_BYTES, Plane
-from gdp.switch.machine import Switch
+from gdp.ports.rtnetlink import LinkMonitor
+from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
 from gdp.telemetry.sources import Sources
 
@@ -71,7 +71,7 @@ def run_switch(
         config.keepalive_ms,
         config.detect_multiplier,
     )
-    switch = Switch(identity, policy, table, settings)
+    switch = SwitchCore(identity, policy, table, settings)
     with contextlib.ExitStack() as stack:
         stack.enter_context(run_alone("switch", identity.name))
         revocations = load_revocations(config.state, policy.revoked, stack)
@@ -87,12 +87,12 @@ def run_switch(
                 plane.add_port(iface, may_be_absent=True)
         for port in config.ports:
             index = next(each.index for each in plane.ports.values() if each.ifname == port.iface)
-            switch.greeter.set_timing(index, config.timing_of(port))
+            switch.hello_protocol.set_timing(index, config.timing_of(port))
         optional = {port.index for port in plane.ports.values() if port.ifname in ifaces and port.ifname not in wanted}
         runtime = Runtime(switch, plane, {port.iface: port.cost for port in config.ports})
         attachments = {port.index for port in plane.ports.values() if port.ifname not in ifaces}
         node_log = NodeLog(
-            switch.greeter,
+            switch.hello_protocol,
             policy,
             plane,
             switch.boundary,
@@ -139,7 +139,7 @@ def _serve_metrics(sources: Sources, port: int) -> Callable[[], None]:
 
 def _control_handlers(
     identity: Identity,
-    switch: Switch,
+    switch: SwitchCore,
     chosen: Chosen,
     runtime: Runtime,
     reload: Callable[[], None],
@@ -148,7 +148,7 @@ def _control_handlers(
     begun_s = now().mono_s
 
     def status() -> dict[str, object]:
-        neighbours = len(list(switch.greeter.all_up()))
+        neighbours = len(list(switch.hello_protocol.all_up()))
         more = {"data_plane": chosen.name, "ports": len(chosen.plane.ports), "neighbours": neighbours}
         return node_status(identity, sources, uptime_s=now().mono_s - begun_s, **more)
 
@@ -165,7 +165,7 @@ def _absent(plane: Plane, ports: Collection[int]) -> set[int]:
     return {index for index in ports if plane.ports[index].mac == bytes(MAC_BYTES)}
 
 
-def _revoke(switch: Switch, directory: Path | None) -> None:
+def _revoke(switch: SwitchCore, directory: Path | None) -> None:
     """Take in, and spread, the revocations that the operator has put into a directory; known ones are no news."""
     for path in sorted(directory.iterdir()) if directory is not None else ():
         try:
@@ -174,7 +174,7 @@ def _revoke(switch: Switch, directory: Path | None) -> None:
             log.error("revocation not taken file=%s reason=%s", path, error)
 
 
-def _end_if_displaced(switch: Switch) -> None:
+def _end_if_displaced(switch: SwitchCore) -> None:
     """Raise a ``LocalError`` where an older switch with this identity is alive."""
     if switch.is_displaced:
         raise LocalError("an older switch with this identity is alive; this one ends: give it keys of its own")
@@ -182,24 +182,24 @@ def _end_if_displaced(switch: Switch) -> None:
 
 def _widest(ifaces: Sequence[str]) -> int:
     """Return the largest MTU of these devices; what is not there, opening the port will tell."""
-    with contextlib.closing(LinkWatch()) as links:
+    with contextlib.closing(LinkMonitor()) as links:
         mtus = [link.mtu for link in links.all() if link.ifname in ifaces]
     return max(mtus, default=_MTU_FALLBACK)
 
 
-def _sources(switch: Switch, chosen: Chosen, node_log: NodeLog) -> Sources:
+def _sources(switch: SwitchCore, chosen: Chosen, node_log: NodeLog) -> Sources:
     plane = chosen.plane
 
     def frames() -> dict[str, int]:
         now = plane.counters
-        return {"in": now.frames_in, "out": now.frames_out, "forwarded": now.forwarded, "handed-up": now.handed_up}
+        return {"in": now.frames_in, "out": now.frames_out, "forwarded": now.forwarded, "punted": now.punted}
 
     return Sources(
         frames=frames,
         drops=[lambda: plane.counters.drops, lambda: count_list(switch.drops())],
         table_entries=lambda: len(switch.table),
         entries=chosen.entry_counts,
-        parked_frames=lambda: switch.resolver.pending_frames,
+        pending_frames=lambda: switch.resolver.pending_frames,
         waiting=node_log.metrics,
-        clashes=lambda: switch.greeter.clashes,
+        clashes=lambda: switch.hello_protocol.clashes,
     )

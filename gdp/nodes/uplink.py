@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 
 from gdp.errors import LocalError
 from gdp.nodes.single_instance import own_devices
-from gdp.ports.linked import NoDeviceError
+from gdp.ports.netdev import NoDeviceError
 from gdp.ports.raw import RawPlane
 
 __all__ = ["open_uplink", "refuse_loopback"]

@@ -34,7 +34,7 @@ __all__ = [
     "DeviceInfo",
     "LinkAttribute",
     "Message",
-    "Questions",
+    "NetlinkSocket",
     "listen",
     "messages",
     "nested",
@@ -113,7 +113,7 @@ class _RefusedError(LocalError):
         self.number = number
 
 
-class Questions:
+class NetlinkSocket:
     """One socket to ask by. For one thread at a time.
 
     Every question raises ``LocalError`` where the kernel refuses it, or there is no answer; that never reads as an

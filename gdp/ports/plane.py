@@ -12,10 +12,10 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
-from gdp.effects import BROADCAST, Arrival
 from gdp.errors import DROP_COUNTERS
+from gdp.sansio import BROADCAST, ReceivedFrame
 
-__all__ = ["BROADCAST", "MAC_BYTES", "Arrival", "Counters", "HasFileno", "LinkCallback", "Plane", "Port"]
+__all__ = ["BROADCAST", "MAC_BYTES", "Counters", "HasFileno", "LinkCallback", "Plane", "Port", "ReceivedFrame"]
 
 MAC_BYTES: Final = 6
 
@@ -46,14 +46,14 @@ class Counters:
         frames_in: frames taken from ports.
         frames_out: frames put on ports, forwarded copies and our own.
         forwarded: the copies among them that the table asked for.
-        handed_up: frames given to the node.
+        punted: frames given to the node.
         drops: by ``DropReason``; a frame with several hops may be counted for each.
     """
 
     frames_in: int = 0
     frames_out: int = 0
     forwarded: int = 0
-    handed_up: int = 0
+    punted: int = 0
     drops: list[int] = field(default_factory=lambda: [0] * DROP_COUNTERS)
 
 
@@ -79,7 +79,7 @@ class Plane(Protocol):
         """The live counts; any thread may read them. What the kernel dropped at a full socket (``PORT_FULL``) comes in
         with the next idle ``poll``, or the 256th busy one."""
 
-    def poll(self, timeout_s: float | None) -> list[Arrival]:
+    def poll(self, timeout_s: float | None) -> list[ReceivedFrame]:
         """Wait for frames, forward what the table decides, return what is handed up.
 
         Returns early, perhaps with nothing, whenever anything happened: frames forwarded, a link that came or went,

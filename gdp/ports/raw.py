@@ -25,11 +25,11 @@ from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import ETHER_BYTES, FLAGS_AT, HEADER_BYTES, HOPS_AT, KIND_AT, OVERHEAD_BYTES
 from gdp.frame.kinds import CONTROL_FROM, VERSION, Flag
 from gdp.names import NAME_BYTES
-from gdp.ports.batch import SLOTS, Batch, make_batch, put_one
-from gdp.ports.linked import LinkedPlane
-from gdp.ports.plane import MAC_BYTES, Arrival, Port
-from gdp.ports.ration import Ration
-from gdp.ports.sockets import Lane, hear_nothing, kernel_drops, open_port, tell_neighbours
+from gdp.ports.mmsg import SLOTS, MmsgPool, make_batch, put_one
+from gdp.ports.netdev import NetdevPlane
+from gdp.ports.plane import MAC_BYTES, Port, ReceivedFrame
+from gdp.ports.punt_quota import PuntQuota
+from gdp.ports.sockets import TrafficClass, attach_drop_all_filter, kernel_drops, open_port, tell_neighbours
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.table import NOWHERE, Hops, Table, is_side
 
@@ -40,7 +40,13 @@ _GLANCE: Final = struct.Struct("!HxBxxH24x64s")
 _FIRST: Final = VERSION << 8
 _FIRST_CONTROL: Final = _FIRST | CONTROL_FROM
 _URGENT: Final = int(Flag.URGENT)
-_LANES: Final = (Lane.CONTROL, Lane.HELLO, Lane.URGENT, Lane.ORDINARY, Lane.GUEST)  # as they are served
+_LANES: Final = (
+    TrafficClass.CONTROL,
+    TrafficClass.HELLO,
+    TrafficClass.URGENT,
+    TrafficClass.ORDINARY,
+    TrafficClass.GUEST,
+)  # as they are served
 _GREETINGS: Final = (500.0, 128.0)  # a second, and at once; each costs 30 us at most before it is refused
 
 
@@ -50,13 +56,13 @@ def _shape(size: int) -> struct.Struct:
     return struct.Struct(f"{MAC_BYTES}x{MAC_BYTES}s{ETHER_BYTES - 2 * MAC_BYTES}x{size}s")
 
 
-def _lane_of(frame: bytes) -> Lane:
+def _lane_of(frame: bytes) -> TrafficClass:
     if frame[KIND_AT] >= CONTROL_FROM:
-        return Lane.CONTROL
-    return Lane.URGENT if frame[FLAGS_AT] & _URGENT else Lane.ORDINARY
+        return TrafficClass.CONTROL
+    return TrafficClass.URGENT if frame[FLAGS_AT] & _URGENT else TrafficClass.ORDINARY
 
 
-class RawPlane(LinkedPlane):
+class RawPlane(NetdevPlane):
     """``Plane`` over AF_PACKET.
 
     Args:
@@ -70,8 +76,8 @@ class RawPlane(LinkedPlane):
 
     def __init__(self, ifnames: Sequence[str] = (), table: Table | None = None, *, bypass_qdisc: bool = False) -> None:
         self._bypass_qdisc = bypass_qdisc
-        self._lanes: dict[Lane, dict[int, socket.socket]] = {lane: {} for lane in _LANES}  # by port
-        self._batch: Batch = make_batch(OVERHEAD_BYTES)
+        self._lanes: dict[TrafficClass, dict[int, socket.socket]] = {lane: {} for lane in _LANES}  # by port
+        self._batch: MmsgPool = make_batch(OVERHEAD_BYTES)
         self._neighbours: dict[int, frozenset[bytes]] = {}  # addresses, by port
         self._resting: dict[int, tuple[socket.socket, float]] = {}  # not read until then, by file descriptor
         super().__init__(ifnames, table)
@@ -85,15 +91,15 @@ class RawPlane(LinkedPlane):
             self._shut(port.index)
             raise
 
-    def _open_lane(self, port: Port, lane: Lane, rank: int) -> None:
+    def _open_lane(self, port: Port, lane: TrafficClass, rank: int) -> None:
         sockets = self._lanes[lane]
         opened = sockets[port.index] = open_port(port.ifname, lane, bypass_qdisc=self._bypass_qdisc)
         if self._entries is None:
-            ready = partial(self._hand_up_all, port.index, opened)
+            ready = partial(self._punt_all, port.index, opened)
         else:
             ready = partial(self._forward_all, self._entries, self._sides, port.index, opened, sockets)
-        if lane in (Lane.HELLO, Lane.GUEST):
-            ready = partial(self._take_some, opened, Ration(*_GREETINGS, time.monotonic()), ready)
+        if lane in (TrafficClass.HELLO, TrafficClass.GUEST):
+            ready = partial(self._take_some, opened, PuntQuota(*_GREETINGS, time.monotonic()), ready)
         self.watch(opened, ready, rank=rank)
         tell_neighbours(opened, lane, self._neighbours.get(port.index, ()))
 
@@ -101,13 +107,18 @@ class RawPlane(LinkedPlane):
         """Store the addresses of a port's neighbours: their frames get the lanes ahead of strangers'."""
         before, after = self._neighbours.get(port, frozenset()), frozenset(macs)
         self._neighbours[port] = after
-        steps = (Lane.GUEST, before & after), (Lane.CONTROL, after), (Lane.HELLO, after), (Lane.GUEST, after)
+        steps = (
+            (TrafficClass.GUEST, before & after),
+            (TrafficClass.CONTROL, after),
+            (TrafficClass.HELLO, after),
+            (TrafficClass.GUEST, after),
+        )
         for lane, known in steps:  # in this order, so that no frame falls between two lanes
             opened = self._lanes[lane].get(port)
             if opened is not None:
                 tell_neighbours(opened, lane, known)
 
-    def poll(self, timeout_s: float | None) -> list[Arrival]:
+    def poll(self, timeout_s: float | None) -> list[ReceivedFrame]:
         """End the rests of sockets that are due, then as ``Plane.poll``."""
         if self._resting:
             now_s = time.monotonic()
@@ -123,7 +134,7 @@ class RawPlane(LinkedPlane):
         super().remove_port(index)
         self._neighbours.pop(index, None)
 
-    def _take_some(self, source: socket.socket, ration: Ration, ready: Callable[[], None]) -> None:
+    def _take_some(self, source: socket.socket, ration: PuntQuota, ready: Callable[[], None]) -> None:
         """Take a batch; leave the socket alone for a while where that was more than its share."""
         before = self._counters.frames_in
         ready()
@@ -152,7 +163,7 @@ class RawPlane(LinkedPlane):
     def _finish(self, sources: Sequence[socket.socket]) -> None:
         """Take what has arrived at sockets before they are closed, which would lose it without a word."""
         for source in sources:
-            hear_nothing(source)
+            attach_drop_all_filter(source)
             source.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)  # that its device went down would be read first
             ready, before = self._ready.get(source.fileno()), -1
             while ready is not None and self._counters.frames_in > before:
@@ -161,7 +172,7 @@ class RawPlane(LinkedPlane):
         self._audit()
 
     def _is_open(self, index: int) -> bool:
-        return index in self._lanes[Lane.ORDINARY]
+        return index in self._lanes[TrafficClass.ORDINARY]
 
     def _kernel_drops(self) -> int:
         return sum(kernel_drops(opened) for sockets in self._lanes.values() for opened in sockets.values())
@@ -187,17 +198,17 @@ class RawPlane(LinkedPlane):
         counters.frames_out += left
         return left
 
-    def _hand_up_all(self, port: int, source: socket.socket) -> None:
+    def _punt_all(self, port: int, source: socket.socket) -> None:
         batch = self._batch
-        sizes = batch.take(source)
+        sizes = batch.receive(source)
         self._counters.frames_in += len(sizes)
         pool, arrivals = batch.pool, self._arrivals
         for slot, size in zip(range(0, len(pool), batch.slot_bytes), sizes, strict=False):
             mac, frame = _shape(size).unpack_from(pool, slot)
-            arrivals.append(Arrival(port, mac, frame))
+            arrivals.append(ReceivedFrame(port, mac, frame))
 
-    def _arrival(self, port: int, slot: int, size: int) -> Arrival:
-        return Arrival(port, *_shape(size).unpack_from(self._batch.pool, slot))
+    def _arrival(self, port: int, slot: int, size: int) -> ReceivedFrame:
+        return ReceivedFrame(port, *_shape(size).unpack_from(self._batch.pool, slot))
 
     def _forward_all(
         self,
@@ -210,7 +221,7 @@ class RawPlane(LinkedPlane):
         """Take one batch from a port and forward it by ``sinks``, handing up what is for the node."""
         batch, get = self._batch, entries.get
         pool, step, glance = batch.pool, batch.slot_bytes, _GLANCE.unpack_from
-        sizes = batch.take(source)
+        sizes = batch.receive(source)
         self._counters.frames_in += len(sizes)
         run_key, run_hops, run_start, fits = b"", NOWHERE, 0, 0
         for at, size in zip(range(ETHER_BYTES, len(pool), step), sizes, strict=False):
@@ -248,14 +259,14 @@ class RawPlane(LinkedPlane):
         """Decide on the one frame in a slot by the reference, and do what it says."""
         batch, drops = self._batch, self._counters.drops
         at = slot * batch.slot_bytes
-        verdict = decide(batch.pool[at : at + ETHER_BYTES + size], entries, self._mtus, sides, port)
-        if isinstance(verdict, Drop):
-            drops[verdict.reason] += 1
-        elif isinstance(verdict, Forward):
-            for reason in verdict.lost:
+        ack = decide(batch.pool[at : at + ETHER_BYTES + size], entries, self._mtus, sides, port)
+        if isinstance(ack, Drop):
+            drops[ack.reason] += 1
+        elif isinstance(ack, Forward):
+            for reason in ack.lost:
                 drops[reason] += 1
             batch.pool[at + ETHER_BYTES + HOPS_AT] -= 1
-            self._send(sinks, verdict.hops, slot, 1)
+            self._send(sinks, ack.hops, slot, 1)
         else:
             self._arrivals.append(self._arrival(port, at, size))
 
@@ -265,6 +276,6 @@ class RawPlane(LinkedPlane):
             return
         counters = self._counters
         for hop in hops:
-            left = self._batch.put(sinks[hop[0]], first, count, hop[1], counters.drops)
+            left = self._batch.forward(sinks[hop[0]], first, count, hop[1], counters.drops)
             counters.forwarded += left
             counters.frames_out += left

@@ -25,10 +25,10 @@ from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import ETHER_BYTES
 from gdp.frame.kinds import ETHERTYPE
 from gdp.frame.layers import GDP
-from gdp.ports.batch import send_failure
-from gdp.ports.linked import LinkedPlane
-from gdp.ports.plane import MAC_BYTES, Arrival, Port
-from gdp.ports.sockets import NO_RAW_SOCKETS, kernel_drops, large_buffers, only_ours
+from gdp.ports.mmsg import send_failure
+from gdp.ports.netdev import NetdevPlane
+from gdp.ports.plane import MAC_BYTES, Port, ReceivedFrame
+from gdp.ports.sockets import NO_RAW_SOCKETS, attach_ethertype_filter, kernel_drops, large_buffers
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.table import Table
 
@@ -37,7 +37,7 @@ __all__ = ["ScapyPlane"]
 _BURST: Final = 64  # frames of one port before the others have their turn
 
 
-class ScapyPlane(LinkedPlane):
+class ScapyPlane(NetdevPlane):
     """``Plane`` over one Scapy socket a port.
 
     Args:
@@ -59,7 +59,7 @@ class ScapyPlane(LinkedPlane):
             raise LocalError(NO_RAW_SOCKETS) from error
         except (OSError, Scapy_Exception) as error:
             raise LocalError(f"port {port.ifname}: {error}") from error
-        only_ours(opened.ins)
+        attach_ethertype_filter(opened.ins)
         large_buffers(opened.ins)
         self._sockets[port.index] = opened, opened.fileno()
         self.watch(opened, partial(self._sniff, port.index))
@@ -122,23 +122,23 @@ class ScapyPlane(LinkedPlane):
         counters, frame = self._counters, bytes(packet)
         counters.frames_in += 1
         if self._entries is None:
-            self._hand_up(index, frame)
+            self._punt(index, frame)
             return
-        verdict = decide(frame, self._entries, self._mtus, self._sides, index)
-        if isinstance(verdict, Drop):
-            counters.drops[verdict.reason] += 1
-        elif isinstance(verdict, Forward):
-            for reason in verdict.lost:
+        ack = decide(frame, self._entries, self._mtus, self._sides, index)
+        if isinstance(ack, Drop):
+            counters.drops[ack.reason] += 1
+        elif isinstance(ack, Forward):
+            for reason in ack.lost:
                 counters.drops[reason] += 1
             packet[GDP].hops_left -= 1
-            for port, macs in verdict.hops:
+            for port, macs in ack.hops:
                 packet[Ether].dst, packet[Ether].src = str2mac(macs[:MAC_BYTES]), str2mac(macs[MAC_BYTES:])
                 counters.forwarded += self._send(port, packet)
         else:
-            self._hand_up(index, frame)
+            self._punt(index, frame)
 
-    def _hand_up(self, index: int, frame: bytes) -> None:
-        self._arrivals.append(Arrival(index, frame[MAC_BYTES : 2 * MAC_BYTES], frame[ETHER_BYTES:]))
+    def _punt(self, index: int, frame: bytes) -> None:
+        self._arrivals.append(ReceivedFrame(index, frame[MAC_BYTES : 2 * MAC_BYTES], frame[ETHER_BYTES:]))
 
     def _send(self, port: int, packet: Packet) -> int:
         """Send one packet; return 1, or 0 when it is lost and counted."""

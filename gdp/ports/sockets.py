@@ -33,11 +33,11 @@ from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, Flag, Kind
 __all__ = [
     "AS_ROOT",
     "NO_RAW_SOCKETS",
-    "Lane",
-    "hear_nothing",
+    "TrafficClass",
+    "attach_drop_all_filter",
+    "attach_ethertype_filter",
     "kernel_drops",
     "large_buffers",
-    "only_ours",
     "open_port",
     "steps_of",
     "tell_neighbours",
@@ -92,7 +92,7 @@ _NO_HELLO: Final = ((_JUMP_EQUAL, 0, 1, Kind.HELLO), _LEAVE)
 _HELLO_ONLY: Final = ((_JUMP_EQUAL, 1, 0, Kind.HELLO), _LEAVE)
 
 
-class Lane(Enum):
+class TrafficClass(Enum):
     """Which of our frames a socket sees: steps of (code, jump if true, jump if false, value).
 
     In the lanes of ``_BY_ADDRESS`` the sender's address decides what follows.
@@ -134,10 +134,14 @@ class Lane(Enum):
     )
 
 
-_BY_ADDRESS: Final = {Lane.CONTROL: (_TAKE, _LEAVE), Lane.HELLO: (_TAKE, _LEAVE), Lane.GUEST: (_LEAVE, _TAKE)}
+_BY_ADDRESS: Final = {
+    TrafficClass.CONTROL: (_TAKE, _LEAVE),
+    TrafficClass.HELLO: (_TAKE, _LEAVE),
+    TrafficClass.GUEST: (_LEAVE, _TAKE),
+}
 
 
-def steps_of(lane: Lane, neighbours: Iterable[bytes] = ()) -> tuple[_Step, ...]:
+def steps_of(lane: TrafficClass, neighbours: Iterable[bytes] = ()) -> tuple[_Step, ...]:
     """Return the filter of a lane.
 
     Args:
@@ -158,7 +162,7 @@ def steps_of(lane: Lane, neighbours: Iterable[bytes] = ()) -> tuple[_Step, ...]:
     return (*steps, others)
 
 
-def tell_neighbours(opened: socket.socket, lane: Lane, neighbours: Iterable[bytes]) -> None:
+def tell_neighbours(opened: socket.socket, lane: TrafficClass, neighbours: Iterable[bytes]) -> None:
     """Give a socket the addresses of a port's neighbours.
 
     Raises:
@@ -167,7 +171,7 @@ def tell_neighbours(opened: socket.socket, lane: Lane, neighbours: Iterable[byte
     _filter(opened, steps_of(lane, neighbours))
 
 
-def open_port(ifname: str, lane: Lane = Lane.ALL, *, bypass_qdisc: bool = False) -> socket.socket:
+def open_port(ifname: str, lane: TrafficClass = TrafficClass.ALL, *, bypass_qdisc: bool = False) -> socket.socket:
     """Open a non-blocking socket for our EtherType on one device.
 
     Args:
@@ -182,12 +186,12 @@ def open_port(ifname: str, lane: Lane = Lane.ALL, *, bypass_qdisc: bool = False)
     except PermissionError as error:
         raise LocalError(NO_RAW_SOCKETS) from error
     try:
-        only_ours(opened, lane)
-        if lane in (Lane.CONTROL, Lane.HELLO, Lane.URGENT):
+        attach_ethertype_filter(opened, lane)
+        if lane in (TrafficClass.CONTROL, TrafficClass.HELLO, TrafficClass.URGENT):
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_PRIORITY, _PRIORITY)
         if bypass_qdisc:
             opened.setsockopt(_SOL_PACKET, _PACKET_QDISC_BYPASS, 1)
-        if lane in (Lane.HELLO, Lane.GUEST):
+        if lane in (TrafficClass.HELLO, TrafficClass.GUEST):
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _GREETING_BUFFER_BYTES)
         else:
             large_buffers(opened)
@@ -199,7 +203,7 @@ def open_port(ifname: str, lane: Lane = Lane.ALL, *, bypass_qdisc: bool = False)
     return opened
 
 
-def only_ours(opened: socket.socket, lane: Lane = Lane.ALL) -> None:
+def attach_ethertype_filter(opened: socket.socket, lane: TrafficClass = TrafficClass.ALL) -> None:
     """Let in what the head of this module says, as far as it belongs on this lane.
 
     Raises:
@@ -213,7 +217,7 @@ def only_ours(opened: socket.socket, lane: Lane = Lane.ALL) -> None:
             raise
 
 
-def hear_nothing(opened: socket.socket) -> None:
+def attach_drop_all_filter(opened: socket.socket) -> None:
     """Let nothing more in; what has arrived can still be taken.
 
     Raises:

@@ -131,7 +131,7 @@ class Replication:
             self._started_s = now_s
         self._digest_at_s = now_s
 
-    def timeout(self, now_s: float) -> None:
+    def handle_timer(self, now_s: float) -> None:
         """Send digests when due; give up replies that did not come."""
         for name, peer in self._peers.items():
             if peer.until_s is not None and peer.until_s <= now_s:
@@ -150,7 +150,7 @@ class Replication:
         times = [peer.until_s for peer in self._peers.values() if peer.until_s is not None]
         return min([self._digest_at_s, *times])
 
-    def take(self, now_s: float) -> list[tuple[Name, bytes]]:
+    def statements_to_send(self, now_s: float) -> list[tuple[Name, bytes]]:
         """Return, once, statements to send, each with the peer it is for."""
         if self._news:
             found = (self._entry_of(key, now_s) for key in self._news)

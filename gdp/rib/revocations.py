@@ -11,14 +11,14 @@ from collections.abc import Callable
 from typing import Final
 
 from gdp.crypto.statements import Statement
-from gdp.effects import Instant
 from gdp.errors import StatementError
 from gdp.names import Name
 from gdp.rib.route import Route
 from gdp.rib.store import Store
+from gdp.sansio import Timestamps
 from gdp.trust.revocation import Revocation
 from gdp.trust.token_buckets import TokenBuckets
-from gdp.trust.verifier import ClaimVerifier
+from gdp.trust.verifier import AdvertisementVerifier
 
 __all__ = ["RibRevocations"]
 
@@ -34,7 +34,7 @@ class RibRevocations:
         is_watched: whether somebody watches a name.
     """
 
-    def __init__(self, verifier: ClaimVerifier, store: Store, is_watched: Callable[[Name], bool]) -> None:
+    def __init__(self, verifier: AdvertisementVerifier, store: Store, is_watched: Callable[[Name], bool]) -> None:
         self._verifier = verifier
         self._revoked = verifier.revoked
         self._store = store
@@ -42,7 +42,7 @@ class RibRevocations:
         self._passed = TokenBuckets(_PASSED_PER_S, _PASSED_BURST)
         self._told = TokenBuckets(_TOLD_PER_S, _TOLD_BURST)
 
-    def take(self, statement: Statement, giver: Name, now: Instant) -> Revocation | None:
+    def receive_revocation(self, statement: Statement, origin: Name, now: Timestamps) -> Revocation | None:
         """Take a revocation; return it if it is news.
 
         Raises:
@@ -50,27 +50,27 @@ class RibRevocations:
             StoreError: a shared store did not answer.
         """
         issued_for = Revocation.read(statement).issuer.name
-        return self._revoked.take(
-            statement, giver, now, lambda key: self._store.has_issuer(key) or self._concerns(issued_for)
+        return self._revoked.receive_revocation(
+            statement, origin, now, lambda key: self._store.has_issuer(key) or self._concerns(issued_for)
         )
 
-    def closed(self, revocation: Revocation, now: Instant) -> list[Route]:
+    def closed(self, revocation: Revocation, now: Timestamps) -> list[Route]:
         """Return the routes that rest on what was revoked, and hold no more."""
         closed = []
         for route in self._store.resting_on(revocation.fingerprint):
             try:
-                self._verifier.verify(route.claim, now.unix_s)
+                self._verifier.verify(route.advertisement, now.unix_s)
             except StatementError:
                 closed.append(route)
         return closed
 
-    def may_pass_up(self, statement: Statement, sender: Name, now: Instant) -> bool:
+    def may_pass_up(self, statement: Statement, sender: Name, now: Timestamps) -> bool:
         """Return whether a revocation that is not kept here goes on to the tier above.
 
         Raises:
             StatementError: its signature does not hold.
         """
-        if not self._passed.take(sender, now.mono_s):
+        if not self._passed.spend(sender, now.mono_s):
             return False
         Revocation.from_statement(statement)
         return True
@@ -80,7 +80,7 @@ class RibRevocations:
         if digest == self._revoked.digest_about(name):
             return []
         wires = self._revoked.about(name)[:_TOLD_ABOUT_MAX]
-        return [wire for wire in wires if self._told.take(asker, now_s)]
+        return [wire for wire in wires if self._told.spend(asker, now_s)]
 
     def behind(self, fingerprints: list[tuple[bytes, bytes]]) -> list[bytes]:
         """Return the statements that took these certificates back, each by its fingerprint and a key that may."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from gdp.limits import CLOCK_SKEW_S
 from gdp.names import Name
-from gdp.trust.claim import Claim
+from gdp.trust.advertisement import Advertisement
 
 __all__ = ["Route", "Withdrawn"]
 
@@ -41,7 +41,7 @@ class Route:
     transit: tuple[Name, ...]
     sequence: int
     is_global: bool
-    claim: bytes
+    advertisement: bytes
     is_from_above: bool
     expires_s: float
     valid_until_unix_s: int
@@ -51,7 +51,7 @@ class Route:
     @classmethod
     def of(
         cls,
-        claim: Claim,
+        advertisement: Advertisement,
         *,
         sender: Name,
         domain: Name,
@@ -62,21 +62,21 @@ class Route:
     ) -> Route:
         """Return what is kept of a verified claim."""
         return cls(
-            name=claim.name,
-            advertiser=claim.node,
+            name=advertisement.name,
+            advertiser=advertisement.node,
             sender=sender,
-            switch=claim.switch,
+            switch=advertisement.switch,
             domain=domain,
             via=via,
             transit=transit,
-            sequence=claim.sequence,
-            is_global=claim.is_global,
-            claim=claim.wire,
+            sequence=advertisement.sequence,
+            is_global=advertisement.is_global,
+            advertisement=advertisement.wire,
             is_from_above=is_from_above,
             expires_s=expires_s,
-            valid_until_unix_s=claim.valid_until_unix_s + int(CLOCK_SKEW_S),
-            fingerprints=claim.fingerprints,
-            issuers=claim.issuers,
+            valid_until_unix_s=advertisement.valid_until_unix_s + int(CLOCK_SKEW_S),
+            fingerprints=advertisement.fingerprints,
+            issuers=advertisement.issuers,
         )
 
     @property

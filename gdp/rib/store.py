@@ -11,11 +11,11 @@ from collections.abc import Collection, Iterator
 from typing import Protocol
 
 from gdp.control.replica import Key
-from gdp.effects import Instant
 from gdp.names import Name
 from gdp.rib.digest_tree import DigestTree
 from gdp.rib.route import Route, Withdrawn
-from gdp.trust.holdings import EvidenceIndex
+from gdp.sansio import Timestamps
+from gdp.trust.evidence_index import EvidenceIndex
 
 __all__ = ["MemoryStore", "Store"]
 
@@ -33,7 +33,7 @@ class Store(Protocol):
     def __len__(self) -> int:
         """Return how many routes are kept."""
 
-    def prefetch(self, names: Collection[Name], now: Instant) -> None:
+    def prefetch(self, names: Collection[Name], now: Timestamps) -> None:
         """Make ready what the next calls are about, all in one go."""
 
     def commit(self) -> list[Key]:
@@ -92,7 +92,7 @@ class MemoryStore:
         yield from ((name, advertiser) for name, routes in self._routes.items() for advertiser in routes)
         yield from self._withdrawn
 
-    def prefetch(self, names: Collection[Name], now: Instant) -> None:
+    def prefetch(self, names: Collection[Name], now: Timestamps) -> None:
         """Do nothing: all of it is in memory."""
 
     def commit(self) -> list[Key]:

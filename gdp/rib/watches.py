@@ -50,7 +50,7 @@ class Watches:
         if known_s is not None and watchers is not None:
             watchers[asker] = max(until_s, known_s)
             return
-        if not self._shares.take(asker.name, asker.domain):
+        if not self._shares.reserve(asker.name, asker.domain):
             raise StatementError(DropReason.QUOTA, "watches")
         self._by_name.setdefault(name, {})[asker] = until_s
         heapq.heappush(self._ends, (until_s, name, asker))
@@ -75,4 +75,4 @@ class Watches:
             del self._by_name[name][asker]
             if not self._by_name[name]:
                 del self._by_name[name]
-            self._shares.give(asker.name, asker.domain)
+            self._shares.release(asker.name, asker.domain)

@@ -46,7 +46,7 @@ class Calls(Generic[T]):
         """Yield numbers and contexts, the oldest first; calls may begin and end meanwhile."""
         return iter(list(self._contexts.items()))
 
-    def begin(self, now_s: float, timeout_s: float | None, context: T) -> int:
+    def add_call(self, now_s: float, timeout_s: float | None, context: T) -> int:
         """Return the number of a new call; none comes twice.
 
         Args:
@@ -87,7 +87,7 @@ class Calls(Generic[T]):
                 ended.append((number, self._contexts.pop(number)))
         return ended
 
-    def next_timeout(self) -> float | None:
+    def get_timer(self) -> float | None:
         """Return the monotonic second at which a call's time runs out, or None."""
         while self._timers and self._timers[0][1] not in self._contexts:
             heapq.heappop(self._timers)

@@ -164,7 +164,7 @@ class Dispatch(Generic[A]):
         if self._held_bytes >= self._held_max_bytes:
             raise LocalError(f"requests of {self._held_bytes} bytes are under way: no more at once")
         call = _Call(answered, failed, now_s)
-        number = self._calls.begin(now_s, timeout_s, call)
+        number = self._calls.add_call(now_s, timeout_s, call)
         call.request = write(number)
         self._held_bytes += len(call.request)
         self._budget.earn()
@@ -236,7 +236,7 @@ class Dispatch(Generic[A]):
             call.declined.append(answer)
             self._go_on(number, call, Failure.REFUSED, "", now_s)
 
-    def timeout(self, now_s: float) -> None:
+    def handle_timer(self, now_s: float) -> None:
         """Do what is due."""
         for number, call in self._calls.expired(now_s):
             self._fail(number, call, Failure.TIMED_OUT, "")
@@ -246,11 +246,11 @@ class Dispatch(Generic[A]):
         self._hedge(now_s)
         self._tell_stops(now_s)
 
-    def next_timeout(self) -> float | None:
+    def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         while self._hedges and self._hedges[0][1] not in self._calls:
             heapq.heappop(self._hedges)
-        times = [self._calls.next_timeout(), self._hedges[0][0] if self._hedges else None]
+        times = [self._calls.get_timer(), self._hedges[0][0] if self._hedges else None]
         times.append(next(iter(self._ended.values())).stop_at_s if self._ended else None)
         return min((time for time in times if time is not None), default=None)
 
@@ -262,7 +262,7 @@ class Dispatch(Generic[A]):
         self._hedges.clear()
         self._ended.clear()
 
-    def take(self) -> list[Effect]:
+    def poll_effects(self) -> list[Effect]:
         """Return, once, what is to be sent, in order; no request of a call that has ended meanwhile."""
         effects, self._effects = self._effects, []
         return [each for each in effects if isinstance(each, Stop) or each.call in self._calls]

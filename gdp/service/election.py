@@ -11,8 +11,8 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 from gdp.names import Name
-from gdp.service.ordered import Log, Position
 from gdp.service.replicas import Replicas
+from gdp.service.replication_messages import LogId, ReplicaStatus
 
 __all__ = ["Elected", "Election"]
 
@@ -26,9 +26,9 @@ class Elected(NamedTuple):
     ``root``: the replica that it begins with; ``position``: where the furthest replicas are.
     """
 
-    log: Log
+    log: LogId
     root: Name
-    position: Position
+    position: ReplicaStatus
 
 
 class Election:
@@ -50,7 +50,7 @@ class Election:
         """Return whether silent replicas have had their time."""
         return now_s >= self._collect_until_s
 
-    def must_yield(self, log: Log, own: Log, replicas: Replicas) -> bool:
+    def must_yield(self, log: LogId, own: LogId, replicas: Replicas) -> bool:
         """Return whether another log holds: unless the own one has begun and is greater."""
         return not (replicas.following() and log < own)
 
@@ -75,4 +75,4 @@ class Election:
             return None
         root = min(name for name, each in sound.items() if (each.log, each.at) == (best.log, best.at))
         generation = max(position.log.generation for position in known.values()) + 1
-        return Elected(Log(generation, instance), root, best)
+        return Elected(LogId(generation, instance), root, best)

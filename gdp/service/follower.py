@@ -12,7 +12,17 @@ from enum import Enum
 from typing import Final, NamedTuple, TypeAlias
 
 from gdp.names import Name
-from gdp.service.ordered import NO_LOG, Follow, FollowerWord, Keep, Log, Position, State, Tell, place_of
+from gdp.service.replication_messages import (
+    NO_LOG,
+    AttachReplica,
+    FollowerMessage,
+    LogId,
+    ReplicaProbe,
+    ReplicaStatus,
+    Snapshot,
+    SnapshotRequest,
+    place_of,
+)
 
 __all__ = ["Apply", "Doing", "Fetch", "Follower", "Load", "Refuse", "Say"]
 
@@ -43,7 +53,7 @@ class Say(NamedTuple):
     """Tell a client."""
 
     client: Name
-    word: FollowerWord
+    word: FollowerMessage
 
 
 class Refuse(NamedTuple):
@@ -79,36 +89,36 @@ class Follower:
         self._log = NO_LOG
         self._index = 0
         self._is_lost = False
-        self._keeper: Name | None = None
+        self._sequencer: Name | None = None
         self._held: dict[int, tuple[int, bytes]] = {}  # index -> call and request; of this log, not done yet
         self._held_bytes = 0
         self._gap_told = -1
-        self._follow: Follow | None = None  # with a state that waits, or is being taken on
+        self._follow: AttachReplica | None = None  # with a state that waits, or is being taken on
         self._asked_state = False
         self._effects: list[Effect] = []
         self.doing = Doing.NOTHING
 
     @property
-    def keeper(self) -> Name | None:
+    def sequencer(self) -> Name | None:
         """Return whose log it follows."""
-        return self._keeper
+        return self._sequencer
 
-    def take(self) -> list[Effect]:
+    def poll_effects(self) -> list[Effect]:
         """Return, once, what is to be done, in order."""
         effects, self._effects = self._effects, []
         return effects
 
-    def heard(self, client: Name, word: Keep | Follow | Tell) -> None:
+    def heard(self, client: Name, word: ReplicaProbe | AttachReplica | SnapshotRequest) -> None:
         """Take a keeper's word."""
-        if isinstance(word, Keep):
-            if client == self._keeper and word.life != self._log.life and self._follow is None:
-                self._keeper = None  # it keeps this log no more
-            if self._follow is None or client != self._keeper:
+        if isinstance(word, ReplicaProbe):
+            if client == self._sequencer and word.life != self._log.life and self._follow is None:
+                self._sequencer = None  # it keeps this log no more
+            if self._follow is None or client != self._sequencer:
                 self._say(client)
-        elif isinstance(word, Follow):
+        elif isinstance(word, AttachReplica):
             self._take_follow(client, word)
-        elif client != self._keeper or word.log != self._log or not self._can_tell or self._is_lost:
-            self._effects.append(Say(client, State(word.log, 0, None)))
+        elif client != self._sequencer or word.log != self._log or not self._can_tell or self._is_lost:
+            self._effects.append(Say(client, Snapshot(word.log, 0, None)))
         else:
             self._asked_state = True
         self._go_on()
@@ -116,8 +126,8 @@ class Follower:
     def entry(self, client: Name, call: int, request: bytes) -> None:
         """Take an entry, or what somebody takes for one."""
         life, index = place_of(call)
-        if client != self._keeper:
-            reason = UNKEPT if self._keeper is None else f"kept in order by {self._keeper.short}"
+        if client != self._sequencer:
+            reason = UNKEPT if self._sequencer is None else f"kept in order by {self._sequencer.short}"
             self._effects.append(Refuse(client, call, reason))
             return
         if life != self._log.life or self._is_lost or index <= self._index or index in self._held:
@@ -152,8 +162,8 @@ class Follower:
         self._end(Doing.TELLING)
         self._asked_state = False
         self._can_tell = self._can_tell and state is not None
-        if self._keeper is not None:
-            self._effects.append(Say(self._keeper, State(self._log, self._index, state)))
+        if self._sequencer is not None:
+            self._effects.append(Say(self._sequencer, Snapshot(self._log, self._index, state)))
         self._go_on()
 
     def loaded(self, *, is_done: bool) -> None:
@@ -179,29 +189,29 @@ class Follower:
         self._follow, self._asked_state, self._can_tell = None, False, self._tells
         self._log, self._index, self._is_lost = NO_LOG, 0, is_doubtful
         self._clear()
-        if self._keeper is not None:
-            self._say(self._keeper)
+        if self._sequencer is not None:
+            self._say(self._sequencer)
 
     def gone(self) -> None:
         """Learn that the keeper is no more: another may come. What is held is done all the same."""
-        self._keeper = None
+        self._sequencer = None
 
-    def _take_follow(self, client: Name, word: Follow) -> None:
-        if self._keeper not in {None, client}:
+    def _take_follow(self, client: Name, word: AttachReplica) -> None:
+        if self._sequencer not in {None, client}:
             self._say(client)
         elif self._follow is not None:
             pass  # it hears when the state is taken on that it brought
         elif word.state is None:
             at = (self._log, self._index) == (word.log_before, word.at_before)
             if at and not self._is_lost and self.doing is Doing.NOTHING:
-                self._keeper = client
+                self._sequencer = client
                 self._stand(word.log, word.at)
             else:
                 self._say(client)
         elif not self._can_tell or word.log < self._log or (word.log == self._log and word.at < self._index):
             self._say(client)
         else:
-            self._keeper, self._follow = client, word
+            self._sequencer, self._follow = client, word
             self._clear()
 
     def _go_on(self) -> None:
@@ -218,23 +228,23 @@ class Follower:
             self.doing = Doing.APPLYING
             call, request = self._held[self._index + 1]
             # One whose client is gone is done as well, and answered to nobody.
-            self._effects.append(Apply(self._keeper or _NOBODY, call, request))
+            self._effects.append(Apply(self._sequencer or _NOBODY, call, request))
 
-    def _stand(self, log: Log, index: int) -> None:
+    def _stand(self, log: LogId, index: int) -> None:
         """Stand in a log; what is held of it stays."""
         if log != self._log:
             self._clear()
         self._log, self._index, self._is_lost = log, index, False
         for done in [each for each in self._held if each <= index]:
             self._held_bytes -= len(self._held.pop(done)[1])
-        if self._keeper is not None:
-            self._say(self._keeper)
+        if self._sequencer is not None:
+            self._say(self._sequencer)
 
     def _lose(self) -> None:
         self._log, self._index, self._is_lost = NO_LOG, 0, True
         self._clear()
-        if self._keeper is not None and self._follow is None:
-            self._say(self._keeper)
+        if self._sequencer is not None and self._follow is None:
+            self._say(self._sequencer)
 
     def _clear(self) -> None:
         """Forget what is held, but for the entry that the server is at."""
@@ -254,8 +264,8 @@ class Follower:
         return reach
 
     def _say(self, client: Name) -> None:
-        kept_by = None if self._keeper in {None, client} else self._keeper
-        said = Position(self._log, self._index, self._reach(), self._is_lost, self._can_tell, kept_by)
+        kept_by = None if self._sequencer in {None, client} else self._sequencer
+        said = ReplicaStatus(self._log, self._index, self._reach(), self._is_lost, self._can_tell, kept_by)
         self._effects.append(Say(client, said))
 
 

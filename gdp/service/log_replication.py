@@ -9,9 +9,9 @@ from typing import Final
 
 from gdp.names import Name
 from gdp.service.dispatch import Ask
-from gdp.service.ordered import Log, Word, call_of
 from gdp.service.replicas import Replica, Replicas
 from gdp.service.replicated_log import ReplicatedLog
+from gdp.service.replication_messages import LogId, ReplicaCommand, call_of
 
 __all__ = ["STALL_S", "LogReplication"]
 
@@ -30,7 +30,9 @@ class LogReplication:
         is_sent: an entry of this log was sent.
     """
 
-    def __init__(self, *, log: Log, entries: ReplicatedLog, replicas: Replicas, effects: list[Ask | Word]) -> None:
+    def __init__(
+        self, *, log: LogId, entries: ReplicatedLog, replicas: Replicas, effects: list[Ask | ReplicaCommand]
+    ) -> None:
         self.log = log
         self.is_sent = False
         self._entries = entries

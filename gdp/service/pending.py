@@ -52,9 +52,9 @@ class Pending(Generic[A]):
         Raises:
             LocalError: as many as there may be are under way.
         """
-        return self._calls.begin(now_s, timeout_s, _Call(answered, failed))
+        return self._calls.add_call(now_s, timeout_s, _Call(answered, failed))
 
-    def answer(self, number: int, answer: A) -> bool:
+    def handle_response(self, number: int, answer: A) -> bool:
         """Answer a call; return whether it was still under way."""
         call = self._calls.end(number)
         if call is not None:
@@ -70,14 +70,14 @@ class Pending(Generic[A]):
                 self._calls.end(number)
                 call.failed(Failure.REFUSED, reason)
 
-    def expire(self, now_s: float) -> None:
+    def fail_expired(self, now_s: float) -> None:
         """Fail the calls whose time has run out."""
         for _, call in self._calls.expired(now_s):
             call.failed(Failure.TIMED_OUT, "")
 
-    def next_timeout(self) -> float | None:
+    def get_timer(self) -> float | None:
         """Return the monotonic second at which a call's time runs out, or None."""
-        return self._calls.next_timeout()
+        return self._calls.get_timer()
 
     def fail_all(self, failure: Failure, reason: str) -> None:
         """Fail every call."""

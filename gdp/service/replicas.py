@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gdp.names import Name
-from gdp.service.ordered import Position
+from gdp.service.replication_messages import ReplicaStatus
 
 __all__ = ["Replica", "Replicas"]
 
@@ -26,7 +26,7 @@ class Replica:
     """
 
     quiet_until_s: float
-    position: Position | None = None
+    position: ReplicaStatus | None = None
     follows: bool = False
     is_offered: bool = False
     sent: int = 0
@@ -42,7 +42,7 @@ class Replica:
 class Replicas(dict[Name, Replica]):
     """All of them, by name."""
 
-    def following(self) -> dict[Name, Position]:
+    def following(self) -> dict[Name, ReplicaStatus]:
         """Return where those are that follow."""
         places = ((name, each.position) for name, each in self.items() if each.follows)
         return {name: position for name, position in places if position is not None}
@@ -51,7 +51,7 @@ class Replicas(dict[Name, Replica]):
         """Return those that follow and can tell their state, and after which entry."""
         return {name: position.at for name, position in self.following().items() if position.tells}
 
-    def known(self) -> dict[Name, Position]:
+    def known(self) -> dict[Name, ReplicaStatus]:
         """Return where those are that have said so."""
         return {name: each.position for name, each in self.items() if each.position is not None}
 

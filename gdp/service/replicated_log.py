@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final
 
-from gdp.service.ordered import State
+from gdp.service.replication_messages import Snapshot
 
 __all__ = ["ReplicatedLog"]
 
@@ -36,7 +36,7 @@ class ReplicatedLog:
         self._bytes = 0
         self._bytes_after_state = 0
         self.last = 0
-        self.state: State | None = None
+        self.state: Snapshot | None = None
 
     def __len__(self) -> int:
         return len(self._requests)
@@ -70,7 +70,7 @@ class ReplicatedLog:
         self._bytes += len(request)
         self._bytes_after_state += len(request)
 
-    def learn(self, state: State) -> None:
+    def learn(self, state: Snapshot) -> None:
         """Take a state, if it is newer."""
         if self.state is None or state.at > self.state.at:
             self.state = state

@@ -125,7 +125,7 @@ class Serving(Generic[R]):
         if self._shares[client] >= room or self._waiting_bytes[client] + size > room_bytes:
             raise LocalError(f"{self._shares[client]} requests of this client are under way: no more at once")
         after = after if after in self._numbers else None
-        number = self._calls.begin(now_s, patience_s, _Served(asked, request, size, after))
+        number = self._calls.add_call(now_s, patience_s, _Served(asked, request, size, after))
         self._numbers[asked] = number
         self._shares[client] += 1
         self._waiting_bytes[client] += size
@@ -135,7 +135,7 @@ class Serving(Generic[R]):
             self._held_back.setdefault(after, {})[number] = None
         return number
 
-    def take(self) -> list[Turn[R]]:
+    def poll_turns(self) -> list[Turn[R]]:
         """Return, once, the requests whose turn it is."""
         turns: list[Turn[R]] = []
         while self._waiting and (self._at_once is None or self._given < self._at_once):
@@ -218,9 +218,9 @@ class Serving(Generic[R]):
             ended.append(Expired(number, served.asked.part, asked, served.request is None))
         return ended
 
-    def next_timeout(self) -> float | None:
+    def get_timer(self) -> float | None:
         """Return the monotonic second at which a call has taken too long, or None."""
-        return self._calls.next_timeout()
+        return self._calls.get_timer()
 
     def fail_all(self) -> list[Asked]:
         """End every call; return whose they are."""

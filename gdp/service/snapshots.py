@@ -8,9 +8,9 @@ from __future__ import annotations
 from typing import Final
 
 from gdp.names import Name
-from gdp.service.ordered import Log, State
 from gdp.service.replicas import Replicas
 from gdp.service.replicated_log import ReplicatedLog
+from gdp.service.replication_messages import LogId, Snapshot
 
 __all__ = ["SnapshotRequests"]
 
@@ -39,7 +39,7 @@ class SnapshotRequests:
         self._until_s = now_s + _TIMEOUT_S
         return server
 
-    def handle_state(self, server: Name, state: State, log: Log, entries: ReplicatedLog) -> bool:
+    def handle_state(self, server: Name, state: Snapshot, log: LogId, entries: ReplicatedLog) -> bool:
         """Return whether a state is the one that was requested; if so, the request is over."""
         if server != self._server or state.log != log or state.at > entries.last:
             return False
@@ -51,7 +51,7 @@ class SnapshotRequests:
         if self._server == server:
             self._server = None
 
-    def timeout(self, now_s: float) -> None:
+    def handle_timer(self, now_s: float) -> None:
         """Drop a request whose time has run out."""
         if self._server is not None and now_s >= self._until_s:
             self._server = None

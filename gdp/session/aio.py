@@ -12,7 +12,7 @@ import time
 from collections.abc import Awaitable, Callable, Generator, Sequence
 from types import TracebackType
 
-from gdp.client.member import Topic
+from gdp.client.participant import Topic
 from gdp.client.publisher import Publisher as MemberPublisher
 from gdp.errors import LocalError
 from gdp.names import Name
@@ -158,7 +158,7 @@ class AsyncSubscription:
     @property
     def publishers(self) -> int:
         """Return how many publishers are there."""
-        return len(self._session.core.member.feeds_of(self.name))
+        return len(self._session.core.member.writer_proxies_of(self.name))
 
     @property
     def lost(self) -> int:
@@ -535,7 +535,7 @@ def open_session_async(
         delegations=delegations,
         state=state,
         lease_s=lease_s,
-        spin_us=0,  # the event loop sleeps by itself
+        busy_poll_us=0,  # the event loop sleeps by itself
     )
     return _Opening(config, timeout_s)
 

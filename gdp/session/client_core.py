@@ -10,7 +10,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
-from gdp.client.member import Member, Message, Topic
+from gdp.client.participant import Message, Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
 from gdp.names import Name
@@ -61,7 +61,7 @@ class ClientCore:
     """
 
     def __init__(
-        self, member: Member, topic: Topic, label: str, *, start: int, is_global: bool = True, urgent: bool = False
+        self, member: Participant, topic: Topic, label: str, *, start: int, is_global: bool = True, urgent: bool = False
     ) -> None:
         self._member = member
         self._name = topic.name
@@ -117,7 +117,7 @@ class ClientCore:
             found.answered(frame.call, server, Response(frame.payload, server), now_s)
         self._send_out(now_s)
 
-    def timeout(self, now_s: float) -> None:
+    def handle_timer(self, now_s: float) -> None:
         """Do what is due."""
         if now_s >= self._follow_at_s:
             self._follow(now_s)
@@ -128,12 +128,12 @@ class ClientCore:
                 " time with timeout_s"
             )
         for dispatch in self._dispatches.values():
-            dispatch.timeout(now_s)
+            dispatch.handle_timer(now_s)
         self._send_out(now_s)
 
-    def next_timeout(self) -> float | None:
+    def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [dispatch.next_timeout() for dispatch in self._dispatches.values()]
+        times = [dispatch.get_timer() for dispatch in self._dispatches.values()]
         times += [call.deadline_s for call in self._unasked]
         if not self.is_idle or self._for_all:
             times.append(self._follow_at_s)
@@ -154,20 +154,24 @@ class ClientCore:
         self._follow_at_s = now_s + _FOLLOW_S
         member = self._member
         peers = set(member.peers(self._name) or member.heard(self._name))  # one that lags is better than none
-        heard = {feed.publisher: feed for feed in member.feeds_of(self._name) if feed.publisher in peers}
+        heard = {
+            writer_proxy.publisher: writer_proxy
+            for writer_proxy in member.writer_proxies_of(self._name)
+            if writer_proxy.publisher in peers
+        }
         for name, incarnation in list(self._servers.items()):
             if name not in heard or heard[name].incarnation != incarnation:
                 del self._servers[name]
                 self._leaving.discard(name)
                 for dispatch in self._dispatches.values():
                     dispatch.gone(name, now_s, _GONE)
-        for name, feed in heard.items():
+        for name, writer_proxy in heard.items():
             is_new = name not in self._servers
-            self._servers[name] = feed.incarnation
+            self._servers[name] = writer_proxy.incarnation
             if is_new:
                 for dispatch in self._dispatches.values():
                     dispatch.came(name, now_s)
-            if feed.description == LEAVING and name not in self._leaving:
+            if writer_proxy.description == LEAVING and name not in self._leaving:
                 self._leaving.add(name)
                 for dispatch in self._dispatches.values():
                     dispatch.leaves(name)
@@ -210,7 +214,7 @@ class ClientCore:
     def _send_out(self, now_s: float) -> None:
         """Send what was decided; what all servers get waits for the window of their common stream."""
         for dispatch in self._dispatches.values():
-            while effects := dispatch.take():
+            while effects := dispatch.poll_effects():
                 for effect in effects:
                     servers = effect.servers if isinstance(effect, Ask) else effect.server and (effect.server,)
                     if servers is None:

@@ -10,8 +10,8 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Final, Protocol
 
-from gdp.client.member import Member, Topic
-from gdp.client.member import Message as MemberMessage
+from gdp.client.participant import Message as MemberMessage
+from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.errors import LocalError, RemoteError
 from gdp.metadata import Metadata
@@ -100,7 +100,7 @@ class SessionCore:
 
     def __init__(
         self,
-        member: Member,
+        member: Participant,
         topics: Iterable[Topic],
         random_start: Callable[[], int],
         delegations_at: str = "its delegations",
@@ -159,7 +159,7 @@ class SessionCore:
     def advertise(
         self, topic: Topic, *, reliable: bool, urgent: bool, latched: int, is_global: bool, description: bytes
     ) -> Publisher:
-        """Publish a name; see ``Member.advertise``.
+        """Publish a name; see ``Participant.advertise``.
 
         Raises:
             LocalError: the name is published already in this session.
@@ -237,7 +237,7 @@ class SessionCore:
 
     def handle(self, now_s: float) -> None:
         """Distribute what has arrived, and do what is due."""
-        for message in self.member.take_messages():
+        for message in self.member.poll_messages():
             receiver = self._receivers.get(message.topic)
             if receiver is None:
                 continue  # it arrived while its subscription was being closed
@@ -246,15 +246,15 @@ class SessionCore:
             except RemoteError:
                 self.malformed += 1
         for service in self._services:
-            due_s = service.next_timeout()
+            due_s = service.get_timer()
             if due_s is not None and now_s >= due_s:
-                service.timeout(now_s)
+                service.handle_timer(now_s)
 
-    def next_timeout(self) -> float | None:
+    def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer beyond the member's own, or None."""
         if not self._services:
             return None
-        times = [service.next_timeout() for service in self._services]
+        times = [service.get_timer() for service in self._services]
         return min((time for time in times if time is not None), default=None)
 
 

@@ -112,7 +112,7 @@ class ThreadDriver:
         runtime.watch(self._wake, self._wake.clear)
         self._leads = 0  # how often a thread of the program has led
         self._is_led = False  # by a thread of the program
-        self._is_parked = False  # the background thread sleeps until a leader leaves
+        self._is_pending = False  # the background thread sleeps until a leader leaves
         self._unparked = threading.Event()
         self._is_closed = False
         self._error: BaseException | None = None
@@ -224,7 +224,7 @@ class ThreadDriver:
         finally:
             self._is_led = False
             self._lock.release()
-            if self._is_parked:
+            if self._is_pending:
                 self._unparked.set()
             if self._commands or self._followers:
                 self._after_release()
@@ -233,7 +233,7 @@ class ThreadDriver:
         core = self._core
         if self._commands:
             self._run_commands()
-        due_s = core.next_timeout()
+        due_s = core.get_timer()
         if due_s is None or (deadline_s is not None and deadline_s < due_s):
             due_s = deadline_s
         self._runtime.step(due_s)
@@ -333,10 +333,10 @@ class ThreadDriver:
                 return
             if self._leads == leads and self._is_led:  # the same leader waits for long
                 self._unparked.clear()
-                self._is_parked = True
+                self._is_pending = True
                 if self._is_led and not self._is_closed:
                     self._unparked.wait()
-                self._is_parked = False
+                self._is_pending = False
                 self._unparked.clear()
             leads = self._leads
 

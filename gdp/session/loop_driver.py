@@ -13,7 +13,7 @@ from typing import Final
 
 from gdp.client.publisher import Publisher
 from gdp.nodes.runtime import Runtime
-from gdp.ports.linked import LinkedPlane
+from gdp.ports.netdev import NetdevPlane
 from gdp.session.core import SessionCore
 from gdp.session.errors import ClosedError
 
@@ -27,7 +27,7 @@ _STEPS_MAX: Final = 8  # before the program's other tasks have their turn
 class LoopDriver:
     """Drives a core from the running event loop; only that loop's thread may use it."""
 
-    def __init__(self, core: SessionCore, runtime: Runtime, plane: LinkedPlane) -> None:
+    def __init__(self, core: SessionCore, runtime: Runtime, plane: NetdevPlane) -> None:
         self._core = core
         self._member = core.member
         self._runtime = runtime
@@ -132,7 +132,7 @@ class LoopDriver:
     def _set_timer(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
-        times = [self._runtime.next_due_s(), self._core.next_timeout()]
+        times = [self._runtime.next_due_s(), self._core.get_timer()]
         due_s = min((each for each in times if each is not None), default=None)
         if due_s is not None:
             delay_s = max(due_s - time.monotonic(), 0.0)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from gdp.client.attachment import attachment_waits
-from gdp.client.member import Member
+from gdp.client.participant import Participant
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
@@ -44,7 +44,7 @@ class SessionNode:
 
     config: SessionConfig
     identity: Identity
-    member: Member
+    member: Participant
     runtime: Runtime
     plane: RawPlane
     node_log: NodeLog
@@ -58,8 +58,8 @@ class SessionNode:
 
     def refused(self, name: Name) -> str:
         """Return why the overlay refused an advertisement of this node; empty where it did not."""
-        claims = (each for each in self.member.attachment.claims if each.subject.name == name)
-        return next((each.refused.label for each in claims if each.refused is not None), "")
+        advertisements = (each for each in self.member.attachment.advertisements if each.subject.name == name)
+        return next((each.refused.label for each in advertisements if each.refused is not None), "")
 
     def reload(self) -> None:
         """Read the delegations again.
@@ -82,7 +82,7 @@ def open_node(config: SessionConfig) -> SessionNode:
     """
     identity, policy = load_member(config.identity, config.domain, Role.PROXY)
     settings = NodeSettings(incarnation(), wall_clock_ms(), fresh_bytes, lease_s=config.lease_s)
-    member = Member(identity, policy, settings)
+    member = Participant(identity, policy, settings)
     directory = config.delegation_directory
     topics = DelegationStore(directory, identity)
     core = SessionCore(member, topics, lambda: secrets.randbits(64), str(directory))
@@ -91,15 +91,15 @@ def open_node(config: SessionConfig) -> SessionNode:
         stack.enter_context(run_alone("node", identity.name))
         revocations = load_revocations(config.state, policy.revoked, stack)
         plane = stack.enter_context(open_uplink(config.iface))
-        runtime = Runtime(member, plane, spin_s=config.spin_us / 1e6)
+        runtime = Runtime(member, plane, spin_s=config.busy_poll_us / 1e6)
         labels = {topic.name: core.label(topic) for topic in topics}
         node_log = NodeLog(
-            member.attachment.greeter,
+            member.attachment.hello_protocol,
             policy,
             plane,
             member.boundary,
             lambda now_s: attachment_waits(member.attachment, now_s),
-            rival=lambda: member.attachment.rival_at,
+            conflict=lambda: member.attachment.conflict_at,
             local_name=lambda name: labels.get(name, name.short),
         )
         runtime.every(LOOK_S, node_log.look)

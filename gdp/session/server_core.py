@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Final
 
-from gdp.client.member import Member, Message, Topic
+from gdp.client.participant import Message, Participant, Topic
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.service.serving import Asked, Serving, Turn
@@ -40,7 +40,7 @@ class ServerCore:
     """
 
     def __init__(
-        self, member: Member, topic: Topic, *, start: int, at_once: int | None, is_global: bool, urgent: bool
+        self, member: Participant, topic: Topic, *, start: int, at_once: int | None, is_global: bool, urgent: bool
     ) -> None:
         self._member = member
         self._name = topic.name
@@ -50,7 +50,7 @@ class ServerCore:
         self._check_at_s: float | None = None  # when clients are checked next; None: no call is under way
         self._is_leaving = False
         self.turns: deque[Turn[bytes]] = deque()
-        self.unsent = 0
+        self.best_effort_queue = 0
 
     @property
     def clients(self) -> int:
@@ -107,7 +107,7 @@ class ServerCore:
         self._member.flush(now_s)  # the responses must go before their stream ends
         self._member.withdraw(self._name)
 
-    def timeout(self, now_s: float) -> None:
+    def handle_timer(self, now_s: float) -> None:
         """Give up requests that no client waits for."""
         for each in self._serving.expired(now_s):
             if each.asked is not None:
@@ -117,9 +117,9 @@ class ServerCore:
             self._check_at_s = now_s + _CHECK_CLIENTS_S if self._serving else None
         self._give()
 
-    def next_timeout(self) -> float | None:
+    def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._serving.next_timeout(), self._check_at_s]
+        times = [self._serving.get_timer(), self._check_at_s]
         return min((time for time in times if time is not None), default=None)
 
     def _begin(self, client: Name, frame: RequestFrame, now_s: float) -> None:
@@ -142,7 +142,7 @@ class ServerCore:
             self._check_at_s = now_s + _CHECK_CLIENTS_S
 
     def _give(self) -> None:
-        self.turns.extend(self._serving.take())
+        self.turns.extend(self._serving.poll_turns())
 
     def _respond(self, asked: Asked, frame: ResponseFrame) -> None:
         wire = frame.to_wire()
@@ -151,14 +151,14 @@ class ServerCore:
 
     def _send(self, client: Name, wire: bytes) -> None:
         try:
-            self._member.answer(self._name, client, wire)
+            self._member.respond(self._name, client, wire)
         except LocalError:
-            self.unsent += 1  # the client has gone; asked again, it gets the response that is remembered
+            self.best_effort_queue += 1  # the client has gone; asked again, it gets the response that is remembered
 
     def _check_clients(self, now_s: float) -> None:
         """Forget the calls of clients that have gone."""
         here = set(self._member.heard(self._name))
-        known = {feed.publisher for feed in self._member.feeds_of(self._name)}
+        known = {writer_proxy.publisher for writer_proxy in self._member.writer_proxies_of(self._name)}
         clients = self._serving.clients
         self._seen_s = {each: now_s if each in here else self._seen_s.get(each, now_s) for each in clients}
         for client, seen_s in self._seen_s.items():

@@ -14,7 +14,7 @@ from functools import partial
 from types import TracebackType
 from typing import Final, Literal, Protocol
 
-from gdp.client.member import Topic
+from gdp.client.participant import Topic
 from gdp.client.publisher import Publisher as MemberPublisher
 from gdp.errors import LocalError
 from gdp.names import Name
@@ -188,7 +188,7 @@ class Subscription:
     @property
     def publishers(self) -> int:
         """Return how many publishers are there."""
-        return len(self._session.core.member.feeds_of(self.name))
+        return len(self._session.core.member.writer_proxies_of(self.name))
 
     @property
     def lost(self) -> int:
@@ -573,7 +573,7 @@ def open_session(
     delegations: str | os.PathLike[str] | None = None,
     state: str | os.PathLike[str] | None = None,
     lease_s: float | None = None,
-    spin_us: int | None = None,
+    busy_poll_us: int | None = None,
     timeout_s: float = ATTACH_TIMEOUT_S,
 ) -> Session:
     """Open a session: attach this process to the overlay as a node.
@@ -590,7 +590,7 @@ def open_session(
             node's directory.
         state: directory that keeps revocations across restarts.
         lease_s: lease of what the node advertises.
-        spin_us: microseconds to poll for more frames before sleeping, where most waits were shorter. 0: never.
+        busy_poll_us: microseconds to poll for more frames before sleeping, where most waits were shorter. 0: never.
         timeout_s: longest wait until a switch has accepted the node.
 
     Raises:
@@ -606,7 +606,7 @@ def open_session(
         delegations=delegations,
         state=state,
         lease_s=lease_s,
-        spin_us=spin_us,
+        busy_poll_us=busy_poll_us,
     )
     made: SessionNode = open_node(config)
     session = Session(made, ThreadDriver(made.core, made.runtime))

@@ -8,18 +8,18 @@ comes from the directory: ``root.crt``, ``delegations/``, and its own name for t
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final
 
 import orjson
 from pydantic import Field, ValidationError
 
 from gdp.errors import LocalError
-from gdp.limits import CLAIM_LEASE_S
+from gdp.limits import ADVERTISEMENT_LEASE_S
+from gdp.nodes.busy_poll import SPIN_MAX_US, SPIN_US
 from gdp.nodes.config import LeaseSeconds
 from gdp.nodes.schema import Directory, Domain, Ifname, Section, load
-from gdp.nodes.spin import SPIN_MAX_US, SPIN_US
 from gdp.stores.keyring import DELEGATIONS, NODE_CERTIFICATE, ROOT_CERTIFICATE
 
 __all__ = ["SessionConfig", "settings_of"]
@@ -30,13 +30,15 @@ _SUFFIXES: Final = (".yaml", ".yml")
 class SessionConfig(Section):
     """``session.yaml``, or a ``proxy.yaml`` whose rules and graphs a session does not use."""
 
+    renamed: ClassVar[Mapping[str, str]] = {"spin_us": "busy_poll_us"}
+
     identity: Directory
     domain: Domain
     iface: Ifname
     delegations: Directory | None = None
     state: Directory | None = None
-    lease_s: LeaseSeconds = CLAIM_LEASE_S
-    spin_us: int = Field(default=SPIN_US, ge=0, le=SPIN_MAX_US)
+    lease_s: LeaseSeconds = ADVERTISEMENT_LEASE_S
+    busy_poll_us: int = Field(default=SPIN_US, ge=0, le=SPIN_MAX_US)
     # keys of proxy.yaml alone
     ros: object = None
     expose: object = None
@@ -60,7 +62,7 @@ def settings_of(
     delegations: str | os.PathLike[str] | None = None,
     state: str | os.PathLike[str] | None = None,
     lease_s: float | None = None,
-    spin_us: int | None = None,
+    busy_poll_us: int | None = None,
 ) -> SessionConfig:
     """Return the settings of a session; see ``gdp.open`` for the options.
 
@@ -86,7 +88,13 @@ def settings_of(
         values = _values(load(SessionConfig, path))
     else:
         raise LocalError(f"{path}: no such directory or file; give a node's directory, or its configuration file")
-    options = {"iface": iface, "delegations": delegations, "state": state, "lease_s": lease_s, "spin_us": spin_us}
+    options = {
+        "iface": iface,
+        "delegations": delegations,
+        "state": state,
+        "lease_s": lease_s,
+        "busy_poll_us": busy_poll_us,
+    }
     values |= {key: value for key, value in options.items() if value is not None}
     values["domain"] = _domain(values["domain"], root, trusts)
     try:
@@ -98,7 +106,7 @@ def settings_of(
 
 
 def _values(config: SessionConfig) -> dict[str, object]:
-    keys = ("identity", "iface", "delegations", "state", "lease_s", "spin_us")
+    keys = ("identity", "iface", "delegations", "state", "lease_s", "busy_poll_us")
     domain = {
         "root": config.domain.root,
         "trusts": list(config.domain.trusts),

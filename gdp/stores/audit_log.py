@@ -80,7 +80,7 @@ class AuditLog:
         path = self._folder / _CURRENT
         with _locked(path, os.O_RDWR | os.O_CREAT) as file:
             seq, previous = self._end_of(path, file)
-            lines = trail.take(mono_s, unix_s, seq, previous)
+            lines = trail.poll_lines(mono_s, unix_s, seq, previous)
             file.write(b"".join(line.to_line() + b"\n" for line in lines))
             is_full = file.tell() >= self._file_max_bytes
             file.flush()

@@ -22,13 +22,13 @@ from gdp.control.replica import Key
 from gdp.crypto import cbor, cbor_writer
 from gdp.crypto.fields import Fields
 from gdp.crypto.statements import parse
-from gdp.effects import Instant
 from gdp.errors import DropReason, LocalError, RemoteError, StatementError, StoreError
 from gdp.names import NAME_BYTES, Name
 from gdp.rib.route import Route, Withdrawn
+from gdp.sansio import Timestamps
 from gdp.stores.cluster_link import ClusterLink, Command, tag_of
-from gdp.trust.claim import ClaimBody
-from gdp.trust.verifier import ClaimVerifier
+from gdp.trust.advertisement import UnverifiedAdvertisement
+from gdp.trust.verifier import AdvertisementVerifier
 
 __all__ = ["ClusterStore", "load_functions"]
 
@@ -76,11 +76,11 @@ class ClusterStore:
         verifier: of the RIB: what is read is verified before it is used.
     """
 
-    def __init__(self, link: ClusterLink, verifier: ClaimVerifier) -> None:
+    def __init__(self, link: ClusterLink, verifier: AdvertisementVerifier) -> None:
         self._link = link
         self._verifier = verifier
         self._me = secrets.token_bytes(8)
-        self._now = Instant(0.0, 0.0)
+        self._now = Timestamps(0.0, 0.0)
         self._cache: OrderedDict[Name, dict[Name, Route]] = OrderedDict()
         self._contexts: OrderedDict[bytes, bytes] = OrderedDict()  # by hash tag and id
         self._floors: OrderedDict[Key, Withdrawn] = OrderedDict()  # what the cluster said is newer
@@ -93,7 +93,7 @@ class ClusterStore:
     def __len__(self) -> int:
         return sum(map(len, self._cache.values()))
 
-    def prefetch(self, names: Collection[Name], now: Instant) -> None:
+    def prefetch(self, names: Collection[Name], now: Timestamps) -> None:
         """Read the names that are not in memory, in one round trip for each primary.
 
         Names that could not be read raise when they are asked for.
@@ -169,7 +169,7 @@ class ClusterStore:
 
     def expire(self, now_s: float, unix_s: float) -> list[Route]:
         """Take away and return the routes in memory whose lease ended; the cluster does so by itself."""
-        self._now = Instant(now_s, unix_s)
+        self._now = Timestamps(now_s, unix_s)
         gone = []
         while self._ends and self._ends[0][0] <= now_s:
             _, name, advertiser = heapq.heappop(self._ends)
@@ -248,7 +248,7 @@ class ClusterStore:
 
     def _put_command(self, route: Route) -> _Write:
         """Return the call of the server's function; the claim is compressed against what its node's claims share."""
-        body = ClaimBody.from_statement(parse(route.claim))
+        body = UnverifiedAdvertisement.from_statement(parse(route.advertisement))
         context = cbor_writer.encode(
             {
                 "w": route.sender,
@@ -262,7 +262,7 @@ class ClusterStore:
         tag = tag_of(route.name)
         context_id = blake2b(context, digest_size=_ID_BYTES).digest()
         squeeze = zlib.compressobj(6, zlib.DEFLATED, -15, zdict=context)
-        data = context_id + squeeze.compress(route.claim) + squeeze.flush()
+        data = context_id + squeeze.compress(route.advertisement) + squeeze.flush()
         end_ms = int((self._now.unix_s + route.expires_s - self._now.mono_s) * 1_000)
         keys = (_routes_key(route.name), _sequence_key(route.name, route.advertiser), _context_key(tag, context_id))
         sequence = min(route.sequence, _SEQUENCE_MAX).to_bytes(8, "big")
@@ -291,23 +291,23 @@ class ClusterStore:
     def _route(self, name: Name, data: bytes, end_unix_s: float) -> Route:
         context = self._context(tag_of(name), data[:_ID_BYTES])
         try:
-            claim_wire = zlib.decompressobj(-15, zdict=context).decompress(data[_ID_BYTES:], 1 << 16)
+            advertisement_wire = zlib.decompressobj(-15, zdict=context).decompress(data[_ID_BYTES:], 1 << 16)
         except zlib.error as error:
             raise StatementError(DropReason.MALFORMED, "a record of the store") from error
         decoded = cbor.decode(context)
         if not isinstance(decoded, dict):
             raise StatementError(DropReason.MALFORMED, "a context of the store")
         fields = Fields(decoded)
-        claim = self._verifier.verify(claim_wire, self._now.unix_s)
-        if claim.name != name:
+        advertisement = self._verifier.verify(advertisement_wire, self._now.unix_s)
+        if advertisement.name != name:
             raise StatementError(DropReason.WRONG_NAME, "a record of the store under another name")
         return Route.of(
-            claim,
+            advertisement,
             sender=fields.name("w"),
             domain=fields.name("d"),
             via=fields.name("v"),
             transit=tuple(fields.names("x", 64)),
-            expires_s=self._now.mono_s + min(end_unix_s - self._now.unix_s, claim.lease_s),
+            expires_s=self._now.mono_s + min(end_unix_s - self._now.unix_s, advertisement.lease_s),
         )
 
     def _context(self, tag: bytes, context_id: bytes) -> bytes:

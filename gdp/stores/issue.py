@@ -12,9 +12,9 @@ from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
+from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Membership, Role, Root, Unverified
 from gdp.crypto.identity import Identity, NodeKeys, node_metadata
-from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
@@ -47,9 +47,9 @@ from gdp.stores.keyring import (
 from gdp.stores.ledger import append_issued
 from gdp.stores.private_keys import Storage
 from gdp.trust.audit import Action
-from gdp.trust.card import Recipient
 from gdp.trust.delegation import Delegation
 from gdp.trust.grants import SECRET_BYTES
+from gdp.trust.node_descriptor import Recipient
 from gdp.trust.owner import Owner
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
@@ -86,7 +86,7 @@ def make_domain(
     passphrase: bytes | None = None,
     force: bool = False,
     unix_s: float | None = None,
-) -> DomainAuthority:
+) -> CertificateAuthority:
     """Found a trust domain and keep its root in ``directory``.
 
     Args:
@@ -97,7 +97,7 @@ def make_domain(
         LocalError: a wrong label, or there is one already.
     """
     validity = Validity.lasting(_now(unix_s), days * DAY_S)
-    authority = DomainAuthority.found(label, key or SigningKey.generate(), validity)
+    authority = CertificateAuthority.create(label, key or SigningKey.generate(), validity)
     save_domain(directory, authority, passphrase=passphrase, force=force)
     return authority
 
@@ -203,7 +203,7 @@ def admit(domain: Path, request: bytes, *, days: float = MEMBER_DAYS, unix_s: fl
         LocalError: no domain there, or its ledger cannot be written.
     """
     authority, now = load_domain(domain), _now(unix_s)
-    member = authority.admit(request, _within(authority.root, now, days))
+    member = authority.issue(request, _within(authority.root, now, days))
     _issued(domain, member, now)
     return member
 

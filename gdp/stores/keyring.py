@@ -18,18 +18,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, TypeVar
 
+from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Membership, Role, Root
 from gdp.crypto.identity import Identity, NodeKeys, node_metadata
-from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.kem import KemPrivateKey
 from gdp.crypto.keys import PublicKey
-from gdp.crypto.x509_form import to_pem
+from gdp.crypto.x509_profile import to_pem
 from gdp.errors import GdpError, LocalError
 from gdp.metadata import Metadata
 from gdp.stores.files import NewFile, private, public, read_private, read_public, write_all
 from gdp.stores.private_keys import Storage, key_file, read_secret, read_signing_key, secret_file, storage_of
-from gdp.trust.card import Card
 from gdp.trust.delegation import Delegation
+from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.owner import Owner
 
 __all__ = [
@@ -112,17 +112,17 @@ def load_public_key(path: Path) -> PublicKey:
     return parsed(path, PublicKey.from_pem, read_public(path))
 
 
-def load_card(path: Path) -> Card:
+def load_card(path: Path) -> NodeDescriptor:
     """Read a node's card.
 
     Raises:
         LocalError: not there, or it does not hold; the text names the file.
     """
-    return parsed(path, Card.from_wire, read_public(path))
+    return parsed(path, NodeDescriptor.from_wire, read_public(path))
 
 
 def save_domain(
-    directory: Path, authority: DomainAuthority, *, passphrase: bytes | None = None, force: bool = False
+    directory: Path, authority: CertificateAuthority, *, passphrase: bytes | None = None, force: bool = False
 ) -> None:
     """Write a domain's root key and certificate; the key under a passphrase, if there is one.
 
@@ -136,7 +136,7 @@ def save_domain(
     write_all(directory, files, force=force)
 
 
-def load_domain(directory: Path) -> DomainAuthority:
+def load_domain(directory: Path) -> CertificateAuthority:
     """Read a domain with its private key.
 
     Raises:
@@ -144,7 +144,7 @@ def load_domain(directory: Path) -> DomainAuthority:
     """
     key = read_signing_key(directory / ROOT_KEY)
     root = load_root(directory / ROOT_CERTIFICATE)
-    return parsed(directory, lambda _: DomainAuthority(key, root), b"")
+    return parsed(directory, lambda _: CertificateAuthority(key, root), b"")
 
 
 def save_owner(directory: Path, owner: Owner, *, passphrase: bytes | None = None, force: bool = False) -> None:
@@ -218,7 +218,7 @@ def save_identity(directory: Path, identity: Identity, *, force: bool = False) -
     files = {
         ROOT_CERTIFICATE: public(identity.root.to_pem()),
         NODE_CERTIFICATE: public(to_pem(identity.membership)),
-        CARD: public(Card.make(identity)),
+        CARD: public(NodeDescriptor.make(identity)),
     }
     write_all(directory, files, force=force)
 

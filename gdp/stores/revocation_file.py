@@ -44,7 +44,7 @@ class Row(NamedTuple):
     """One revocation as it was written."""
 
     is_root: bool
-    giver: bytes
+    origin: bytes
     statement: bytes
 
 
@@ -77,8 +77,8 @@ class RevocationFile:
                 with database:
                     database.execute("DELETE FROM revocations WHERE until < ?", (int(unix_s - CLOCK_SKEW_S),))
                 rows = database.execute("SELECT is_root, giver, statement FROM revocations ORDER BY is_root DESC")
-                for is_root, giver, statement in rows:
-                    yield Row(bool(is_root), bytes(giver), bytes(statement))
+                for is_root, origin, statement in rows:
+                    yield Row(bool(is_root), bytes(origin), bytes(statement))
         except sqlite3.OperationalError as error:
             self.failures += 1
             log.error("revocations not read path=%s reason=%s; the node starts without them", self._path, error)
@@ -169,7 +169,7 @@ def _opened(path: Path) -> sqlite3.Connection:
 def _write(database: sqlite3.Connection, changes: Sequence[Change]) -> None:
     gone = [(b"".join(key),) for key, kept in changes if kept is None]
     added = [
-        (b"".join(key), int(kept.is_root), kept.giver, kept.until_unix_s, kept.wire)
+        (b"".join(key), int(kept.is_root), kept.origin, kept.until_unix_s, kept.wire)
         for key, kept in changes
         if kept is not None
     ]

@@ -13,8 +13,8 @@ import time
 from pathlib import Path
 from typing import Final
 
+from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Root
-from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
@@ -38,7 +38,7 @@ def begin_rollover(
     key: SigningKey | None = None,
     passphrase: bytes | None = None,
     unix_s: float | None = None,
-) -> DomainAuthority:
+) -> CertificateAuthority:
     """Make a successor of a domain's root; the domain goes on issuing with the present one.
 
     Args:

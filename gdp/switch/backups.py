@@ -11,7 +11,7 @@ from __future__ import annotations
 from gdp.names import Name
 from gdp.switch.outbox import Outbox
 from gdp.switch.paths import Paths
-from gdp.switch.trees import At, Tree
+from gdp.switch.trees import Downstream, Tree
 
 __all__ = ["Backups"]
 
@@ -30,7 +30,7 @@ class Backups:
         self._paths = paths
         self._outbox = outbox
 
-    def above(self, tree: Tree) -> tuple[At, Name] | None:
+    def above(self, tree: Tree) -> tuple[Downstream, Name] | None:
         """Return whom a backup branch is to be asked of: the loop-free alternate towards the publisher, or None."""
         if tree.is_backup or tree.above is None or tree.switch == self._me:
             return None
@@ -42,13 +42,13 @@ class Backups:
             return None
         return at, neighbour.name
 
-    def protection(self, tree: Tree) -> dict[At, At]:
+    def protection(self, tree: Tree) -> dict[Downstream, Downstream]:
         """Return, for each branch that a backup can take the place of, that backup.
 
         A backup protects the branch over which this switch would itself reach whoever asked for it, where messages
         that fit that branch fit the backup, too. Of several the one asked for by the nearest switch is taken.
         """
-        found: dict[At, tuple[int, At]] = {}
+        found: dict[Downstream, tuple[int, Downstream]] = {}
         for at, branch in tree.branches.items():
             if branch.backup_for is None or branch.is_active:
                 continue

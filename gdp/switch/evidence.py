@@ -7,17 +7,17 @@ is verified here like anywhere else. Only the domain and its transit are the wor
 from __future__ import annotations
 
 from gdp.control.join import Join
-from gdp.control.query import Answer
+from gdp.control.query import Response
 from gdp.control.relay import Relay
 from gdp.crypto.statements import Statement, StatementType, parse
-from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
-from gdp.switch.places import Place
-from gdp.trust.claim import Claim
+from gdp.sansio import Timestamps
+from gdp.switch.name_cache import Location
+from gdp.trust.advertisement import Advertisement
 from gdp.trust.domain import Policy
 from gdp.trust.right import HEARS
-from gdp.trust.verifier import ClaimVerifier
+from gdp.trust.verifier import AdvertisementVerifier
 
 __all__ = ["Evidence"]
 
@@ -29,22 +29,22 @@ class Evidence:
         verifier: shared with the switch's other rooms, so that a claim seen before is cheap.
     """
 
-    def __init__(self, policy: Policy, verifier: ClaimVerifier) -> None:
+    def __init__(self, policy: Policy, verifier: AdvertisementVerifier) -> None:
         self._policy = policy
         self._verifier = verifier
 
-    def from_answer(self, answer: Answer, now: Instant) -> Place:
+    def from_answer(self, answer: Response, now: Timestamps) -> Location:
         """Return the place that an answer, whose signature was verified, tells of.
 
         Raises:
             StatementError: the claim in it does not hold, or is about something else.
         """
-        claim = self._verifier.verify(answer.claim, now.unix_s)
-        if claim.name != answer.name or claim.node != answer.advertiser:
+        advertisement = self._verifier.verify(answer.advertisement, now.unix_s)
+        if advertisement.name != answer.name or advertisement.node != answer.advertiser:
             raise StatementError(DropReason.WRONG_NAME, "an answer about something else than its claim")
-        return _place(claim, answer.domain, frozenset(answer.transit), answer.lease_s, now)
+        return _place(advertisement, answer.domain, frozenset(answer.transit), answer.lease_s, now)
 
-    def from_relay(self, statement: Statement, now: Instant) -> Place:
+    def from_relay(self, statement: Statement, now: Timestamps) -> Location:
         """Return the place that a switch tells of a node that is attached to it.
 
         Raises:
@@ -55,12 +55,12 @@ class Evidence:
         if member.name != statement.signer or not member.role.is_switch:
             raise StatementError(DropReason.BAD_CERTIFICATE, "a relay that is not from a switch")
         statement.verify(member.key)
-        claim = self._verifier.verify_statement(parse(relay.statement), now.unix_s)
-        if claim.switch != member.name:
+        advertisement = self._verifier.verify_statement(parse(relay.statement), now.unix_s)
+        if advertisement.switch != member.name:
             raise StatementError(DropReason.NOT_DELEGATED, "the RtCert names another switch")
-        return _place(claim, member.domain, frozenset(relay.transit), claim.lease_s, now)
+        return _place(advertisement, member.domain, frozenset(relay.transit), advertisement.lease_s, now)
 
-    def of_join(self, join: Join, now: Instant) -> Claim:
+    def of_join(self, join: Join, now: Timestamps) -> Advertisement:
         """Return the reader's claim that a join with a lease shows; the publisher's proves where the join leads.
 
         Raises:
@@ -75,7 +75,7 @@ class Evidence:
             raise StatementError(DropReason.NOT_DELEGATED, "a join to where the publisher's claim is not")
         return reader
 
-    def still_holds(self, place: Place, now: Instant) -> bool:
+    def still_holds(self, place: Location, now: Timestamps) -> bool:
         """Return whether the proofs of a place hold; one made without proofs does."""
         if place.proof is None:
             return True
@@ -86,16 +86,18 @@ class Evidence:
         return True
 
 
-def _place(claim: Claim, domain: Name, transit: frozenset[Name], lease_s: float, now: Instant) -> Place:
-    return Place(
-        name=claim.name,
-        advertiser=claim.node,
-        right=claim.right,
-        switch=claim.switch,
+def _place(
+    advertisement: Advertisement, domain: Name, transit: frozenset[Name], lease_s: float, now: Timestamps
+) -> Location:
+    return Location(
+        name=advertisement.name,
+        advertiser=advertisement.node,
+        right=advertisement.right,
+        switch=advertisement.switch,
         domain=domain,
         transit=transit,
-        claim=claim.wire,
+        advertisement=advertisement.wire,
         expires_s=now.mono_s + lease_s,
-        proof=claim,
-        stale_until_s=now.mono_s + claim.valid_until_unix_s - now.unix_s,
+        proof=advertisement,
+        stale_until_s=now.mono_s + advertisement.valid_until_unix_s - now.unix_s,
     )

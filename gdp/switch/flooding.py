@@ -14,21 +14,21 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
-from gdp.control.greeter import Greeter, LinkPort
 from gdp.control.hello import DIGEST_BYTES, LIFE_BYTES
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
+from gdp.control.neighbor_discovery import HelloPort, HelloProtocol
 from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
 from gdp.crypto.fields import check_sequence
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement
-from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
 from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_REFRESH_S, LINK_STATES_BURST, LINK_STATES_PER_S
 from gdp.message.token_bucket import Paces
 from gdp.names import Name
+from gdp.sansio import Timestamps
 from gdp.switch.damping import Damping
-from gdp.switch.link_states import LinkStates
+from gdp.switch.lsdb import LinkStateDatabase
 from gdp.switch.paths import Paths
 from gdp.trust.domain import Policy
 from gdp.trust.rtcert import RtCertCache
@@ -65,27 +65,27 @@ class Flooding:
         *,
         identity: Identity,
         policy: Policy,
-        greeter: Greeter,
+        hello_protocol: HelloProtocol,
         send: SendStatement,
         first_sequence: int,
         life: bytes = bytes(LIFE_BYTES),
     ) -> None:
         self._identity = identity
         self._policy = policy
-        self._greeter = greeter
+        self._hello_protocol = hello_protocol
         self._send = send
         self._sequence = self._first_sequence = first_sequence
         self._life = life
         self._answers: dict[tuple[bytes, Scope], int] = {}  # by life: how often it went above what we said
         self.is_displaced = False
-        self._rivals_seen = 0
+        self._conflicts_seen = 0
         self._unix_ahead_s = 0.0  # of the wall clock before the monotonic one
         self._begun_s: float | None = None
         self._stub_until_s: float | None = None
         self._was_stub = False
         self._domain = identity.member.domain
         self._is_leaf = identity.role is Role.LEAF
-        self.link_states = LinkStates(self._domain)
+        self.link_states = LinkStateDatabase(self._domain)
         self.paths = Paths(identity.name, self._domain, self.link_states)
         self.damping = Damping()
         self._rtcerts = RtCertCache(_RTCERTS_REMEMBERED)
@@ -96,16 +96,16 @@ class Flooding:
         self._synced_s: dict[tuple[int, Name], float] = {}
         self._differs_s: dict[tuple[int, Name], float] = {}  # since when keepalives show other ones
 
-    def look_at_clock(self, now: Instant) -> None:
+    def look_at_clock(self, now: Timestamps) -> None:
         """Learn what the wall clock says, before anything is said."""
         self._unix_ahead_s = now.unix_s - now.mono_s
 
-    def digest_for(self, port: LinkPort) -> bytes:
+    def digest_for(self, port: HelloPort) -> bytes:
         """Return what to say in a hello on a port: nothing where its switches are of several domains."""
         domains = {each.domain for each in port.neighbours.values() if each.role.is_switch}
         return self.link_states.digest(domains.pop()) if len(domains) == 1 else bytes(DIGEST_BYTES)
 
-    def receive(self, neighbour: Neighbour, statement: Statement, now: Instant) -> bool:
+    def receive(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> bool:
         """Take a link state that a neighbour passed on; return whether it was news.
 
         Raises:
@@ -134,7 +134,7 @@ class Flooding:
         if state.origin == self._identity.name:
             self._outdo(state, now.mono_s)
             return False
-        if not self._paces.take(state.origin, now.mono_s):
+        if not self._paces.spend(state.origin, now.mono_s):
             raise StatementError(DropReason.QUOTA, "link states of one origin")  # digests bring the last one later
         proven = tuple(rib for rib in state.ribs if self._is_placed(rib, state, now.unix_s))
         if not self.link_states.put(replace(state, ribs=proven), statement.wire, now.mono_s):
@@ -163,9 +163,9 @@ class Flooding:
             self.drops[DropReason.MISPLACED] += 1
         return is_its and is_here
 
-    def tell_of_rivals(self, now_s: float) -> None:
+    def tell_of_conflicts(self, now_s: float) -> None:
         """Say anew which identities are refused here, if that changed; cheap when it did not."""
-        if self._rivals_seen != self._greeter.rivals.changes:
+        if self._conflicts_seen != self._hello_protocol.conflicts.changes:
             self._originate(now_s)
 
     def neighbour_changed(self, now_s: float) -> None:
@@ -193,7 +193,7 @@ class Flooding:
         elif now_s - self._differs_s.setdefault(key, now_s) >= _OUT_OF_STEP_S:
             self.sync(neighbour, now_s)
 
-    def timeout(self, now_s: float) -> None:
+    def handle_timer(self, now_s: float) -> None:
         """Renew our link states, forget what others did not renew, and follow what moved inside our domain."""
         self._begun_s = now_s if self._begun_s is None else self._begun_s
         if self._stub_until_s is not None and now_s >= self._stub_until_s:
@@ -205,14 +205,14 @@ class Flooding:
                 self._said.pop(scope, None)
         self._originate(now_s)
 
-    def next_timeout(self) -> float:
+    def get_timer(self) -> float:
         """Return the monotonic second of the next timer."""
         times = (
             min(self._refresh_at_s.values(), default=0.0),
             self.link_states.next_expiry(),
             self._stub_until_s,
             self.damping.next_reuse(),
-            self._greeter.rivals.next_expiry(),
+            self._hello_protocol.conflicts.next_expiry(),
         )
         return min(time for time in times if time is not None)
 
@@ -220,16 +220,16 @@ class Flooding:
         if self.is_displaced:
             self._refresh_at_s = dict.fromkeys(self._refresh_at_s, now_s + LINK_STATE_REFRESH_S)
             return
-        up = [each for each in self._greeter.all_up() if not self._is_leaf or each.domain == self._domain]
+        up = [each for each in self._hello_protocol.all_up() if not self._is_leaf or each.domain == self._domain]
         switches = [each for each in up if each.role.is_switch]
         links = tuple(sorted(Adjacency(n.name, n.domain, self._cost(n), n.mtu) for n in switches))
-        self._rivals_seen = self._greeter.rivals.changes
+        self._conflicts_seen = self._hello_protocol.conflicts.changes
         ribs = {
             AttachedRib(n.name, n.domain, n.nonce, n.life, *n.proof)
             for n in up
             if n.role == Role.RIB and n.proof is not None
         }
-        refused = tuple(self._greeter.rivals.refused(now_s))
+        refused = tuple(self._hello_protocol.conflicts.refused(now_s))
         self._say(Scope.DOMAIN, links, (), tuple(sorted(ribs)), (), refused, now_s)
         leaving = tuple(link for link in links if link.domain != self._domain)
         if leaving or Scope.BORDER in self._refresh_at_s or self._had_border_state():
@@ -289,7 +289,7 @@ class Flooding:
             if key in self._answers or len(self._answers) < _LIVES_MAX:
                 self._answers[key] = self._answers.get(key, 0) + 1
             if self._answers.get(key, 0) > _ANSWERS:
-                self._greeter.note_clash(self._identity.name, now_s, is_proven=True)
+                self._hello_protocol.note_clash(self._identity.name, now_s, is_proven=True)
                 self.is_displaced = self.is_displaced or state.life < self._life
         is_early = self._begun_s is not None and now_s - self._begun_s < _EARLY_S
         if is_early and not self._was_stub and state.sequence <= self._first_sequence:
@@ -301,13 +301,13 @@ class Flooding:
             self._originate(now_s)
 
     def _flood(self, scope: Scope, wire: bytes, but: Neighbour | None = None) -> None:
-        for neighbour in self._greeter.all_up():
+        for neighbour in self._hello_protocol.all_up():
             is_sender = but is not None and neighbour.port == but.port and neighbour.name == but.name
             is_in_scope = scope is Scope.BORDER or neighbour.domain == self._domain
             if neighbour.role.is_switch and is_in_scope and not is_sender:
                 self._send(neighbour, wire)
 
     def _cost(self, neighbour: Neighbour) -> int:
-        cost = self._greeter.ports[neighbour.port].cost
+        cost = self._hello_protocol.ports[neighbour.port].cost
         cost += _STUB_COST if self._stub_until_s is not None else 0
         return cost + (_FLAPPING_COST if self.damping.suppresses((neighbour.port, neighbour.name)) else 0)

@@ -22,7 +22,7 @@ from gdp.frame.codec import DESTINATION_AT, ETHER_BYTES, HEADER_BYTES, HOPS_AT, 
 from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION
 from gdp.switch.table import MACS_BYTES, Hop, Hops, is_side
 
-__all__ = ["HAND_UP", "Drop", "Forward", "HandUp", "Verdict", "decide", "rewrite"]
+__all__ = ["PUNT", "Drop", "Forward", "Punt", "Verdict", "decide", "rewrite"]
 
 _NO_SIDES: Final[Mapping[bytes, int]] = {}
 _ETHERTYPE: Final = ETHERTYPE.to_bytes(2, "big")
@@ -38,7 +38,7 @@ class Drop(NamedTuple):
     reason: DropReason
 
 
-class HandUp(NamedTuple):
+class Punt(NamedTuple):
     """The frame is for the switch's own machine: a neighbour's word, or a destination that it must look for."""
 
 
@@ -49,8 +49,8 @@ class Forward(NamedTuple):
     lost: tuple[DropReason, ...] = ()
 
 
-Verdict = Drop | HandUp | Forward
-HAND_UP: Final = HandUp()
+Verdict = Drop | Punt | Forward
+PUNT: Final = Punt()
 
 
 def decide(
@@ -76,7 +76,7 @@ def decide(
     if frame[ETHER_BYTES] != VERSION:
         return Drop(DropReason.BAD_VERSION)
     if frame[ETHER_BYTES + KIND_AT] >= CONTROL_FROM:
-        return HAND_UP
+        return PUNT
     if frame[_HOPS] <= 1:
         return Drop(DropReason.HOPS_EXPIRED)
     if len(frame) < OVERHEAD_BYTES + int.from_bytes(frame[_LENGTH : _LENGTH + 2], "big"):
@@ -86,7 +86,7 @@ def decide(
     if hops is None:
         hops = entries.get(bytes(frame[_DESTINATION:_SOURCE]))
     if hops is None:
-        return HAND_UP
+        return PUNT
     if key in sides and not is_side(sides[key], port):
         return Drop(DropReason.WRONG_SIDE)
     if not hops:

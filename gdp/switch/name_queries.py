@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from gdp.limits import CLAIM_LEASE_S, PARKED_S
+from gdp.limits import ADVERTISEMENT_LEASE_S, PENDING_S
 from gdp.names import Name
 from gdp.switch.query_window import QueryWindow
 
@@ -46,7 +46,7 @@ class NameQueries:
             frames are sent to is watched for twice as long after the last use.
     """
 
-    def __init__(self, watch_s: float = CLAIM_LEASE_S) -> None:
+    def __init__(self, watch_s: float = ADVERTISEMENT_LEASE_S) -> None:
         self.watch_s = watch_s
         self._watch_again_s = watch_s / 4
         self._use_watch_s = 2 * watch_s
@@ -145,7 +145,7 @@ class NameQueries:
         while len(queries) < BATCH_MAX and self._window.is_ready:
             name = self._window.pop()
             query = self._queries[name]
-            if now_s >= query.since_s + PARKED_S:  # the frame that needs it has expired
+            if now_s >= query.since_s + PENDING_S:  # the frame that needs it has expired
                 self._remove(name)
                 failed.append(name)
                 continue

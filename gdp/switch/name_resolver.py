@@ -6,8 +6,8 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds). It works like the neig
     frame without an entry (machine.py)
       -> Unicast.miss -> resolve: a location, or a negative entry -> table entry, and the frame goes on
                       `-> resolve: unknown                        -> a query is open: buffer_frame
-    machine's timer   -> Inquirer.ask -> queries_to_send           -> query to the RIB, again until it is answered
-    RIB's answer      -> Inquirer.receive -> Locations.receive     -> receive_location -> Unicast.release: the frame
+    machine's timer   -> RibClient.ask -> queries_to_send           -> query to the RIB, again until it is answered
+    RIB's answer      -> RibClient.receive -> Locations.receive     -> receive_location -> Unicast.release: the frame
                                           `-> receive_negative     -> the frame is dropped, counted
     machine's timer   -> expire: leases, negative entries and pending frames end
 """
@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 from gdp.control.neighbour import Neighbour
 from gdp.errors import DropReason
 from gdp.limits import (
-    CLAIM_LEASE_S,
+    ADVERTISEMENT_LEASE_S,
     QUESTIONS_BURST,
     QUESTIONS_PER_S,
     SWITCH_QUESTIONS_BURST,
@@ -28,9 +28,9 @@ from gdp.limits import (
 )
 from gdp.message.token_bucket import Paces
 from gdp.names import Name
+from gdp.switch.name_cache import Location, NameCache
 from gdp.switch.name_queries import NameQueries
-from gdp.switch.parked import Parked
-from gdp.switch.places import Place, Places
+from gdp.switch.pending_frames import PendingFrames
 from gdp.trust.right import Right
 
 __all__ = ["NameResolver", "Resolution"]
@@ -48,7 +48,7 @@ class Resolution(NamedTuple):
         reason: why ``locations`` is empty; None where it is not.
     """
 
-    locations: list[Place]
+    locations: list[Location]
     reason: DropReason | None = None
 
 
@@ -63,11 +63,11 @@ class NameResolver:
         cache: the locations that are known; others only read it.
     """
 
-    def __init__(self, me: Name, lease_s: float = CLAIM_LEASE_S) -> None:
+    def __init__(self, me: Name, lease_s: float = ADVERTISEMENT_LEASE_S) -> None:
         self._me = me
-        self.cache = Places(lease_s)
+        self.cache = NameCache(lease_s)
         self._queries = NameQueries(lease_s)
-        self._pending = Parked()
+        self._pending = PendingFrames()
         self._rates = {
             _FROM_NODE: Paces(QUESTIONS_PER_S, QUESTIONS_BURST),
             _FROM_SWITCH: Paces(SWITCH_QUESTIONS_PER_S, SWITCH_QUESTIONS_BURST),
@@ -112,7 +112,7 @@ class NameResolver:
         if elsewhere:
             self._queries.use(name, now_s)
             return Resolution(elsewhere)
-        if accepting or not (known or self.cache.is_nowhere(name, now_s)):  # it has left this switch, or is unknown
+        if accepting or not (known or self.cache.is_negative(name, now_s)):  # it has left this switch, or is unknown
             self._request(name, now_s, owner)
             return None
         return Resolution([], DropReason.NO_READER if known else DropReason.NO_ROUTE)
@@ -127,7 +127,7 @@ class NameResolver:
         if known:
             self._queries.use(name, now_s)
             return Resolution(known)
-        if self.cache.is_nowhere(name, now_s):
+        if self.cache.is_negative(name, now_s):
             return Resolution([], DropReason.NO_ROUTE)
         self._request(name, now_s, owner)
         return None
@@ -135,7 +135,7 @@ class NameResolver:
     def _request(self, name: Name, now_s: float, owner: bytes) -> None:
         """Open a query within the rate of its owner."""
         rate = self._rates.get(owner[:1])
-        if rate is None or name in self._queries or rate.take(owner, now_s):
+        if rate is None or name in self._queries or rate.spend(owner, now_s):
             self._queries.request(name, now_s, owner)
 
     def watch(self, name: Name, now_s: float) -> None:
@@ -156,7 +156,7 @@ class NameResolver:
         if name in self._queries:
             self._pending.park(name, frame, now_s, until_s, owner=owner)
         else:
-            self._refused[DropReason.PARKED_FULL] += 1
+            self._refused[DropReason.PENDING_FULL] += 1
 
     def release_frames(self, name: Name) -> list[tuple[bytes, float, bytes]]:
         """Remove and return the frames that wait for a name, in order, each with its ``until_s`` and owner."""
@@ -164,7 +164,7 @@ class NameResolver:
 
     # -- receive an answer
 
-    def receive_location(self, place: Place, now_s: float, *, is_ours: bool = False, has_left: bool = False) -> None:
+    def receive_location(self, place: Location, now_s: float, *, is_ours: bool = False, has_left: bool = False) -> None:
         """Store a verified location.
 
         Args:
@@ -174,7 +174,7 @@ class NameResolver:
                 query stays open.
         """
         before = self.cache.put(place)
-        is_repeated = before is not None and before.claim == place.claim
+        is_repeated = before is not None and before.advertisement == place.advertisement
         if not has_left and (not is_ours or is_repeated):
             self._queries.receive_answer(place.name, now_s)
 
@@ -191,7 +191,7 @@ class NameResolver:
         """
         self._queries.receive_answer(name, now_s)
         if not (keep and self.cache.of(name, now_s)):
-            self.cache.nobody(name, now_s)
+            self.cache.put_negative(name, now_s)
             self._pending.refuse(name, DropReason.NO_ROUTE)
 
     # -- time and the RIB
@@ -212,7 +212,7 @@ class NameResolver:
         """Begin, or end, to serve entries beyond their leases: the RIB does not answer, or does again."""
         self.cache.serve_stale(stale, now_s)
 
-    def expire(self, now_s: float) -> list[Place]:
+    def expire(self, now_s: float) -> list[Location]:
         """Drop the frames that waited too long and the entries whose leases ended; return the places among them."""
         self._pending.expire(now_s)
         return self.cache.expire(now_s)

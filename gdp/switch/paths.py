@@ -18,19 +18,19 @@ from typing import TYPE_CHECKING, NamedTuple
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
 from gdp.crypto.certificates import Role
 from gdp.names import Name
-from gdp.switch.link_states import LinkStates
+from gdp.switch.lsdb import LinkStateDatabase
 
 if TYPE_CHECKING:
     import networkx as nx
 
-__all__ = ["Paths", "Way"]
+__all__ = ["Path", "Paths"]
 
 _CACHE_MAX = 64
 _ALTERNATES_CACHE_MAX = 4_096
 _ALTERNATES_SWITCHES_MAX = 256  # among more, paths from every neighbour would keep a switch busy for too long
 
 
-class Way(NamedTuple):
+class Path(NamedTuple):
     """The way to a target."""
 
     first: Name  # the neighbour to go through
@@ -46,7 +46,7 @@ class Paths:
             each neighbour: nobody should wait for them.
     """
 
-    def __init__(self, me: Name, domain: Name, link_states: LinkStates) -> None:
+    def __init__(self, me: Name, domain: Name, link_states: LinkStateDatabase) -> None:
         self._me = me
         self._domain = domain
         self._link_states = link_states
@@ -65,11 +65,11 @@ class Paths:
         self._known_domains: frozenset[Name] = frozenset()
         self._lives: dict[Name, bytes] = {}  # of every switch whose link state is known
         self._refused: frozenset[Name] = frozenset()
-        self._ways: dict[tuple[Name, frozenset[Name]], dict[Name, Way]] = {}
+        self._ways: dict[tuple[Name, frozenset[Name]], dict[Name, Path]] = {}
         self._alternates: dict[tuple[Name, Name, frozenset[Name]], Name | None] = {}
         self.has_alternates = False
 
-    def to_switch(self, switch: Name, domain: Name, allowed: frozenset[Name]) -> Way | None:
+    def to_switch(self, switch: Name, domain: Name, allowed: frozenset[Name]) -> Path | None:
         """Return the way to a switch of a domain; None when there is none through ``allowed`` domains.
 
         A way within our own domain goes first (RFC 2328, 16.2): those outside know only how far our borders
@@ -88,7 +88,7 @@ class Paths:
             self._alternates[key] = self._alternate(way, switch, domain, allowed)
         return way._replace(alternate=self._alternates[key])
 
-    def _alternate(self, way: Way, switch: Name, domain: Name, allowed: frozenset[Name]) -> Name | None:
+    def _alternate(self, way: Path, switch: Name, domain: Name, allowed: frozenset[Name]) -> Name | None:
         """Return the best neighbour whose own shortest path does not lead back here: RFC 5286, inequality 1.
 
         Only one of our domain: how others choose their paths is theirs to know. A leaf is none; for a leaf each
@@ -122,7 +122,7 @@ class Paths:
         way = self._pick(self._to_all(allowed, start), switch, domain)
         return 0 if start == switch else None if way is None else way.distance
 
-    def _pick(self, ways: dict[Name, Way], switch: Name, domain: Name) -> Way | None:
+    def _pick(self, ways: dict[Name, Path], switch: Name, domain: Name) -> Path | None:
         if switch in ways:
             return ways[switch]
         borders = self._borders_of.get((switch, domain)) or self._fallback_borders(domain)
@@ -134,7 +134,7 @@ class Paths:
             return self._open_borders.get(domain, [])
         return self._beyond.get(domain, [])
 
-    def to_rib(self, rib: Name, allowed: frozenset[Name]) -> tuple[Way | None, Name | None]:
+    def to_rib(self, rib: Name, allowed: frozenset[Name]) -> tuple[Path | None, Name | None]:
         """Return the way to the nearest switch from which a RIB is reached, and that switch (self: no way needed).
 
         Args:
@@ -219,7 +219,7 @@ class Paths:
         borders = {s.origin for s in states if any(link.domain != self._domain for link in s.links)}
         return {each: ways[each].distance for each in sorted(borders & self._members) if each in ways}
 
-    def _to_all(self, allowed: frozenset[Name], start: Name | None = None) -> dict[Name, Way]:
+    def _to_all(self, allowed: frozenset[Name], start: Name | None = None) -> dict[Name, Path]:
         """Return the ways from a switch, this one if not given, to all others."""
         self._refresh()
         key = start or self._me, allowed & self._known_domains  # a stranger's list may name others, each time anew
@@ -231,7 +231,7 @@ class Paths:
         self._ways[key] = ways
         return ways
 
-    def _compute(self, start: Name, allowed: frozenset[Name]) -> dict[Name, Way]:
+    def _compute(self, start: Name, allowed: frozenset[Name]) -> dict[Name, Path]:
         if self._graph is None or start not in self._graph:
             return {}
         from networkx import dijkstra_predecessor_and_distance
@@ -243,11 +243,11 @@ class Paths:
             return edge["weight"] if to in open_ and from_ not in ends else None  # None hides an edge
 
         before, distances = dijkstra_predecessor_and_distance(self._graph, start, weight=cost)
-        ways: dict[Name, Way] = {}
+        ways: dict[Name, Path] = {}
         for to, distance in distances.items():  # the nearest first: whoever comes before ``to`` is there already
             if to != start:
                 last = before[to][0]
-                ways[to] = Way(to if last == start else ways[last].first, int(distance))
+                ways[to] = Path(to if last == start else ways[last].first, int(distance))
         return ways
 
     def _refresh(self) -> None:

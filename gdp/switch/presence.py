@@ -9,12 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final
 
-from gdp.control.greeter import Greeter
+from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.presence import Presence
 from gdp.crypto.identity import Identity
 from gdp.frame.kinds import Kind
 from gdp.names import Name
-from gdp.switch.attached import Attached
+from gdp.switch.local_advertisements import LocalAdvertisements
 from gdp.switch.outbox import Outbox
 from gdp.switch.unicast import Unicast
 
@@ -34,10 +34,15 @@ class PresenceAnswers:
     """Open questions of RIBs about attached nodes."""
 
     def __init__(
-        self, identity: Identity, greeter: Greeter, attached: Attached, unicast: Unicast, outbox: Outbox
+        self,
+        identity: Identity,
+        hello_protocol: HelloProtocol,
+        attached: LocalAdvertisements,
+        unicast: Unicast,
+        outbox: Outbox,
     ) -> None:
         self._identity = identity
-        self._greeter = greeter
+        self._hello_protocol = hello_protocol
         self._attached = attached
         self._unicast = unicast
         self._outbox = outbox
@@ -49,8 +54,8 @@ class PresenceAnswers:
             return  # the RIB asks again
         self._open[presence.node] = _Question(presence, rib, now_s)
         held = self._attached.get(presence.node, presence.node)
-        if held is not None and held.claim.incarnation == presence.incarnation:
-            self._outbox.say_at(held.port, held.mac, Kind.VERDICT, wire)
+        if held is not None and held.advertisement.incarnation == presence.incarnation:
+            self._outbox.say_at(held.port, held.mac, Kind.ADVERTISE_ACK, wire)
         self.answer(now_s)
 
     def answer(self, now_s: float) -> None:
@@ -68,9 +73,9 @@ class PresenceAnswers:
         """Return None while that is not known."""
         node = question.presence.node
         held = self._attached.get(node, node)
-        if held is None or held.claim.incarnation != question.presence.incarnation:
+        if held is None or held.advertisement.incarnation != question.presence.incarnation:
             return False
-        neighbour = self._greeter.neighbour(held.port, node)
+        neighbour = self._hello_protocol.neighbour(held.port, node)
         if neighbour is None:
             return False
         return True if neighbour.heard_s > question.asked_s else None

@@ -28,11 +28,11 @@ from gdp.control.relay import relayed
 from gdp.crypto.identity import Identity
 from gdp.frame.kinds import Kind
 from gdp.names import ZERO, Name
+from gdp.switch.multicast import MulticastTrees
+from gdp.switch.name_cache import Location
 from gdp.switch.outbox import Outbox
-from gdp.switch.places import Place
-from gdp.switch.planter import Planter
 from gdp.switch.unicast import Unicast
-from gdp.trust.claim import Claim
+from gdp.trust.advertisement import Advertisement
 from gdp.trust.domain import Policy
 
 __all__ = ["GRACE_S", "Relocations"]
@@ -69,10 +69,12 @@ class _Moved:
 class Relocations:
     """What one switch does for nodes that have come from, or gone to, another switch."""
 
-    def __init__(self, identity: Identity, policy: Policy, planter: Planter, unicast: Unicast, outbox: Outbox) -> None:
+    def __init__(
+        self, identity: Identity, policy: Policy, multicast: MulticastTrees, unicast: Unicast, outbox: Outbox
+    ) -> None:
         self._identity = identity
         self._policy = policy
-        self._planter = planter
+        self._multicast = multicast
         self._unicast = unicast
         self._outbox = outbox
         self._notices: OrderedDict[_Key, _Notice] = OrderedDict()
@@ -82,14 +84,18 @@ class Relocations:
         self._moved_names: dict[Name, float] = {}  # of ``_moved``, until when
         self._said: OrderedDict[tuple[Name, int, bytes], float] = OrderedDict()
 
-    def arrived(self, claim: Claim, now_s: float) -> None:
+    def arrived(self, advertisement: Advertisement, now_s: float) -> None:
         """Tell the former switch of a node that claims a name here."""
-        if claim.previous in (ZERO, self._identity.name):
+        if advertisement.previous in (ZERO, self._identity.name):
             return
-        statement = relayed(claim.wire, self._identity, self._policy.transit)
-        _remember(self._notices, (claim.name, claim.node), _Notice(claim.previous, statement, claim.sequence, now_s))
-        _remember(self._former, claim.previous, now_s + _FORMER_S)
-        self.timeout(now_s)
+        statement = relayed(advertisement.wire, self._identity, self._policy.transit)
+        _remember(
+            self._notices,
+            (advertisement.name, advertisement.node),
+            _Notice(advertisement.previous, statement, advertisement.sequence, now_s),
+        )
+        _remember(self._former, advertisement.previous, now_s + _FORMER_S)
+        self.handle_timer(now_s)
 
     def acknowledged(self, name: Name, advertiser: Name, sequence: int) -> None:
         """Learn that the former switch knows; ``sequence``: of the claim that it was told."""
@@ -97,9 +103,9 @@ class Relocations:
         if notice is not None and sequence >= notice.sequence:
             del self._notices[name, advertiser]
 
-    def departed(self, claim: Claim, now_s: float) -> None:
+    def departed(self, advertisement: Advertisement, now_s: float) -> None:
         """Note that a node is not attached here any more."""
-        _remember(self._departed, (claim.name, claim.node), now_s + _DEPARTED_S)
+        _remember(self._departed, (advertisement.name, advertisement.node), now_s + _DEPARTED_S)
 
     def was_here(self, name: Name, advertiser: Name, now_s: float) -> bool:
         """Return whether an advertiser of a name was attached here a moment ago."""
@@ -109,14 +115,14 @@ class Relocations:
         """Return whether a switch was asked a moment ago what a node that came from it hears."""
         return self._former.get(switch, 0.0) > now_s
 
-    def moved(self, place: Place, statement: bytes, now_s: float) -> None:
+    def moved(self, place: Location, statement: bytes, now_s: float) -> None:
         """Note where a node is now that others may look for here; tell those who take its topic from here."""
         until_s = now_s + GRACE_S
         _remember(self._moved, (place.name, place.advertiser), _Moved(statement, until_s))
         if len(self._moved_names) > 2 * _REMEMBERED_MAX:
             self._moved_names = {name: end_s for name, end_s in self._moved_names.items() if end_s > now_s}
         self._moved_names[place.name] = until_s
-        for at in self._planter.below(place.name, place.advertiser):
+        for at in self._multicast.below(place.name, place.advertiser):
             self._outbox.say_at(*at, Kind.REDIRECT, statement)
 
     def frame_came(self, destination: Name, neighbour: Neighbour, now_s: float) -> None:
@@ -146,7 +152,7 @@ class Relocations:
             query = Query(name, 0.0).to_wire(identity.name, identity.key, identity.membership)
             self._outbox.say(neighbour, Kind.WHERE, query)
 
-    def timeout(self, now_s: float) -> None:
+    def handle_timer(self, now_s: float) -> None:
         """Send the notices that are due."""
         for key, notice in list(self._notices.items()):
             if notice.due_s > now_s:
@@ -157,7 +163,7 @@ class Relocations:
             if notice.sent == len(_NOTICE_AT_S):
                 del self._notices[key]
 
-    def next_timeout(self) -> float | None:
+    def get_timer(self) -> float | None:
         """Return the monotonic second of the next notice, or None."""
         return min((notice.due_s for notice in self._notices.values()), default=None)
 

@@ -19,7 +19,7 @@ from gdp.switch.table import Hop, Hops, ProtectedHop, sides_of
 
 __all__ = ["Branch", "Tree", "Trees"]
 
-At = tuple[int, bytes]  # port, MAC of the one below
+Downstream = tuple[int, bytes]  # port, MAC of the one below
 _Key = tuple[Name, Name]  # topic and publisher
 _HEAP_SLACK: Final = 1_024
 
@@ -56,8 +56,8 @@ class Tree:
     switch: Name  # where the publisher is attached
     domain: Name  # of that switch
     allowed: frozenset[Name]
-    branches: dict[At, Branch] = field(default_factory=dict)
-    above: At | None = None  # whom the last join went to
+    branches: dict[Downstream, Branch] = field(default_factory=dict)
+    above: Downstream | None = None  # whom the last join went to
     above_name: Name | None = None
     renew_at_s: float = 0.0
     asked_mtu: int = 0  # what the last join said
@@ -66,13 +66,15 @@ class Tree:
     proof: bytes = b""  # the publisher's claim that ``switch`` was read from
     joins: int = 0  # that the one above was sent since it was chosen
     has_moved: bool = False  # the publisher has, since the one above was chosen
-    former: tuple[At, Name] | None = None  # whom this tree took its messages from before, until ``former_until_s``
+    former: tuple[Downstream, Name] | None = (
+        None  # whom this tree took its messages from before, until ``former_until_s``
+    )
     former_until_s: float = 0.0
     is_doubted: bool = False  # that proves nothing any more
     asked_backup_for: Name | None = None  # what the last join said
-    backup: tuple[At, Name] | None = None  # whom a backup branch was asked of
+    backup: tuple[Downstream, Name] | None = None  # whom a backup branch was asked of
     left: set[int] = field(default_factory=set)  # ports that copies may still come from, until the tree has settled
-    protection: dict[At, At] = field(default_factory=dict)  # branch to the backup that takes its place
+    protection: dict[Downstream, Downstream] = field(default_factory=dict)  # branch to the backup that takes its place
 
     @property
     def key(self) -> bytes:

@@ -17,11 +17,11 @@ from gdp.crypto.certificates import Role
 from gdp.errors import DropReason
 from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_AT, SOURCE_AT, Header
 from gdp.names import Name
-from gdp.switch.attached import Attached
+from gdp.switch.local_advertisements import LocalAdvertisements
+from gdp.switch.name_cache import Location
 from gdp.switch.name_resolver import NameResolver
 from gdp.switch.outbox import Outbox
-from gdp.switch.paths import Paths, Way
-from gdp.switch.places import Place
+from gdp.switch.paths import Path, Paths
 from gdp.switch.table import NOWHERE, Hop, ProtectedHop, Table
 
 __all__ = ["Unicast"]
@@ -58,7 +58,7 @@ class Unicast:
         table: Table,
         paths: Paths,
         resolver: NameResolver,
-        attached: Attached,
+        attached: LocalAdvertisements,
         outbox: Outbox,
     ) -> None:
         self._me = me
@@ -238,7 +238,7 @@ class Unicast:
         places = self._resolver.cache.of(source, now_s)
         return bool(places) and all(place.domain == self._own_domain for place in places)
 
-    def _nearest(self, takers: list[Place], allowed: frozenset[Name]) -> tuple[Place, Way] | None:
+    def _nearest(self, takers: list[Location], allowed: frozenset[Name]) -> tuple[Location, Path] | None:
         ways = [
             (place, way)
             for place in takers
@@ -250,7 +250,7 @@ class Unicast:
         self,
         destination: Name,
         source_key: bytes,
-        best: tuple[Place, Way] | None,
+        best: tuple[Location, Path] | None,
         source: Name,
         now_s: float,
         otherwise: DropReason = DropReason.NO_ROUTE,
@@ -261,7 +261,7 @@ class Unicast:
             self._install_way(destination, source_key, best[1], source, self._until_s(best[0], now_s), now_s)
 
     @staticmethod
-    def _until_s(place: Place, now_s: float) -> float:
+    def _until_s(place: Location, now_s: float) -> float:
         """Return how long an entry stands for a place; one that is served stale is looked at again soon."""
         return max(place.expires_s, now_s + STALE_S)
 
@@ -269,7 +269,7 @@ class Unicast:
         self,
         destination: Name,
         source_key: bytes,
-        way: Way | None,
+        way: Path | None,
         source: Name,
         expires_s: float,
         now_s: float,

@@ -46,7 +46,7 @@ class Metrics(Collector):
             yield from _counter("gdp_drops", "What went no further, by reason", "reason", self._drops)
         yield from _gauge("gdp_table_entries", "Entries of the forwarding table", of.table_entries)
         yield from _entries(of.entries)
-        yield from _gauge("gdp_parked_frames", "Frames waiting for an answer", of.parked_frames)
+        yield from _gauge("gdp_parked_frames", "Frames waiting for an answer", of.pending_frames)
         yield from _counter("gdp_rib_answers", "Answers by what they said", "answer", of.rib_answers)
         yield from _counter("gdp_rib_refusals", "Refusals by reason", "reason", of.rib_refusals)
         yield from _counter("gdp_messages", "Whole messages by direction", "direction", of.messages)

@@ -41,7 +41,7 @@ class _Pace:
         self._tokens = per_s
         self._seen_s = time.monotonic()
 
-    def take(self, now_s: float) -> bool:
+    def spend(self, now_s: float) -> bool:
         """Return whether one more is within the pace, and count it then."""
         self._tokens = min(self._per_s, self._tokens + (now_s - self._seen_s) * self._per_s)
         self._seen_s = now_s
@@ -124,7 +124,7 @@ class ScrapeServer:
 
     def _accept(self) -> None:
         now_s = time.monotonic()
-        if not self._accepts.take(now_s):
+        if not self._accepts.spend(now_s):
             self._pause(now_s)
             return
         try:
@@ -179,7 +179,7 @@ class ScrapeServer:
         method = request.partition(b" ")[0]
         if method not in (b"GET", b"HEAD"):
             return _answer("405 Method Not Allowed", b"")
-        if not self._answers.take(time.monotonic()):
+        if not self._answers.spend(time.monotonic()):
             return _answer("503 Service Unavailable", b"")
         try:
             body = self._text()

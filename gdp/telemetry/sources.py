@@ -46,11 +46,11 @@ class Sources:
     """Whom to ask, on each scrape and from another thread, for what a node counts; None: it has no such number.
 
     Attributes:
-        frames: by direction: in, out, forwarded, handed-up.
+        frames: by direction: in, out, forwarded, punted.
         drops: lists of counts by ``DropReason``, added up.
         table_entries: entries of the forwarding table.
         entries: frames and bytes forwarded by the busiest entries, by the table's key.
-        parked_frames: frames that wait for an answer.
+        pending_frames: frames that wait for an answer.
         rib_answers: a RIB's answers by what they said.
         rib_refusals: a RIB's refusals by reason.
         messages: whole messages by direction.
@@ -69,7 +69,7 @@ class Sources:
     drops: Sequence[Callable[[], Sequence[int]]] = ()
     table_entries: Gauge | None = None
     entries: EntryCounts | None = None
-    parked_frames: Gauge | None = None
+    pending_frames: Gauge | None = None
     rib_answers: Counts | None = None
     rib_refusals: Counts | None = None
     messages: Counts | None = None

@@ -134,7 +134,7 @@ class AuditTrail:
         counted.who, counted.about = who, about
         counted.count += count
 
-    def take(self, mono_s: float, unix_s: float, seq: int, previous: str) -> list[AuditLine]:
+    def poll_lines(self, mono_s: float, unix_s: float, seq: int, previous: str) -> list[AuditLine]:
         """Return, once, the lines that are due.
 
         Args:

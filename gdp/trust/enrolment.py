@@ -51,8 +51,8 @@ __all__ = [
     "REFUSED",
     "REQUEST_MAX_BYTES",
     "TOKEN_BYTES",
-    "Answer",
     "Application",
+    "EnrolmentResponse",
     "Granted",
     "Request",
     "Seat",
@@ -211,7 +211,7 @@ class Granted:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class EnrolmentResponse:
     """What a machine is given.
 
     Args:
@@ -228,7 +228,7 @@ class Answer:
         return encode({"root": self.root, "granted": members})
 
     @classmethod
-    def from_wire(cls, wire: bytes) -> Answer:
+    def from_wire(cls, wire: bytes) -> EnrolmentResponse:
         """Read an answer.
 
         Raises:
@@ -327,7 +327,7 @@ def answer_bytes(head: bytes) -> int:
     return size
 
 
-def open_answer(token: bytes, request: bytes, answer_secret: bytes, sealed: bytes) -> Answer:
+def open_answer(token: bytes, request: bytes, answer_secret: bytes, sealed: bytes) -> EnrolmentResponse:
     """Open what followed the head of an answer.
 
     Raises:
@@ -337,7 +337,7 @@ def open_answer(token: bytes, request: bytes, answer_secret: bytes, sealed: byte
         wire = _answer_key(token, request, answer_secret).decrypt(_NONCE, sealed, None)
     except InvalidTag as error:
         raise StatementError(DropReason.BAD_TAG, "an answer that the responder did not make") from error
-    return Answer.from_wire(wire)
+    return EnrolmentResponse.from_wire(wire)
 
 
 def _answer_key(token: bytes, request: bytes, answer_secret: bytes) -> AESGCM:

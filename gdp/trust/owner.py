@@ -20,9 +20,9 @@ from gdp.limits import CHAIN_MAX
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.trust.adcert import AdCert
-from gdp.trust.card import Recipient
 from gdp.trust.delegation import Delegation
 from gdp.trust.grants import SECRET_BYTES, make_grant
+from gdp.trust.node_descriptor import Recipient
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 

@@ -20,17 +20,17 @@ from typing import Final, NamedTuple
 
 from gdp.crypto.statements import Statement, StatementType, assemble
 from gdp.crypto.subject import Subject
-from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
 from gdp.limits import (
     CERTIFICATE_LIFE_MAX_S,
     CLOCK_SKEW_S,
     REVOCATIONS_OF_OWNERS,
-    REVOCATIONS_PER_GIVER,
     REVOCATIONS_PER_ISSUER,
+    REVOCATIONS_PER_ORIGIN,
     REVOCATIONS_PER_ROOT,
 )
 from gdp.names import Name
+from gdp.sansio import Timestamps
 from gdp.trust.revocation import Revocation
 from gdp.trust.token_buckets import TokenBuckets
 
@@ -53,7 +53,7 @@ class Kept(NamedTuple):
     """One revocation as it is kept, for a file."""
 
     is_root: bool
-    giver: bytes
+    origin: bytes
     until_unix_s: int
     wire: bytes
 
@@ -80,7 +80,7 @@ class _Owned:
     name: Name
     until_unix_s: int
     wire: bytes
-    giver: bytes
+    origin: bytes
 
 
 class Revocations:
@@ -101,7 +101,7 @@ class Revocations:
         per_root: int = REVOCATIONS_PER_ROOT,
         of_owners: int = REVOCATIONS_OF_OWNERS,
         per_issuer: int = REVOCATIONS_PER_ISSUER,
-        per_giver: int = REVOCATIONS_PER_GIVER,
+        per_origin: int = REVOCATIONS_PER_ORIGIN,
     ) -> None:
         self._roots: dict[bytes, _Root] = {}
         self._key_of: dict[Name, bytes] = {}  # by the hash by which neighbours speak of it
@@ -113,7 +113,7 @@ class Revocations:
         self._per_root = per_root
         self._of_owners = of_owners
         self._per_issuer = per_issuer
-        self._per_giver = per_giver
+        self._per_origin = per_origin
         self._root_rates = TokenBuckets(_ROOTS_PER_S, _ROOTS_BURST)
         self._owner_rates = TokenBuckets(_OWNERS_PER_S, _OWNERS_BURST)
         self._issuer_rates = TokenBuckets(_ISSUER_PER_S, _ISSUER_BURST)
@@ -142,8 +142,8 @@ class Revocations:
         of_owner = self._owners.get(issuer_key)
         return of_owner is not None and fingerprint in of_owner
 
-    def take(
-        self, statement: Statement, giver: bytes, now: Instant, holds: Callable[[bytes], bool]
+    def receive_revocation(
+        self, statement: Statement, origin: bytes, now: Timestamps, holds: Callable[[bytes], bool]
     ) -> Revocation | None:
         """Take a parsed revocation; return it if it is news.
 
@@ -159,26 +159,26 @@ class Revocations:
         self._check_end(revocation, now.unix_s)
         key, is_root = revocation.issuer.owner_key, self.is_root(revocation.issuer.owner_key)
         if self._until(key, revocation.fingerprint) >= revocation.until_unix_s:
-            if giver == OPERATOR and not is_root:
+            if origin == OPERATOR and not is_root:
                 self._pin(key, revocation.fingerprint)
             return None
         rates = self._root_rates if is_root else self._owner_rates
-        if giver != OPERATOR:
-            if not rates.take(giver, now.mono_s):
+        if origin != OPERATOR:
+            if not rates.spend(origin, now.mono_s):
                 raise StatementError(DropReason.QUOTA, "revocations over one neighbour")
             if not is_root and not holds(key):
                 raise StatementError(DropReason.UNCONCERNED, "a revocation of whom nothing is held here")
         try:
             revocation.verify(statement)
         except StatementError:
-            rates.charge(giver, now.mono_s, _FORGED_COST)
+            rates.charge(origin, now.mono_s, _FORGED_COST)
             raise
-        if giver != OPERATOR and not is_root and not self._issuer_rates.take(key, now.mono_s):
+        if origin != OPERATOR and not is_root and not self._issuer_rates.spend(key, now.mono_s):
             raise StatementError(DropReason.QUOTA, "revocations of one owner")
-        self._add(revocation, statement, giver, now.unix_s)
+        self._add(revocation, statement, origin, now.unix_s)
         return revocation
 
-    def restore(self, statement: Statement, giver: bytes, now: Instant, *, of_root: bool) -> None:
+    def restore(self, statement: Statement, origin: bytes, now: Timestamps, *, of_root: bool) -> None:
         """Take back what this node kept in an earlier life: verified, but without a rate.
 
         Args:
@@ -193,7 +193,7 @@ class Revocations:
         self._check_end(revocation, now.unix_s)
         revocation.verify(statement)
         if self._until(revocation.issuer.owner_key, revocation.fingerprint) < revocation.until_unix_s:
-            self._add(revocation, statement, giver, now.unix_s)
+            self._add(revocation, statement, origin, now.unix_s)
 
     def expire(self, unix_s: float) -> None:
         """Forget what has run out."""
@@ -221,7 +221,7 @@ class Revocations:
         until_unix_s = self._until(issuer_key, fingerprint)
         if self.is_root(issuer_key):
             return Kept(True, OPERATOR, until_unix_s, wire)
-        return Kept(False, self._owners[issuer_key][fingerprint].giver, until_unix_s, wire)
+        return Kept(False, self._owners[issuer_key][fingerprint].origin, until_unix_s, wire)
 
     def wire(self, issuer_key: bytes, fingerprint: bytes) -> bytes | None:
         """Return the signed statement by which a certificate was taken back, or None."""
@@ -297,14 +297,14 @@ class Revocations:
         owned = self._owners.get(issuer_key, {}).get(fingerprint)
         return -1 if owned is None else owned.until_unix_s
 
-    def _add(self, revocation: Revocation, statement: Statement, giver: bytes, unix_s: float) -> None:
+    def _add(self, revocation: Revocation, statement: Statement, origin: bytes, unix_s: float) -> None:
         self.expire(unix_s)
         issuer_key, fingerprint = revocation.issuer.owner_key, revocation.fingerprint
         root = self._roots.get(issuer_key)
         if root is not None:
             self._add_of_root(root, revocation, statement)
         else:
-            self._add_of_owner(revocation, statement, giver)
+            self._add_of_owner(revocation, statement, origin)
         self._next_end_s = min(self._next_end_s, revocation.until_unix_s + CLOCK_SKEW_S)
         if self.changes is not None:
             self.changes.add((issuer_key, fingerprint))
@@ -322,32 +322,32 @@ class Revocations:
         root.buckets[fingerprint[0]][fingerprint] = _packed(root, revocation, statement)
         root.hashes[fingerprint[0]] ^= _id(fingerprint, revocation.until_unix_s)
 
-    def _add_of_owner(self, revocation: Revocation, statement: Statement, giver: bytes) -> None:
+    def _add_of_owner(self, revocation: Revocation, statement: Statement, origin: bytes) -> None:
         issuer_key, fingerprint = revocation.issuer.owner_key, revocation.fingerprint
         known = self._owners.get(issuer_key, {}).get(fingerprint)
         if known is not None:
-            giver = OPERATOR if OPERATOR in (giver, known.giver) else known.giver
+            origin = OPERATOR if OPERATOR in (origin, known.origin) else known.origin
             self._remove(issuer_key, fingerprint)
-        elif giver != OPERATOR:
-            self._make_room(issuer_key, giver)
-        owned = _Owned(revocation.issuer.name, revocation.until_unix_s, statement.wire, giver)
+        elif origin != OPERATOR:
+            self._make_room(issuer_key, origin)
+        owned = _Owned(revocation.issuer.name, revocation.until_unix_s, statement.wire, origin)
         self._put_owned(issuer_key, fingerprint, owned)
 
     def _pin(self, issuer_key: bytes, fingerprint: bytes) -> None:
         """Let the operator be the giver of what is kept: it never gives way."""
         owned = self._owners[issuer_key][fingerprint]
-        if owned.giver != OPERATOR:
+        if owned.origin != OPERATOR:
             self._remove(issuer_key, fingerprint)
-            self._put_owned(issuer_key, fingerprint, replace(owned, giver=OPERATOR))
+            self._put_owned(issuer_key, fingerprint, replace(owned, origin=OPERATOR))
 
     def _put_owned(self, issuer_key: bytes, fingerprint: bytes, owned: _Owned) -> None:
         self._owners.setdefault(issuer_key, {})[fingerprint] = owned
         self._about.setdefault(owned.name, {})[issuer_key, fingerprint] = None
-        share = self._shares.setdefault(owned.giver, {})
+        share = self._shares.setdefault(owned.origin, {})
         share[issuer_key] = share.get(issuer_key, 0) + 1
         self._owned += 1
 
-    def _make_room(self, issuer_key: bytes, giver: bytes) -> None:
+    def _make_room(self, issuer_key: bytes, origin: bytes) -> None:
         """See that one more of an owner fits.
 
         Raises:
@@ -355,26 +355,26 @@ class Revocations:
         """
         if len(self._owners.get(issuer_key, ())) >= self._per_issuer:
             raise StatementError(DropReason.QUOTA, "revocations of one owner")
-        own = self._shares.get(giver, {})
-        if sum(own.values()) >= self._per_giver and not self._give_way(giver, above=own.get(issuer_key, 0) + 1):
+        own = self._shares.get(origin, {})
+        if sum(own.values()) >= self._per_origin and not self._give_way(origin, above=own.get(issuer_key, 0) + 1):
             raise StatementError(DropReason.QUOTA, "revocations over one neighbour")
         if self._owned < self._of_owners:
             return
         held = sum(own.values()) + 1
         others = {each: sum(share.values()) for each, share in self._shares.items() if each != OPERATOR}
-        most = max(others, key=lambda each: others[each], default=giver)
-        above = own.get(issuer_key, 0) + 1 if most == giver else 0
-        if (most != giver and others[most] <= held) or not self._give_way(most, above=above):
+        most = max(others, key=lambda each: others[each], default=origin)
+        above = own.get(issuer_key, 0) + 1 if most == origin else 0
+        if (most != origin and others[most] <= held) or not self._give_way(most, above=above):
             raise StatementError(DropReason.QUOTA, "revocations of owners")
 
-    def _give_way(self, giver: bytes, above: int) -> bool:
+    def _give_way(self, origin: bytes, above: int) -> bool:
         """Drop the oldest revocation of the owner that has most of a giver's share, if that is more than ``above``."""
-        share = self._shares.get(giver, {})
+        share = self._shares.get(origin, {})
         issuer_key = max(share, key=lambda key: share[key], default=None)
         if issuer_key is None or share[issuer_key] <= above:
             return False
         entries = self._owners[issuer_key].items()
-        self._remove(issuer_key, next(fingerprint for fingerprint, owned in entries if owned.giver == giver))
+        self._remove(issuer_key, next(fingerprint for fingerprint, owned in entries if owned.origin == origin))
         return True
 
     def _remove(self, issuer_key: bytes, fingerprint: bytes) -> None:
@@ -392,12 +392,12 @@ class Revocations:
         del self._about[owned.name][issuer_key, fingerprint]
         if not self._about[owned.name]:
             del self._about[owned.name]
-        share = self._shares[owned.giver]
+        share = self._shares[owned.origin]
         share[issuer_key] -= 1
         if not share[issuer_key]:
             del share[issuer_key]
         if not share:
-            del self._shares[owned.giver]
+            del self._shares[owned.origin]
         self._owned -= 1
 
 

@@ -36,7 +36,7 @@ class TokenBuckets:
         tokens, at_s = known
         return min(tokens + max(now_s - at_s, 0.0) * self._per_s, self._burst)
 
-    def take(self, key: bytes, now_s: float, tokens: float = 1.0) -> bool:
+    def spend(self, key: bytes, now_s: float, tokens: float = 1.0) -> bool:
         """Take tokens of a key; False, and none taken, where there are fewer."""
         left = self.left(key, now_s)
         if left < tokens:

@@ -17,20 +17,20 @@ from gdp.crypto.statements import Statement, parse
 from gdp.errors import DropReason, StatementError
 from gdp.limits import LEASE_MAX_S, LEASE_MIN_S
 from gdp.trust.adcert import AdCertCache, Chain
-from gdp.trust.claim import Claim, ClaimBody
+from gdp.trust.advertisement import Advertisement, UnverifiedAdvertisement
 from gdp.trust.domain import Policy
 from gdp.trust.revocations import Revocations
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCertCache
 
-__all__ = ["ADCERTS_REMEMBERED", "RTCERTS_REMEMBERED", "ClaimVerifier"]
+__all__ = ["ADCERTS_REMEMBERED", "RTCERTS_REMEMBERED", "AdvertisementVerifier"]
 
 ADCERTS_REMEMBERED: Final = 16_384
 RTCERTS_REMEMBERED: Final = 4_096
 _MS = 1_000
 
 
-class ClaimVerifier:
+class AdvertisementVerifier:
     """Verifies claims under a policy.
 
     Args:
@@ -58,7 +58,7 @@ class ClaimVerifier:
         """Return what has been taken back, as far as this node was told."""
         return self.policy.revoked
 
-    def verify(self, wire: bytes, unix_s: float) -> Claim:
+    def verify(self, wire: bytes, unix_s: float) -> Advertisement:
         """Return the claim if all of it holds now. Whether its sequence is news is for the RIB to say.
 
         Args:
@@ -70,13 +70,13 @@ class ClaimVerifier:
         """
         return self.verify_statement(parse(wire), unix_s)
 
-    def verify_statement(self, statement: Statement, unix_s: float) -> Claim:
+    def verify_statement(self, statement: Statement, unix_s: float) -> Advertisement:
         """The same for a statement that was parsed already.
 
         Raises:
             StatementError: with the reason.
         """
-        body = ClaimBody.from_statement(statement)
+        body = UnverifiedAdvertisement.from_statement(statement)
         if not LEASE_MIN_S * _MS <= body.lease_ms <= LEASE_MAX_S * _MS:
             raise StatementError(DropReason.LEASE_BOUNDS, f"{body.lease_ms} ms")
         check_sequence(body.sequence, unix_s)
@@ -86,7 +86,7 @@ class ClaimVerifier:
         statement.verify(member.key)
         rtcert = self._rtcerts.verified(body.rtcert, member.name, member.key)
         chain = self._chain(body, member)
-        claim = Claim(
+        advertisement = Advertisement(
             subject=body.subject,
             right=body.right,
             member=member,
@@ -100,19 +100,19 @@ class ClaimVerifier:
             previous=body.previous,
             exchange=body.exchange,
         )
-        self._check_evidence(claim, unix_s)
-        return claim
+        self._check_evidence(advertisement, unix_s)
+        return advertisement
 
-    def recheck(self, claim: Claim, unix_s: float) -> None:
+    def recheck(self, advertisement: Advertisement, unix_s: float) -> None:
         """Return if a claim verified before holds still; costs a few microseconds.
 
         Raises:
             StatementError: EXPIRED, REVOKED or WRONG_DOMAIN.
         """
-        self.policy.check_member(claim.member, unix_s)
-        self._check_evidence(claim, unix_s)
+        self.policy.check_member(advertisement.member, unix_s)
+        self._check_evidence(advertisement, unix_s)
 
-    def _chain(self, body: ClaimBody, member: Membership) -> Chain:
+    def _chain(self, body: UnverifiedAdvertisement, member: Membership) -> Chain:
         """Return the proof that the member may act on the name, its links verified."""
         subject = body.subject
         if body.right is Right.ATTACH and subject.name != member.name:
@@ -124,9 +124,9 @@ class ClaimVerifier:
             raise StatementError(DropReason.NOT_DELEGATED, "no delegation from the owner")
         return Chain(())
 
-    def _check_evidence(self, claim: Claim, unix_s: float) -> None:
+    def _check_evidence(self, advertisement: Advertisement, unix_s: float) -> None:
         """Refuse what time or a revocation has taken away, the membership apart."""
-        claim.rtcert.validity.check(unix_s, "RtCert")
-        if self.revoked.has(claim.rtcert.fingerprint, claim.member.key.compressed):
+        advertisement.rtcert.validity.check(unix_s, "RtCert")
+        if self.revoked.has(advertisement.rtcert.fingerprint, advertisement.member.key.compressed):
             raise StatementError(DropReason.REVOKED, "RtCert")
-        claim.chain.check(claim.right, unix_s, self.revoked)
+        advertisement.chain.check(advertisement.right, unix_s, self.revoked)

@@ -2,7 +2,8 @@
 
 Place: shell; endpoints and the member do the I/O. The loop that drives it calls ``work`` after every step.
 
-A message's way out: endpoint -> ``Seat.deliver`` -> its flow -> ``Publisher.publish``. And in: ``take_messages`` ->
+A message's way out: endpoint -> ``EndpointDispatcher.deliver`` -> its flow -> ``Publisher.publish``. And in:
+``take_messages`` ->
 the flow of its name -> ``Endpoint.publish``, ``call`` or ``answer``.
 """
 
@@ -14,23 +15,23 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple, Protocol, TypeAlias
 
-from gdp.client.member import Message, Topic
+from gdp.client.participant import Message, Topic
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.trust.right import Right
+from proxy.bridge.bridge_election import SIGN, BridgeElection, presence_of, sign
+from proxy.bridge.context import BridgeContext
+from proxy.bridge.desired_flows import ConfigProblem, FlowSpec, exposed, imported
+from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.exposed_service import ExposedService
 from proxy.bridge.exposed_topic import ExposedTopic
+from proxy.bridge.faults import Fault
 from proxy.bridge.imported_service import ImportedService
 from proxy.bridge.imported_topic import ImportedTopic
-from proxy.bridge.rivals import SIGN, Rivals, mark_of, sign
-from proxy.bridge.seat import Seat
-from proxy.bridge.site import Site
-from proxy.bridge.wishes import Complaint, Wish, exposed, imported
-from proxy.endpoints.endpoint import End, Endpoint, Event, Faulted, Graph, Role, proxy_node_name
-from proxy.faults import Fault
-from proxy.rules.rule import Rule
-from proxy.tally import Tally
+from proxy.bridge.topic_stats import TopicStats
+from proxy.config.rule import Rule
+from proxy.endpoints.endpoint import Endpoint, EndpointError, Event, Graph, GraphEntity, Role, proxy_node_name
 
 __all__ = ["Bridge", "BridgeRules"]
 
@@ -70,24 +71,24 @@ class _View:
 
     def __init__(self, graph: Graph, me: str) -> None:
         self.graph = graph
-        self.rivals = Rivals(me, graph)
-        self._ends: dict[tuple[Role, str, str], list[End]] = {}
+        self.conflicts = BridgeElection(me, graph)
+        self._ends: dict[tuple[Role, str, str], list[GraphEntity]] = {}
         for end in graph:
             if not end.is_proxy:
                 self._ends.setdefault((end.role, end.name, end.type_name), []).append(end)
 
-    def ends(self, role: Role, wish: Wish) -> Sequence[End]:
+    def ends(self, role: Role, flow_spec: FlowSpec) -> Sequence[GraphEntity]:
         """Return what nodes other than proxies do with the wish's name."""
-        return self._ends.get((role, wish.local, wish.type_name), ())
+        return self._ends.get((role, flow_spec.local, flow_spec.type_name), ())
 
 
 class _Signboard:
     """Owns the sign by which other proxies know this one."""
 
-    def take(self, event: Event, now_s: float) -> None:
+    def handle_event(self, event: Event, now_s: float) -> None:
         """Say what is wrong with it: without a sign two proxies of one graph may both carry a name for a moment."""
         del now_s
-        if isinstance(event, Faulted):
+        if isinstance(event, EndpointError):
             log.warning("no sign for other proxies reason=%s", event.reason)
 
 
@@ -101,7 +102,7 @@ class Bridge:
 
     def __init__(
         self,
-        site: Site,
+        site: BridgeContext,
         config: BridgeRules,
         endpoints: Sequence[Endpoint],
         held: DelegationStore,
@@ -112,14 +113,14 @@ class Bridge:
         self._config = config
         self._held = held
         self._me = proxy_node_name(site.member.name.to_text())
-        self._seats = [Seat(endpoint) for endpoint in endpoints]
-        self._flows: dict[_Key, tuple[Wish, Flow]] = {}
+        self._seats = [EndpointDispatcher(endpoint) for endpoint in endpoints]
+        self._flows: dict[_Key, tuple[FlowSpec, Flow]] = {}
         self._inbound: dict[Name, Flow] = {}  # who takes the overlay's messages of a name
         self._timed: list[ExposedService | ImportedService] = []
         self._since: dict[_Key, float] = {}  # wished, and waiting for other proxies to begin
-        self._failed: dict[_Key, Complaint] = {}  # could not begin in this graph as it is
-        self._complaints: set[Complaint] = set()
-        self._ended = deque[Tally](maxlen=_ENDED_MAX)
+        self._failed: dict[_Key, ConfigProblem] = {}  # could not begin in this graph as it is
+        self._complaints: set[ConfigProblem] = set()
+        self._ended = deque[TopicStats](maxlen=_ENDED_MAX)
         self._is_stale = True
         self._look_s = look_s
         self._begun_s: float | None = None  # when the first look was
@@ -135,7 +136,7 @@ class Bridge:
                 log.warning("no sign for other proxies endpoint=%s reason=%s", seat.endpoint.label, error)
 
     @property
-    def flows(self) -> list[tuple[Wish, Flow]]:
+    def flows(self) -> list[tuple[FlowSpec, Flow]]:
         """Return what is carried now."""
         return list(self._flows.values())
 
@@ -145,12 +146,12 @@ class Bridge:
         return [seat.endpoint.label for seat in self._seats]
 
     @property
-    def tallies(self) -> list[Tally]:
+    def stats(self) -> list[TopicStats]:
         """Return the figures of every topic that comes in, those that ended included."""
         imported = [flow for _, flow in self.flows if isinstance(flow, ImportedTopic)]
         for flow in imported:
             flow.count_losses()
-        return [*self._ended, *(flow.tally for flow in imported)]
+        return [*self._ended, *(flow.stats for flow in imported)]
 
     @property
     def is_settled(self) -> bool:
@@ -164,7 +165,7 @@ class Bridge:
             if seat.deliver(now_s):
                 self._is_stale = True
                 self._failed.clear()
-        for message in self._site.member.take_messages():
+        for message in self._site.member.poll_messages():
             self._receive(message, now_s)
         if self._is_stale or (self._since and now_s >= self._tick_at_s):
             self._refresh(now_s)
@@ -172,29 +173,29 @@ class Bridge:
             seat.deliver_faults(now_s)
         is_tick = now_s >= self._tick_at_s
         for flow in self._timed:
-            due_s = flow.next_timeout()
+            due_s = flow.get_timer()
             if is_tick:
                 flow.tick(now_s)
             elif due_s is not None and due_s <= now_s:
-                flow.timeout(now_s)
+                flow.handle_timer(now_s)
         if is_tick:
             self._tick_at_s = now_s + TICK_S
             self._site.traffic.dropped = sum(seat.endpoint.dropped for seat in self._seats)
 
-    def next_timeout(self) -> float | None:
+    def get_timer(self) -> float | None:
         """Return the monotonic second at which there is something to do, or None."""
         if self._is_stale:
             return 0.0
         if not self._timed:
             return self._tick_at_s if self._since else None
-        times = [flow.next_timeout() for flow in self._timed]
+        times = [flow.get_timer() for flow in self._timed]
         return min([self._tick_at_s, *(time for time in times if time is not None)])
 
     def reload(self, config: BridgeRules, held: DelegationStore) -> None:
         """Take rules and delegations anew; flows whose rule is the same go on undisturbed while it is delegated."""
         self._config, self._held = config, held
-        for key, (wish, flow) in list(self._flows.items()):
-            topic = held.find(wish.name, _right(wish))
+        for key, (flow_spec, flow) in list(self._flows.items()):
+            topic = held.find(flow_spec.name, _right(flow_spec))
             if topic is None:
                 self._end(key)
             else:
@@ -227,26 +228,28 @@ class Bridge:
     def _refresh(self, now_s: float) -> None:
         """Begin what is wished and not there, end what is there and not wished, tell the others who is there."""
         self._is_stale = False
-        complaints = list[Complaint]()
+        complaints = list[ConfigProblem]()
         wished = set[_Key]()
         for at, seat in enumerate(self._seats):
             view = _View(seat.endpoint.graph(), self._me)
-            for wish in self._wishes(at, view.graph, complaints):
-                key = _Key(at, wish.is_exposed, wish.rule.kind, wish.local, wish.name)
-                rival = view.rivals.before_us(_shown_as(wish), is_begun=key in self._flows)
-                if rival:
-                    complaints.append(Complaint(wish.local, Fault.RIVAL, f"{rival} carries it in this graph"))
+            for flow_spec in self._flow_specs(at, view.graph, complaints):
+                key = _Key(at, flow_spec.is_exposed, flow_spec.rule.kind, flow_spec.local, flow_spec.name)
+                conflict = view.conflicts.before_us(_shown_as(flow_spec), is_begun=key in self._flows)
+                if conflict:
+                    complaints.append(
+                        ConfigProblem(flow_spec.local, Fault.CONFLICT, f"{conflict} carries it in this graph")
+                    )
                     continue
                 wished.add(key)
-                if key in self._flows and self._flows[key][0].rule != wish.rule:
+                if key in self._flows and self._flows[key][0].rule != flow_spec.rule:
                     self._end(key)
                 if key not in self._flows and key not in self._failed and self._is_our_turn(key, view, now_s):
-                    self._begin(key, wish, view)
+                    self._begin(key, flow_spec, view)
                 try:
-                    self._follow(key, wish, view, now_s)
+                    self._follow(key, flow_spec, view, now_s)
                 except LocalError as error:
                     self._end(key)
-                    self._failed[key] = Complaint(wish.local, Fault.NO_GRAPH, str(error))
+                    self._failed[key] = ConfigProblem(flow_spec.local, Fault.NO_GRAPH, str(error))
                 complaints += [self._failed[key]] if key in self._failed else []
         for key in [key for key in self._flows if key not in wished]:
             self._end(key)
@@ -256,91 +259,91 @@ class Bridge:
     def _is_our_turn(self, key: _Key, view: _View, now_s: float) -> bool:
         """Return whether the proxies before us in this graph had time to show themselves, and to begin."""
         self._begun_s = now_s if self._begun_s is None else self._begun_s
-        ours_s = self._since.setdefault(key, now_s) + view.rivals.patience_s
+        ours_s = self._since.setdefault(key, now_s) + view.conflicts.patience_s
         if now_s < max(ours_s, self._begun_s + self._look_s):
             return False
         del self._since[key]
         return True
 
-    def _follow(self, key: _Key, wish: Wish, view: _View, now_s: float) -> None:
-        _, flow = self._flows.get(key, (wish, None))
+    def _follow(self, key: _Key, flow_spec: FlowSpec, view: _View, now_s: float) -> None:
+        _, flow = self._flows.get(key, (flow_spec, None))
         if isinstance(flow, ExposedTopic):
-            flow.follow(view.ends(Role.PUBLISHES, wish))
+            flow.follow(view.ends(Role.PUBLISHES, flow_spec))
         elif isinstance(flow, ImportedTopic):
-            flow.follow(view.ends(Role.SUBSCRIBES, wish))
+            flow.follow(view.ends(Role.SUBSCRIBES, flow_spec))
         elif isinstance(flow, ExposedService):
-            flow.follow(view.ends(Role.SERVES, wish), now_s)
+            flow.follow(view.ends(Role.SERVES, flow_spec), now_s)
 
-    def _wishes(self, at: int, graph: Graph, complaints: list[Complaint]) -> Iterator[Wish]:
+    def _flow_specs(self, at: int, graph: Graph, complaints: list[ConfigProblem]) -> Iterator[FlowSpec]:
         config = self._config
         yield from exposed([rule for rule in config.expose if config.endpoint_of(rule) == at], graph, complaints)
         rules = [rule for rule in config.imports if config.endpoint_of(rule) == at]
         held = [*self._held.described(Right.READ), *self._held.described(Right.CALL)]
         yield from imported(rules, graph, held, complaints)
 
-    def _begin(self, key: _Key, wish: Wish, view: _View) -> None:
+    def _begin(self, key: _Key, flow_spec: FlowSpec, view: _View) -> None:
         """Begin a flow, or note why it cannot be begun in this graph."""
-        topic = self._held.find(wish.name, _right(wish))
+        topic = self._held.find(flow_spec.name, _right(flow_spec))
         if topic is None:
-            self._failed[key] = Complaint(wish.local, Fault.NO_DELEGATION, self._how_to_delegate(wish))
+            self._failed[key] = ConfigProblem(flow_spec.local, Fault.NO_DELEGATION, self._how_to_delegate(flow_spec))
             return
         try:
-            flow = self._make(self._seats[key.seat], wish, topic, view)
+            flow = self._make(self._seats[key.seat], flow_spec, topic, view)
         except LocalError as error:
-            self._failed[key] = Complaint(wish.local, Fault.UNKNOWN_TYPE, str(error))
+            self._failed[key] = ConfigProblem(flow_spec.local, Fault.UNKNOWN_TYPE, str(error))
             return
-        self._flows[key] = wish, flow
+        self._flows[key] = flow_spec, flow
         if not isinstance(flow, ExposedTopic):
-            self._inbound[wish.name] = flow
+            self._inbound[flow_spec.name] = flow
         if isinstance(flow, ExposedService | ImportedService):
             self._timed.append(flow)
-        log.debug("flow begun name=%s exposed=%s", wish.name.short, wish.is_exposed)
+        log.debug("flow begun name=%s exposed=%s", flow_spec.name.short, flow_spec.is_exposed)
 
-    def _make(self, seat: Seat, wish: Wish, topic: Topic, view: _View) -> Flow:
+    def _make(self, seat: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic, view: _View) -> Flow:
         site = self._site
-        if wish.rule.kind != "topic":
-            kind = ExposedService if wish.is_exposed else ImportedService
-            return kind(site, seat, wish, topic, secrets.randbits(63))
-        if wish.is_exposed:
-            return ExposedTopic(site, seat, wish, topic, view.ends(Role.PUBLISHES, wish))
-        return ImportedTopic(site, seat, wish, topic)
+        if flow_spec.rule.kind != "topic":
+            kind = ExposedService if flow_spec.is_exposed else ImportedService
+            return kind(site, seat, flow_spec, topic, secrets.randbits(63))
+        if flow_spec.is_exposed:
+            return ExposedTopic(site, seat, flow_spec, topic, view.ends(Role.PUBLISHES, flow_spec))
+        return ImportedTopic(site, seat, flow_spec, topic)
 
     def _end(self, key: _Key) -> None:
-        wish, flow = self._flows.pop(key)
-        if self._inbound.get(wish.name) is flow:
-            del self._inbound[wish.name]
+        flow_spec, flow = self._flows.pop(key)
+        if self._inbound.get(flow_spec.name) is flow:
+            del self._inbound[flow_spec.name]
         if isinstance(flow, ExposedService | ImportedService):
             self._timed.remove(flow)
         if isinstance(flow, ImportedTopic):
-            self._ended.append(flow.tally)
+            self._ended.append(flow.stats)
         flow.close(self._now_s)
-        log.debug("flow ended name=%s exposed=%s", wish.name.short, wish.is_exposed)
+        log.debug("flow ended name=%s exposed=%s", flow_spec.name.short, flow_spec.is_exposed)
 
-    def _how_to_delegate(self, wish: Wish) -> str:
-        right, kind = _right(wish).value, wish.rule.kind
+    def _how_to_delegate(self, flow_spec: FlowSpec) -> str:
+        right, kind = _right(flow_spec).value, flow_spec.rule.kind
         return (
-            f"no delegation for {wish.name.to_text()} in {self._held.directory}; the owner makes one with"
-            f" 'gdp delegate name --right {right} --kind {kind} --name {wish.rule.global_name_of(wish.local)}"
-            f" --type {wish.type_name} ...'"
+            f"no delegation for {flow_spec.name.to_text()} in {self._held.directory}; the owner makes one with"
+            f" 'gdp delegate name --right {right} --kind {kind} --name {flow_spec.rule.global_name_of(flow_spec.local)}"
+            f" --type {flow_spec.type_name} ...'"
         )
 
-    def _tell(self, complaints: Sequence[Complaint]) -> None:
+    def _tell(self, complaints: Sequence[ConfigProblem]) -> None:
         """Tell what is newly odd; what no longer is may be told again."""
         now = set(complaints)
         for complaint in self._complaints - now:
             if complaint.fault is not Fault.UNKNOWN_TYPE and complaint.fault is not Fault.NO_DELEGATION:
-                self._site.faults.over(complaint.local, complaint.fault)
+                self._site.faults.clear(complaint.local, complaint.fault)
         for complaint in now - self._complaints:
-            self._site.faults.tell(complaint.local, complaint.fault, complaint.detail)
+            self._site.faults.report(complaint.local, complaint.fault, complaint.detail)
         self._complaints = now
 
 
-def _shown_as(wish: Wish) -> str:
+def _shown_as(flow_spec: FlowSpec) -> str:
     """Return the local name at which other proxies see that we carry this."""
-    return mark_of(wish.local) if wish.is_exposed and wish.rule.kind != "topic" else wish.local
+    return presence_of(flow_spec.local) if flow_spec.is_exposed and flow_spec.rule.kind != "topic" else flow_spec.local
 
 
-def _right(wish: Wish) -> Right:
-    if wish.rule.kind == "topic":
-        return Right.PUBLISH if wish.is_exposed else Right.READ
-    return Right.SERVE if wish.is_exposed else Right.CALL
+def _right(flow_spec: FlowSpec) -> Right:
+    if flow_spec.rule.kind == "topic":
+        return Right.PUBLISH if flow_spec.is_exposed else Right.READ
+    return Right.SERVE if flow_spec.is_exposed else Right.CALL

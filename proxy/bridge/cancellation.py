@@ -10,10 +10,10 @@ from typing import Final
 
 from gdp.names import Name
 from gdp.service.serving import Asked, Serving
+from proxy.bridge.action_interface import RESULT
 from proxy.bridge.goal_calls import GoalCalls
-from proxy.bridge.parts import RESULT
 from proxy.endpoints.endpoint import Endpoint
-from proxy.exchange import Stop
+from proxy.wire.service import Stop
 
 __all__ = ["TRIGGER", "Cancellation"]
 

@@ -2,9 +2,10 @@
 
 I/O: endpoint and member; ``gdp/service/serving.py`` keeps order. A service and an action differ in their parts.
 
-It joins ``callers.py`` (what requests mean), ``early.py`` (requests that wait for their description),
+It joins ``remote_clients.py`` (what requests mean), ``undescribed_requests.py`` (requests that wait for their
+description),
 ``response_sender.py`` (what clients get), ``cancellation.py`` (what is stopped), ``client_liveness.py`` (who is there)
-and ``kept_server.py`` (a server that keeps state).
+and ``ordered_server.py`` (a server that keeps state).
 """
 
 from __future__ import annotations
@@ -13,31 +14,39 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
-from gdp.client.member import Message, Topic
+from gdp.client.participant import Message, Topic
 from gdp.errors import LocalError, RemoteError
 from gdp.names import Name
 from gdp.service.follower import Refuse
-from gdp.service.ordered import FollowerWord
+from gdp.service.replication_messages import FollowerMessage
 from gdp.service.serving import Asked, Serving
-from proxy.bridge.callers import Callers
+from proxy.bridge.action_interface import CANCEL, GOAL, PROFILES, RESULT, ActionInterface
+from proxy.bridge.bridge_election import presence_of, sign
 from proxy.bridge.cancellation import TRIGGER, Cancellation
 from proxy.bridge.client_liveness import ClientLiveness
-from proxy.bridge.early import Early
+from proxy.bridge.context import BridgeContext
+from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.endpoint_dispatch import EndpointDispatcher
+from proxy.bridge.faults import Fault
 from proxy.bridge.goal_calls import GoalCalls
 from proxy.bridge.goals import cancel_of, goal_of
-from proxy.bridge.kept_server import KeptServer
-from proxy.bridge.parts import CANCEL, GOAL, PROFILES, RESULT, Parts
+from proxy.bridge.ordered_server import OrderedServer
+from proxy.bridge.remote_clients import RemoteClients
 from proxy.bridge.response_sender import ResponseSender
-from proxy.bridge.rivals import mark_of, sign
-from proxy.bridge.seat import Seat
-from proxy.bridge.site import Site
-from proxy.bridge.wishes import Wish
-from proxy.endpoints.endpoint import Answered, Described, End, Event, Failed, Faulted, Heard
-from proxy.exchange import Answer, Request, Stop
-from proxy.faults import Fault
-from proxy.ordering import is_word, keeper_word, to_wire
-from proxy.rules.rule import CALL_MAX_S
+from proxy.bridge.undescribed_requests import UndescribedRequests
+from proxy.config.rule import CALL_MAX_S
+from proxy.endpoints.endpoint import (
+    CallFailed,
+    EndpointError,
+    Event,
+    GraphEntity,
+    MessageReceived,
+    ResponseReceived,
+    TypeResolved,
+)
 from proxy.serial.schema import DefinitionError
+from proxy.wire.replication import is_word, sequencer_message, to_wire
+from proxy.wire.service import Answer, Request, Stop
 
 __all__ = ["ExposedService"]
 
@@ -56,24 +65,26 @@ class ExposedService:
         LocalError: this machine does not know a type.
     """
 
-    def __init__(self, site: Site, seat: Seat, wish: Wish, topic: Topic, random_start: int) -> None:
+    def __init__(
+        self, site: BridgeContext, seat: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic, random_start: int
+    ) -> None:
         self._site = site
         self._seat = seat
-        self._wish = wish
+        self._flow_spec = flow_spec
         self._topic = topic
-        self._serving: Serving[bytes] = Serving(random_start, wish.rule.at_once)
+        self._serving: Serving[bytes] = Serving(random_start, flow_spec.rule.at_once)
         self._goals = GoalCalls()
         self._cancels = 0  # requests of our own that cancel a goal; their numbers
         self._refuses_from_s: float | None = None
         self._liveness = ClientLiveness()
-        self._early = Early()
-        endpoint, rule = seat.endpoint, wish.rule
-        parts = Parts.of(rule.kind, wish.local, wish.type_name)
+        self._early = UndescribedRequests()
+        endpoint, rule = seat.endpoint, flow_spec.rule
+        parts = ActionInterface.of(rule.kind, flow_spec.local, flow_spec.type_name)
         self._exchange = replace(parts.known(endpoint, rule.encoding), is_ordered=rule.is_ordered)
-        self._callers = Callers(self._exchange, endpoint.ros)
-        self._mark = seat.advertise(self, sign(mark_of(wish.local), endpoint.ros))
-        self._servers = [seat.dial(self, *part) for part in parts.services]
-        self._stopper = None if rule.stop is None else seat.dial(self, rule.stop, TRIGGER)
+        self._remote_clients = RemoteClients(self._exchange, endpoint.ros)
+        self._mark = seat.advertise(self, sign(presence_of(flow_spec.local), endpoint.ros))
+        self._servers = [seat.create_client(self, *part) for part in parts.services]
+        self._stopper = None if rule.stop is None else seat.create_client(self, rule.stop, TRIGGER)
         self._kept = None if not rule.is_ordered else self._keep(random_start)
         self._topics = [
             seat.subscribe(self, *part, profile) for part, profile in zip(parts.topics, PROFILES, strict=False)
@@ -83,7 +94,7 @@ class ExposedService:
         )
         self._responses = ResponseSender(
             site=site,
-            wish=wish,
+            flow_spec=flow_spec,
             service=topic.name,
             exchange=self._exchange,
             serving=self._serving,
@@ -108,53 +119,57 @@ class ExposedService:
         try:
             if self._kept is not None and is_word(message.delivered.message):
                 client = Name(message.delivered.publisher)
-                self._kept.heard(client, keeper_word(message.delivered.message), now_s)
+                self._kept.heard(client, sequencer_message(message.delivered.message), now_s)
             elif Stop.is_in(message.delivered.message):
                 client, stop = Name(message.delivered.publisher), Stop.from_wire(message.delivered.message)
                 self._cancellation.handle_stop(client, stop, now_s)
             else:
                 self._ask(message, now_s)
         except RemoteError as error:
-            self._site.faults.tell(self._wish.local, Fault.MALFORMED, str(error))
+            self._site.faults.report(self._flow_spec.local, Fault.MALFORMED, str(error))
         self._give()
 
-    def take(self, event: Event, now_s: float) -> None:
+    def handle_event(self, event: Event, now_s: float) -> None:
         """Take what the local server, or an action's topics, say."""
-        if self._kept is not None and isinstance(event, Answered | Failed) and event.handle != self._stopper:
+        if (
+            self._kept is not None
+            and isinstance(event, ResponseReceived | CallFailed)
+            and event.handle != self._stopper
+        ):
             self._take_in_order(self._kept, event, now_s)
-        elif isinstance(event, Answered | Failed) and event.handle == self._stopper:
-            if isinstance(event, Failed):
-                self._site.faults.tell(f"{self._wish.rule.stop}", Fault.REFUSED, event.reason)
-        elif isinstance(event, Answered | Failed):
+        elif isinstance(event, ResponseReceived | CallFailed) and event.handle == self._stopper:
+            if isinstance(event, CallFailed):
+                self._site.faults.report(f"{self._flow_spec.rule.stop}", Fault.REFUSED, event.reason)
+        elif isinstance(event, ResponseReceived | CallFailed):
             asked = self._serving.end(event.call)
             if asked is not None:
                 self._goals.end(asked)
-            if asked is not None and isinstance(event, Answered):
+            if asked is not None and isinstance(event, ResponseReceived):
                 self._responses.respond(asked, event.raw)
-            elif asked is not None and isinstance(event, Failed):
+            elif asked is not None and isinstance(event, CallFailed):
                 self._responses.fail(asked, Fault.REFUSED, event.reason)
             self._give()
-        elif isinstance(event, Heard):
+        elif isinstance(event, MessageReceived):
             at = self._topics.index(event.handle)
             self._responses.publish_news(at, event.raw, event.stamp_ns)
-        elif isinstance(event, Faulted):
-            self._site.tell(self._wish.local, event, Fault.REFUSED)
+        elif isinstance(event, EndpointError):
+            self._site.tell(self._flow_spec.local, event, Fault.REFUSED)
         else:
-            assert isinstance(event, Described)  # what an action's topics are was known before
+            assert isinstance(event, TypeResolved)  # what an action's topics are was known before
 
     def tick(self, now_s: float) -> None:
         """Take what came before its description; look whose clients are still there."""
         self._look_at_clients(now_s)
         if self._kept is not None:
             self._kept.look(self._site.member.peers(self._topic.name), now_s)
-        self.timeout(now_s)
+        self.handle_timer(now_s)
 
-    def follow(self, ends: Sequence[End], now_s: float) -> None:
+    def follow(self, ends: Sequence[GraphEntity], now_s: float) -> None:
         """Take the local servers of the name: where state is kept it matters which one it is."""
         if self._kept is not None:
             self._kept.follow(ends, now_s)
 
-    def timeout(self, now_s: float) -> None:
+    def handle_timer(self, now_s: float) -> None:
         """Give up what its client no longer waits for."""
         for number, part, asked, is_given in self._serving.expired(now_s):
             if is_given:
@@ -164,9 +179,9 @@ class ExposedService:
                 self._responses.fail(asked, Fault.TIMED_OUT, "the server did not answer in time")
         self._give()
 
-    def next_timeout(self) -> float | None:
+    def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        return self._serving.next_timeout()
+        return self._serving.get_timer()
 
     def drain(self, now_s: float) -> None:
         """Tell clients to ask others, and answer what is under way."""
@@ -202,19 +217,19 @@ class ExposedService:
 
     def _look_at_clients(self, now_s: float) -> None:
         """Take what came before its description; let the calls of clients that left go."""
-        feeds = self._site.member.feeds_of(self._topic.name)
-        known = {bytes(feed.publisher): feed.description for feed in feeds}
+        writer_proxies = self._site.member.writer_proxies_of(self._topic.name)
+        known = {bytes(writer_proxy.publisher): writer_proxy.description for writer_proxy in writer_proxies}
         for _ in range(self._early.forget_all_but(known.keys())):
             self._drop_early("a client left before its description came")
         for client, description in known.items():
-            for message in self._early.take(client):
+            for message in self._early.poll_messages(client):
                 self.receive(message._replace(description=description), now_s)
         here = {self._site.member.name, *self._site.member.heard(self._topic.name)}
         for client in self._liveness.update(self._serving.clients, present=here, known=known.keys(), now_s=now_s):
             self._cancellation.handle_client_gone(client)
 
     def _drop_early(self, reason: str) -> None:
-        self._site.faults.tell(self._wish.local, Fault.TOO_FAST, reason)
+        self._site.faults.report(self._flow_spec.local, Fault.TOO_FAST, reason)
 
     def _ask(self, message: Message, now_s: float) -> None:
         delivered = message.delivered
@@ -230,7 +245,9 @@ class ExposedService:
             self._responses.refuse(asked, "the server is leaving")
             return
         try:
-            raw = self._callers.incoming(delivered.publisher, message.description, asked.part).decode(request.body)
+            raw = self._remote_clients.incoming(delivered.publisher, message.description, asked.part).decode(
+                request.body
+            )
             if self._kept is not None:
                 self._kept.entry(asked.client, asked.call, raw, now_s)
             else:
@@ -244,48 +261,48 @@ class ExposedService:
 
     def _patience_s(self, request: Request) -> float | None:
         """Return how long a call may take; None: as long as a goal does."""
-        if self._wish.rule.kind == "action" and request.part == RESULT and not request.patience_ms:
+        if self._flow_spec.rule.kind == "action" and request.part == RESULT and not request.patience_ms:
             return None
         asked_s = request.patience_ms / 1e3 + _GRACE_S if request.patience_ms else CALL_MAX_S
         return min(asked_s, CALL_MAX_S)
 
-    def _keep(self, number: int) -> KeptServer:
-        rule, what = self._wish.rule, self._wish.local
-        return KeptServer(
+    def _keep(self, number: int) -> OrderedServer:
+        rule, what = self._flow_spec.rule, self._flow_spec.local
+        return OrderedServer(
             seat=self._seat,
             owner=self,
             node=rule.state_node,
             number=number,
             give=lambda number, raw: self._seat.endpoint.call(self._servers[0], number, raw),
             tell=self._tell,
-            complain=lambda reason: self._site.faults.tell(what, Fault.REFUSED, reason),
+            complain=lambda reason: self._site.faults.report(what, Fault.REFUSED, reason),
         )
 
-    def _tell(self, client: Name, word: FollowerWord | Refuse) -> None:
+    def _tell(self, client: Name, word: FollowerMessage | Refuse) -> None:
         if isinstance(word, Refuse):
-            self._site.faults.tell(self._wish.local, Fault.REFUSED, word.reason)
+            self._site.faults.report(self._flow_spec.local, Fault.REFUSED, word.reason)
             self._responses.send_wire(client, Answer.failed(0, word.call, word.reason).to_wire())
         else:
             self._responses.send_wire(client, to_wire(word))
 
-    def _take_in_order(self, kept: KeptServer, event: Answered | Failed, now_s: float) -> None:
+    def _take_in_order(self, kept: OrderedServer, event: ResponseReceived | CallFailed, now_s: float) -> None:
         entry = kept.done(event, now_s)
-        if entry is not None and isinstance(event, Answered):
+        if entry is not None and isinstance(event, ResponseReceived):
             self._responses.respond(Asked(entry.client, 0, entry.call), event.raw)
-        elif entry is not None and isinstance(event, Failed):
+        elif entry is not None and isinstance(event, CallFailed):
             self._responses.fail(Asked(entry.client, 0, entry.call), Fault.REFUSED, event.reason)
 
     def _begin(self, now_s: float, patience_s: float | None, asked: Asked, raw: bytes) -> None:
         """Take a request; what is about a goal waits until the local server knows whether it accepts that one."""
-        goal = goal_of(raw) if self._wish.rule.kind == "action" else b""
+        goal = goal_of(raw) if self._flow_spec.rule.kind == "action" else b""
         after = None if asked.part == GOAL else self._goals.accepting(goal)
         self._serving.begin(now_s, patience_s, asked, raw, after)
         if goal and asked.part != CANCEL:
-            self._goals.begin(asked, goal)
+            self._goals.add(asked, goal)
 
     def _give(self) -> None:
         """Give the local server what it is the turn of."""
-        for turn in self._serving.take():
+        for turn in self._serving.poll_turns():
             self._seat.endpoint.call(self._servers[turn.asked.part], turn.number, turn.request)
 
     def _cancel_goal(self, goal: bytes, now_s: float) -> None:
@@ -294,4 +311,4 @@ class ExposedService:
         try:
             self._begin(now_s, _CANCEL_S, cancel, cancel_of(goal))
         except LocalError as error:
-            self._site.faults.tell(self._wish.local, Fault.TOO_FAST, str(error))
+            self._site.faults.report(self._flow_spec.local, Fault.TOO_FAST, str(error))

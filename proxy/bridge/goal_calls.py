@@ -6,7 +6,7 @@ Place: pure.
 from __future__ import annotations
 
 from gdp.service.serving import Asked
-from proxy.bridge.parts import GOAL, RESULT
+from proxy.bridge.action_interface import GOAL, RESULT
 
 __all__ = ["GoalCalls"]
 
@@ -21,7 +21,7 @@ class GoalCalls:
     def __len__(self) -> int:
         return len(self._goals)
 
-    def begin(self, asked: Asked, goal: bytes) -> None:
+    def add(self, asked: Asked, goal: bytes) -> None:
         """Learn of a call."""
         self._goals[asked] = goal
         self._calls.setdefault((asked.part, goal), {})[asked] = None

@@ -20,12 +20,12 @@ from typing import Final
 
 from gdp.errors import DropReason, RemoteError
 from gdp.names import Name
-from proxy.bridge.parts import CANCEL
+from proxy.bridge.action_interface import CANCEL
 
 __all__ = ["Goals", "cancel_of", "goal_of", "says_yes"]
 
 GOALS_MAX: Final = 1_024  # that clients here asked for, and as many that only servers named
-STATUSES_MAX: Final = 16_384  # goals in one status message
+HEARTBEATS_MAX: Final = 16_384  # goals in one status message
 GOAL_KEPT_MAX_BYTES: Final = 64 << 10  # larger goals are not sent again to a server that arrives later
 _HEAD: Final = 4  # of CDR
 _ID: Final = 16
@@ -128,7 +128,7 @@ class Goals:
             if known.leader == server and known.result is None:
                 known.leader = None
 
-    def may_feed(self, server: Name, raw: bytes) -> bool:
+    def may_writer_proxy(self, server: Name, raw: bytes) -> bool:
         """Return whether feedback goes to the clients.
 
         Raises:
@@ -136,7 +136,7 @@ class Goals:
         """
         return self._led(goal_of(raw), server) is not None
 
-    def statuses(self, server: Name, raw: bytes) -> bytes | None:
+    def heartbeats(self, server: Name, raw: bytes) -> bytes | None:
         """Return the status message that clients get now that a server has sent this one; None: nothing new.
 
         Raises:
@@ -208,8 +208,10 @@ def _read(raw: bytes) -> dict[bytes, tuple[int, int, int]]:
     body, said = raw[_HEAD:], dict[bytes, tuple[int, int, int]]()
     try:
         (count,) = _COUNT[order].unpack_from(body)
-        if count > STATUSES_MAX:
-            raise RemoteError(DropReason.MALFORMED, f"a status message of {count} goals; at most {STATUSES_MAX} can be")
+        if count > HEARTBEATS_MAX:
+            raise RemoteError(
+                DropReason.MALFORMED, f"a status message of {count} goals; at most {HEARTBEATS_MAX} can be"
+            )
         at = _COUNT[order].size
         for _ in range(min(count, len(body) // _ENTRY_MIN)):
             stamp_at = -(-(at + _ID) // 4) * 4
@@ -220,9 +222,9 @@ def _read(raw: bytes) -> dict[bytes, tuple[int, int, int]]:
     return said
 
 
-def _write(statuses: dict[bytes, tuple[int, int, int]]) -> bytes:
-    body = bytearray(_COUNT["<"].pack(len(statuses)))
-    for goal, (seconds, nanoseconds, status) in statuses.items():
+def _write(heartbeats: dict[bytes, tuple[int, int, int]]) -> bytes:
+    body = bytearray(_COUNT["<"].pack(len(heartbeats)))
+    for goal, (seconds, nanoseconds, status) in heartbeats.items():
         body += goal
         body += bytes(-len(body) % 4) + _STAMP["<"].pack(seconds, nanoseconds) + bytes([status])
     return b"\0\1\0\0" + bytes(body)

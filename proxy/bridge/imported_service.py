@@ -1,6 +1,6 @@
 """Virtual server on this machine for the remote servers of one service or action.
 
-I/O: endpoint and member; ``gdp/service/dispatch.py`` or ``gdp/service/keeper.py`` decide. The virtual server exists
+I/O: endpoint and member; ``gdp/service/dispatch.py`` or ``gdp/service/sequencer.py`` decide. The virtual server exists
 while a remote one is heard, so that local clients see whether there is one. A call ends with the first response, with a
 reason, or when its time is up; a later response is counted, and servers that still work on it are told to stop.
 
@@ -14,26 +14,26 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
 
-from gdp.client.member import Message, Topic
+from gdp.client.participant import Message, Topic
 from gdp.errors import LocalError, RemoteError
 from gdp.names import Name
 from gdp.service.dispatch import Dispatch, Failure
-from gdp.service.keeper import Keeper
-from gdp.service.ordered import LIFE_BITS
 from gdp.service.replication import ALL, Mode
+from gdp.service.replication_messages import LIFE_BITS
+from gdp.service.sequencer import Sequencer
+from proxy.bridge.action_interface import CANCEL, GOAL, PROFILES, RESULT, ActionInterface
+from proxy.bridge.context import BridgeContext
+from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.endpoint_dispatch import EndpointDispatcher
+from proxy.bridge.faults import Fault
 from proxy.bridge.goals import Goals, goal_of, says_yes
-from proxy.bridge.parts import CANCEL, GOAL, PROFILES, RESULT, Parts
 from proxy.bridge.request_sender import RequestSender
-from proxy.bridge.seat import Seat
 from proxy.bridge.server_discovery import Response, ServerCalls, ServerDiscovery
-from proxy.bridge.site import Site
-from proxy.bridge.wishes import Wish
-from proxy.endpoints.endpoint import Asked, Event, Faulted
-from proxy.exchange import PATIENCE_MAX_MS, Answer, Exchange, News, Outcome, Request, too_large
-from proxy.faults import Fault
-from proxy.ordering import follower_word, is_word
+from proxy.endpoints.endpoint import EndpointError, Event, RequestReceived
 from proxy.serial.empty import NoAnswer
 from proxy.serial.serializer import Serializer
+from proxy.wire.replication import follower_message, is_word
+from proxy.wire.service import PATIENCE_MAX_MS, Answer, Exchange, News, Outcome, Request, too_large
 
 __all__ = ["ImportedService"]
 
@@ -61,22 +61,24 @@ class ImportedService:
         random_start: the first number of a call, random.
     """
 
-    def __init__(self, site: Site, seat: Seat, wish: Wish, topic: Topic, random_start: int) -> None:
+    def __init__(
+        self, site: BridgeContext, seat: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic, random_start: int
+    ) -> None:
         self._site = site
         self._seat = seat
-        self._wish = wish
+        self._flow_spec = flow_spec
         self._topic = topic
-        self._parts = Parts.of(wish.rule.kind, wish.local, wish.type_name)
-        self._goals = Goals() if wish.rule.kind == "action" else None
-        self._keeper: Keeper[Response] | None = None
+        self._parts = ActionInterface.of(flow_spec.rule.kind, flow_spec.local, flow_spec.type_name)
+        self._goals = Goals() if flow_spec.rule.kind == "action" else None
+        self._sequencer: Sequencer[Response] | None = None
         self._outside: dict[Name, str] = {}  # servers that cannot be kept in order, as told
-        if wish.rule.is_ordered:
-            self._keeper = Keeper(life=lambda: secrets.randbits(LIFE_BITS))
+        if flow_spec.rule.is_ordered:
+            self._sequencer = Sequencer(life=lambda: secrets.randbits(LIFE_BITS))
         self._calls: tuple[ServerCalls, ...] = tuple(
-            self._keeper
-            if self._keeper is not None
+            self._sequencer
+            if self._sequencer is not None
             else Dispatch[Response](
-                ALL if self._goals is not None and part == CANCEL else wish.rule.spread,
+                ALL if self._goals is not None and part == CANCEL else flow_spec.rule.spread,
                 start=random_start,
                 stops=self._goals is None or part == RESULT,  # a goal is every server's, until one has its result
             )
@@ -88,7 +90,7 @@ class ImportedService:
         self._handles: list[int] = []
         self._topics: list[int] = []
         self._publisher = site.member.call(
-            topic, self._description(), is_global=wish.rule.is_global, urgent=wish.rule.priority == "urgent"
+            topic, self._description(), is_global=flow_spec.rule.is_global, urgent=flow_spec.rule.priority == "urgent"
         )
         self._sender = RequestSender(
             site=site, service=topic.name, calls=self._calls, goals=self._goals, publisher=self._publisher
@@ -96,7 +98,7 @@ class ImportedService:
         self._discovery = ServerDiscovery(
             site=site,
             seat=seat,
-            wish=wish,
+            flow_spec=flow_spec,
             service=topic.name,
             parts=self._parts,
             calls=self._calls,
@@ -109,48 +111,48 @@ class ImportedService:
         """Take a far server's answer, or what its action's topics say."""
         self._site.traffic.received(len(message.delivered.message))
         try:
-            if message.private and self._keeper is not None and is_word(message.delivered.message):
-                word, name = follower_word(message.delivered.message), Name(message.delivered.publisher)
+            if message.private and self._sequencer is not None and is_word(message.delivered.message):
+                word, name = follower_message(message.delivered.message), Name(message.delivered.publisher)
                 self._discovery.find(name, now_s)
-                self._keeper.positioned(name, word, now_s)
+                self._sequencer.positioned(name, word, now_s)
             elif message.private:
                 self._receive_response(message, now_s)
             else:
                 self._receive_news(message)
         except RemoteError as error:
-            self._site.faults.tell(self._wish.local, Fault.MALFORMED, str(error))
+            self._site.faults.report(self._flow_spec.local, Fault.MALFORMED, str(error))
         self._sender.flush(now_s)
 
-    def take(self, event: Event, now_s: float) -> None:
+    def handle_event(self, event: Event, now_s: float) -> None:
         """Take a local client's request."""
-        if isinstance(event, Asked):
+        if isinstance(event, RequestReceived):
             self._ask(event, now_s)
             self._sender.flush(now_s)
-        elif isinstance(event, Faulted):
-            self._site.tell(self._wish.local, event, Fault.REFUSED)
+        elif isinstance(event, EndpointError):
+            self._site.tell(self._flow_spec.local, event, Fault.REFUSED)
 
     def tick(self, now_s: float) -> None:
         """Open or close the virtual server as far ones come and go."""
         self._discovery.update(now_s)
-        self.timeout(now_s)
+        self.handle_timer(now_s)
         self._count()
-        if self._keeper is not None:
-            outside = dict(self._keeper.outside)
+        if self._sequencer is not None:
+            outside = dict(self._sequencer.outside)
             for name in [name for name, reason in outside.items() if self._outside.get(name) != reason]:
-                self._site.faults.tell(self._wish.local, Fault.REFUSED, f"server {name.short}: {outside[name]}")
+                self._site.faults.report(self._flow_spec.local, Fault.REFUSED, f"server {name.short}: {outside[name]}")
             self._outside = outside
 
-    def timeout(self, now_s: float) -> None:
+    def handle_timer(self, now_s: float) -> None:
         """Do what is due, between looks at who is there."""
         for dispatch in self._calls:
-            dispatch.timeout(now_s)
+            dispatch.handle_timer(now_s)
         self._sender.flush(now_s)
 
-    def next_timeout(self) -> float | None:
+    def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         if self._sender.is_ready:
             return 0.0
-        times = [dispatch.next_timeout() for dispatch in self._calls]
+        times = [dispatch.get_timer() for dispatch in self._calls]
         return min((time for time in times if time is not None), default=None)
 
     def close(self, now_s: float) -> None:
@@ -176,7 +178,7 @@ class ImportedService:
     def _description(self) -> bytes:
         """Return how this machine knows the service; empty where it must learn that from the far side."""
         try:
-            exchange = self._parts.known(self._seat.endpoint, self._wish.rule.encoding)
+            exchange = self._parts.known(self._seat.endpoint, self._flow_spec.rule.encoding)
         except LocalError:
             return b""
         return exchange.to_wire()
@@ -201,8 +203,8 @@ class ImportedService:
             self._seat.close(handle)
         self._handles, self._topics = [], []
 
-    def _ask(self, event: Asked, now_s: float) -> None:
-        part, rule = self._handles.index(event.handle), self._wish.rule
+    def _ask(self, event: RequestReceived, now_s: float) -> None:
+        part, rule = self._handles.index(event.handle), self._flow_spec.rule
         waiting = _Waiting(part, event.ticket, b"")
         body = self._requests[part].encode(event.raw)
         if reason := too_large("a request", len(event.raw), rule.max_bytes, len(body)):
@@ -221,7 +223,7 @@ class ImportedService:
         except RemoteError as error:
             self._refuse(waiting, Fault.MALFORMED, str(error))
         except LocalError as error:
-            fault = Fault.REFUSED if self._keeper is not None else Fault.TOO_FAST
+            fault = Fault.REFUSED if self._sequencer is not None else Fault.TOO_FAST
             self._refuse(waiting, fault if self._calls[part].servers else Fault.NO_SERVER, str(error))
 
     def _write(self, waiting: _Waiting, body: bytes, timeout_s: float | None, call: int) -> bytes:
@@ -240,7 +242,7 @@ class ImportedService:
         """Return whom to ask for a result, in place of what the rule says; nobody: as it says."""
         servers = self._calls[RESULT].servers
         holders = goals.holders(goal) & set(servers)
-        if self._wish.rule.spread.mode is Mode.ALL:
+        if self._flow_spec.rule.spread.mode is Mode.ALL:
             return () if not holders or len(holders) == len(servers) else tuple(servers)
         return tuple(holders or servers)
 
@@ -256,7 +258,7 @@ class ImportedService:
         try:
             raw = server.answers[answer.part].decode(answer.body)
         except RemoteError as error:
-            self._site.faults.tell(self._wish.local, Fault.MALFORMED, str(error))
+            self._site.faults.report(self._flow_spec.local, Fault.MALFORMED, str(error))
             dispatch.refused(answer.call, name, str(error), now_s)
             return
         if self._goals is None or says_yes(answer.part, raw):
@@ -280,16 +282,16 @@ class ImportedService:
         if failure is not Failure.TIMED_OUT:
             self._refuse(waiting, _FAULTS[failure], reason)
             return
-        reason = f"no answer within {self._wish.rule.timeout_s:g} s"
+        reason = f"no answer within {self._flow_spec.rule.timeout_s:g} s"
         no_answer = self._no_answers[waiting.part] if self._handles else None
-        if no_answer is None or no_answer.says_reason or self._wish.rule.on_timeout == "silent":
+        if no_answer is None or no_answer.says_reason or self._flow_spec.rule.on_timeout == "silent":
             self._refuse(waiting, Fault.TIMED_OUT, reason)
             return
-        self._site.faults.tell(self._wish.local, Fault.TIMED_OUT, reason)
+        self._site.faults.report(self._flow_spec.local, Fault.TIMED_OUT, reason)
         self._seat.endpoint.answer(self._handles[waiting.part], waiting.ticket, no_answer.to_raw(reason))
 
     def _forget(self, waiting: _Waiting) -> None:
-        is_cancelled = self._keeper is None  # a log's entries go to all servers in any case
+        is_cancelled = self._sequencer is None  # a log's entries go to all servers in any case
         self._sender.forget(waiting.part, waiting.call, is_cancelled=is_cancelled)
 
     def _receive_news(self, message: Message) -> None:
@@ -300,8 +302,8 @@ class ImportedService:
             return
         raw = server.news[at].decode(news.body)
         if at > 0:
-            self._tell_status(self._goals.statuses(name, raw))
-        elif self._goals.may_feed(name, raw):
+            self._tell_status(self._goals.heartbeats(name, raw))
+        elif self._goals.may_writer_proxy(name, raw):
             self._seat.endpoint.publish(self._topics[at], raw)
 
     def _tell_status(self, raw: bytes | None) -> None:
@@ -309,6 +311,6 @@ class ImportedService:
             self._seat.endpoint.publish(self._topics[-1], raw)
 
     def _refuse(self, waiting: _Waiting, fault: Fault, reason: str) -> None:
-        self._site.faults.tell(self._wish.local, fault, reason)
+        self._site.faults.report(self._flow_spec.local, fault, reason)
         if self._handles:
             self._seat.endpoint.refuse(self._handles[waiting.part], waiting.ticket, reason)

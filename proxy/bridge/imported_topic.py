@@ -11,22 +11,22 @@ from collections import deque
 from collections.abc import Sequence, Set
 from typing import NamedTuple
 
-from gdp.client.member import Message, Topic
+from gdp.client.participant import Message, Topic
 from gdp.errors import LocalError, RemoteError
 from gdp.message.loss import Losses
-from proxy.bridge.incoming import Incoming
+from proxy.bridge.context import BridgeContext
+from proxy.bridge.decoder import MessageDecoder
+from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.endpoint_dispatch import EndpointDispatcher
+from proxy.bridge.faults import Fault
 from proxy.bridge.local_output import ChannelPublishers, LocalOutput, MergedPublisher
-from proxy.bridge.pace import Pace
-from proxy.bridge.seat import Seat
-from proxy.bridge.site import Site
-from proxy.bridge.wishes import Wish
-from proxy.endpoints.endpoint import End, Event, Faulted
-from proxy.faults import Fault
-from proxy.parcel import Description, Parcel
-from proxy.qos import unmatched
+from proxy.bridge.rate_limit import RateLimiter
+from proxy.bridge.topic_stats import SAMPLES_MAX, TopicStats
+from proxy.endpoints.endpoint import EndpointError, Event, GraphEntity
+from proxy.endpoints.qos import unmatched
+from proxy.node.metrics_sources import Sources
 from proxy.serial.schema import DefinitionError
-from proxy.sources import Sources
-from proxy.tally import SAMPLES_MAX, Tally
+from proxy.wire.message import RosMessage, TopicDescription
 
 __all__ = ["ImportedTopic"]
 
@@ -36,7 +36,7 @@ _SAMPLES_MAX = 4_096  # latencies kept of a live topic
 class _Decoded(NamedTuple):
     """One far channel, made ready."""
 
-    incoming: Incoming
+    incoming: MessageDecoder
     handle: int  # of the local output
 
 
@@ -47,21 +47,21 @@ class ImportedTopic:
         LocalError: this graph does not take a publisher of it.
     """
 
-    def __init__(self, site: Site, seat: Seat, wish: Wish, topic: Topic) -> None:
+    def __init__(self, site: BridgeContext, seat: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic) -> None:
         self._site = site
-        self._wish = wish
+        self._flow_spec = flow_spec
         self._topic = topic
         self._unmatched: Set[str] = frozenset()  # keys of readers that want what cannot be had
         self._sources = Sources[tuple[_Decoded, ...]]()
         self._is_joined = False
         self._past_losses = Losses()  # of when a local reader stood before
-        self._pace = Pace(wish.rule.max_hz)
+        self._pace = RateLimiter(flow_spec.rule.max_hz)
         samples = _SAMPLES_MAX if seat.endpoint.is_live else SAMPLES_MAX
-        self.tally = Tally(wish.local, wish.type_name, latencies_ms=deque(maxlen=samples))
+        self.stats = TopicStats(flow_spec.local, flow_spec.type_name, latencies_ms=deque(maxlen=samples))
         kind = MergedPublisher if seat.endpoint.is_live else ChannelPublishers
-        self._output: LocalOutput = kind(seat, self, wish)
+        self._output: LocalOutput = kind(seat, self, flow_spec)
 
-    def follow(self, ends: Sequence[End]) -> None:
+    def follow(self, ends: Sequence[GraphEntity]) -> None:
         """Learn who reads here now."""
         self._tell_unmatched(ends)
         if ends and not self._is_joined:
@@ -82,11 +82,11 @@ class ImportedTopic:
         except LocalError as error:
             self._refuse(Fault.REFUSED, str(error))
 
-    def take(self, event: Event, now_s: float) -> None:
+    def handle_event(self, event: Event, now_s: float) -> None:
         """Take what the endpoint says of the local publisher."""
         del now_s
-        if isinstance(event, Faulted):
-            self._site.tell(self._wish.local, event, Fault.QOS)
+        if isinstance(event, EndpointError):
+            self._site.tell(self._flow_spec.local, event, Fault.QOS)
 
     def close(self, now_s: float) -> None:
         """Carry nothing any more."""
@@ -104,7 +104,7 @@ class ImportedTopic:
 
     def count_losses(self) -> None:
         """Bring the tally's losses up to date."""
-        self.tally.losses = losses = Losses()
+        self.stats.losses = losses = Losses()
         losses.update(self._past_losses)
         if self._is_joined:
             losses.update(self._site.member.losses_of(self._topic.name))
@@ -114,66 +114,66 @@ class ImportedTopic:
         self._past_losses.update(self._site.member.losses_of(self._topic.name))
         self._site.member.unsubscribe(self._topic.name)
 
-    def _tell_unmatched(self, ends: Sequence[End]) -> None:
+    def _tell_unmatched(self, ends: Sequence[GraphEntity]) -> None:
         """Tell, once, of each reader that wants what cannot be had."""
         odd = {end.key: (end.node or "a node", policy) for end in ends if end.qos and (policy := unmatched(end.qos))}
         for key in odd.keys() - self._unmatched:
             detail = "{} will get nothing: {}, which no network can promise".format(*odd[key])
-            self._site.faults.tell(self._wish.local, Fault.QOS, detail)
+            self._site.faults.report(self._flow_spec.local, Fault.QOS, detail)
         if self._unmatched and not odd:
-            self._site.faults.over(self._wish.local, Fault.QOS)
+            self._site.faults.clear(self._flow_spec.local, Fault.QOS)
         self._unmatched = odd.keys()
 
     def _refuse(self, fault: Fault, detail: str) -> None:
-        self.tally.refused += 1
-        self._site.faults.tell(self._wish.local, fault, detail)
+        self.stats.refused += 1
+        self._site.faults.report(self._flow_spec.local, fault, detail)
 
     def _receive(self, message: Message, now_s: float) -> None:
-        delivered, traffic, rule = message.delivered, self._site.traffic, self._wish.rule
+        delivered, traffic, rule = message.delivered, self._site.traffic, self._flow_spec.rule
         publisher = delivered.publisher
         if (publisher, message.description) not in self._sources:
             self._sources.put(publisher, message.description, None)
-            ready = self._describe(publisher, Description.from_wire(message.description))
+            ready = self._describe(publisher, TopicDescription.from_wire(message.description))
             self._sources.put(publisher, message.description, ready)
         channels = self._sources.get(publisher, message.description)
         if channels is None or not self._output.is_open:
-            self.tally.refused += 1
+            self.stats.refused += 1
             return
         if not self._pace.may_pass(now_s):
             traffic.thinned += 1
             return
-        parcel = Parcel.from_wire(delivered.message)
-        if parcel.channel >= len(channels):
-            self._refuse(Fault.MALFORMED, f"a message of channel {parcel.channel}, of {len(channels)} described")
+        ros_message = RosMessage.from_wire(delivered.message)
+        if ros_message.channel >= len(channels):
+            self._refuse(Fault.MALFORMED, f"a message of channel {ros_message.channel}, of {len(channels)} described")
             return
-        incoming, handle = channels[parcel.channel]
-        raw = incoming.decode(parcel.body)
+        incoming, handle = channels[ros_message.channel]
+        raw = incoming.decode(ros_message.body)
         if len(raw) > rule.max_bytes:
             detail = f"a message of {len(raw)} bytes; the rule's max_bytes is {rule.max_bytes}"
             self._refuse(Fault.TOO_LARGE, detail)
             return
         self._output.publish(handle, raw)
-        latency_ms = (time.time_ns() - parcel.stamp_ns) / 1e6
-        self.tally.count_number(delivered.publisher, delivered.incarnation, delivered.number, delivered.place)
-        self.tally.add(latency_ms, delivered.parts, delivered.hops)
+        latency_ms = (time.time_ns() - ros_message.stamp_ns) / 1e6
+        self.stats.count_number(delivered.publisher, delivered.incarnation, delivered.number, delivered.place)
+        self.stats.add(latency_ms, delivered.parts, delivered.hops)
         traffic.latency.observe(latency_ms / 1e3)
         traffic.received(len(delivered.message))
 
-    def _describe(self, publisher: bytes, description: Description) -> tuple[_Decoded, ...] | None:
+    def _describe(self, publisher: bytes, description: TopicDescription) -> tuple[_Decoded, ...] | None:
         """Make ready for a publisher's messages; None if they cannot be had here."""
-        what, sources = self._wish.local, description.channels
-        other = next((each.type_name for each in sources if each.type_name != self._wish.type_name), None)
+        what, sources = self._flow_spec.local, description.channels
+        other = next((each.type_name for each in sources if each.type_name != self._flow_spec.type_name), None)
         if other is not None:
-            self._site.faults.tell(what, Fault.OTHER_TYPE, f"the far side sends {other}")
+            self._site.faults.report(what, Fault.OTHER_TYPE, f"the far side sends {other}")
             return None
         try:
             incoming = [self._output.decoder(source, description.encoding) for source in sources]
         except DefinitionError as error:
-            self._site.faults.tell(what, Fault.OTHER_TYPE, f"the far side's definition does not fit: {error}")
+            self._site.faults.report(what, Fault.OTHER_TYPE, f"the far side's definition does not fit: {error}")
             return None
         try:
             handles = self._output.add(publisher, sources, [each.target for each in incoming])
         except LocalError as error:
-            self._site.faults.tell(what, self._output.refusal, str(error))
+            self._site.faults.report(what, self._output.refusal, str(error))
             return None
         return tuple(map(_Decoded, incoming, handles))

@@ -13,15 +13,15 @@ from dataclasses import replace
 from typing import Final, Protocol
 
 from gdp.errors import LocalError
-from proxy.bridge.incoming import Incoming
-from proxy.bridge.seat import Owner, Seat
-from proxy.bridge.wishes import Wish
-from proxy.endpoints.endpoint import End
-from proxy.faults import Fault
-from proxy.parcel import CHANNELS_MAX
-from proxy.qos import default, offer
+from proxy.bridge.decoder import MessageDecoder
+from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.endpoint_dispatch import EndpointDispatcher, EventHandler
+from proxy.bridge.faults import Fault
+from proxy.endpoints.endpoint import GraphEntity
+from proxy.endpoints.qos import default, offer
 from proxy.serial.channel import Channel, Qos
 from proxy.serial.serializer import Encoding
+from proxy.wire.message import CHANNELS_MAX
 
 __all__ = ["ChannelPublishers", "LocalOutput", "MergedPublisher"]
 
@@ -38,7 +38,7 @@ class LocalOutput(Protocol):
     def is_open(self) -> bool:
         """Return whether messages can be published now."""
 
-    def decoder(self, source: Channel, encoding: Encoding) -> Incoming:
+    def decoder(self, source: Channel, encoding: Encoding) -> MessageDecoder:
         """Return what turns bodies of a far channel into local messages.
 
         Raises:
@@ -63,7 +63,7 @@ class LocalOutput(Protocol):
             LocalError: it cannot be written.
         """
 
-    def receive_readers(self, ends: Sequence[End]) -> None:
+    def receive_readers(self, ends: Sequence[GraphEntity]) -> None:
         """Take the local readers of now."""
 
     def drop_kept(self) -> None:
@@ -82,10 +82,10 @@ class MergedPublisher:
 
     refusal = Fault.UNKNOWN_TYPE
 
-    def __init__(self, seat: Seat, owner: Owner, wish: Wish) -> None:
+    def __init__(self, seat: EndpointDispatcher, owner: EventHandler, flow_spec: FlowSpec) -> None:
         self._seat = seat
         self._owner = owner
-        self._wish = wish
+        self._flow_spec = flow_spec
         self._wants: tuple[Qos, ...] = ()
         self._handle: int | None = None
         self._channel: Channel | None = None  # as it is offered here
@@ -99,9 +99,9 @@ class MergedPublisher:
         """Return whether the virtual publisher stands."""
         return self._handle is not None
 
-    def decoder(self, source: Channel, encoding: Encoding) -> Incoming:
+    def decoder(self, source: Channel, encoding: Encoding) -> MessageDecoder:
         """Return what decodes by the far definition and converts into this machine's."""
-        return Incoming.ready(source, encoding, self._known(), self._seat.endpoint.ros)
+        return MessageDecoder.ready(source, encoding, self._known(), self._seat.endpoint.ros)
 
     def add(self, publisher: bytes, sources: Sequence[Channel], targets: Sequence[Channel]) -> list[int]:
         """Offer what a far publisher does; its channels share the virtual publisher."""
@@ -119,7 +119,7 @@ class MergedPublisher:
             self._seat.endpoint.publish(self._handle, raw)
             self._kept.append(raw)
 
-    def receive_readers(self, ends: Sequence[End]) -> None:
+    def receive_readers(self, ends: Sequence[GraphEntity]) -> None:
         """Offer what local readers insist on."""
         self._wants = tuple(end.qos for end in sorted(ends, key=lambda end: end.key) if end.qos is not None)
         if self._channel is not None:
@@ -139,15 +139,15 @@ class MergedPublisher:
 
     def _known(self) -> Channel | None:
         try:
-            return self._seat.endpoint.channel(self._wish.local, self._wish.type_name)
+            return self._seat.endpoint.channel(self._flow_spec.local, self._flow_spec.type_name)
         except LocalError:
             return None
 
     def _offer(self, channel: Channel) -> None:
         """Be the publisher that the far one is, as far as local readers allow; again where that has changed."""
-        profile = offer(tuple(self._far.values()), self._wants, is_latched=self._wish.rule.wants_latched)
+        profile = offer(tuple(self._far.values()), self._wants, is_latched=self._flow_spec.rule.wants_latched)
         latched = profile.durability == "transient_local"
-        offered = replace(channel, topic=self._wish.local, qos=(profile,), latched=latched, callerid=None)
+        offered = replace(channel, topic=self._flow_spec.local, qos=(profile,), latched=latched, callerid=None)
         if self._handle is not None and self._channel is not None and _is_served(self._channel, offered):
             return
         self.close()
@@ -164,15 +164,15 @@ class ChannelPublishers:
     refusal = Fault.REFUSED
     is_open = True
 
-    def __init__(self, seat: Seat, owner: Owner, wish: Wish) -> None:
+    def __init__(self, seat: EndpointDispatcher, owner: EventHandler, flow_spec: FlowSpec) -> None:
         self._seat = seat
         self._owner = owner
-        self._wish = wish
+        self._flow_spec = flow_spec
         self._handles: dict[bytes, set[int]] = {}  # of each far publisher
 
-    def decoder(self, source: Channel, encoding: Encoding) -> Incoming:
+    def decoder(self, source: Channel, encoding: Encoding) -> MessageDecoder:
         """Return what decodes by the far definition alone."""
-        return Incoming(source, encoding, source, None)
+        return MessageDecoder(source, encoding, source, None)
 
     def add(self, publisher: bytes, sources: Sequence[Channel], targets: Sequence[Channel]) -> list[int]:
         """Return the handles of a far publisher's channels, whose number is bounded; equal channels share a handle."""
@@ -184,7 +184,7 @@ class ChannelPublishers:
         for target in targets:
             if len(known) >= CHANNELS_MAX:
                 raise LocalError(f"its publisher has described more than {CHANNELS_MAX} channels")
-            handles.append(self._seat.advertise(self._owner, replace(target, topic=self._wish.local)))
+            handles.append(self._seat.advertise(self._owner, replace(target, topic=self._flow_spec.local)))
             known.add(handles[-1])
         return handles
 
@@ -192,7 +192,7 @@ class ChannelPublishers:
         """Publish one message of a channel."""
         self._seat.endpoint.publish(handle, raw)
 
-    def receive_readers(self, ends: Sequence[End]) -> None:
+    def receive_readers(self, ends: Sequence[GraphEntity]) -> None:
         """Take the readers: a recording reads everything."""
 
     def drop_kept(self) -> None:

@@ -11,12 +11,12 @@ from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.service.dispatch import Ask
-from gdp.service.ordered import Word
+from gdp.service.replication_messages import ReplicaCommand
+from proxy.bridge.action_interface import CANCEL, RESULT
+from proxy.bridge.broadcast_queue import BroadcastQueue, Effect, wire_of
+from proxy.bridge.context import BridgeContext
 from proxy.bridge.goals import Goals
-from proxy.bridge.outgoing import Effect, ForAll, wire_of
-from proxy.bridge.parts import CANCEL, RESULT
 from proxy.bridge.server_discovery import ServerCalls
-from proxy.bridge.site import Site
 
 __all__ = ["RequestSender"]
 
@@ -31,14 +31,20 @@ class RequestSender:
     """
 
     def __init__(
-        self, *, site: Site, service: Name, calls: Sequence[ServerCalls], goals: Goals | None, publisher: Publisher
+        self,
+        *,
+        site: BridgeContext,
+        service: Name,
+        calls: Sequence[ServerCalls],
+        goals: Goals | None,
+        publisher: Publisher,
     ) -> None:
         self._site = site
         self._service = service
         self._calls = calls
         self._goals = goals
         self._publisher = publisher
-        self._for_all = ForAll()
+        self._for_all = BroadcastQueue()
         self._goal_of: dict[tuple[int, int], bytes] = {}  # part and call -> goal, while under way
 
     @property
@@ -67,15 +73,15 @@ class RequestSender:
     def flush(self, now_s: float) -> None:
         """Send what was decided, as far as there is room."""
         for part, dispatch in enumerate(self._calls):
-            while effects := dispatch.take():
+            while effects := dispatch.poll_effects():
                 for effect in effects:
                     whom = effect.servers if isinstance(effect, Ask) else effect.server and (effect.server,)
-                    if whom is None and not isinstance(effect, Word):
+                    if whom is None and not isinstance(effect, ReplicaCommand):
                         self._for_all.add(part, effect)
                     for server in whom or ():
                         self._send_to(server, part, effect, now_s)
         while self.is_ready:
-            self._send_to_all(*self._for_all.take(), now_s)
+            self._send_to_all(*self._for_all.poll_effect(), now_s)
 
     def _send_to_all(self, part: int, effect: Effect, now_s: float) -> None:
         servers = self._calls[part].servers

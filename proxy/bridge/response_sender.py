@@ -10,11 +10,11 @@ from gdp.errors import LocalError
 from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.service.serving import Asked, Serving
-from proxy.bridge.site import Site
-from proxy.bridge.wishes import Wish
-from proxy.exchange import Answer, Exchange, News, Outcome, too_large
-from proxy.faults import Fault
+from proxy.bridge.context import BridgeContext
+from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.faults import Fault
 from proxy.serial.serializer import Serializer
+from proxy.wire.service import Answer, Exchange, News, Outcome, too_large
 
 __all__ = ["ResponseSender"]
 
@@ -32,32 +32,32 @@ class ResponseSender:
     def __init__(
         self,
         *,
-        site: Site,
-        wish: Wish,
+        site: BridgeContext,
+        flow_spec: FlowSpec,
         service: Name,
         exchange: Exchange,
         serving: Serving[bytes],
         publisher: Publisher,
     ) -> None:
         self._site = site
-        self._wish = wish
+        self._flow_spec = flow_spec
         self._service = service
         self._serving = serving
         self._publisher = publisher
-        self._responses = [Serializer(each.response, wish.rule.encoding) for each in exchange.services]
-        self._news = [Serializer(each, wish.rule.encoding) for each in exchange.topics]
+        self._responses = [Serializer(each.response, flow_spec.rule.encoding) for each in exchange.services]
+        self._news = [Serializer(each, flow_spec.rule.encoding) for each in exchange.topics]
 
     def respond(self, asked: Asked, raw: bytes) -> None:
         """Send a response of the local server; one that is too large fails the call."""
         body = self._responses[asked.part].encode(raw)
-        if reason := too_large("an answer", len(raw), self._wish.rule.max_bytes, len(body)):
+        if reason := too_large("an answer", len(raw), self._flow_spec.rule.max_bytes, len(body)):
             self.fail(asked, Fault.TOO_LARGE, reason)
         else:
             self._send(asked, Answer(asked.part, asked.call, Outcome.ANSWERED, body))
 
     def fail(self, asked: Asked, fault: Fault, reason: str) -> None:
         """Report a fault, and send its reason in place of a response."""
-        self._site.faults.tell(self._wish.local, fault, reason)
+        self._site.faults.report(self._flow_spec.local, fault, reason)
         self.refuse(asked, reason)
 
     def refuse(self, asked: Asked, reason: str) -> None:
@@ -67,7 +67,7 @@ class ResponseSender:
     def send_wire(self, client: Name, wire: bytes) -> None:
         """Send bytes to one client; to one that has gone nothing is sent."""
         try:
-            self._site.member.answer(self._service, client, wire)
+            self._site.member.respond(self._service, client, wire)
         except LocalError:
             self._site.traffic.unread += 1  # the client is gone
             return
@@ -80,18 +80,18 @@ class ResponseSender:
             at: which topic.
             stamp_ns: when the local server sent it, in nanoseconds since 1970.
         """
-        what, publisher, services = self._wish.local, self._publisher, len(self._responses)
+        what, publisher, services = self._flow_spec.local, self._publisher, len(self._responses)
         if not publisher.is_wanted:
             self._site.traffic.unread += 1
             publisher.skip(LossReason.NO_READER)
             return
         if not publisher.has_room():
-            self._site.faults.tell(what, Fault.TOO_FAST, "news come faster than clients confirm them")
+            self._site.faults.report(what, Fault.TOO_FAST, "news come faster than clients confirm them")
             publisher.skip(LossReason.WINDOW_OVERFLOW)
             return
         body = self._news[at].encode(raw)
-        if reason := too_large("news", len(raw), self._wish.rule.max_bytes, len(body)):
-            self._site.faults.tell(what, Fault.TOO_LARGE, reason)
+        if reason := too_large("news", len(raw), self._flow_spec.rule.max_bytes, len(body)):
+            self._site.faults.report(what, Fault.TOO_LARGE, reason)
             publisher.skip(LossReason.TOO_LARGE)
             return
         wire = News(services + at, stamp_ns, body).to_wire()

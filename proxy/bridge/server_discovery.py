@@ -11,22 +11,22 @@ from typing import Final, TypeAlias
 from gdp.errors import GdpError, LocalError
 from gdp.names import Name
 from gdp.service.dispatch import Dispatch
-from gdp.service.keeper import Keeper
-from proxy.bridge.far_server import FarServer
+from gdp.service.sequencer import Sequencer
+from proxy.bridge.action_interface import ActionInterface
+from proxy.bridge.context import BridgeContext
+from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.endpoint_dispatch import EndpointDispatcher
+from proxy.bridge.faults import Fault
 from proxy.bridge.goals import Goals
-from proxy.bridge.parts import Parts
-from proxy.bridge.seat import Seat
-from proxy.bridge.site import Site
-from proxy.bridge.wishes import Wish
-from proxy.exchange import Exchange
-from proxy.faults import Fault
+from proxy.bridge.remote_server import RemoteServer
+from proxy.wire.service import Exchange
 
 __all__ = ["Response", "ServerCalls", "ServerDiscovery"]
 
 _SERVER_GONE: Final = "the far server is gone"
 
 Response: TypeAlias = "tuple[Name, bytes]"  # who sent it, and its body as the local endpoint has it
-ServerCalls: TypeAlias = "Dispatch[Response] | Keeper[Response]"
+ServerCalls: TypeAlias = "Dispatch[Response] | Sequencer[Response]"
 
 
 class ServerDiscovery:
@@ -46,11 +46,11 @@ class ServerDiscovery:
     def __init__(
         self,
         *,
-        site: Site,
-        seat: Seat,
-        wish: Wish,
+        site: BridgeContext,
+        seat: EndpointDispatcher,
+        flow_spec: FlowSpec,
         service: Name,
-        parts: Parts,
+        parts: ActionInterface,
         calls: Sequence[ServerCalls],
         goals: Goals | None,
         opened: Callable[[Exchange], None],
@@ -58,14 +58,14 @@ class ServerDiscovery:
     ) -> None:
         self._site = site
         self._endpoint = seat.endpoint
-        self._wish = wish
+        self._flow_spec = flow_spec
         self._service = service
         self._parts = parts
         self._calls = calls
         self._goals = goals
         self._opened = opened
         self._closed = closed
-        self.servers: dict[Name, FarServer] = {}
+        self.servers: dict[Name, RemoteServer] = {}
         self._is_open = False
 
     def update(self, now_s: float) -> None:
@@ -73,26 +73,35 @@ class ServerDiscovery:
         member = self._site.member
         # Where nobody keeps up, to wait for who may do so again is better than to give up.
         peers = set(member.peers(self._service) or member.heard(self._service))
-        feeds = member.feeds_of(self._service) if peers else []
-        heard = {feed.publisher: feed for feed in feeds if feed.publisher in peers}
+        writer_proxies = member.writer_proxies_of(self._service) if peers else []
+        heard = {
+            writer_proxy.publisher: writer_proxy for writer_proxy in writer_proxies if writer_proxy.publisher in peers
+        }
         for name, server in list(self.servers.items()):
-            feed = heard.get(name)
-            if feed is not None and (feed.incarnation, feed.description) == (server.incarnation, server.description):
+            writer_proxy = heard.get(name)
+            if writer_proxy is not None and (writer_proxy.incarnation, writer_proxy.description) == (
+                server.incarnation,
+                server.description,
+            ):
                 continue
-            same = server.said_anew(feed.description) if feed and feed.incarnation == server.incarnation else None
+            same = (
+                server.said_anew(writer_proxy.description)
+                if writer_proxy and writer_proxy.incarnation == server.incarnation
+                else None
+            )
             if same is not None:
                 self.servers[name] = same
                 self._announce(name, same, now_s)
             else:
                 self._remove(name, now_s)
-        for name, feed in heard.items():
+        for name, writer_proxy in heard.items():
             if name not in self.servers:
-                self._add(name, feed.incarnation, feed.description, now_s)
+                self._add(name, writer_proxy.incarnation, writer_proxy.description, now_s)
         if not self.servers and self._is_open:
             self._is_open = False
             self._closed(_SERVER_GONE)
 
-    def find(self, name: Name, now_s: float) -> FarServer | None:
+    def find(self, name: Name, now_s: float) -> RemoteServer | None:
         """Return a server that may have come just now, or None."""
         if name not in self.servers:
             self.update(now_s)
@@ -107,9 +116,9 @@ class ServerDiscovery:
 
     def _add(self, name: Name, incarnation: int, description: bytes, now_s: float) -> None:
         """Prepare for a server's responses; one that cannot be understood is reported."""
-        rule = self._wish.rule
+        rule = self._flow_spec.rule
         try:
-            server = FarServer.learn(incarnation, description, self._parts, self._endpoint, rule.encoding)
+            server = RemoteServer.learn(incarnation, description, self._parts, self._endpoint, rule.encoding)
             if server.exchange is not None and server.exchange.is_ordered != rule.is_ordered:
                 side = "the far side's" if rule.is_ordered else "this side's"
                 raise LocalError(f"'state: ordered' is missing in {side} rule")
@@ -117,13 +126,13 @@ class ServerDiscovery:
                 self._opened(server.ours)
                 self._is_open = True
         except GdpError as error:
-            self._site.faults.tell(self._wish.local, Fault.OTHER_TYPE, str(error))
-            self.servers[name] = FarServer(incarnation, description)
+            self._site.faults.report(self._flow_spec.local, Fault.OTHER_TYPE, str(error))
+            self.servers[name] = RemoteServer(incarnation, description)
             return
         self.servers[name] = server
         self._announce(name, server, now_s)
 
-    def _announce(self, name: Name, server: FarServer, now_s: float) -> None:
+    def _announce(self, name: Name, server: RemoteServer, now_s: float) -> None:
         for dispatch in self._calls:
             dispatch.came(name, now_s)
             if server.is_leaving:

@@ -10,9 +10,9 @@ from dataclasses import replace
 from enum import Enum
 from typing import Protocol
 
-from proxy.endpoints.endpoint import End
-from proxy.qos import DEPTH_MAX, default, kept, request
-from proxy.rules.rule import Rule
+from proxy.config.rule import Rule
+from proxy.endpoints.endpoint import GraphEntity
+from proxy.endpoints.qos import DEPTH_MAX, default, kept, request
 from proxy.serial.channel import Channel, Qos
 
 __all__ = ["Change", "LiveQos", "RecordedQos", "StreamQos"]
@@ -41,7 +41,7 @@ class StreamQos(Protocol):
     def depth(self) -> int:
         """Return how many messages late joiners get."""
 
-    def receive_publishers(self, ends: Sequence[End]) -> Change:
+    def receive_publishers(self, ends: Sequence[GraphEntity]) -> Change:
         """Take the local publishers of now; return what that makes necessary."""
 
     def describe(self, channels: Sequence[Channel], topic: str) -> tuple[Channel, ...]:
@@ -55,7 +55,7 @@ class StreamQos(Protocol):
 class LiveQos:
     """Follows the publishers of a live graph, whose messages come as one channel."""
 
-    def __init__(self, rule: Rule, ends: Sequence[End]) -> None:
+    def __init__(self, rule: Rule, ends: Sequence[GraphEntity]) -> None:
         self._rule = rule
         self._publishers, self._offers = len(ends), _offers(ends)
         self._is_latched = False
@@ -81,7 +81,7 @@ class LiveQos:
             return max(kept(self._offers), DEPTH_MAX if self._is_latched and self._publishers > 1 else 1)
         return kept(self._offers)
 
-    def receive_publishers(self, ends: Sequence[End]) -> Change:
+    def receive_publishers(self, ends: Sequence[GraphEntity]) -> Change:
         """Take the local publishers of now; return what that makes necessary."""
         publishers, offers, depth = self._publishers, self._offers, self.depth
         self._publishers, self._offers = len(ends), _offers(ends)
@@ -126,7 +126,7 @@ class RecordedQos:
         """Return the largest recorded depth of a latched channel, and at least 1 where the rule latches."""
         return max(self._recorded_depth, int(self._rule.latched))
 
-    def receive_publishers(self, ends: Sequence[End]) -> Change:
+    def receive_publishers(self, ends: Sequence[GraphEntity]) -> Change:
         """Return NONE: the publishers of a recording do not change."""
         del ends
         return Change.NONE
@@ -143,5 +143,5 @@ def _recorded_depth(channel: Channel) -> int:
     return min(max((profile.depth for profile in channel.qos), default=1) or 1, DEPTH_MAX)
 
 
-def _offers(ends: Sequence[End]) -> tuple[Qos, ...]:
+def _offers(ends: Sequence[GraphEntity]) -> tuple[Qos, ...]:
     return tuple(end.qos for end in sorted(ends, key=lambda end: end.key) if end.qos is not None)

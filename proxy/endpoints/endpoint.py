@@ -20,18 +20,18 @@ from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
 
 __all__ = [
-    "Answered",
-    "Asked",
-    "Described",
-    "End",
+    "CallFailed",
     "Endpoint",
+    "EndpointError",
     "Event",
-    "Failed",
-    "Faulted",
     "Graph",
     "GraphChanged",
-    "Heard",
+    "GraphEntity",
+    "MessageReceived",
+    "RequestReceived",
+    "ResponseReceived",
     "Role",
+    "TypeResolved",
     "is_proxy_node",
     "proxy_node_name",
 ]
@@ -49,7 +49,7 @@ class Role(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class End:
+class GraphEntity:
     """One end in the graph: a node's publisher, subscription, server or client; never one of this endpoint's own.
 
     Args:
@@ -78,15 +78,15 @@ class End:
         return is_proxy_node(self.node)
 
 
-Graph: TypeAlias = frozenset[End]
+Graph: TypeAlias = frozenset[GraphEntity]
 
 
 class GraphChanged(NamedTuple):
     """``graph()`` has news."""
 
 
-class Described(NamedTuple):
-    """What the messages of a subscription are; comes before its first ``Heard``, and again if that changes.
+class TypeResolved(NamedTuple):
+    """What the messages of a subscription are; comes before its first ``MessageReceived``, and again if that changes.
 
     ``others`` are the channels of further publishers, where the endpoint tells publishers apart: a recording does.
     """
@@ -96,16 +96,16 @@ class Described(NamedTuple):
     others: tuple[Channel, ...] = ()
 
 
-class Heard(NamedTuple):
+class MessageReceived(NamedTuple):
     """One message of a subscription; never one that this endpoint published itself."""
 
     handle: int
     stamp_ns: int  # wall clock, when the endpoint took it
     raw: bytes  # the channel's wire form: CDR with its four bytes of encapsulation, or ROS 1
-    channel: int = 0  # 0: ``Described.channel``; n: number n - 1 of ``Described.others``
+    channel: int = 0  # 0: ``TypeResolved.channel``; n: number n - 1 of ``TypeResolved.others``
 
 
-class Asked(NamedTuple):
+class RequestReceived(NamedTuple):
     """A local client's request to a virtual server, to be answered or failed under this ticket."""
 
     handle: int
@@ -113,7 +113,7 @@ class Asked(NamedTuple):
     raw: bytes
 
 
-class Answered(NamedTuple):
+class ResponseReceived(NamedTuple):
     """A local server's response to ``call``."""
 
     handle: int
@@ -121,7 +121,7 @@ class Answered(NamedTuple):
     raw: bytes
 
 
-class Failed(NamedTuple):
+class CallFailed(NamedTuple):
     """A call that got no response, and why."""
 
     handle: int
@@ -129,7 +129,7 @@ class Failed(NamedTuple):
     reason: str
 
 
-class Faulted(NamedTuple):
+class EndpointError(NamedTuple):
     """Something about a handle's name is wrong and stays so until the graph changes; the handle stays open."""
 
     handle: int
@@ -137,7 +137,9 @@ class Faulted(NamedTuple):
     is_graph: bool = False  # it is the whole graph that cannot be had
 
 
-Event: TypeAlias = GraphChanged | Described | Heard | Asked | Answered | Failed | Faulted
+Event: TypeAlias = (
+    GraphChanged | TypeResolved | MessageReceived | RequestReceived | ResponseReceived | CallFailed | EndpointError
+)
 
 
 class Endpoint(Protocol):
@@ -162,7 +164,7 @@ class Endpoint(Protocol):
     def fileno(self) -> int:
         """Return a descriptor that is readable while ``take`` has something."""
 
-    def take(self) -> Sequence[Event]:
+    def poll_events(self) -> Sequence[Event]:
         """Return, once, what happened, in order."""
 
     def graph(self) -> Graph:
@@ -212,7 +214,7 @@ class Endpoint(Protocol):
         """Return how many local subscriptions a publisher of ours has now."""
 
     def serve(self, service: Service) -> int:
-        """Be the server of ``service.name``; requests come as ``Asked``.
+        """Be the server of ``service.name``; requests come as ``RequestReceived``.
 
         Raises:
             LocalError: the type is not known here.
@@ -224,7 +226,7 @@ class Endpoint(Protocol):
     def refuse(self, handle: int, ticket: int, reason: str) -> None:
         """Fail a request with a reason, as far as the dialect can say one; its client must not hang if it can."""
 
-    def dial(self, name: str, type_name: str) -> int:
+    def create_client(self, name: str, type_name: str) -> int:
         """Be a client of a local service.
 
         Raises:
@@ -232,7 +234,8 @@ class Endpoint(Protocol):
         """
 
     def call(self, handle: int, call: int, raw: bytes) -> None:
-        """Send a request under a number of the caller's; ``Answered`` or ``Failed`` follows, unless it is dropped.
+        """Send a request under a number of the caller's; ``ResponseReceived`` or ``CallFailed`` follows, unless it is
+        dropped.
 
         Any number of calls may be under way; the caller keeps the time.
         """
@@ -243,7 +246,7 @@ class Endpoint(Protocol):
     def close(self, handle: int) -> None:
         """End a subscription, publisher, server or client."""
 
-    def shut(self) -> None:
+    def remove_entity(self) -> None:
         """Leave the graph and free everything; no method is called afterwards."""
 
 

@@ -14,18 +14,18 @@ from itertools import count
 
 from gdp.errors import LocalError
 from proxy.endpoints.endpoint import (
-    Answered,
-    Asked,
-    Described,
-    End,
+    CallFailed,
     Event,
-    Failed,
     Graph,
     GraphChanged,
-    Heard,
+    GraphEntity,
+    MessageReceived,
+    RequestReceived,
+    ResponseReceived,
     Role,
+    TypeResolved,
 )
-from proxy.qos import default, depth_of
+from proxy.endpoints.qos import default, depth_of
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
 
@@ -37,7 +37,7 @@ class Publication:
     """A publisher in the graph."""
 
     graph: FakeGraph
-    end: End
+    end: GraphEntity
     qos: Qos
     kept: deque[bytes]
 
@@ -60,7 +60,7 @@ class Subscription:
     """A subscription in the graph."""
 
     graph: FakeGraph
-    end: End
+    end: GraphEntity
     qos: Qos
     hear: Callable[[bytes], None]
     described: Callable[[], None]  # what the topic's messages are may have changed
@@ -76,7 +76,7 @@ class Server:
     """A server in the graph; ``ask`` is given a request and what to call with the response or a reason."""
 
     graph: FakeGraph
-    end: End
+    end: GraphEntity
     ask: Callable[[bytes, Callable[[bytes | str], None]], None]
 
     def close(self) -> None:
@@ -172,7 +172,7 @@ class FakeGraph:
         """Return the subscriptions of a topic."""
         return [each for each in self.readers if (each.end.name, each.end.type_name) == (topic, type_name)]
 
-    def ends(self) -> list[End]:
+    def ends(self) -> list[GraphEntity]:
         """Return everything in the graph."""
         topics = [*(each.end for each in self.publications), *(each.end for each in self.readers)]
         return [*topics, *(each.end for each in self.servers)]
@@ -182,8 +182,8 @@ class FakeGraph:
         for endpoint in self.endpoints:
             endpoint.tell(GraphChanged())
 
-    def _end(self, role: Role, node: str, name: str, type_name: str, qos: Qos | None) -> End:
-        return End(role, name, type_name, node, str(next(self._keys)), qos=qos if self.ros == 2 else None)
+    def _end(self, role: Role, node: str, name: str, type_name: str, qos: Qos | None) -> GraphEntity:
+        return GraphEntity(role, name, type_name, node, str(next(self._keys)), qos=qos if self.ros == 2 else None)
 
 
 @dataclass(slots=True)
@@ -243,7 +243,7 @@ class FakeEndpoint:
             os.eventfd_write(self._wake, 1)
         self._events.append(event)
 
-    def take(self) -> Sequence[Event]:
+    def poll_events(self) -> Sequence[Event]:
         """Return, once, what happened."""
         if not self._events:
             return ()
@@ -276,11 +276,11 @@ class FakeEndpoint:
         self._open[handle] = _Open(lambda: None)
 
         def describe() -> None:
-            self.tell(Described(handle, replace(channel, latched=self._graph.is_latched(topic, type_name))))
+            self.tell(TypeResolved(handle, replace(channel, latched=self._graph.is_latched(topic, type_name))))
 
         describe()
         subscription = self._graph.subscribe(
-            self._node, topic, type_name, lambda raw: self.tell(Heard(handle, 0, raw)), qos, describe
+            self._node, topic, type_name, lambda raw: self.tell(MessageReceived(handle, 0, raw)), qos, describe
         )
         self._open[handle].close = subscription.close
         return handle
@@ -313,7 +313,7 @@ class FakeEndpoint:
         def ask(raw: bytes, done: Callable[[bytes | str], None]) -> None:
             ticket = next(self._numbers)
             opened.tickets[ticket] = done
-            self.tell(Asked(handle, ticket, raw))
+            self.tell(RequestReceived(handle, ticket, raw))
 
         opened.close = self._graph.serve(self._node, service.name, service.type_name, ask).close
         return handle
@@ -330,7 +330,7 @@ class FakeEndpoint:
         if done is not None:
             done(reason)
 
-    def dial(self, name: str, type_name: str) -> int:
+    def create_client(self, name: str, type_name: str) -> int:
         """Be a client."""
         self.service(name, type_name)
         return self._add(_Open(lambda: None, name=name))
@@ -343,7 +343,11 @@ class FakeEndpoint:
         def done(outcome: bytes | str) -> None:
             if call in opened.calls:
                 opened.calls.discard(call)
-                said = Failed(handle, call, outcome) if isinstance(outcome, str) else Answered(handle, call, outcome)
+                said = (
+                    CallFailed(handle, call, outcome)
+                    if isinstance(outcome, str)
+                    else ResponseReceived(handle, call, outcome)
+                )
                 self.tell(said)
 
         self._graph.call(opened.name, raw, done)
@@ -356,7 +360,7 @@ class FakeEndpoint:
         """End what a handle stands for."""
         self._open.pop(handle).close()
 
-    def shut(self) -> None:
+    def remove_entity(self) -> None:
         """Leave the graph."""
         for handle in list(self._open):
             self.close(handle)

@@ -8,13 +8,13 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 
+from proxy.config.graph import RosGraphConfig
 from proxy.endpoints.endpoint import Endpoint
-from proxy.rules.ros_end import RosEnd
 
 __all__ = ["open_endpoint", "open_endpoints"]
 
 
-def open_endpoint(end: RosEnd, node: str) -> Endpoint:
+def open_endpoint(end: RosGraphConfig, node: str) -> Endpoint:
     """Join a graph as a node of this name.
 
     Raises:
@@ -34,11 +34,11 @@ def open_endpoint(end: RosEnd, node: str) -> Endpoint:
 
 
 @contextlib.contextmanager
-def open_endpoints(ends: Sequence[RosEnd], node: str) -> Iterator[list[Endpoint]]:
+def open_endpoints(ends: Sequence[RosGraphConfig], node: str) -> Iterator[list[Endpoint]]:
     """Join all graphs; leave them on leaving."""
     with contextlib.ExitStack() as stack:
         opened = list[Endpoint]()
         for end in ends:
             opened.append(open_endpoint(end, node))
-            stack.callback(opened[-1].shut)
+            stack.callback(opened[-1].remove_entity)
         yield opened

@@ -29,7 +29,7 @@ from gdp.errors import LocalError
 from proxy.recordings.plain_yaml import load_plain
 from proxy.recordings.unpacking import SalvageError
 from proxy.serial.channel import Channel, DefinitionFormat, Qos
-from proxy.serial.standard import standard_definition, type_hash
+from proxy.serial.standard_types import standard_definition, type_hash
 
 __all__ = ["from_connection", "from_ros2", "offered_qos", "to_qos"]
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NamedTuple, NoReturn
 
 from gdp.errors import LocalError
-from proxy.endpoints.endpoint import Described, End, Event, Graph, GraphChanged, Heard, Role
+from proxy.endpoints.endpoint import Event, Graph, GraphChanged, GraphEntity, MessageReceived, Role, TypeResolved
 from proxy.recordings.reader import BagReader
 from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import Channel, Qos, RosVersion
@@ -48,7 +48,7 @@ class _TopicsEndpoint:
         """Return a descriptor that is readable while ``take`` has something."""
         return self._wake
 
-    def take(self) -> Sequence[Event]:
+    def poll_events(self) -> Sequence[Event]:
         """Return, once, what happened, in order."""
         if not self._events:
             return ()
@@ -80,7 +80,7 @@ class _TopicsEndpoint:
     def refuse(self, handle: int, ticket: int, reason: str) -> None:
         """Ignore the refusal: no client asked."""
 
-    def dial(self, name: str, type_name: str) -> int:
+    def create_client(self, name: str, type_name: str) -> int:
         """Refuse: a recording holds topics only; raises ``LocalError``."""
         del type_name
         self._refuse(name)
@@ -93,7 +93,7 @@ class _TopicsEndpoint:
     def drop(self, handle: int, call: int) -> None:
         """Ignore the call: there is none."""
 
-    def shut(self) -> None:
+    def remove_entity(self) -> None:
         """Free the descriptor; the recording itself belongs to the caller."""
         os.close(self._wake)
 
@@ -131,7 +131,8 @@ class ReplayEndpoint(_TopicsEndpoint):
         """Return one publisher for each channel; whose node it was says nothing about the nodes of now."""
         channels = enumerate(self._reader.channels)
         return frozenset(
-            End(Role.PUBLISHES, each.topic, each.type_name, "", str(index), hash=each.hash) for index, each in channels
+            GraphEntity(Role.PUBLISHES, each.topic, each.type_name, "", str(index), hash=each.hash)
+            for index, each in channels
         )
 
     def channels_of(self, topic: str, type_name: str) -> list[int]:
@@ -156,7 +157,7 @@ class ReplayEndpoint(_TopicsEndpoint):
         for number, index in enumerate(indexes):
             self._subscribed[index] = self._numbers, number
         first, *others = (self._reader.channels[index] for index in indexes)
-        self._put(Described(self._numbers, first, tuple(others)))
+        self._put(TypeResolved(self._numbers, first, tuple(others)))
         return self._numbers
 
     def messages(self, waiting: Callable[[], bool] | None = None) -> Iterator[RecordedMessage]:
@@ -175,7 +176,7 @@ class ReplayEndpoint(_TopicsEndpoint):
 
     def deliver(self, message: RecordedMessage) -> None:
         """Let a message be published now; its stamp is that of the present."""
-        self._put(Heard(message.handle, time.time_ns(), message.raw, message.channel))
+        self._put(MessageReceived(message.handle, time.time_ns(), message.raw, message.channel))
 
     def advertise(self, channel: Channel) -> int:
         """Refuse to publish; raises ``LocalError``."""
@@ -210,7 +211,8 @@ class RecordingEndpoint(_TopicsEndpoint):
         super().__init__("messages that are counted" if writer is None else f"recording {writer.path}")
         self._writer = writer
         self._graph: Graph = frozenset(
-            End(Role.SUBSCRIBES, topic, type_name, "", str(index)) for index, (topic, type_name) in enumerate(topics)
+            GraphEntity(Role.SUBSCRIBES, topic, type_name, "", str(index))
+            for index, (topic, type_name) in enumerate(topics)
         )
 
     @property

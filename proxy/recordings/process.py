@@ -119,7 +119,7 @@ class BagProcess:
         with contextlib.suppress(BrokenPipeError):  # it has ended; that is found when its answer is read
             os.write(self._commands, b"m")
 
-    def take(self, size: int, waiting: Callable[[], bool] | None = None) -> bytes:
+    def read(self, size: int, waiting: Callable[[], bool] | None = None) -> bytes:
         """Return the next ``size`` bytes.
 
         Raises:

@@ -63,7 +63,7 @@ class BagReader:
             self._process = BagProcess(self.path, _cost(limits or BagLimits(), size), scratch)
             stack.callback(self._process.close)
             with self._checked():
-                self.count, self.counts = self._frames.open(self._process.take)
+                self.count, self.counts = self._frames.open(self._process.read)
             self._stack = stack.pop_all()
 
     @property
@@ -87,7 +87,7 @@ class BagReader:
             return
 
         def take(size: int) -> bytes:
-            return self._process.take(size, waiting)
+            return self._process.read(size, waiting)
 
         try:
             with self._checked():

@@ -61,7 +61,7 @@ def scan(path: Path) -> ScannedSource:
         raise SalvageError(reason or "no channel in it")
     source = ScannedSource(path, found.channels, found.chunks, found.places)
     if reason:
-        source.unread = found.tally.text(reason)
+        source.unread = found.stats.text(reason)
     return source
 
 
@@ -70,7 +70,7 @@ class _Found:
         self.channels: list[Channel] = []
         self.chunks: list[Chunk] = []
         self.places: list[Place] = []
-        self.tally = Tally()
+        self.stats = Tally()
         self._schemas: dict[int, tuple[str, DefinitionFormat, str]] = {}
         self._index: dict[int, int] = {}  # channel id to index
 
@@ -107,8 +107,8 @@ class _Found:
         size = min(size, len(record) - at)
         data = unpack(compression, record[at : at + size], unpacked_size)
         if len(data) < unpacked_size:
-            self.tally.missing_bytes = unpacked_size - len(data)
-        self.tally.walked_bytes += len(data)
+            self.stats.missing_bytes = unpacked_size - len(data)
+        self.stats.walked_bytes += len(data)
         self.chunks.append(Chunk(start + at, size, compression, unpacked_size))
         at = 0
         while at + _RECORD.size <= len(data):
@@ -127,7 +127,7 @@ class _Found:
         if channel not in self._index or length < _MESSAGE_HEAD.size:
             raise SalvageError(f"a message of an unknown channel {channel}")
         size = length - _MESSAGE_HEAD.size
-        self.tally.messages += 1
+        self.stats.messages += 1
         self.places.append(
             Place(stamp_ns, len(self.places), self._index[channel], chunk, start + _MESSAGE_HEAD.size, size)
         )

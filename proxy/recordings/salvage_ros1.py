@@ -44,7 +44,7 @@ def scan(path: Path) -> ScannedSource:
     if not found.channels:
         raise SalvageError(reason or "no connection in it")
     source = ScannedSource(path, found.channels, found.chunks, found.places)
-    source.unread = found.tally.text(reason or "the recording was never closed")
+    source.unread = found.stats.text(reason or "the recording was never closed")
     return source
 
 
@@ -53,7 +53,7 @@ class _Found:
         self.channels: list[Channel] = []
         self.chunks: list[Chunk] = []
         self.places: list[Place] = []
-        self.tally = Tally()
+        self.stats = Tally()
         self._index: dict[int, int] = {}  # connection id to index
 
     def walk(self, file: BinaryIO, size: int) -> str:
@@ -70,8 +70,8 @@ class _Found:
                 code = _code(header)
                 if code == _BAG:
                     (index_at,) = _LENGTH.unpack(header.get(b"index_pos", bytes(8)))
-                    self.tally.missing_bytes = max(0, index_at - size)
-                    self.tally.walked_bytes = size
+                    self.stats.missing_bytes = max(0, index_at - size)
+                    self.stats.walked_bytes = size
                 elif code == _CHUNK:
                     self._chunk(header, data, start)
                 elif len(data) == length:
@@ -111,7 +111,7 @@ class _Found:
             seconds, nanoseconds = _TIME.unpack(header[b"time"])
             if number not in self._index:
                 raise SalvageError(f"a message of an unknown connection {number}")
-            self.tally.messages += 1
+            self.stats.messages += 1
             stamp_ns = seconds * 1_000_000_000 + nanoseconds
             self.places.append(Place(stamp_ns, len(self.places), self._index[number], chunk, start, len(data)))
         elif number not in self._index:

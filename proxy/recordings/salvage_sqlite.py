@@ -91,10 +91,10 @@ class SqliteSource:
         self.unread = ""
         self._index: dict[int, int] = {}  # topic id to index
         self._order: list[tuple[int, int, int]] = []  # stamp, row, topic id
-        self._tally = Tally()
-        self._tally.missing_bytes = _missing_bytes(path)
-        self._tally.walked_bytes = path.stat().st_size
-        self._copy, file = _whole_pages(path) if self._tally.missing_bytes else _with_index(path)
+        self._stats = Tally()
+        self._stats.missing_bytes = _missing_bytes(path)
+        self._stats.walked_bytes = path.stat().st_size
+        self._copy, file = _whole_pages(path) if self._stats.missing_bytes else _with_index(path)
         mode = "mode=ro" if _journal(file).exists() else "immutable=1"
         flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
         try:
@@ -127,12 +127,12 @@ class SqliteSource:
                 with closing(self._db.execute("SELECT data FROM messages WHERE id = ?", (row,))) as rows:
                     found = rows.fetchone()
             except (apsw.Error, UnicodeDecodeError) as error:
-                self.unread = self._tally.text(f"the message in row {row} cannot be read ({error})")
+                self.unread = self._stats.text(f"the message in row {row} cannot be read ({error})")
                 continue
             if found is not None and isinstance(found[0], bytes):
                 yield Message(self._index[topic], stamp_ns, found[0])
             else:
-                self.unread = self._tally.text(f"the message in row {row} is not bytes")
+                self.unread = self._stats.text(f"the message in row {row} is not bytes")
 
     def close(self) -> None:
         """Close the database."""
@@ -171,11 +171,11 @@ class SqliteSource:
             for row, topic, stamp_ns, _ in rows:
                 if topic in self._index and isinstance(stamp_ns, int):
                     self._order.append((int(stamp_ns), int(row), int(topic)))
-                    self._tally.messages += 1
+                    self._stats.messages += 1
         except apsw.Error as error:
             reason = f"the file ends in the middle ({error})"
         self._order.sort()
-        if self._tally.missing_bytes and not reason:
+        if self._stats.missing_bytes and not reason:
             reason = "the file ends in the middle"
         if reason:
-            self.unread = self._tally.text(reason)
+            self.unread = self._stats.text(reason)

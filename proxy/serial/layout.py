@@ -64,10 +64,10 @@ def structs_for(wire: Wire, code: str) -> struct.Struct:
 def _padded(letters: str, phase: int) -> str:
     parts = []
     at = phase
-    for letter in letters:
-        size = SIZES[letter]
+    for outgoing in letters:
+        size = SIZES[outgoing]
         pad = -at % size
-        parts.append("x" * pad + letter)
+        parts.append("x" * pad + outgoing)
         at += pad + size
     return "".join(parts)
 

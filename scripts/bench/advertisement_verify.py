@@ -27,19 +27,19 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
-from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import PublicKey, SigningKey
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.metadata import Metadata
 from gdp.trust.adcert import AdCert
-from gdp.trust.claim import make_claim
+from gdp.trust.advertisement import sign_advertisement
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
-from gdp.trust.verifier import ClaimVerifier
+from gdp.trust.verifier import AdvertisementVerifier
 
 TARGET_PER_S = 2_000
 RUNS = 5
@@ -52,17 +52,19 @@ class Field:
     def __init__(self, unix_s: float) -> None:
         self.unix_s = unix_s
         self.validity = Validity.lasting(unix_s, 3_600)
-        self.authority = DomainAuthority.found("bench", SigningKey.generate(), self.validity)
+        self.authority = CertificateAuthority.create("bench", SigningKey.generate(), self.validity)
         self.switch = self._node(Role.SWITCH, "switch")
         self.proxies = [self._node(Role.PROXY, f"proxy{i}") for i in range(PROXIES)]
         self.rtcerts = [RtCert.make(proxy, self.switch.name, self.validity) for proxy in self.proxies]
 
-    def verifier(self) -> ClaimVerifier:
+    def verifier(self) -> AdvertisementVerifier:
         """Return a verifier that has seen nothing yet, in a process that has decompressed no key yet."""
         PublicKey.from_compressed.cache_clear()
-        return ClaimVerifier(Policy(self.authority.root))
+        return AdvertisementVerifier(Policy(self.authority.root))
 
-    def claims(self, count: int, *, owners: bool = False, links: int = 1, sequences: int = 1) -> list[list[bytes]]:
+    def advertisements(
+        self, count: int, *, owners: bool = False, links: int = 1, sequences: int = 1
+    ) -> list[list[bytes]]:
         """Return ``sequences`` lists of claims on the same ``count`` names, each newer than the one before."""
         owner = SigningKey.generate()
         gateway = self.proxies[0]
@@ -73,7 +75,7 @@ class Field:
             at = i % PROXIES
             chain = self._chain(key, subject, gateway, self.proxies[at], links)
             for sequence, wires in enumerate(rounds):
-                wires.append(self._claim(at, subject, chain, sequence))
+                wires.append(self._advertisement(at, subject, chain, sequence))
         return rounds
 
     def _node(self, role: Role, label: str) -> Identity:
@@ -88,8 +90,8 @@ class Field:
             AdCert.make(gateway.key, gateway.name, subject, proxy.subject, rights, self.validity),
         ]
 
-    def _claim(self, at: int, subject: Subject, chain: Sequence[bytes], sequence: int) -> bytes:
-        return make_claim(
+    def _advertisement(self, at: int, subject: Subject, chain: Sequence[bytes], sequence: int) -> bytes:
+        return sign_advertisement(
             self.proxies[at],
             Right.PUBLISH,
             subject,
@@ -102,7 +104,7 @@ class Field:
         )
 
 
-def rate(verifier: ClaimVerifier, wires: Sequence[bytes], unix_s: float) -> float:
+def rate(verifier: AdvertisementVerifier, wires: Sequence[bytes], unix_s: float) -> float:
     """Return the claims verified in a second of CPU time."""
     begin = time.process_time()
     for wire in wires:
@@ -126,10 +128,10 @@ def run(count: int) -> dict[str, dict[str, float]]:
     field = Field(time.time())
     results: dict[str, dict[str, float]] = {}
     for name, owners, links in (("new", False, 1), ("owners", True, 1), ("chain", False, 2)):
-        (wires,) = field.claims(count, owners=owners, links=links)
+        (wires,) = field.advertisements(count, owners=owners, links=links)
         results[name] = median_of(partial(fresh_rate, field, wires))
         results[name]["bytes"] = len(wires[0])
-    first, *refreshed = field.claims(count, sequences=RUNS + 1)
+    first, *refreshed = field.advertisements(count, sequences=RUNS + 1)
     verifier = field.verifier()
     rate(verifier, first, field.unix_s)
     rounds = iter(refreshed)
@@ -144,7 +146,7 @@ def main() -> None:
     parser.add_argument("--claims", type=int, default=2_000, help="claims in each run")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to this file")
     options = parser.parse_args()
-    results = run(options.claims)
+    results = run(options.advertisements)
     table = Table(title=f"claims verified per second of one core, median of {RUNS} (target {TARGET_PER_S}, 'new')")
     for column in ("workload", "median", "lowest", "highest", "bytes"):
         table.add_column(column, justify="left" if column == "workload" else "right")
@@ -152,7 +154,7 @@ def main() -> None:
         table.add_row(name, *(f"{figures[each]:,.0f}" for each in ("median", "lowest", "highest", "bytes")))
     Console().print(table)
     if options.json is not None:
-        settings = {"claims": options.claims, "runs": RUNS, "python": platform.python_version()}
+        settings = {"claims": options.advertisements, "runs": RUNS, "python": platform.python_version()}
         options.json.write_text(json.dumps({"settings": settings, "claims_per_s": results}, indent=2) + "\n")
 
 

@@ -22,8 +22,8 @@ from report import Rounds, Target
 from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, run_bench
 from testbed import LEFT, RIGHT, Lab, MemberRow, row
 
-from gdp.host.run_registry import Runs
-from gdp.nodes.spin import SPIN_US
+from gdp.host.run_registry import RunRegistry
+from gdp.nodes.busy_poll import SPIN_US
 from gdp.trust.right import Right
 
 BUNDLES: Final = "bundles"
@@ -80,9 +80,9 @@ def targets_of(over: Rounds) -> list[Target]:
     ]
 
 
-def measure(options: Options, runs: Runs) -> Outcome:
+def measure(options: Options, runs: RunRegistry) -> Outcome:
     """Measure both cases with and without bundles, round by round."""
-    settings = {"topics": options.topics, "seconds": options.seconds, "spin_s": options.spin_us / 1e6}
+    settings = {"topics": options.topics, "seconds": options.seconds, "spin_s": options.busy_poll_us / 1e6}
     rights = {LEFT: {Right.PUBLISH: topics(options.topics)}, RIGHT: {Right.READ: topics(options.topics)}}
     recorder = Recorder()
     with (
@@ -109,7 +109,7 @@ def measure(options: Options, runs: Runs) -> Outcome:
             "message, B": MESSAGE_BYTES,
             "under way in overload, of a topic": BACKLOG,
             "MTU": options.mtu,
-            "ends spin, us": options.spin_us,
+            "ends spin, us": options.busy_poll_us,
             "trouble": recorder.notes or "none",
         },
         lambda: [
@@ -125,5 +125,7 @@ if __name__ == "__main__":
     )
     parser.add_argument("--topics", type=int, default=20)
     parser.add_argument("--mtu", type=int, default=1_500, help="bytes after the Ethernet header")
-    parser.add_argument("--spin-us", type=int, default=SPIN_US, help="as spin_us of proxy.yaml (default: %(default)s)")
+    parser.add_argument(
+        "--spin-us", type=int, default=SPIN_US, help="as busy_poll_us of proxy.yaml (default: %(default)s)"
+    )
     run_bench(parser, measure)

@@ -21,7 +21,7 @@ from priority_endpoint import End, Timer
 from report import percentile
 
 from gdp.client.publisher import Publisher
-from gdp.nodes.allocator import settle_memory
+from gdp.nodes.memory_tuning import tune_memory
 
 __all__ = ["BACKLOG", "MESSAGE_BYTES", "main", "topics"]
 
@@ -111,7 +111,7 @@ def send(end: End, settings: Settings) -> None:
     if not settings["bundles"]:
         for publisher in publishers:
             publisher.bundle_bytes = 0
-    settle_memory()
+    tune_memory()
     if not end.runtime.run(lambda: all(each.readers for each in publishers), time.monotonic() + _PATIENCE_S):
         raise TimeoutError("nobody reads: the overlay did not come up")
     sender = _Sender(end, publishers, float(settings["seconds"]))
@@ -135,7 +135,7 @@ def read(end: End, settings: Settings) -> None:
         while open_topics and not end.runtime.is_stopped:
             end.runtime.step(time.monotonic() + _PATIENCE_S)
             now_ns = time.monotonic_ns()
-            for each in end.member.take_messages():
+            for each in end.member.poll_messages():
                 what, due_ns = _MESSAGE.unpack(each.delivered.message)
                 if what == _LAST:
                     open_topics.discard(each.topic)
@@ -151,7 +151,7 @@ def read(end: End, settings: Settings) -> None:
             seals=len(seals),
             p50_s=percentile(latencies_s, 0.5),
             p99_s=percentile(latencies_s, 0.99),
-            lost=sum(feed.lost for feed in end.member.feeds()),
+            lost=sum(feed.lost for feed in end.member.writer_proxies()),
             drops=end.drops(),
         )
         while not end.runtime.is_stopped:  # the last confirmations

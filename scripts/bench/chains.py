@@ -20,7 +20,7 @@ from rate_search import Try
 from worker import Worker, floats, integer, number
 
 from gdp.host import netns_files
-from gdp.host.run_registry import Runs
+from gdp.host.run_registry import RunRegistry
 from gdp.simulation.namespaces import Namespaces
 from gdp.simulation.topology import chain
 
@@ -44,7 +44,7 @@ class Chain:
         LocalError: the kernel refuses.
     """
 
-    def __init__(self, runs: Runs, switches: int, mtu: int, *, pin: bool = True) -> None:
+    def __init__(self, runs: RunRegistry, switches: int, mtu: int, *, pin: bool = True) -> None:
         self.switches = switches
         self._undo = ExitStack()
         with ExitStack() as undo:

@@ -48,7 +48,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gdp.errors import GdpError
-from gdp.host.run_registry import Runs
+from gdp.host.run_registry import RunRegistry
 
 SECONDS: Final = 60.0
 AFTER_S: Final = 8.0  # that everything is watched after the last fault
@@ -100,7 +100,7 @@ class Chaos:
             FailedError: not in time.
         """
         end_s = time.monotonic() + SETTLE_S
-        while missing := self._unheard():
+        while missing := self._unreachable():
             if time.monotonic() > end_s:
                 raise FailedError(f"before any fault, nothing came: {', '.join(missing)}")
             self._watch(time.monotonic() + LOOK_S)
@@ -129,7 +129,7 @@ class Chaos:
         self._watch(time.monotonic() + AFTER_S)
         self.waited_share = (_waited_s() - waited_s) / (time.monotonic() - begun_s)
 
-    def verdict(self, limit_s: float) -> list[str]:
+    def ack(self, limit_s: float) -> list[str]:
         """Return what broke, in words."""
         last_ns, end_ns = self.moments[-1][0] if self.moments else self.begun_ns, time.monotonic_ns()
         found = [f"{who} ended by itself" for who in self._overlay.died()]
@@ -165,7 +165,7 @@ class Chaos:
         is_revoked = member == VICTIM and self.revoked_ns is not None
         return life == self._overlay.life(f"member {member}") and not is_revoked
 
-    def _unheard(self) -> list[str]:
+    def _unreachable(self) -> list[str]:
         silent = [
             f"{self._plan.flows[channel].topic} at {reader}"
             for channel, _, reader in self._oracle.pairs()
@@ -305,7 +305,7 @@ def _moments(faults: list[Fault]) -> Iterator[tuple[float, Fault, bool]]:
     return iter(sorted([*begins, *ends], key=lambda each: (each[0], not each[2])))
 
 
-def run_seed(runs: Runs, seed: int, options: argparse.Namespace) -> list[str]:
+def run_seed(runs: RunRegistry, seed: int, options: argparse.Namespace) -> list[str]:
     """Run one seed; print its table; return what broke.
 
     Raises:
@@ -329,7 +329,7 @@ def run_seed(runs: Runs, seed: int, options: argparse.Namespace) -> list[str]:
         progress(f"everything is delivered after {time.monotonic() - begun_s:.1f} s; {len(faults)} faults")
         try:
             chaos.run()
-            broke = chaos.verdict(options.limit_s)
+            broke = chaos.ack(options.limit_s)
         except FailedError as error:
             broke = [str(error)]
         _show(seed, chaos)
@@ -435,7 +435,7 @@ def main() -> None:
     """Run seeds; exit 1 when one broke."""
     options = arguments().parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
-    runs = Runs()
+    runs = RunRegistry()
     runs.sweep()  # what a killed run left
     broken: list[int] = []
     for seed in _seeds(options.seed or [1], options.hours, time.monotonic):

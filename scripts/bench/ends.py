@@ -21,7 +21,7 @@ from itertools import repeat
 from typing import Final, NamedTuple
 
 from gdp.frame.codec import ETHER_BYTES
-from gdp.ports.batch import SLOTS, Batch, make_batch
+from gdp.ports.mmsg import SLOTS, MmsgPool, make_batch
 from gdp.ports.sockets import kernel_drops
 
 __all__ = ["Counted", "Sent", "answer_pings", "count_frames", "open_end", "ping", "send", "spread_frames"]
@@ -82,7 +82,7 @@ def open_end(ifname: str, ethertype: int, *, cut_bytes: int = 0) -> socket.socke
     return opened
 
 
-def _batches(frames: list[bytes]) -> list[Batch]:
+def _batches(frames: list[bytes]) -> list[MmsgPool]:
     """Return full batches that go through the frames in turn."""
     many = frames * (-(-SLOTS // len(frames)))
     filled = []
@@ -112,15 +112,15 @@ def send(ifname: str, frames: list[bytes], rate: float | None, seconds: float) -
         return Sent(sent, sum(drops), start_s, time.monotonic(), time.process_time() - cpu_s)
 
 
-def _flat_out(sock: socket.socket, batches: list[Batch], head: bytes, drops: list[int], until_s: float) -> int:
+def _flat_out(sock: socket.socket, batches: list[MmsgPool], head: bytes, drops: list[int], until_s: float) -> int:
     sent = 0
     while time.monotonic() < until_s:
         for batch in batches:
-            sent += batch.put(sock, 0, SLOTS, head, drops)
+            sent += batch.forward(sock, 0, SLOTS, head, drops)
     return sent
 
 
-def _paced(sock: socket.socket, batches: list[Batch], head: bytes, drops: list[int], rate: float, total: int) -> int:
+def _paced(sock: socket.socket, batches: list[MmsgPool], head: bytes, drops: list[int], rate: float, total: int) -> int:
     burst = max(1, min(SLOTS, int(rate / 1000)))
     offered, sent, turn, start_s = 0, 0, 0, time.monotonic()
     while offered < total:
@@ -128,7 +128,7 @@ def _paced(sock: socket.socket, batches: list[Batch], head: bytes, drops: list[i
         if behind < burst:
             time.sleep((burst - behind) / rate)
             continue
-        sent += batches[turn % len(batches)].put(sock, 0, burst, head, drops)
+        sent += batches[turn % len(batches)].forward(sock, 0, burst, head, drops)
         offered += burst
         turn += 1
     return sent
@@ -148,7 +148,7 @@ def count_frames(ifname: str, ethertype: int, ready: Callable[[], None], asked: 
     with open_end(ifname, ethertype, cut_bytes=_SLOT_BYTES) as sock:
         ready()
         while True:
-            came = len(batch.take(sock))
+            came = len(batch.receive(sock))
             if came:
                 got += came
                 last_s = time.monotonic()

@@ -37,7 +37,7 @@ from report import Rounds, Target, percentile, progress
 from skeleton import Options, Outcome, command_line, run_bench
 
 from gdp.errors import LocalError
-from gdp.host.run_registry import Runs
+from gdp.host.run_registry import RunRegistry
 
 PINGS: Final = 1_000
 SIZES: Final = {1_500: (128, 1_400), 9_000: (8_900,)}
@@ -147,7 +147,7 @@ def targets_of(over: Rounds) -> list[Target]:
     ]
 
 
-def measure(options: Options, runs: Runs) -> Outcome:
+def measure(options: Options, runs: RunRegistry) -> Outcome:
     """Measure every baseline in every chain, round by round."""
     if options.realtime:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))

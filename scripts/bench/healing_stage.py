@@ -18,10 +18,10 @@ from typing import Final, TypeVar
 from peers.process import FailedError, Started
 from report import progress
 
-from fog.providers.local import trouble
+from fog.providers.local import fault_injection
 from fog.site import open_site
 from fog.supervisor.background import pid_of
-from fog.supervisor.ground import local_provider
+from fog.supervisor.infrastructure import local_provider
 from fog.supervisor.journal import Journal
 from fog.supervisor.record import Record
 from fog_demo.stage import ENVIRONMENT, STATE, end_all_of, fog_command, standing_runs, sweep
@@ -110,15 +110,15 @@ class Cluster:
 
     def freeze(self, machine: Record) -> None:
         """Stop all of a machine where it is."""
-        trouble.freeze(self._runs, machine.id)
+        fault_injection.freeze(self._runs, machine.id)
 
     def notice(self, machine: Record, seconds: float) -> None:
         """Give a machine notice."""
-        trouble.notice(self._runs, machine.id, seconds)
+        fault_injection.notice(self._runs, machine.id, seconds)
 
     def kill(self, machine: Record) -> None:
         """Kill all of a machine, and unplug it."""
-        trouble.kill(self._runs, machine.id)
+        fault_injection.kill(self._runs, machine.id)
 
     def kill_supervisor(self) -> None:
         """Kill the supervisor; return when it is gone."""

@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.table import Table
 from skeleton import clean_exit, command_line, new_run
 
-from gdp.host.run_registry import Runs
+from gdp.host.run_registry import RunRegistry
 
 OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks" / "hellos.json"
 TARGET: Final = 1.0  # percent of a core
@@ -47,7 +47,7 @@ def processor_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) * _TICK_S
 
 
-def measure(runs: Runs, neighbours: int, seconds: float, rounds: int, keepalive_ms: int | None) -> list[float]:
+def measure(runs: RunRegistry, neighbours: int, seconds: float, rounds: int, keepalive_ms: int | None) -> list[float]:
     """Return the percent of a core that the switch in the middle took, one figure a round."""
     more = {} if keepalive_ms is None else {"switch": {"keepalive_ms": keepalive_ms}}
     with new_run(runs) as run, Overlay(run, plan(neighbours), more=more) as overlay:
@@ -67,7 +67,7 @@ def main() -> None:
     parser.add_argument("--neighbours", type=int, default=20)
     parser.add_argument("--no-save", action="store_true", help=f"do not write {OUTPUT.name}")
     options = parser.parse_args()
-    state, runs = machine_state(), Runs()
+    state, runs = machine_state(), RunRegistry()
     runs.sweep()
     found: dict[str, list[float]] = {}
     with clean_exit():

@@ -20,8 +20,8 @@ from peers.gdp_net import GdpNet
 from peers.rounds import Plan, Turns
 from skeleton import Options, Outcome, command_line, run_bench
 
-from gdp.host.run_registry import Runs
-from gdp.nodes.spin import SPIN_US
+from gdp.host.run_registry import RunRegistry
+from gdp.nodes.busy_poll import SPIN_US
 
 ENCODING: Final = "cdr"
 RATIO_MAX: Final = 1.05
@@ -35,15 +35,17 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--size", type=size_of, default=100, help="bytes of a message (default: %(default)s)")
     parser.add_argument("--mtu", type=int, default=1_500, help="bytes after the Ethernet header")
     parser.add_argument("--plane", choices=("kernel", "raw"), default="raw", help="of the switches")
-    parser.add_argument("--spin-us", type=int, default=SPIN_US, help="as spin_us of proxy.yaml (default: %(default)s)")
+    parser.add_argument(
+        "--spin-us", type=int, default=SPIN_US, help="as busy_poll_us of proxy.yaml (default: %(default)s)"
+    )
     parser.add_argument("--json", type=Path, help="write all figures here")
     return parser
 
 
-def measure(options: Options, runs: Runs) -> Outcome:
+def measure(options: Options, runs: RunRegistry) -> Outcome:
     """Measure both paths in turn, round by round."""
     library, internal = (
-        GdpNet(options.plane, (ENCODING,), options.spin_us / 1e6, path) for path in ("library", "internal")
+        GdpNet(options.plane, (ENCODING,), options.busy_poll_us / 1e6, path) for path in ("library", "internal")
     )
     load = Load((options.size,), options.count)
     plan = Plan((options.mtu,), (False,), (internal, library), load, options.rounds)

@@ -36,8 +36,8 @@ from plot import Panel, panel_of
 from report import Rounds
 from skeleton import Options, Outcome, command_line, parse, perform
 
-from gdp.host.run_registry import Runs
-from gdp.nodes.spin import SPIN_US
+from gdp.host.run_registry import RunRegistry
+from gdp.nodes.busy_poll import SPIN_US
 
 SIZES: Final = (100, 10_000, 921_600)
 MTUS: Final = (1_500, 9_000)
@@ -78,7 +78,9 @@ def arguments(names: Sequence[str]) -> argparse.ArgumentParser:
     parser.add_argument("--size", type=size_of, action="append", help="bytes of a message; may be repeated")
     parser.add_argument("--offloads", choices=("off", "on", "both"), default="both", help="of the veth devices")
     parser.add_argument("--encoding", action="append", choices=ENCODINGS, help="of ours; may be repeated")
-    parser.add_argument("--spin-us", type=int, default=SPIN_US, help="as spin_us of proxy.yaml (default: %(default)s)")
+    parser.add_argument(
+        "--spin-us", type=int, default=SPIN_US, help="as busy_poll_us of proxy.yaml (default: %(default)s)"
+    )
     parser.add_argument("--realtime", action="store_true", help="SCHED_FIFO for all: what else runs does not disturb")
     parser.add_argument("--json", type=Path, help="write all figures here")
     parser.add_argument("--plot", type=Path, help="draw them here (PNG)")
@@ -114,13 +116,13 @@ def plan_of(options: argparse.Namespace) -> Plan:
     return Plan(
         tuple(options.mtu or MTUS),
         {"off": (False,), "on": (True,), "both": (False, True)}[options.offloads],
-        baselines_of(options.only or (), tuple(options.encoding or ENCODINGS), options.spin_us / 1e6),
+        baselines_of(options.only or (), tuple(options.encoding or ENCODINGS), options.busy_poll_us / 1e6),
         Load(tuple(options.size or SIZES), QUICK_COUNT if options.quick else options.count),
         1 if options.quick else options.rounds,
     )
 
 
-def measure(options: Options, runs: Runs) -> Outcome:
+def measure(options: Options, runs: RunRegistry) -> Outcome:
     """Measure every baseline in every case, round by round."""
     plan = plan_of(options)
     if options.realtime:
@@ -137,7 +139,7 @@ def measure(options: Options, runs: Runs) -> Outcome:
             "messages a round": [plan.load.repeats(size) for size in plan.load.sizes],
             "answer, B": ANSWER.size,
             "scheduler": "SCHED_FIFO" if options.realtime else "ordinary",
-            "ends of gdp spin, us": options.spin_us,
+            "ends of gdp spin, us": options.busy_poll_us,
             "shared memory": "off everywhere",
             **{f"offloads {'on' if on else 'off'}": text for on, text in turns.offload_states.items()},
             "trouble": turns.notes or "none",

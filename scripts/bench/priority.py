@@ -33,8 +33,8 @@ from report import Rounds, Target, percentile
 from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, run_bench
 from testbed import MIDDLE, Lab, MemberRow, make_topology
 
-from gdp.host.run_registry import Run, Runs
-from gdp.nodes.spin import SPIN_US
+from gdp.host.run_registry import Run, RunRegistry
+from gdp.nodes.busy_poll import SPIN_US
 from gdp.trust.right import Right
 
 MTU: Final = 1_500
@@ -109,7 +109,7 @@ def measure_row(run: Run, plane: str, link: str, recorder: Recorder, number: int
     bound_ms: float | None = None
     with MemberRow(lab, "priority_endpoint", rights, plane=plane) as members:
         for flood in FLOODS:
-            work = partial(measure_flood, members, flood, options.seconds, options.spin_us / 1e6)
+            work = partial(measure_flood, members, flood, options.seconds, options.busy_poll_us / 1e6)
             trial = Trial(case, flood, columns, lambda _, work=work: work())  # type: ignore[misc]
             found = recorder.attempt(trial, number, options.rounds)
             if flood == IDLE and found:
@@ -140,7 +140,7 @@ def panels_of(over: Rounds, cases: Sequence[str]) -> list[Panel]:
     return [panel_of(over, case, MEDIAN, list(FLOODS), p99=P99, ours=list(FLOODS)) for case in cases]
 
 
-def measure(options: Options, runs: Runs) -> Outcome:
+def measure(options: Options, runs: RunRegistry) -> Outcome:
     """Measure every plane on every link, round by round."""
     recorder, rows = Recorder(), [(each, on) for each in options.only or PLANES for on in options.link or LINKS]
     for number in range(1, options.rounds + 1):
@@ -159,7 +159,7 @@ def measure(options: Options, runs: Runs) -> Outcome:
             "MTU": MTU,
             "one frame's time at 100 Mbit/s, ms": round(FRAME_MS["shaped"], 3),
             "scheduler": "SCHED_FIFO" if options.realtime else "ordinary",
-            "ends spin, us": options.spin_us,
+            "ends spin, us": options.busy_poll_us,
             "trouble": recorder.notes or "none",
         },
         lambda: panels_of(over, cases),
@@ -178,6 +178,8 @@ if __name__ == "__main__":
     )
     parser.add_argument("--only", action="append", choices=PLANES, help="this data plane")
     parser.add_argument("--link", action="append", choices=list(LINKS), help="on such links")
-    parser.add_argument("--spin-us", type=int, default=SPIN_US, help="as spin_us of proxy.yaml (default: %(default)s)")
+    parser.add_argument(
+        "--spin-us", type=int, default=SPIN_US, help="as busy_poll_us of proxy.yaml (default: %(default)s)"
+    )
     parser.add_argument("--realtime", action="store_true", help="SCHED_FIFO: what else runs does not disturb")
     run_bench(parser, measure)

@@ -20,15 +20,15 @@ from typing import Final
 
 from peers.jsonl import say
 
-from gdp.client.member import Member, Topic
+from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.errors import DropReason, LocalError
 from gdp.names import Name
-from gdp.nodes.allocator import settle_memory
 from gdp.nodes.config import RibConfig
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
+from gdp.nodes.memory_tuning import tune_memory
 from gdp.nodes.runtime import Runtime
 from gdp.ports.raw import RawPlane
 from gdp.stores.keyring import load_delegations
@@ -87,7 +87,7 @@ class End:
     def __init__(self, config: Path, spin_s: float) -> None:
         settings = RibConfig.load(config)  # identity, domain and iface are all that an end needs
         identity, policy = load_member(settings.identity, settings.domain, Role.PROXY)
-        self.member = Member(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes))
+        self.member = Participant(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes))
         self.plane = RawPlane([settings.iface])
         self.runtime = Runtime(self.member, self.plane, spin_s=spin_s)
         self._topics: dict[str, Topic] = {}
@@ -183,7 +183,7 @@ def tick(end: End, settings: Mapping[str, str | float]) -> None:
     """Be A: tick, and flood if asked to."""
     control = end.advertise(CONTROL, reliable=True, urgent=True)
     flood = Flood(end, str(settings["flood"]))
-    settle_memory()
+    tune_memory()
     if not end.runtime.run(lambda: control.readers > 0 and flood.is_ready, time.monotonic() + _PATIENCE_S):
         raise TimeoutError("nobody reads: the overlay did not come up")
     seconds = float(settings["seconds"])
@@ -223,7 +223,7 @@ def read(end: End) -> None:
         while not end.runtime.is_stopped:
             end.runtime.step(time.monotonic() + _PATIENCE_S)
             now_ns = time.monotonic_ns()
-            for each in end.member.take_messages():
+            for each in end.member.poll_messages():
                 if each.topic != control:
                     images += 1
                     continue

@@ -30,7 +30,7 @@ from plot import Panel, panel_of
 from report import Rounds, Target, progress
 from skeleton import Options, Outcome, command_line, run_bench
 
-from gdp.host.run_registry import Runs
+from gdp.host.run_registry import RunRegistry
 
 PREEMPTED, KILLED, FROZEN, SUPERVISOR = "preempted", "killed", "frozen", "supervisor"
 DEDICATED, REPLICA = "dedicated", "replica"
@@ -114,7 +114,7 @@ def panels_of(over: Rounds) -> list[Panel]:
     ]
 
 
-def measure(options: Options, runs: Runs) -> Outcome:
+def measure(options: Options, runs: RunRegistry) -> Outcome:
     """Measure every case, round by round."""
     del runs  # the cluster has runs of its own
     is_replica = options.gateway == REPLICA

@@ -35,7 +35,7 @@ from plot import Panel, panel_of  # noqa: E402
 from report import Rounds, Target, percentile, progress  # noqa: E402
 from skeleton import Options, Outcome, command_line, new_run, run_bench  # noqa: E402
 
-from gdp.host.run_registry import Runs  # noqa: E402
+from gdp.host.run_registry import RunRegistry  # noqa: E402
 
 KILLED, ADDED, HEDGED = "killed", "added", "hedged"
 CASES: Final = {
@@ -141,7 +141,7 @@ class Bench:
         over: the figures.
     """
 
-    def __init__(self, runs: Runs, rate: float, draw: random.Random) -> None:
+    def __init__(self, runs: RunRegistry, rate: float, draw: random.Random) -> None:
         self._runs = runs
         self._rate = rate
         self._draw = draw
@@ -221,7 +221,7 @@ def panels_of(over: Rounds) -> list[Panel]:
     ]
 
 
-def measure(options: Options, runs: Runs) -> Outcome:
+def measure(options: Options, runs: RunRegistry) -> Outcome:
     """Measure the parts in turn, round by round."""
     bench = Bench(runs, options.rate, random.Random(options.seed))
     parts = {KILLED: bench.killed, ADDED: bench.added, HEDGED: bench.hedged}

@@ -32,26 +32,26 @@ from report import percentile, progress
 from rich.console import Console
 from rich.table import Table
 
+from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
-from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
-from gdp.effects import Instant
 from gdp.errors import GdpError, LocalError, StoreError
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.nodes.config import ClusterConfig
 from gdp.rib.route import Route
+from gdp.sansio import Timestamps
 from gdp.stores.cluster import ClusterStore, load_functions
 from gdp.stores.cluster_link import ClusterLink
 from gdp.trust.adcert import AdCert
-from gdp.trust.claim import Claim, make_claim
+from gdp.trust.advertisement import Advertisement, sign_advertisement
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
-from gdp.trust.verifier import ClaimVerifier
+from gdp.trust.verifier import AdvertisementVerifier
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 OUTPUT: Final = ROOT / "docs" / "benchmarks" / "rib_cluster.json"
@@ -91,7 +91,7 @@ class Field:
 
     def __init__(self) -> None:
         self.validity = Validity.lasting(time.time(), 86_400)
-        self.authority = DomainAuthority.found("bench", SigningKey.generate(), self.validity)
+        self.authority = CertificateAuthority.create("bench", SigningKey.generate(), self.validity)
         self.switch, self.proxy = self._node(Role.SWITCH, "s"), self._node(Role.PROXY, "p")
         self.owner = SigningKey.generate()
         self.rtcert = RtCert.make(self.proxy, self.switch.name, self.validity)
@@ -99,8 +99,8 @@ class Field:
     def _node(self, role: Role, label: str) -> Identity:
         return NodeKeys.generate(role, label).join(self.authority, self.validity)
 
-    def verifier(self) -> ClaimVerifier:
-        return ClaimVerifier(Policy(self.authority.root))
+    def verifier(self) -> AdvertisementVerifier:
+        return AdvertisementVerifier(Policy(self.authority.root))
 
     def about(self, number: int) -> Subject:
         return Subject.of(Metadata({"kind": "topic", "name": f"/topic/{number}"}), self.owner.public.compressed)
@@ -108,24 +108,26 @@ class Field:
     def name(self, number: int) -> Name:
         return self.about(number).name
 
-    def claim(self, number: int, sequence: int = 1) -> bytes:
+    def advertisement(self, number: int, sequence: int = 1) -> bytes:
         about = self.about(number)
         adcert = AdCert.make(
             self.owner, about.name, about, self.proxy.subject, {Right.PUBLISH}, self.validity, may_delegate=False
         )
-        return make_claim(
+        return sign_advertisement(
             self.proxy, Right.PUBLISH, about,
             rtcert=self.rtcert, sequence=sequence, incarnation=1, lease_s=LEASE_S, is_global=False, chain=(adcert,),
         )  # fmt: skip
 
-    def route(self, claim: Claim, now: Instant) -> Route:
+    def route(self, advertisement: Advertisement, now: Timestamps) -> Route:
         domain = self.authority.root.domain
         expires_s = now.mono_s + LEASE_S
-        return Route.of(claim, sender=self.switch.name, domain=domain, via=domain, transit=(), expires_s=expires_s)
+        return Route.of(
+            advertisement, sender=self.switch.name, domain=domain, via=domain, transit=(), expires_s=expires_s
+        )
 
 
-def now() -> Instant:
-    return Instant(time.monotonic(), time.time())
+def now() -> Timestamps:
+    return Timestamps(time.monotonic(), time.time())
 
 
 def put(store: ClusterStore, field_: Field, numbers: range, sequence: int = 1) -> None:
@@ -137,7 +139,7 @@ def put(store: ClusterStore, field_: Field, numbers: range, sequence: int = 1) -
     verifier, at = field_.verifier(), now()
     store.prefetch([field_.name(number) for number in numbers], at)
     for number in numbers:
-        store.put(field_.route(verifier.verify(field_.claim(number, sequence), at.unix_s), at))
+        store.put(field_.route(verifier.verify(field_.advertisement(number, sequence), at.unix_s), at))
     if refused := store.commit():
         raise LocalError(f"the cluster did not take {len(refused)} of {len(numbers)} names")
 

@@ -18,19 +18,19 @@ from table_fill import resident_bytes
 
 from gdp.control.query import Query
 from gdp.control.relay import Relay
+from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
-from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
-from gdp.effects import Instant
 from gdp.errors import LocalError
 from gdp.metadata import Metadata
-from gdp.rib.machine import Rib, RibSettings
+from gdp.rib.core import RibCore, RibSettings
 from gdp.rib.store import MemoryStore
+from gdp.sansio import Timestamps
 from gdp.trust.adcert import AdCert
-from gdp.trust.claim import make_claim
+from gdp.trust.advertisement import sign_advertisement
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
@@ -54,7 +54,7 @@ def advertisements(count: int, validity: Validity, proxy: Identity, switch: Iden
     for number in range(count):
         about = Subject.of(topic(number), owner.public.compressed)
         adcert = AdCert.make(owner, about.name, about, proxy.subject, {Right.PUBLISH}, validity, may_delegate=False)
-        claim = make_claim(
+        advertisement = sign_advertisement(
             proxy,
             Right.PUBLISH,
             about,
@@ -65,7 +65,7 @@ def advertisements(count: int, validity: Validity, proxy: Identity, switch: Iden
             is_global=False,
             chain=(adcert,),
         )
-        made.append(Relay(claim, (), switch.membership).to_wire(switch.name, switch.key))
+        made.append(Relay(advertisement, (), switch.membership).to_wire(switch.name, switch.key))
     return made
 
 
@@ -82,15 +82,15 @@ def measure(names: int) -> Load:
     """
     unix_s = time.time()
     validity = Validity.lasting(unix_s, 86_400)
-    authority = DomainAuthority.found("bench", SigningKey.generate(), validity)
+    authority = CertificateAuthority.create("bench", SigningKey.generate(), validity)
 
     def node(role: Role, label: str) -> Identity:
         return NodeKeys.generate(role, label).join(authority, validity)
 
     switch, proxy, me, owner = node(Role.SWITCH, "s"), node(Role.PROXY, "p"), node(Role.RIB, "r"), SigningKey.generate()
     wires = advertisements(names, validity, proxy, switch, owner)
-    now = Instant(1_000.0, unix_s)
-    rib = Rib(me, Policy(authority.root), MemoryStore(), RibSettings())
+    now = Timestamps(1_000.0, unix_s)
+    rib = RibCore(me, Policy(authority.root), MemoryStore(), RibSettings())
     gc.collect()
     before, begun_s = resident_bytes(), time.process_time()
     for wire in wires:
@@ -98,7 +98,7 @@ def measure(names: int) -> Load:
     taken_s = time.process_time() - begun_s
     if rib.accepted != names:
         raise LocalError(f"the RIB took {rib.accepted} of {names} advertisements: {rib.refusals}")
-    rib.take()
+    rib.statements_to_send()
     gc.collect()
     grown = resident_bytes() - before
     name = topic(7).name(owner.public.compressed)

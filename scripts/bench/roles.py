@@ -18,11 +18,11 @@ from table_fill import ENTRY_LEASE_S, fill, resident_bytes
 from worker import answer, command, command_waits, integer
 
 from gdp.errors import DropReason, LocalError
-from gdp.ports.linked import LinkedPlane
+from gdp.ports.netdev import NetdevPlane
 from gdp.switch.table import Table
 
 
-def make_plane(kind: str, ifnames: list[str], table: Table, entries_max: int) -> LinkedPlane:
+def make_plane(kind: str, ifnames: list[str], table: Table, entries_max: int) -> NetdevPlane:
     """Return a plane by its name in the benches.
 
     Raises:

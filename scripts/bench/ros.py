@@ -28,7 +28,7 @@ from report import Rounds, Target
 from ros_row import LEFT, READY_S, RIGHT, Carried, Row
 from ros_stage import DIRECT, Bench, Options, Turn, parse, perform
 
-from proxy.config import Encoding
+from proxy.config.config import Encoding
 
 MODULE: Final = "ros_topics"
 LOST: Final = "lost"

@@ -38,7 +38,7 @@ from testbed import SOCKET_BUFFER_BYTES as BUFFER_BYTES
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
 from gdp.trust.right import Right
-from proxy.config import Encoding
+from proxy.config.config import Encoding
 
 __all__ = ["BUFFER_BYTES", "DIRECT_DOMAIN", "LEFT", "READY_S", "RIGHT", "Carried", "Row"]
 
@@ -100,7 +100,7 @@ class Row:
             undo.callback(self._nodes.close)
             proxies = []
             for node in (LEFT, RIGHT):
-                argv = ["-m", "proxy.cli", "--config", self._admit(node, carried)]
+                argv = ["-m", "proxy.cli.proxy", "--config", self._admit(node, carried)]
                 environment = self._nodes.ros_environment(_DOMAINS[node])
                 proxies.append(undo.enter_context(self._lab.start(node, "proxy", argv, environment)))
             for proxy in proxies:

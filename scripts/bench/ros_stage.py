@@ -20,7 +20,7 @@ from report import Rounds, Target
 from ros_row import BUFFER_BYTES, Carried, Row
 from skeleton import Options
 
-from gdp.host.run_registry import Runs
+from gdp.host.run_registry import RunRegistry
 
 __all__ = ["DIRECT", "Bench", "Options", "Turn", "parse", "perform"]
 
@@ -72,7 +72,7 @@ def perform(bench: Bench, options: Options) -> None:
     skeleton.perform(options, partial(_measure, bench))
 
 
-def _measure(bench: Bench, options: Options, runs: Runs) -> skeleton.Outcome:
+def _measure(bench: Bench, options: Options, runs: RunRegistry) -> skeleton.Outcome:
     recorder = skeleton.Recorder()
     with ExitStack() as stack:
         rows = {}

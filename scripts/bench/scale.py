@@ -38,7 +38,7 @@ from skeleton import Options, Outcome, command_line, run_bench
 from worker import Worker, number
 
 from gdp.errors import LocalError
-from gdp.host.run_registry import Runs
+from gdp.host.run_registry import RunRegistry
 
 PLANES: Final = ("kernel", "raw")
 SIZES: Final = (1_000, 100_000, 1_000_000)
@@ -124,7 +124,7 @@ def targets_of(over: Rounds, sizes: Sequence[int], rib_names: int) -> list[Targe
     ]
 
 
-def measure(options: Options, runs: Runs) -> Outcome:
+def measure(options: Options, runs: RunRegistry) -> Outcome:
     """Measure both planes and the RIB, round by round."""
     sizes, rib_names = ((1_000, 10_000), 300) if options.quick else (SIZES, 3_000)
     over = Rounds()

@@ -39,7 +39,7 @@ from peers.process import FailedError
 from report import Rounds, Target, progress, show
 from worker import Worker
 
-from gdp.host.run_registry import Runs
+from gdp.host.run_registry import RunRegistry
 
 __all__ = ["add_arguments", "run"]
 
@@ -217,7 +217,7 @@ def _line(end: subprocess.Popen[str], asked: str | None = None) -> str:
 
 def _forwarding(tree: Tree, _: argparse.Namespace) -> Figures:
     found: Figures = {}
-    runs = Runs()
+    runs = RunRegistry()
     runs.sweep()
     with Chain(runs, 1, 1_500) as chain:
         for name in ("kernel", "raw"):

@@ -47,18 +47,18 @@ from report import progress
 from rich.console import Console
 from rich.table import Table
 
-from gdp.control.frames import ControlSplitter
+from gdp.control.fragments import ControlFragmenter
 from gdp.control.hello import ECHO_BYTES, LIFE_BYTES, NONCE_BYTES, Hello
+from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
-from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.validity import Validity
 from gdp.frame.codec import KIND_AT
 from gdp.frame.kinds import Kind
 from gdp.host import netns_files
-from gdp.host.run_registry import Run, Runs
-from gdp.ports.link import LinkWatch
+from gdp.host.run_registry import Run, RunRegistry
+from gdp.ports.rtnetlink import LinkMonitor
 from gdp.stores.keyring import load_identity
 
 __all__ = ["add_arguments", "run"]
@@ -136,7 +136,7 @@ def hellos(kind: str, overlay: Overlay) -> list[bytes]:
     members = [load_identity(directory / f"switch-{each}", time.time()) for each in overlay.plan.switches]
     if kind == "fresh":
         now_s = int(time.time())
-        authority = DomainAuthority.found("stranger", SigningKey.generate(), Validity(now_s - 60, now_s + 86_400))
+        authority = CertificateAuthority.create("stranger", SigningKey.generate(), Validity(now_s - 60, now_s + 86_400))
         members = [
             NodeKeys.generate(Role.PROXY, f"x{number}").join(authority, Validity(now_s - 60, now_s + 86_400))
             for number in range(_FRAMES // 10)
@@ -154,7 +154,7 @@ def _hello(member: Identity, key: SigningKey | None) -> list[bytes]:
         exchange_key=secrets.token_bytes(32), life=secrets.token_bytes(LIFE_BYTES),
     )  # fmt: skip
     wire = hello.to_wire(member.name, key or member.key)
-    return ControlSplitter(member.name, secrets.randbits(64)).split(Kind.HELLO, wire, _MTU)
+    return ControlFragmenter(member.name, secrets.randbits(64)).split(Kind.HELLO, wire, _MTU)
 
 
 def memory_mib(pid: int) -> float:
@@ -240,7 +240,7 @@ def phase(overlay: Overlay, kind: str, seconds: float) -> Phase:
 
 
 def measure(
-    runs: Runs, plane: str, kinds: Sequence[str], seconds: float, rate: float, rounds: int, *, spoof: bool
+    runs: RunRegistry, plane: str, kinds: Sequence[str], seconds: float, rate: float, rounds: int, *, spoof: bool
 ) -> dict[str, list[dict[str, Phase]]]:
     """Return for each kind of flood what each round showed, calm and flooded."""
     run = runs.start()
@@ -306,8 +306,8 @@ def _address_of(overlay: Overlay) -> str:
 
 
 def _own_address() -> bytes:
-    with closing(LinkWatch()) as links:
-        link = links.ask(_VICTIM)
+    with closing(LinkMonitor()) as links:
+        link = links.get(_VICTIM)
     assert link is not None
     return link.mac
 
@@ -324,12 +324,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
     """Measure every plane with every kind of flood; return the figures, and whether the targets were met."""
-    runs = Runs()
+    runs = RunRegistry()
     runs.sweep()
     verified = verifications_hz()
     rate = options.rate or TIMES * verified
-    heads = ("goodput, ratio", "lost", "memory, MiB", "core", "restart, s", "backlog drops", "waited", "reached")
-    table = Table("plane", "flood", *heads, title=f"{rate:,.0f} frames a second")
+    headers = ("goodput, ratio", "lost", "memory, MiB", "core", "restart, s", "backlog drops", "waited", "reached")
+    table = Table("plane", "flood", *headers, title=f"{rate:,.0f} frames a second")
     saved: dict[str, object] = {"verified_hz": verified, "rate_hz": rate}
     has_met = True
     for plane in options.planes:

@@ -48,21 +48,21 @@ from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from gdp.client.feed import Feed
 from gdp.client.rib_host import RibHost
+from gdp.client.writer_proxy import WriterProxy
 from gdp.control.boundary import ErrorBoundary
 from gdp.control.neighbour import NeighbourState
 from gdp.control.replica import Entry
-from gdp.effects import Arrival, Instant, Machine, Transmit
 from gdp.frame.codec import ETHER_BYTES, decode
 from gdp.frame.kinds import Kind
+from gdp.message.heartbeat import Heartbeat
 from gdp.message.replay import ReplayWindow
-from gdp.message.status import Status
 from gdp.rib.route import Route
-from gdp.simulation.memory import EPOCH_UNIX_S, MemoryNetwork
+from gdp.sansio import OutgoingFrames, ProtocolCore, ReceivedFrame, Timestamps
+from gdp.simulation.network import EPOCH_UNIX_S, SimNetwork
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
-from gdp.simulation.world import World
-from gdp.switch.claims import Claims
+from gdp.switch.advertisements import AdvertisementHandler
 from gdp.switch.table import Table as ForwardingTable
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
@@ -115,36 +115,36 @@ class Recorded:
 class _Stepped:
     """A machine whose wall clock is off."""
 
-    def __init__(self, machine: Machine, ahead_s: float) -> None:
+    def __init__(self, machine: ProtocolCore, ahead_s: float) -> None:
         self._machine = machine
         self._ahead_s = ahead_s
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._machine, name)
 
-    def _at(self, now: Instant) -> Instant:
-        return Instant(now.mono_s, now.unix_s + self._ahead_s)
+    def _at(self, now: Timestamps) -> Timestamps:
+        return Timestamps(now.mono_s, now.unix_s + self._ahead_s)
 
-    def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Instant) -> None:
+    def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Timestamps) -> None:
         self._machine.add_port(index, mac, mtu, cost, self._at(now))
 
-    def port_changed(self, port: int, up: bool, now: Instant) -> None:
+    def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
         self._machine.port_changed(port, up, self._at(now))
 
-    def receive(self, arrivals: Sequence[Arrival], now: Instant) -> None:
+    def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
         self._machine.receive(arrivals, self._at(now))
 
-    def timeout(self, now: Instant) -> None:
-        self._machine.timeout(self._at(now))
+    def timeout(self, now: Timestamps) -> None:
+        self._machine.handle_timer(self._at(now))
 
     def next_timeout(self) -> float | None:
-        return self._machine.next_timeout()
+        return self._machine.get_timer()
 
-    def take(self) -> list[Transmit]:
-        return self._machine.take()
+    def take(self) -> list[OutgoingFrames]:
+        return self._machine.frames_to_send()
 
 
-class RecordingNetwork(MemoryNetwork):
+class RecordingNetwork(SimNetwork):
     """Records what comes in where, and lets clocks jump and be off.
 
     Attributes:
@@ -156,14 +156,14 @@ class RecordingNetwork(MemoryNetwork):
     ahead_s = 0.0
 
     @property
-    def now(self) -> Instant:
-        return Instant(self._now_s, EPOCH_UNIX_S + self._now_s + self.ahead_s)
+    def now(self) -> Timestamps:
+        return Timestamps(self._now_s, EPOCH_UNIX_S + self._now_s + self.ahead_s)
 
     def jump(self, gap_s: float) -> None:
         """Let time go by in which nobody is alive."""
         self._now_s += gap_s
 
-    def replace(self, name: str, machine: Machine, table: ForwardingTable | None = None) -> None:
+    def replace(self, name: str, machine: ProtocolCore, table: ForwardingTable | None = None) -> None:
         stepped = _Stepped(machine, self.ahead_s) if self.ahead_s else machine
         ahead_s, self.ahead_s = self.ahead_s, 0.0
         super().replace(name, stepped, table)  # type: ignore[arg-type]
@@ -184,7 +184,7 @@ class Domain:
 
     seed: int
     rng: random.Random = field(init=False)
-    world: World = field(init=False)
+    world: Simulation = field(init=False)
     network: RecordingNetwork = field(init=False)
     flow: Flow = field(init=False)
     moved: Flow = field(init=False)
@@ -201,7 +201,9 @@ class Domain:
 
     def __post_init__(self) -> None:
         self.rng = random.Random(self.seed)
-        self.world = world = World(_TOPOLOGY, self.seed, hello_s=1.0, dead_s=3.6, lease_s=_LEASE_S, keepalive_ms=500)
+        self.world = world = Simulation(
+            _TOPOLOGY, self.seed, hello_s=1.0, dead_s=3.6, lease_s=_LEASE_S, keepalive_ms=500
+        )
         assert isinstance(world.network, RecordingNetwork)
         self.network = world.network
         self.network.records = self.records
@@ -359,7 +361,7 @@ class Domain:
     def play(self, tries: int, counts: Counter[str], *, is_live: bool, to: str | None = None) -> Iterator[None]:
         """Play back so many frames; yield now and then. ``to``: half of them are of what that member heard."""
         done = 0
-        heard = [each for each in self.records if each.node == to and each.kind in (Kind.STATUS, Kind.DATA)]
+        heard = [each for each in self.records if each.node == to and each.kind in (Kind.HEARTBEAT, Kind.DATA)]
         while done < tries:
             first = self.rng.choice(self.kinds[self.rng.choice(list(self.kinds))])
             chance = self.rng.random()
@@ -420,7 +422,7 @@ class Domain:
 
     def collect(self) -> None:
         """Take what was delivered."""
-        self.flow.got[READER] += [each.delivered for each in self.world.members[READER].take_messages()]
+        self.flow.got[READER] += [each.delivered for each in self.world.members[READER].poll_messages()]
         self.server.collect()
         self.client.collect()
 
@@ -471,33 +473,35 @@ class Domain:
         """Return where everybody is, whoever says what."""
         world = self.world
         at = {label: label.split("/")[0] for label in world.members} | {ROAMER: "b"}
-        claims = {
-            (claim.subject.name, member.name, world.identities[at[label]].name)
+        advertisements = {
+            (advertisement.subject.name, member.name, world.identities[at[label]].name)
             for label, member in world.members.items() if label != OUTCAST
-            for claim in member.attachment.claims if claim.right is not Right.READ
+            for advertisement in member.attachment.advertisements if advertisement.right is not Right.READ
         }  # fmt: skip
         last = {
             (switch.name, entry.state.scope, entry.state.sequence)
             for switch in world.switches.values()
             for (origin, _), entry in switch._flooding.link_states._entries.items() if origin == switch.name
         }  # fmt: skip
-        return {"attached": claims, "places": claims, "routes": claims, "link states": last}
+        return {"attached": advertisements, "places": advertisements, "routes": advertisements, "link states": last}
 
     def state(self) -> dict[str, set[Any]]:
         """Return what nodes believe."""
         world = self.world
-        hosts = {world.rib_node(label): host.attachment.greeter for label, host in world.ribs.items()}
-        members = {label: member.attachment.greeter for label, member in world.members.items() if label != OUTCAST}
-        greeters = {label: switch.greeter for label, switch in world.switches.items()} | hosts | members
+        hosts = {world.rib_node(label): host.attachment.hello_protocol for label, host in world.ribs.items()}
+        members = {
+            label: member.attachment.hello_protocol for label, member in world.members.items() if label != OUTCAST
+        }
+        greeters = {label: switch.hello_protocol for label, switch in world.switches.items()} | hosts | members
         switches = world.switches
         return {
             "neighbours": {
                 (node, port.index, each.name, each.mac)
-                for node, greeter in greeters.items() for port in greeter.ports.values()
+                for node, hello_protocol in greeters.items() for port in hello_protocol.ports.values()
                 for each in port.neighbours.values() if each.state is NeighbourState.UP
             },
             "attached": {
-                (each.claim.name, each.claim.node, switch.name)
+                (each.advertisement.name, each.advertisement.node, switch.name)
                 for switch in switches.values() for each in switch.attached.all()
             },
             "places": {
@@ -511,7 +515,7 @@ class Domain:
             },
             "trees": {
                 (node, tree.topic, tree.publisher, at)
-                for node, switch in switches.items() for tree in switch.planter.trees.all() for at in tree.branches
+                for node, switch in switches.items() for tree in switch.multicast.trees.all() for at in tree.branches
             },
             "link states": {
                 (origin, scope, entry.state.sequence)
@@ -528,9 +532,9 @@ def _always(value: Any) -> Callable[..., Any]:
     return lambda *_: value
 
 
-def _any_start(self: Feed, joined: Any, epoch: int, now_s: float) -> None:
+def _any_start(self: WriterProxy, joined: Any, epoch: int, now_s: float) -> None:
     """Take a start that is of another life of this reader."""
-    status = Status.from_wire(joined.message)
+    status = Heartbeat.from_wire(joined.message)
     start = status.starts.get(self._reader.name)
     if start is not None:
         wire = status._replace(
@@ -540,13 +544,13 @@ def _any_start(self: Feed, joined: Any, epoch: int, now_s: float) -> None:
     _HANDLE_STATUS(self, joined, epoch, now_s)
 
 
-_HANDLE_STATUS: Final = Feed._handle_status
+_HANDLE_STATUS: Final = WriterProxy._handle_status
 
 
 CONTROLS: Final[dict[str, tuple[tuple[object, str, Any], ...]]] = {
     "window": ((ReplayWindow, "is_finished", _always(False)),),
-    "start": ((Feed, "_handle_status", _any_start),),
-    "claims": ((Claims, "_check_fresh", _always(None)),),
+    "start": ((WriterProxy, "_handle_status", _any_start),),
+    "claims": ((AdvertisementHandler, "_check_fresh", _always(None)),),
 }
 
 
@@ -570,7 +574,7 @@ def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
     begun_s, first = time.monotonic(), held["seeds"][1] + 1 if held else options.seed
     seed = first
     with ExitStack() as stack:
-        stack.enter_context(mock.patch("gdp.simulation.world.MemoryNetwork", RecordingNetwork))
+        stack.enter_context(mock.patch("gdp.simulation.simulation.MemoryNetwork", RecordingNetwork))
         stack.enter_context(signing_oracle())
         while counts.total() < options.tries and time.monotonic() - begun_s < options.seconds:
             with reproducible_keys(seed), _without(options.control):

@@ -34,19 +34,19 @@ from report import percentile, progress
 from rich.console import Console
 from rich.table import Table
 
-from gdp.crypto.issuing import DomainAuthority
+from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import Statement, parse
 from gdp.crypto.validity import Validity
-from gdp.effects import Instant
 from gdp.errors import StatementError
 from gdp.frame.codec import ETHER_BYTES, decode
 from gdp.frame.kinds import Kind as FrameKind
-from gdp.host.run_registry import Runs
+from gdp.host.run_registry import RunRegistry
 from gdp.metadata import Metadata
 from gdp.nodes.revocation_upkeep import RevocationUpkeep
+from gdp.sansio import Timestamps
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import DomainPlan, Link, Topology
-from gdp.simulation.world import World
 from gdp.stores.files import read_public
 from gdp.stores.keyring import NODE_CERTIFICATE, load_owner
 from gdp.trust.revocation import Revocation
@@ -97,7 +97,7 @@ def _resident_bytes() -> int:
     return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def _statements(authority: DomainAuthority, count: int, unix_s: float) -> Iterator[bytes]:
+def _statements(authority: CertificateAuthority, count: int, unix_s: float) -> Iterator[bytes]:
     """Yield revocations of memberships that a domain never issued: fingerprints are hashes, so they look alike."""
     chance = random.Random(1)
     for _ in range(count):
@@ -107,7 +107,7 @@ def _statements(authority: DomainAuthority, count: int, unix_s: float) -> Iterat
 
 def _kept(count: int) -> dict[str, float]:
     unix_s = time.time()
-    authority = DomainAuthority.found("lab", SigningKey.generate(), Validity.lasting(unix_s, _YEAR_S))
+    authority = CertificateAuthority.create("lab", SigningKey.generate(), Validity.lasting(unix_s, _YEAR_S))
     key = authority.root.key.compressed
     progress(f"kept: signing {count}")
     wires = list(_statements(authority, count, unix_s))
@@ -117,13 +117,15 @@ def _kept(count: int) -> dict[str, float]:
     took = array("d", bytes(8 * count))
     for at, wire in enumerate(wires):
         statement = parse(wire)
-        giver, now = at.to_bytes(8, "big"), Instant(at / 1_000, unix_s)
+        origin, now = at.to_bytes(8, "big"), Timestamps(at / 1_000, unix_s)
         begun_ns = time.perf_counter_ns()
-        revoked.take(statement, giver, now, _nothing)
+        revoked.receive_revocation(statement, origin, now, _nothing)
         took[at] = (time.perf_counter_ns() - begun_ns) / 1e3
     found["kept_bytes_each"] = (_resident_bytes() - before) / count
     found["take_us_p50"], found["take_us_p99"] = percentile(took, 0.5), percentile(took, 0.99)
-    found["known_us"] = _each_us(lambda s: revoked.take(s, b"a", Instant(1e6, unix_s), _nothing), wires[:5_000])
+    found["known_us"] = _each_us(
+        lambda s: revoked.receive_revocation(s, b"a", Timestamps(1e6, unix_s), _nothing), wires[:5_000]
+    )
     found["unconcerned_us"] = _unconcerned_us(revoked, unix_s)
     prints = [parse(wire).fields.bytes_("cert") for wire in wires[:20_000]]
     begun_ns = time.perf_counter_ns()
@@ -149,21 +151,23 @@ def _each_us(call: Any, wires: list[bytes]) -> float:
 
 def _unconcerned_us(revoked: Revocations, unix_s: float) -> float:
     """Return what a junk revocation costs, its parsing included."""
-    stranger = DomainAuthority.found("none", SigningKey.generate(), Validity.lasting(unix_s, _YEAR_S))
+    stranger = CertificateAuthority.create("none", SigningKey.generate(), Validity.lasting(unix_s, _YEAR_S))
     wires = list(_statements(stranger, 5_000, unix_s))
 
     def take(statement: Statement) -> None:
         try:
-            revoked.take(parse(statement.wire), statement.signature[:8], Instant(1e6, unix_s), _nothing)
+            revoked.receive_revocation(
+                parse(statement.wire), statement.signature[:8], Timestamps(1e6, unix_s), _nothing
+            )
         except StatementError:
             return
 
     return _each_us(take, wires)
 
 
-def _on_disk(revoked: Revocations, authority: DomainAuthority, unix_s: float) -> dict[str, float]:
+def _on_disk(revoked: Revocations, authority: CertificateAuthority, unix_s: float) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
-        upkeep, now = RevocationUpkeep(Path(folder), revoked), Instant(0.0, unix_s)
+        upkeep, now = RevocationUpkeep(Path(folder), revoked), Timestamps(0.0, unix_s)
         upkeep.load(now)
         revoked.changes = set(revoked.keys())
         upkeep.start()
@@ -188,17 +192,17 @@ def _on_disk(revoked: Revocations, authority: DomainAuthority, unix_s: float) ->
 def _newcomer(count: int) -> dict[str, float]:
     """Return what it takes until a neighbour that comes up and knows none keeps all, and again ten more."""
     topology = Topology((Link("s1", "s2"),), (DomainPlan("lab", ("s1", "s2")),), ())
-    world = World(topology, keepalive_ms=1_000, dead_s=10.0, hello_s=1.0)
+    world = Simulation(topology, keepalive_ms=1_000, dead_s=10.0, hello_s=1.0)
     first, second = world.topology.nodes
     domain = world.topology.domain_of(first).label
     authority = world.authorities[domain]
     world.network.run(3)
-    cable = world.cables[frozenset((first, second))]
-    world.network.set_link(cable, up=False)
+    sim_link = world.cables[frozenset((first, second))]
+    world.network.set_link(sim_link, up=False)
     now = world.network.now
     here, there = (world.switches[node]._policy.revoked for node in (first, second))
     for at, wire in enumerate(_statements(authority, count, now.unix_s)):
-        here.take(parse(wire), at.to_bytes(8, "big"), now, _nothing)
+        here.receive_revocation(parse(wire), at.to_bytes(8, "big"), now, _nothing)
     sent = {"bytes": 0}
 
     def tap(_at_s: float, _a: str, _b: str, frame: bytes) -> None:
@@ -209,21 +213,21 @@ def _newcomer(count: int) -> dict[str, float]:
     found: dict[str, float] = {}
     for what, more in (("newcomer", 0), ("ten_more", 10)):
         for wire in _statements_more(authority, more, now.unix_s):
-            here.take(parse(wire), b"more", world.network.now, _nothing)
+            here.receive_revocation(parse(wire), b"more", world.network.now, _nothing)
         sent["bytes"] = 0
-        world.network.set_link(cable, up=True)
+        world.network.set_link(sim_link, up=True)
         begun_s, cpu_s = world.network.now.mono_s, time.process_time()
         if not world.network.run(3 * count / 1_000 + 60, lambda: len(there) == len(here)):
             raise FailedError(f"the newcomer keeps {len(there)} of {len(here)}")
         found[f"{what}_s"] = world.network.now.mono_s - begun_s
         found[f"{what}_cpu_s"] = time.process_time() - cpu_s
         found[f"{what}_bytes"] = sent["bytes"]
-        world.network.set_link(cable, up=False)
+        world.network.set_link(sim_link, up=False)
         world.network.run(12)
     return found
 
 
-def _statements_more(authority: DomainAuthority, count: int, unix_s: float) -> Iterator[bytes]:
+def _statements_more(authority: CertificateAuthority, count: int, unix_s: float) -> Iterator[bytes]:
     for number in range(count):
         until = int(unix_s) + _YEAR_S
         yield Revocation.make(authority.key, authority.root.subject, number.to_bytes(32, "little"), until)
@@ -272,7 +276,7 @@ def _closed(options: argparse.Namespace) -> dict[str, Any]:
     found: dict[str, list[float]] = {"delegation": [], "delegation_command": [], "membership": []}
     found["membership_command"] = []
     late = 0
-    runs = Runs()
+    runs = RunRegistry()
     runs.sweep()
     for number in range(options.rounds):
         progress(f"closed: network {number + 1} of {options.rounds}")

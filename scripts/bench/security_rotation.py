@@ -21,12 +21,12 @@ from typing import Final
 from rich.console import Console
 from rich.table import Table
 
-from gdp.client.member import Topic
+from gdp.client.participant import Topic
 from gdp.client.publisher import Publisher
 from gdp.metadata import Metadata
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import ring5
-from gdp.simulation.world import World
-from gdp.trust.card import Card
+from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.right import Right
 
 __all__ = ["add_arguments", "run"]
@@ -51,7 +51,7 @@ class Rotation:
     """The ring, its topics, and the epochs that have begun."""
 
     def __init__(self, loss: float) -> None:
-        self.world = World(ring5(), seed=5)
+        self.world = Simulation(ring5(), seed=5)
         self.world.add_member("nuc3/desk", "nuc3")
         if not self.world.settle():
             raise SystemExit("the ring does not come up")
@@ -68,8 +68,8 @@ class Rotation:
             self.world.network.touch(label)
         if not self.world.network.run(10.0, self._is_read):
             raise SystemExit("the readers do not begin")
-        for cable in self.world.cables.values():
-            cable.loss = loss
+        for sim_link in self.world.cables.values():
+            sim_link.loss = loss
 
     def _is_read(self) -> bool:
         return all(each.publisher is not None and each.publisher.readers == len(READERS) for each in self.streams)
@@ -79,7 +79,7 @@ class Rotation:
         identity = self.world.identities[label]
         metadata = Metadata({"kind": "topic", "name": stream.name})
         epochs = [each for each in (self.epoch - 1, self.epoch) if each > 0]
-        card = Card.from_wire(Card.make(identity))
+        card = NodeDescriptor.from_wire(NodeDescriptor.make(identity))
         given = self.world.owner.delegate(card, metadata, [right], epochs, self.world.validity)
         return Topic(given, {epoch: grant.secret for epoch, grant in given.open(identity).items()})
 
@@ -108,7 +108,7 @@ class Rotation:
         """Take what came."""
         by_name = {stream.publisher.topic: stream for stream in self.streams if stream.publisher is not None}
         for label in READERS:
-            for message in self.world.members[label].take_messages():
+            for message in self.world.members[label].poll_messages():
                 by_name[message.topic].got[label].append(int.from_bytes(message.delivered.message[:8], "big"))
 
     def run(self, messages: int, rate: float, rotate_s: float) -> dict[str, dict[str, int]]:

@@ -1,6 +1,6 @@
 """Bench skeleton: command line, rounds, interruption, machine facts, table, JSON record and picture of every bench.
 
-I/O. Figures, their spread and targets are ``report.py``'s. A bench states its options and measures::
+I/O. Figures, their spread and targets are ``acknack.py``'s. A bench states its options and measures::
 
     def measure(options: Options, runs: Runs) -> Outcome: ...
 
@@ -26,7 +26,7 @@ from plot import Panel, require_plot, save_bars
 from report import Rounds, Settings, Target, progress, show, write_json
 
 from gdp.errors import GdpError
-from gdp.host.run_registry import Run, Runs
+from gdp.host.run_registry import Run, RunRegistry
 
 OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks"
 
@@ -149,10 +149,10 @@ def clean_exit() -> Iterator[None]:
 
 
 @contextmanager
-def new_run(runs: Runs | None = None) -> Iterator[Run]:
+def new_run(runs: RunRegistry | None = None) -> Iterator[Run]:
     """Have a run of the test bed; without ``runs``, what an earlier killed run left is removed first."""
     if runs is None:
-        runs = Runs()
+        runs = RunRegistry()
         runs.sweep()
     run = runs.start()
     try:
@@ -161,12 +161,12 @@ def new_run(runs: Runs | None = None) -> Iterator[Run]:
         run.end()
 
 
-def run_bench(parser: argparse.ArgumentParser, measure: Callable[[Options, Runs], Outcome]) -> None:
+def run_bench(parser: argparse.ArgumentParser, measure: Callable[[Options, RunRegistry], Outcome]) -> None:
     """Parse the command line, and run a bench to its table, JSON record and picture."""
     perform(parse(parser), measure)
 
 
-def perform(options: Options, measure: Callable[[Options, Runs], Outcome]) -> None:
+def perform(options: Options, measure: Callable[[Options, RunRegistry], Outcome]) -> None:
     """Run a bench to its table, JSON record and picture."""
     is_saved = not getattr(options, "no_save", False)
     is_drawn = is_saved and not getattr(options, "no_plot", True)
@@ -174,7 +174,7 @@ def perform(options: Options, measure: Callable[[Options, Runs], Outcome]) -> No
         require_plot()
     state, begun_s = machine_state(), time.monotonic()
     with clean_exit():
-        runs = Runs()
+        runs = RunRegistry()
         runs.sweep()
         outcome = measure(options, runs)
     finish(outcome, options, state, time.monotonic() - begun_s, is_saved=is_saved, is_drawn=is_drawn)

@@ -36,8 +36,8 @@ from rich.console import Console
 from rich.table import Table
 from skeleton import clean_exit, command_line, new_run
 
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import chain
-from gdp.simulation.world import World
 from gdp.trust.right import Right
 from gdp.trust.verifier import ADCERTS_REMEMBERED
 
@@ -61,7 +61,7 @@ class Memory:
     """Three switches, a RIB and two members on a network in memory."""
 
     def __init__(self) -> None:
-        self._world = World(chain(3), seed=1, hello_s=20.0, dead_s=70.0)  # hellos cost most of the time otherwise
+        self._world = Simulation(chain(3), seed=1, hello_s=20.0, dead_s=70.0)  # hellos cost most of the time otherwise
         if not self._world.settle():
             raise FailedError("the network in memory did not settle")
         self._names = 0
@@ -80,7 +80,7 @@ class Memory:
             publisher.publish(b"message")
             left.flush(world.network.now.mono_s)
             world.network.touch(LEFT)
-            self._until(lambda: bool(right.take_messages()), "a message")
+            self._until(lambda: bool(right.poll_messages()), "a message")
             right.unsubscribe(topic.name)
             world.network.touch(RIGHT)
             self._until(lambda: not publisher.readers, "the reader's end")
@@ -105,7 +105,7 @@ class Memory:
             publisher.publish(b"message")
             left.flush(world.network.now.mono_s)
             world.network.touch(LEFT)
-            self._until(lambda: bool(right.take_messages()), "a message")
+            self._until(lambda: bool(right.poll_messages()), "a message")
             left.withdraw(topic.name)
             right.unsubscribe(topic.name)
             world.network.touch(LEFT)

@@ -37,7 +37,7 @@ from rich.table import Table
 from survive_rows import NEW_TOPICS, ROWS, Row
 
 from gdp.errors import GdpError
-from gdp.host.run_registry import Run, Runs
+from gdp.host.run_registry import Run, RunRegistry
 
 OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks" / "survive.json"
 ROUNDS: Final = 30
@@ -143,7 +143,7 @@ class Flowing:
         return len(missing), sum(number - 1 for number in self.numbers.values())
 
 
-def measure(runs: Runs, row: Row, rounds: int, options: argparse.Namespace) -> Measured:
+def measure(runs: RunRegistry, row: Row, rounds: int, options: argparse.Namespace) -> Measured:
     """Let the event of a row happen so often.
 
     Raises:
@@ -283,7 +283,7 @@ def main() -> None:
     if options.quick:
         options.rounds, options.dead_s, options.settle_s = 1, 3.0, 0.0
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
-    runs = Runs()
+    runs = RunRegistry()
     runs.sweep()  # what a killed run left
     measured: dict[str, Measured] = {}
     failures: list[str] = []

@@ -25,7 +25,7 @@ from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
 from gdp.trust.right import Right
-from ring.materials import Materials
+from ring.materials import OverlayCredentials
 
 LEFT: Final = "a"
 MIDDLE: Final = ("s1", "s2", "s3")
@@ -131,7 +131,7 @@ class OverlayNodes:
         number = sum(1 for _ in lab.directory.glob(f"{label}-*"))
         self.files = lab.directory / f"{label}-{number}"
         self.files.mkdir(mode=0o700)
-        credentials = Materials(lab.topology, self.files, metrics=False)
+        credentials = OverlayCredentials(lab.topology, self.files, metrics=False)
         self.planes: set[str] = set()
         self.undo = ExitStack()
         with ExitStack() as undo:

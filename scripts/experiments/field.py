@@ -90,7 +90,7 @@ class Server:
         """Start both."""
         told = {**self._work.settings, "machine": self.label}
         self._running = [
-            self._place.process(self.label, "proxy", ["-m", "proxy.cli", "--config", self._config]),
+            self._place.process(self.label, "proxy", ["-m", "proxy.cli.proxy", "--config", self._config]),
             self._place.process(self.label, "node", [str(self._work.program), self._work.role, json.dumps(told)]),
         ]
 
@@ -166,7 +166,7 @@ class Field:
             self._nodes = OverlayNodes(self._lab, (_NEAR, _GATE), plane="auto", ready_s=READY_S)
             undo.callback(self._nodes.close)
             self.data_plane = ", ".join(sorted(self._nodes.planes))
-            argv = ["-m", "proxy.cli", "--config", self._admit(ROBOT, served)]
+            argv = ["-m", "proxy.cli.proxy", "--config", self._admit(ROBOT, served)]
             robot = undo.enter_context(self.process(ROBOT, "proxy", argv))
             self.servers = {each: Server(self, each, self._admit(each, served), work[each]) for each in self._machines}
             for server in self.servers.values():

@@ -113,8 +113,8 @@ def main(
         work = {each: Work(setting.role, {"services": names[each], "takes_s": times[each]}) for each in _MACHINES}
         with field_of(served, work) as here:
             contention = asdict(Contention("segment", _ONE, ON_S, OFF_S))
-            rival = here.client(_MACHINES[0], "busy", **contention) if setting.is_contended else nullcontext()
-            with rival, Asking(here, series) as asking:
+            conflict = here.client(_MACHINES[0], "busy", **contention) if setting.is_contended else nullcontext()
+            with conflict, Asking(here, series) as asking:
                 found, plane = asking.by_service(what), here.data_plane
         groups[f"{what}, one server"], groups[f"{what}, two replicas"] = found[_ONE], found[_TWO]
         one, two = Summary.of(found[_ONE]), Summary.of(found[_TWO])

@@ -110,12 +110,12 @@ class _CycloneEnd:
 
     def run(self, look: Callable[[], bool], every_s: float) -> None:
         """Work until ``look`` returns that it is over."""
-        from proxy.endpoints.endpoint import Heard
+        from proxy.endpoints.endpoint import MessageReceived
 
         while not look():
             select([self._endpoint], [], [], every_s)
-            for event in self._endpoint.take():
-                if isinstance(event, Heard):
+            for event in self._endpoint.poll_events():
+                if isinstance(event, MessageReceived):
                     self._heard[event.handle](event.raw)
 
 

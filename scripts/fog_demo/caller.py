@@ -89,28 +89,28 @@ def main() -> None:
     profile = copy(qos_profile_services_default)
     profile.depth = int(node.declare_parameter("depth", profile.depth).value)
     client = node.create_client(SetBool, "/echo", qos_profile=profile)
-    tally = Tally()
+    stats = Tally()
     waiting: dict[object, tuple[bool, float]] = {}
 
     def finish(*_: object) -> None:
         nonlocal most
-        most = max(tally.calls, 1)
+        most = max(stats.calls, 1)
 
     def call() -> None:
         overdue = [future for future, (_, began_s) in waiting.items() if time.monotonic() - began_s > timeout_s]
         for future in overdue:
             _, began_s = waiting.pop(future)
             client.remove_pending_request(future)
-            tally.failed += 1
+            stats.failed += 1
             node.get_logger().warning(f"no answer to what was asked {time.monotonic() - began_s:.3f} s ago")
-        if most and tally.calls >= most:
+        if most and stats.calls >= most:
             return
         if not client.service_is_ready():
-            tally.unserved += tally.calls > 0
+            stats.unserved += stats.calls > 0
             return
-        asked = tally.calls % 2 == 0
+        asked = stats.calls % 2 == 0
         future = client.call_async(SetBool.Request(data=asked))
-        tally.calls += 1
+        stats.calls += 1
         waiting[future] = (asked, time.monotonic())
         future.add_done_callback(answered)
 
@@ -118,24 +118,24 @@ def main() -> None:
         if future in waiting and future.done():
             asked, began_s = waiting.pop(future)
             now_s = time.monotonic()
-            tally.answered(asked, future.result(), now_s - began_s, now_s)
+            stats.answered(asked, future.result(), now_s - began_s, now_s)
 
     signal.signal(signal.SIGUSR1, finish)
     node.create_timer(1.0 / rate_hz, call)
 
     def report(*, done: bool = False) -> None:
-        print(tally.line(unix_s=time.time(), done=done), flush=True)  # its output
+        print(stats.line(unix_s=time.time(), done=done), flush=True)  # its output
 
     node.create_timer(report_s, report)
     try:
-        while not (most and tally.calls >= most and not waiting):
+        while not (most and stats.calls >= most and not waiting):
             rclpy.spin_once(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass  # both are how it ends
     report(done=True)
     node.destroy_node()
     rclpy.try_shutdown()
-    sys.exit(1 if tally.failed or tally.wrong else 0)
+    sys.exit(1 if stats.failed or stats.wrong else 0)
 
 
 if __name__ == "__main__":

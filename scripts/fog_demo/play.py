@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from fog.providers.local.trouble import kill, notice
+from fog.providers.local.fault_injection import kill, notice
 from fog.site import Site, open_site
-from fog.supervisor.ground import local_provider
+from fog.supervisor.infrastructure import local_provider
 from fog.supervisor.journal import Entry, Journal
 from fog.supervisor.record import Record
 from fog_demo.stage import Stage
@@ -64,7 +64,7 @@ class Outcome:
     complaints: list[str] = field(default_factory=list)
 
     @property
-    def verdict(self) -> str:
+    def ack(self) -> str:
         """Return the last line."""
         return f"{self.counts.failed} failed of {self.counts.requests} requests"
 

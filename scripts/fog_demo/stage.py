@@ -22,13 +22,13 @@ from typing import Final
 import yaml
 
 from gdp.errors import LocalError
-from gdp.host.run_registry import Run, Runs, outer_uid
+from gdp.host.run_registry import Run, RunRegistry, outer_uid
 from gdp.simulation.namespaces import Namespaces
 from gdp.simulation.topology import Attachment, DomainPlan, Topology, ring5
 from gdp.stores.keyring import CARD, DELEGATIONS, ROOT_CERTIFICATE
 from ring.child import Child
 from ring.children import Children
-from ring.materials import Materials
+from ring.materials import OverlayCredentials
 
 __all__ = ["ENVIRONMENT", "SITE", "STATE", "Stage", "end_all_of", "fog_command", "standing_runs", "sweep"]
 
@@ -67,7 +67,7 @@ class Stage:
         self._topology = Topology(ring.links, (DomainPlan("ring", ring.nodes),), attached)
         self._run = run
         self._namespaces = Namespaces(self._topology, run)
-        self._materials = Materials(self._topology, run.directory, metrics=False)
+        self._materials = OverlayCredentials(self._topology, run.directory, metrics=False)
         self.children = Children(run, kept=False)
         self.state = run.directory / STATE
         self.site_file = run.directory / SITE
@@ -89,7 +89,9 @@ class Stage:
         (at,) = self._topology.attached("rib")
         rib = ["-m", "gdp.cli.rib", "--config", str(self._materials.rib(at)), "--json"]
         await self.children.ready([self._start(at.switch, "rib", rib)])
-        await self.children.ready([self._start(ROBOT, "proxy", ["-m", "proxy.cli", "--config", str(proxy), "--json"])])
+        await self.children.ready(
+            [self._start(ROBOT, "proxy", ["-m", "proxy.cli.proxy", "--config", str(proxy), "--json"])]
+        )
         return ", ".join(sorted(planes))
 
     async def fog(self, *words: str, patience_s: float) -> None:
@@ -160,16 +162,16 @@ class Stage:
         return path
 
 
-def standing_runs(what: str) -> Runs:
+def standing_runs(what: str) -> RunRegistry:
     """Return the records of runs of one kind, such as ``demo``, that ``fog`` made machines for.
 
     Raises:
         LocalError: the folder belongs to somebody else.
     """
-    return Runs(Path(tempfile.gettempdir()) / f"gdp-fog-{what}-{outer_uid()}")
+    return RunRegistry(Path(tempfile.gettempdir()) / f"gdp-fog-{what}-{outer_uid()}")
 
 
-def sweep(runs: Runs) -> list[str]:
+def sweep(runs: RunRegistry) -> list[str]:
     """Take down what killed ones left; return their ids."""
     dead = [each.run for each in runs.all() if each.dead]
     for run in dead:

@@ -20,19 +20,19 @@ from rich.markup import escape
 
 from gdp.errors import GdpError, LocalError
 from gdp.host.interruption import Interrupted, interruptible, let_nothing_interrupt
-from gdp.host.run_registry import Run, Runs
-from gdp.limits import CLAIM_LEASE_S
+from gdp.host.run_registry import Run, RunRegistry
+from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.simulation.topology import MTU_BYTES
-from proxy.config import Encoding
+from proxy.config.config import Encoding
 from ring.child import ChildError
 from ring.faults import Cut, Kill, Roam
 from ring.hints import hints, live_hints
 from ring.live_run import LiveRing
 from ring.options import LIVE_S, Live, Options, RingPlane
-from ring.progress import Teller
+from ring.progress import ProgressReporter
 from ring.result import Result
 from ring.run import DEMO_S, Ring, make_demo
-from ring.table import table, verdict
+from ring.table import ack, table
 
 __all__ = ["main", "spelled_out"]
 
@@ -93,7 +93,7 @@ def ring(
     ] = None,
     lease: Annotated[
         float, typer.Option(help="Of names, in seconds: what is not renewed is forgotten.")
-    ] = CLAIM_LEASE_S,
+    ] = ADVERTISEMENT_LEASE_S,
     keep: Annotated[bool, typer.Option("--keep", help="Leave the ring up, and say what to try.")] = False,
     down: Annotated[bool, typer.Option("--down", help="Take down every ring that was kept, and end.")] = False,
 ) -> None:
@@ -106,7 +106,7 @@ def ring(
     """
     errors = Console(stderr=True)
     try:
-        runs = Runs()
+        runs = RunRegistry()
         if down:
             taken = runs.take_down()
             errors.print(f"taken down: {', '.join(taken)}" if taken else "nothing was left up", highlight=False)
@@ -174,15 +174,15 @@ def _run(options: Options, run: Run, errors: Console) -> int:
 async def _go(options: Options, run: Run, errors: Console) -> int:
     if options.live is not None:
         return await _go_live(options, options.live, run, errors)
-    with Teller(errors) as teller:
+    with ProgressReporter(errors) as reporter:
         bag = options.bag
         if bag is None:
             duration_s = options.seconds or DEMO_S
-            teller.step(f"making a recording: {duration_s:g} seconds of a robot's drive")
+            reporter.step(f"making a recording: {duration_s:g} seconds of a robot's drive")
             bag = await make_demo(run, duration_s)
         if options.out is not None:
             options.out.mkdir(parents=True, exist_ok=True)
-        standing = Ring(options, run, teller, bag)
+        standing = Ring(options, run, reporter, bag)
         try:
             result = await standing.result()
         finally:
@@ -196,8 +196,8 @@ async def _go(options: Options, run: Run, errors: Console) -> int:
 
 
 async def _go_live(options: Options, live: Live, run: Run, errors: Console) -> int:
-    with Teller(errors) as teller:
-        standing = LiveRing(options, live, run, teller)
+    with ProgressReporter(errors) as reporter:
+        standing = LiveRing(options, live, run, reporter)
         try:
             result = await standing.result()
         finally:
@@ -222,7 +222,7 @@ def _show(result: Result) -> None:
     if not output.is_terminal:
         output = Console(width=_WIDE)
     output.print(table(result))
-    output.print(verdict(result), highlight=False, soft_wrap=True)
+    output.print(ack(result), highlight=False, soft_wrap=True)
 
 
 def _write(options: Options, result: Result, recording: Path | None = None) -> None:

@@ -16,16 +16,16 @@ from gdp.simulation.namespaces import Namespaces
 from ring.child import Child
 from ring.children import READY_S, Children
 from ring.faults import Cut, Kill, Roam, roamers
-from ring.materials import Materials
+from ring.materials import OverlayCredentials
 from ring.options import Options
-from ring.progress import Teller
+from ring.progress import ProgressReporter
 
-__all__ = ["Fabric"]
+__all__ = ["Overlay"]
 
 _MIDDLE: Final = "nuc3"
 
 
-class Fabric:
+class Overlay:
     """The overlay of one run, from its laying on; the ends are others' work.
 
     Args:
@@ -37,17 +37,17 @@ class Fabric:
         LocalError: the kernel refuses namespaces.
     """
 
-    def __init__(self, options: Options, run: Run, teller: Teller) -> None:
+    def __init__(self, options: Options, run: Run, reporter: ProgressReporter) -> None:
         self.options = options
         self.topology = options.topology()
         self.robot, self.server = self.topology.attached("proxy")
-        self.teller = teller
-        teller.step(f"run {run.id}: five namespaces, keys and certificates")
+        self.reporter = reporter
+        reporter.step(f"run {run.id}: five namespaces, keys and certificates")
         self.namespaces = Namespaces(self.topology, run)
         roaming = roamers(options.faults, self.topology)
         for at in roaming:
             self.namespaces.plug(at.switch, at.ifname, at.switch)
-        self.materials = Materials(
+        self.materials = OverlayCredentials(
             self.topology, run.directory, metrics=options.keep, roamers=roaming, lease_s=options.lease_s
         )
         self.children = Children(run, kept=options.keep)
@@ -71,19 +71,19 @@ class Fabric:
             ifaces = [f"--iface={link.other(_MIDDLE)}" for link in self.topology.links_of(_MIDDLE)]
             capture = self.start(_MIDDLE, "capture", ["-m", "gdp.ports.capture", *ifaces, str(self.options.pcap)])
             await self.children.ready([capture])
-        self.teller.step("starting a switch in each")
+        self.reporter.step("starting a switch in each")
         for node in self.topology.nodes:
             config = self.materials.switch(node, self.options.data_plane)
             self.switches[node] = self._start_switch(node, config)
         said = await self.children.ready(list(self.switches.values()))
         self._planes = sorted({each.text("data_plane") for each in said})
         for reason in sorted({each.text("reason") for each in said} - {""}):
-            self.teller.step(f"data plane {', '.join(self._planes)}: {reason}")
-        self.teller.step("starting the RIB of each domain")
+            self.reporter.step(f"data plane {', '.join(self._planes)}: {reason}")
+        self.reporter.step("starting the RIB of each domain")
         configs = {at.switch: self.materials.rib(at) for at in self.topology.attached("rib")}
         self._ribs = {node: self._start_rib(node, config) for node, config in configs.items()}
         await self.children.ready(list(self._ribs.values()))
-        self.teller.step(f"starting the proxies at {self.robot.switch} and {self.server.switch}")
+        self.reporter.step(f"starting the proxies at {self.robot.switch} and {self.server.switch}")
 
     def start(
         self,

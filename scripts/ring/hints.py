@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from gdp.host.run_registry import in_first_user_namespace
-from ring.fabric import Fabric
+from ring.fabric import Overlay
 from ring.live_run import LiveRing
 from ring.plan import METRICS_PORTS
 from ring.run import Ring
@@ -27,7 +27,7 @@ def hints(ring: Ring, again: Path) -> list[tuple[str, str]]:
     """
     replay = Path(sys.executable).with_name("gdp-replay")
     sender = f"{replay} {shlex.quote(str(ring.bag))} --config {ring.sender_config}"
-    return [(f"send the recording again, into {again}", inside(ring.fabric, "nuc1", sender)), *common(ring.fabric)]
+    return [(f"send the recording again, into {again}", inside(ring.overlay, "nuc1", sender)), *common(ring.overlay)]
 
 
 def live_hints(ring: LiveRing) -> list[tuple[str, str]]:
@@ -35,33 +35,33 @@ def live_hints(ring: LiveRing) -> list[tuple[str, str]]:
     found = []
     for at, graph in zip(("nuc1", "nuc5"), ring.graphs, strict=True):
         if graph.ros == 1:
-            found.append((f"the topics at {at}", inside(ring.fabric, at, "rostopic list")))
-            found.append((f"what is said at {at}", inside(ring.fabric, at, "rostopic echo -n 5 /chatter")))
+            found.append((f"the topics at {at}", inside(ring.overlay, at, "rostopic list")))
+            found.append((f"what is said at {at}", inside(ring.overlay, at, "rostopic echo -n 5 /chatter")))
         else:
             told = " ".join(f"{name}={value}" for name, value in ring.environment(graph).items())
             listener = f"env {told} timeout 5 {sys.executable} -m ring.nodes 2 listener 0"
-            found.append((f"one more listener at {at}, for five seconds", inside(ring.fabric, at, listener)))
-    proxy = inside(ring.fabric, "nuc5", _metrics("proxy"))
+            found.append((f"one more listener at {at}, for five seconds", inside(ring.overlay, at, listener)))
+    proxy = inside(ring.overlay, "nuc5", _metrics("proxy"))
     logs = f"tail -n 3 {ring.directory}/*.log"
-    return [*found, ("what the proxy at nuc5 counts", proxy), ("what all log", logs), *common(ring.fabric)]
+    return [*found, ("what the proxy at nuc5 counts", proxy), ("what all log", logs), *common(ring.overlay)]
 
 
-def common(fabric: Fabric) -> list[tuple[str, str]]:
+def common(overlay: Overlay) -> list[tuple[str, str]]:
     """Return what may be tried with every ring."""
     script = Path(__file__).parents[2] / "scripts" / "ring_topology.sh"
     return [
-        ("what the switch in the middle counts", inside(fabric, "nuc3", _metrics("switch"))),
-        ("what passes it", inside(fabric, "nuc3", "tcpdump -e -i nuc4 ether proto 0x88b5")),
-        ("cut the usual way, and watch the other be taken", inside(fabric, "nuc2", "ip link set nuc3 down")),
+        ("what the switch in the middle counts", inside(overlay, "nuc3", _metrics("switch"))),
+        ("what passes it", inside(overlay, "nuc3", "tcpdump -e -i nuc4 ether proto 0x88b5")),
+        ("cut the usual way, and watch the other be taken", inside(overlay, "nuc2", "ip link set nuc3 down")),
         ("take everything down", f"{script} --down"),
     ]
 
 
-def inside(fabric: Fabric, node: str, command: str) -> str:
+def inside(overlay: Overlay, node: str, command: str) -> str:
     """Return what a person types, from outside, to run a command in the namespace of a switch."""
     if in_first_user_namespace():
-        return f"ip netns exec {fabric.namespaces.path(node).name} {command}"
-    return f"nsenter --target {fabric.switches[node].pid} --user --mount --net --preserve-credentials {command}"
+        return f"ip netns exec {overlay.namespaces.path(node).name} {command}"
+    return f"nsenter --target {overlay.switches[node].pid} --user --mount --net --preserve-credentials {command}"
 
 
 def _metrics(role: str) -> str:

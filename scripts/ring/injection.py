@@ -11,7 +11,7 @@ from typing import Protocol
 
 from ring.children import cancel
 from ring.faults import Cut, Fault, Kill, Roam
-from ring.progress import Teller
+from ring.progress import ProgressReporter
 
 __all__ = ["Injection", "Injector"]
 
@@ -38,9 +38,9 @@ class Injector(Protocol):
 class Injection:
     """The faults of one run under way. Their seconds count from now."""
 
-    def __init__(self, injector: Injector, faults: Sequence[Fault], teller: Teller) -> None:
+    def __init__(self, injector: Injector, faults: Sequence[Fault], reporter: ProgressReporter) -> None:
         self._injector = injector
-        self._teller = teller
+        self._reporter = reporter
         self._begun: set[Fault] = set()
         self._tasks = {fault: asyncio.ensure_future(self._inject(fault)) for fault in faults}
 
@@ -82,4 +82,4 @@ class Injection:
         if at_s is not None:
             await asyncio.sleep(at_s - passed_s)
             await act()
-            self._teller.step(done)
+            self._reporter.step(done)

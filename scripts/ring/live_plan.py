@@ -12,7 +12,7 @@ from typing import Final, Literal
 
 from gdp.metadata import Metadata
 from gdp.trust.right import Right
-from proxy.config import Encoding
+from proxy.config.config import Encoding
 from proxy.serial.channel import RosVersion
 from ring.nodes.content import LAMP, LAMP_HZ, LAMP_TYPE, TALKS
 from ring.options import Live

@@ -18,13 +18,13 @@ from gdp.simulation.topology import Attachment
 from proxy.endpoints.ros1.install import rospy_folder
 from ring.child import Child
 from ring.events import Event
-from ring.fabric import Fabric
+from ring.fabric import Overlay
 from ring.injection import Injection
 from ring.live_plan import CARRIED, FAST_DDS_PROFILES, MASTER_PORT, Graph, Side, calls_in, graphs_of, messages_in
 from ring.live_result import Heard, rows
-from ring.live_session import ENDING_S, Cast, LiveSession
+from ring.live_session import ENDING_S, LiveNodes, LiveSession
 from ring.options import Live, Options
-from ring.progress import Teller
+from ring.progress import ProgressReporter
 from ring.result import Result
 
 __all__ = ["LiveRing"]
@@ -46,16 +46,16 @@ class LiveRing:
         LocalError: a ROS is missing, or the kernel refuses namespaces.
     """
 
-    def __init__(self, options: Options, live: Live, run: Run, teller: Teller) -> None:
+    def __init__(self, options: Options, live: Live, run: Run, reporter: ProgressReporter) -> None:
         self.graphs = graphs_of(live, run.id)
         _require({graph.ros for graph in self.graphs})
         self._options = options
         self._run = run
-        self._teller = teller
+        self._reporter = reporter
         self._profiles = run.directory / "fast-dds.xml"
         self._profiles.write_text(FAST_DDS_PROFILES, encoding="utf-8")
-        self.fabric = Fabric(options, run, teller)
-        self._ends = tuple(zip((self.fabric.robot, self.fabric.server), self.graphs, _SIDES, strict=True))
+        self.overlay = Overlay(options, run, reporter)
+        self._ends = tuple(zip((self.overlay.robot, self.overlay.server), self.graphs, _SIDES, strict=True))
         self._proxies: list[Child] = []
         self._nodes: list[Child] = []
 
@@ -66,22 +66,22 @@ class LiveRing:
             ChildError: a process failed.
             LocalError: a fault cannot be injected.
         """
-        fabric, children = self.fabric, self.fabric.children
-        await fabric.stand_up()
+        overlay, children = self.overlay, self.overlay.children
+        await overlay.stand_up()
         await children.ready([self._start_master(at, graph) for at, graph, _ in self._ends if graph.ros == 1])
         self._proxies = [self._start_proxy(*end) for end in self._ends]
         await children.ready(self._proxies)
-        cast = await self._cast()
-        session = LiveSession(children, cast, self._teller)
+        live_nodes = await self._live_nodes()
+        session = LiveSession(children, live_nodes, self._reporter)
         await session.meet()
-        self._teller.step(f"they hear each other; {self._options.live_s:g} s of traffic")
-        injection, begun_s = Injection(fabric, self._options.faults, self._teller), time.monotonic()
+        self._reporter.step(f"they hear each other; {self._options.live_s:g} s of traffic")
+        injection, begun_s = Injection(overlay, self._options.faults, self._reporter), time.monotonic()
         try:
             heard = await session.talk(self._options.live_s)
         finally:
             await injection.stop()
         traffic_s = time.monotonic() - begun_s
-        self._teller.step("comparing what was published with what was heard")
+        self._reporter.step("comparing what was published with what was heard")
         result = await self._compare(heard, injection.complaints())
         return replace(result, traffic_s=traffic_s, silent_s=session.silent_s)
 
@@ -103,25 +103,25 @@ class LiveRing:
 
     def forget(self) -> None:
         """Close our ends of the processes; they are left as they are."""
-        self.fabric.forget()
+        self.overlay.forget()
 
-    async def _cast(self) -> Cast:
+    async def _live_nodes(self) -> LiveNodes:
         """Start the nodes; return when all are ready."""
         (robot, at_robot, _), (server, at_server, _) = self._ends
         talking, calls = messages_in(self._options.live_s), calls_in(self._options.live_s)
-        self._teller.step(f"starting nodes at {robot.switch}, ROS {at_robot.ros}: {', '.join(talking)}, lamp")
-        self._teller.step(f"starting nodes at {server.switch}, ROS {at_server.ros}: listener, caller")
+        self._reporter.step(f"starting nodes at {robot.switch}, ROS {at_robot.ros}: {', '.join(talking)}, lamp")
+        self._reporter.step(f"starting nodes at {server.switch}, ROS {at_server.ros}: listener, caller")
         talkers = {self._start_node(robot, at_robot, name, count): count for name, count in talking.items()}
         lamp = self._start_node(robot, at_robot, "lamp", 0)
         listener = self._start_node(server, at_server, "listener", 0)
         caller = self._start_node(server, at_server, "caller", calls)
         self._nodes = [*talkers, lamp, listener, caller]
-        await self.fabric.children.ready(self._nodes)
-        return Cast(talkers, lamp, listener, caller, calls)
+        await self.overlay.children.ready(self._nodes)
+        return LiveNodes(talkers, lamp, listener, caller, calls)
 
     async def _compare(self, heard: Heard, complaints: list[str]) -> Result:
         said = [await self._finish(proxy) for proxy in self._proxies]
-        result = Result(rows(heard, said[1].parts("topics")), self.fabric.settings, complaints=tuple(complaints))
+        result = Result(rows(heard, said[1].parts("topics")), self.overlay.settings, complaints=tuple(complaints))
         if result.passed:
             return result
         ends = zip(self._proxies, said, strict=True)
@@ -130,7 +130,7 @@ class LiveRing:
 
     async def _finish(self, proxy: Child) -> Event:
         """Ask a proxy to end; return what it carried."""
-        children = self.fabric.children
+        children = self.overlay.children
         children.may_end(proxy)
         proxy.interrupt()
         return await children.guarded(proxy.wait_for("done", ENDING_S))
@@ -139,15 +139,15 @@ class LiveRing:
         return self._start(at, graph, "master", ["-m", "ring.nodes.master", str(MASTER_PORT)])
 
     def _start_proxy(self, at: Attachment, graph: Graph, side: Side, *, heard: bool = True) -> Child:
-        config = self.fabric.materials.live(at, side, CARRIED, self._options.encoding, graph.to_yaml())
-        argv = ["-m", "proxy.cli", "--config", str(config), *(["--json"] if heard else [])]
+        config = self.overlay.materials.live(at, side, CARRIED, self._options.encoding, graph.to_yaml())
+        argv = ["-m", "proxy.cli.proxy", "--config", str(config), *(["--json"] if heard else [])]
         return self._start(at, graph, "proxy", argv, heard=heard)
 
     def _start_node(self, at: Attachment, graph: Graph, name: str, count: int) -> Child:
         return self._start(at, graph, name, ["-m", "ring.nodes", str(graph.ros), name, str(count)])
 
     def _start(self, at: Attachment, graph: Graph, role: str, argv: list[str], *, heard: bool = True) -> Child:
-        return self.fabric.start(at.switch, role, argv, heard=heard, environment=self.environment(graph))
+        return self.overlay.start(at.switch, role, argv, heard=heard, environment=self.environment(graph))
 
 
 def _require(versions: set[int]) -> None:

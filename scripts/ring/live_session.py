@@ -17,10 +17,10 @@ from ring.children import Children, cancel
 from ring.events import Event
 from ring.live_result import Heard
 from ring.nodes.content import LAMP
-from ring.progress import Teller, Traffic
+from ring.progress import ProgressReporter, Traffic
 from ring.silence import Silence
 
-__all__ = ["Cast", "LiveSession"]
+__all__ = ["LiveNodes", "LiveSession"]
 
 MEET_S: Final = 60.0
 ENDING_S: Final = 30.0
@@ -28,7 +28,7 @@ QUIET_S: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Cast:
+class LiveNodes:
     """The nodes of a live run; each has said that it is ready. ``talkers``: how many messages each will publish."""
 
     talkers: Mapping[Child, int]
@@ -46,10 +46,10 @@ class Cast:
 class LiveSession:
     """One run's traffic. The nodes stand as long as ``children`` says."""
 
-    def __init__(self, children: Children, cast: Cast, teller: Teller) -> None:
+    def __init__(self, children: Children, live_nodes: LiveNodes, reporter: ProgressReporter) -> None:
         self._children = children
-        self._cast = cast
-        self._teller = teller
+        self._live_nodes = live_nodes
+        self._reporter = reporter
         self._sent: dict[Child, int] = {}
         self._received: dict[str, int] = {}
         self._asked = 0
@@ -69,7 +69,7 @@ class LiveSession:
         Raises:
             ChildError: a process failed, or it took too long.
         """
-        far = (self._cast.listener, self._cast.caller)
+        far = (self._live_nodes.listener, self._live_nodes.caller)
         await self._children.guarded(_all(*(child.wait_for("hears", MEET_S) for child in far)))
 
     async def talk(self, seconds: float) -> Heard:
@@ -78,25 +78,27 @@ class LiveSession:
         Raises:
             ChildError: a process failed, or did not report.
         """
-        cast = self._cast
-        self._teller.begin_traffic(cast.messages + cast.calls)
-        ear = asyncio.ensure_future(self._follow(cast.listener))
-        lamp = asyncio.ensure_future(self._follow(cast.lamp))
+        live_nodes = self._live_nodes
+        self._reporter.begin_traffic(live_nodes.messages + live_nodes.calls)
+        ear = asyncio.ensure_future(self._follow(live_nodes.listener))
+        lamp = asyncio.ensure_future(self._follow(live_nodes.lamp))
         try:
-            for child in (*cast.talkers, cast.caller):
+            for child in (*live_nodes.talkers, live_nodes.caller):
                 child.go()
             patience_s = seconds + ENDING_S
-            speaking = [_in_time(child, self._follow(child), patience_s) for child in (*cast.talkers, cast.caller)]
+            speaking = [
+                _in_time(child, self._follow(child), patience_s) for child in (*live_nodes.talkers, live_nodes.caller)
+            ]
             *talkers, caller = await self._children.guarded(_all(*speaking))
             self._answered = caller.count("answered")
             await self._children.guarded(self._until_quiet())
-            cast.listener.interrupt()
-            cast.lamp.interrupt()
-            ending = _all(_in_time(cast.listener, ear, ENDING_S), _in_time(cast.lamp, lamp, ENDING_S))
+            live_nodes.listener.interrupt()
+            live_nodes.lamp.interrupt()
+            ending = _all(_in_time(live_nodes.listener, ear, ENDING_S), _in_time(live_nodes.lamp, lamp, ENDING_S))
             listener_said, lamp_said = await self._children.guarded(ending)
         finally:
             await cancel(ear, lamp)
-            self._teller.end_traffic()
+            self._reporter.end_traffic()
         return Heard(tuple(talkers), lamp_said, listener_said, caller)
 
     async def _follow(self, child: Child) -> Event:
@@ -111,7 +113,7 @@ class LiveSession:
 
     def _note(self, child: Child, event: Event) -> None:
         now_s, silence = time.monotonic(), self._silence
-        if child is self._cast.listener:
+        if child is self._live_nodes.listener:
             received = {each.text("topic"): each.count("received") for each in event.parts("topics")}
             if received != self._received:
                 self._moved.set()
@@ -119,16 +121,16 @@ class LiveSession:
                 silence.received(topic, count, now_s)
             self._received = received
             self._latency_ms = event.number_or_none("latency_ms")
-        elif child is self._cast.caller:
+        elif child is self._live_nodes.caller:
             self._asked, self._answered = event.count("asked"), event.count("answered")
             silence.sent(LAMP, self._asked, now_s)
             silence.received(LAMP, self._answered, now_s)
         else:
             self._sent[child] = event.count("sent")
             silence.sent(event.text("topic"), event.count("sent"), now_s)
-        self._teller.traffic(
+        self._reporter.traffic(
             Traffic(
-                total=self._cast.messages + self._cast.calls,
+                total=self._live_nodes.messages + self._live_nodes.calls,
                 sent=sum(self._sent.values()) + self._asked,
                 received=sum(self._received.values()) + self._answered,
                 behind=silence.behind,
@@ -139,7 +141,7 @@ class LiveSession:
 
     async def _until_quiet(self) -> None:
         """Wait until all came, or nothing came for a while."""
-        while sum(self._received.values()) < self._cast.messages:
+        while sum(self._received.values()) < self._live_nodes.messages:
             self._moved.clear()
             try:
                 await asyncio.wait_for(self._moved.wait(), QUIET_S)

@@ -17,24 +17,24 @@ from typing import Final, Literal
 import yaml
 
 from gdp.crypto.certificates import Role
-from gdp.limits import CLAIM_LEASE_S
+from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.simulation.topology import Attachment, Topology
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
 from gdp.trust.right import Right
-from proxy.config import Encoding
+from proxy.config.config import Encoding
 from proxy.serial.channel import RosVersion
 from ring.live_plan import Carried, Side
 from ring.plan import Credentials, Topic, Yaml, proxy_yaml, rib_yaml, rule_yaml, switch_yaml, upper_rib
 
-__all__ = ["Materials"]
+__all__ = ["OverlayCredentials"]
 
 _SIDES: Final = {"expose": Right.PUBLISH, "import": Right.READ}
 
 
-class Materials:
+class OverlayCredentials:
     """The files of one run. Making it founds the domains and admits the switches and RIBs.
 
     Args:
@@ -52,7 +52,7 @@ class Materials:
         *,
         metrics: bool,
         roamers: Collection[Attachment] = (),
-        lease_s: float = CLAIM_LEASE_S,
+        lease_s: float = ADVERTISEMENT_LEASE_S,
     ) -> None:
         self._roamers = roamers
         self._lease_s = lease_s

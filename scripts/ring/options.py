@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Final, Literal
 
 from gdp.errors import LocalError
-from gdp.limits import CLAIM_LEASE_S, LEASE_MAX_S, LEASE_MIN_S
+from gdp.limits import ADVERTISEMENT_LEASE_S, LEASE_MAX_S, LEASE_MIN_S
 from gdp.simulation.topology import MTU_BYTES, Topology, ring5
-from proxy.config import Encoding
+from proxy.config.config import Encoding
 from ring.faults import Cut, Fault, Kill, Roam, check_faults
 
 __all__ = ["LIVE_S", "Live", "Options", "RingPlane"]
@@ -59,7 +59,7 @@ class Options:
     keep: bool = False
     live: Live | None = None
     seconds: float | None = None
-    lease_s: float = CLAIM_LEASE_S
+    lease_s: float = ADVERTISEMENT_LEASE_S
 
     def __post_init__(self) -> None:
         if self.live is not None and (self.bag is not None or self.rate != 1 or self.out is not None):

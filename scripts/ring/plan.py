@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, TypeAlias
 
-from gdp.limits import CLAIM_LEASE_S
+from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.names import Name
 from gdp.simulation.topology import Attachment, DomainPlan, Topology
-from proxy.config import Encoding
+from proxy.config.config import Encoding
 from proxy.serial.channel import Channel
 
 __all__ = [
@@ -83,7 +83,7 @@ def switch_yaml(
     *,
     metrics: bool,
     roamers: Collection[Attachment] = (),
-    lease_s: float = CLAIM_LEASE_S,
+    lease_s: float = ADVERTISEMENT_LEASE_S,
 ) -> Yaml:
     """Return ``switch.yaml`` of one switch.
 
@@ -102,7 +102,12 @@ def switch_yaml(
 
 
 def rib_yaml(
-    at: Attachment, credentials: Credentials, upper: Name | None, *, metrics: bool, lease_s: float = CLAIM_LEASE_S
+    at: Attachment,
+    credentials: Credentials,
+    upper: Name | None,
+    *,
+    metrics: bool,
+    lease_s: float = ADVERTISEMENT_LEASE_S,
 ) -> Yaml:
     """Return ``rib.yaml`` of one domain's RIB."""
     return {
@@ -138,7 +143,7 @@ def proxy_yaml(
     record: Path | None,
     *,
     metrics: bool,
-    lease_s: float = CLAIM_LEASE_S,
+    lease_s: float = ADVERTISEMENT_LEASE_S,
 ) -> Yaml:
     """Return ``proxy.yaml`` of one proxy.
 

@@ -13,7 +13,7 @@ from typing import Final
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-__all__ = ["Teller", "Traffic"]
+__all__ = ["ProgressReporter", "Traffic"]
 
 _PLAIN_EVERY_S: Final = 2.0
 
@@ -50,7 +50,7 @@ class Traffic:
         return words + "".join(f"  {flow} silent for {seconds:.0f} s" for flow, seconds in self.silent)
 
 
-class Teller:
+class ProgressReporter:
     """Tells steps and traffic as they come.
 
     Args:
@@ -65,7 +65,7 @@ class Teller:
         self._told_s = time.monotonic()
         self._began_s = self._told_s
 
-    def __enter__(self) -> Teller:
+    def __enter__(self) -> ProgressReporter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:

@@ -15,7 +15,7 @@ from ring.child import Child, ChildError
 from ring.children import Children, cancel
 from ring.events import Event
 from ring.injection import Injection
-from ring.progress import Teller, Traffic
+from ring.progress import ProgressReporter, Traffic
 from ring.silence import Silence
 
 __all__ = ["Replay", "Report"]
@@ -57,11 +57,13 @@ class Replay:
         teller: hears of the traffic.
     """
 
-    def __init__(self, children: Children, sender: Child, receiver: Child, total: int, teller: Teller) -> None:
+    def __init__(
+        self, children: Children, sender: Child, receiver: Child, total: int, reporter: ProgressReporter
+    ) -> None:
         self._children = children
         self._sender = sender
         self._receiver = receiver
-        self._teller = teller
+        self._reporter = reporter
         self._traffic = Traffic(total)
         self._silence = Silence()
         self._unconfirmed = ""  # topics
@@ -74,7 +76,7 @@ class Replay:
             ChildError: a process failed, nothing moved for long, or an end did not finish.
             LocalError: a fault cannot be injected.
         """
-        self._teller.begin_traffic(self._traffic.total)
+        self._reporter.begin_traffic(self._traffic.total)
         heard = asyncio.ensure_future(self._listen(self._receiver))
         injection, begun_s = inject(), time.monotonic()
         try:
@@ -87,7 +89,7 @@ class Replay:
         finally:
             await cancel(heard)
             await injection.stop()
-            self._teller.end_traffic()
+            self._reporter.end_traffic()
         complaints = injection.complaints()
         complaints += [_not_confirmed(topic) for topic in sent.parts("unconfirmed")]
         complaints += [f"the sender ended with code {sender_code}"] if sender_code else []
@@ -135,7 +137,7 @@ class Replay:
         if waiting or self._traffic != before:
             self._moved.set()
         silent = tuple((self._unconfirmed or flow, seconds) for flow, seconds in self._silence.silent(now_s))
-        self._teller.traffic(replace(self._traffic, behind=self._silence.behind, silent=silent))
+        self._reporter.traffic(replace(self._traffic, behind=self._silence.behind, silent=silent))
 
     async def _unstalled(self, work: Coroutine[None, None, T]) -> T:
         """Do ``work`` as long as traffic moves."""

@@ -17,11 +17,11 @@ from proxy.recordings.reader import BagReader
 from proxy.serial.channel import RosVersion
 from ring.child import Child
 from ring.children import READY_S, Children
-from ring.fabric import Fabric
+from ring.fabric import Overlay
 from ring.injection import Injection
 from ring.options import Options
 from ring.plan import Topic, topics_of
-from ring.progress import Teller
+from ring.progress import ProgressReporter
 from ring.replay import Replay
 from ring.result import Result, put_together
 
@@ -46,7 +46,7 @@ class Ring:
         LocalError: the kernel refuses namespaces.
     """
 
-    def __init__(self, options: Options, run: Run, teller: Teller, bag: Path) -> None:
+    def __init__(self, options: Options, run: Run, reporter: ProgressReporter, bag: Path) -> None:
         with BagReader(bag) as reader:
             channels, self._total = list(reader.channels), reader.count
             self._rate = options.rate if options.seconds is None else _recorded_s(reader) / options.seconds
@@ -55,13 +55,13 @@ class Ring:
         self.bag = bag
         self.options = options
         self._run = run
-        self._teller = teller
+        self._reporter = reporter
         self._ros: RosVersion = channels[0].ros
         self._topics: tuple[Topic, ...] = topics_of(channels)
         if self.recording.exists():
             raise ConfigError(str(self.recording), "", "exists already; choose another --out")
-        self.fabric = Fabric(options, run, teller)
-        self._children = self.fabric.children
+        self.overlay = Overlay(options, run, reporter)
+        self._children = self.overlay.children
 
     @property
     def recording(self) -> Path:
@@ -76,19 +76,21 @@ class Ring:
             ChildError: a process failed.
             LocalError: a link cannot be cut.
         """
-        await self.fabric.stand_up()
+        await self.overlay.stand_up()
         receiver = self._start_receiver(self.recording)
         await self._children.ready([receiver])
-        self._teller.step(f"replaying {self._total} messages at {self.fabric.robot.switch}")
+        self._reporter.step(f"replaying {self._total} messages at {self.overlay.robot.switch}")
         sender = self._start_sender()
         await self._children.guarded(sender.wait_for("ready", READY_S))
-        replay = Replay(self._children, sender, receiver, self._total, self._teller)
-        report = await replay.report(lambda: Injection(self.fabric, self.options.faults, self._teller))
-        self._teller.step("comparing what was sent with what was recorded")
+        replay = Replay(self._children, sender, receiver, self._total, self._reporter)
+        report = await replay.report(lambda: Injection(self.overlay, self.options.faults, self._reporter))
+        self._reporter.step("comparing what was sent with what was recorded")
         exact = self.options.encoding == "cdr"
         comparisons = await self._children.guarded(asyncio.to_thread(compare, self.bag, self.recording, exact=exact))
         topics = put_together(comparisons, report.topics)
-        return Result(topics, self.fabric.settings, report.unread, report.complaints, report.traffic_s, report.silent_s)
+        return Result(
+            topics, self.overlay.settings, report.unread, report.complaints, report.traffic_s, report.silent_s
+        )
 
     def start_again(self) -> Path:
         """Start a receiver that outlives us, in place of the one that has ended; return the file it records into."""
@@ -99,23 +101,23 @@ class Ring:
     @property
     def sender_config(self) -> Path:
         """Return the ``proxy.yaml`` of the robot."""
-        return self.fabric.materials.proxy_file(self.fabric.robot)
+        return self.overlay.materials.proxy_file(self.overlay.robot)
 
     def forget(self) -> None:
         """Close our ends of the processes; they are left as they are."""
-        self.fabric.forget()
+        self.overlay.forget()
 
     def _start_receiver(self, record: Path, *, heard: bool = True) -> Child:
-        at, encoding = self.fabric.server, self.options.encoding
-        config = self.fabric.materials.receiver(at, self._topics, encoding, self._ros, record)
-        argv = ["-m", "proxy.cli", "--config", str(config), *(["--json"] if heard else [])]
-        return self.fabric.start(at.switch, "proxy", argv, heard=heard)
+        at, encoding = self.overlay.server, self.options.encoding
+        config = self.overlay.materials.receiver(at, self._topics, encoding, self._ros, record)
+        argv = ["-m", "proxy.cli.proxy", "--config", str(config), *(["--json"] if heard else [])]
+        return self.overlay.start(at.switch, "proxy", argv, heard=heard)
 
     def _start_sender(self) -> Child:
-        at, encoding = self.fabric.robot, self.options.encoding
-        config = self.fabric.materials.sender(at, self._topics, encoding, self._ros)
-        argv = ["-m", "proxy.replay_cli", str(self.bag), "--config", str(config), "--json"]
-        return self.fabric.start(at.switch, "replay", [*argv, "--rate", str(self._rate)])
+        at, encoding = self.overlay.robot, self.options.encoding
+        config = self.overlay.materials.sender(at, self._topics, encoding, self._ros)
+        argv = ["-m", "proxy.cli.replay", str(self.bag), "--config", str(config), "--json"]
+        return self.overlay.start(at.switch, "replay", [*argv, "--rate", str(self._rate)])
 
 
 def _recorded_s(reader: BagReader) -> float:

@@ -7,12 +7,12 @@ from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Kind
 from gdp.limits import HOPS_MAX
 from gdp.names import Name
-from gdp.simulation.world import World
+from gdp.simulation.simulation import Simulation
 from tests.journeys.flows import SERVER, Tap, advertise, flowing, ring
 from tests.journeys.test_attacks import mac_of, still_flows
 
 
-def at_rib(world: World) -> tuple[str, Tap, Tap]:
+def at_rib(world: Simulation) -> tuple[str, Tap, Tap]:
     """Return a RIB's node, and what goes to it and comes from it from now on."""
     node = world.rib_node("school")
     switch = node.partition("/")[0]
@@ -21,7 +21,7 @@ def at_rib(world: World) -> tuple[str, Tap, Tap]:
     return node, there, back
 
 
-def played(world: World, node: str, frames: list[bytes], times: int = 1) -> int:
+def played(world: Simulation, node: str, frames: list[bytes], times: int = 1) -> int:
     """Play frames to a node over its lead; return how many bytes that were."""
     for _ in range(times):
         for frame in frames:
@@ -35,7 +35,7 @@ def of_rib(tap: Tap) -> list[bytes]:
     return [frame for frame in tap.frames if frame[1] in (Kind.RIB_REQUEST, Kind.RIB_ANSWER)]
 
 
-def test_a12_a13_recorded_questions_and_claims_draw_no_more_than_their_own_bytes() -> None:
+def test_a12_a13_recorded_questions_and_advertisements_draw_no_more_than_their_own_bytes() -> None:
     world = ring(lease_s=60.0)  # nothing is renewed meanwhile
     node, there, back = at_rib(world)
     flow = flowing(world)
@@ -54,7 +54,7 @@ def test_a12_a13_recorded_questions_and_claims_draw_no_more_than_their_own_bytes
     still_flows(flow)
 
 
-def test_a39_a_rib_that_restarted_takes_no_claim_that_a_stranger_recorded() -> None:
+def test_a39_a_rib_that_restarted_takes_no_advertisement_that_a_stranger_recorded() -> None:
     world = ring()
     node, there, _ = at_rib(world)
     flow = flowing(world)
@@ -101,11 +101,11 @@ def test_an_old_nobody_delays_no_message() -> None:
     flow.outlive()
 
 
-def _port_of(world: World, switch: str, label: str) -> int:
+def _port_of(world: Simulation, switch: str, label: str) -> int:
     ports = world.network._nodes[switch].ports
     return next(port for port, (_, _, far) in ports.items() if far.node == label)
 
 
-def _to(world: World, name: Name) -> bytes:
+def _to(world: Simulation, name: Name) -> bytes:
     """Return a frame of the server to an invented name."""
     return encode(Header(Kind.DATA, 0, HOPS_MAX, 0, 4, 1, 0, 1, 9, name, world.members[SERVER].name)) + b"data"

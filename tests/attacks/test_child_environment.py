@@ -13,8 +13,8 @@ from fog.child_environment import child_environment
 from fog.cli.robot_nodes import run
 from fog.cluster import CloudNode
 from fog.host.bounded_log import BoundedLog
-from fog.host.life import Life
-from fog.launch.probing import _started
+from fog.host.managed_process import ManagedProcess
+from fog.launch.interface_discovery_worker import _started
 from fog.launch.robot_node import RobotNode
 from fog.machine import Program
 
@@ -41,7 +41,7 @@ def test_a63_a_program_of_a_machine_inherits_no_credentials(tmp_path: Path) -> N
     async def live() -> None:
         program = Program("node", ("{python}", "-c", PRINTS), environment={"OWN": "1"})
         log = BoundedLog(tmp_path / "log")
-        life = Life(program, tmp_path, log, lambda: None)
+        life = ManagedProcess(program, tmp_path, log, lambda: None)
         await asyncio.wait_for(life.ended, 20)
         log.close()
 

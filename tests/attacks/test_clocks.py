@@ -10,15 +10,15 @@ import pytest
 from gdp.client.rib_host import RibHost
 from gdp.control.link_state import Scope
 from gdp.crypto.validity import Validity
-from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
 from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_LEASE_S, LINK_STATE_REFRESH_S
-from gdp.rib.machine import Rib, RibSettings
+from gdp.rib.core import RibCore, RibSettings
 from gdp.rib.store import MemoryStore
-from gdp.simulation.world import World
-from gdp.switch.link_states import PAST_S
-from gdp.switch.machine import Switch
+from gdp.sansio import Timestamps
+from gdp.simulation.simulation import Simulation
+from gdp.switch.core import SwitchCore
+from gdp.switch.lsdb import PAST_S
 from gdp.switch.table import Table
 from tests.gdp.switch.net import known, link, state
 from tests.journeys.flows import SERVER, Flow, flowing, ring
@@ -35,31 +35,31 @@ def off(machine: _M, by_s: float) -> _M:
 
         def shifted(*given: object, method: object = method) -> None:
             *others, now = given
-            assert isinstance(now, Instant)
+            assert isinstance(now, Timestamps)
             method(*others, now._replace(unix_s=now.unix_s + by_s))  # type: ignore[operator]
 
         setattr(machine, name, shifted)
     return machine
 
 
-def restart_switch(world: World, name: str, by_s: float) -> Switch:
+def restart_switch(world: Simulation, name: str, by_s: float) -> SwitchCore:
     settings = world._settings()
     settings = replace(settings, first_sequence=settings.first_sequence + int(by_s * 1_000))
     table = Table()
     policy = world.policy(world.topology.domain_of(name).label)
-    switch = world.switches[name] = off(Switch(world.identities[name], policy, table, settings), by_s)
+    switch = world.switches[name] = off(SwitchCore(world.identities[name], policy, table, settings), by_s)
     world.network.replace(name, switch, table)
     return switch
 
 
-def restart_rib(world: World, label: str, by_s: float) -> None:
+def restart_rib(world: Simulation, label: str, by_s: float) -> None:
     settings = world._settings()
     settings = replace(settings, first_sequence=settings.first_sequence + int(by_s * 1_000))
     identity, policy = world.identities[f"rib:{label}"], world.policy(label)
     (domain,) = (each for each in world.topology.domains if each.label == label)
     places = RibSettings(upper=world._rib_names(domain.upper), peers=world._rib_names(label))
     host = world.ribs[label] = off(
-        RibHost(identity, policy, Rib(identity, policy, MemoryStore(), places), settings), by_s
+        RibHost(identity, policy, RibCore(identity, policy, MemoryStore(), places), settings), by_s
     )
     world.network.replace(world.rib_node(label), host)
 
@@ -109,7 +109,7 @@ def test_a30_a_certificate_holds_at_a_clock_that_is_an_hour_off(off_s: float) ->
         validity.check(20_000 + HOUR_S + 1, "certificate")
 
 
-def buried(world: World, label: str) -> list[bytes]:
+def buried(world: Simulation, label: str) -> list[bytes]:
     """Let a switch die and be forgotten; return its last link states."""
     origin = world.identities[label].name
     wires = [
@@ -121,15 +121,15 @@ def buried(world: World, label: str) -> list[bytes]:
     return wires
 
 
-def play(world: World, wires: list[bytes], to: str = "nuc1") -> None:
+def play(world: Simulation, wires: list[bytes], to: str = "nuc1") -> None:
     """Let the neighbour of a switch, who has gone over to the enemy, play link states."""
     for wire in wires:
-        for frame in world.switches["nuc2"]._splitter.split(Kind.LINK_STATE, wire, 1_500):
+        for frame in world.switches["nuc2"]._fragmenter.split(Kind.LINK_STATE, wire, 1_500):
             world.network.inject(to, 0, frame, mac_of(world, to))
     world.network.run(1)
 
 
-def origins(world: World, label: str) -> set[bytes]:
+def origins(world: Simulation, label: str) -> set[bytes]:
     known_there = world.switches[label]._flooding.link_states
     return {bytes(each.origin) for scope in Scope for each in known_there.states(scope)}
 

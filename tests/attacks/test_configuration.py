@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import ConfigError
-from proxy.config import ProxyConfig
+from proxy.config.config import ProxyConfig
 
 
 @pytest.mark.parametrize("path", ["x" * 5_000, "~nobody-of-this-name/x", "a/" * 3_000, '"\\0"'])

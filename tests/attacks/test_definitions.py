@@ -9,10 +9,10 @@ import pytest
 
 from gdp.crypto.cbor import encode
 from gdp.errors import LocalError, RemoteError
-from proxy.parcel import CHANNELS_MAX, Description
 from proxy.serial.channel import Channel, DefinitionFormat
 from proxy.serial.schema import DefinitionError, parse
 from proxy.serial.serializer import Serializer
+from proxy.wire.message import CHANNELS_MAX, TopicDescription
 from tests.attacks.work import lines_run
 
 SIZE = 64 << 10
@@ -100,10 +100,10 @@ def test_a27_all_definitions_of_a_topic_are_at_most_64_kib() -> None:
         for number in range(2)
     )
     with pytest.raises(LocalError):
-        Description("json", channels).to_wire()
+        TopicDescription("json", channels).to_wire()
     wires = [channel.to_wire() for channel in channels]
     with pytest.raises(RemoteError):
-        Description.from_wire(encode({"e": "json", "c": wires}))
+        TopicDescription.from_wire(encode({"e": "json", "c": wires}))
 
 
 def test_a27_many_channels_of_one_definition_are_still_described() -> None:
@@ -111,7 +111,7 @@ def test_a27_many_channels_of_one_definition_are_still_described() -> None:
         Channel("/tf", "a/msg/B", 1, definition="int8 a\n" + "#\n" * 2_000, definition_format="msg", callerid=f"/n{at}")
         for at in range(CHANNELS_MAX)
     )
-    assert Description.from_wire(Description("json", channels).to_wire()).channels == channels
+    assert TopicDescription.from_wire(TopicDescription("json", channels).to_wire()).channels == channels
 
 
 @pytest.mark.parametrize("unit", ["float64[64] a{0}\n", "wstring a{0}\n", "bool a{0}\nfloat64 b{0}\n"])

@@ -10,14 +10,14 @@ from gdp.crypto.statements import parse
 from gdp.errors import StatementError
 from gdp.limits import DEAD_S, HELLO_S
 from gdp.names import ZERO
-from tests.gdp.control.members import greeter, node
+from tests.gdp.control.members import hello_protocol, node
 from tests.gdp.control.test_greeter import A, B, forged, greet, hear, hellos
 
 MALLORY = node("mallory")
 
 
 def test_x01_a_neighbour_that_heard_our_nonce_from_another_member_only_does_not_come_up() -> None:
-    one, two = greeter(A, 1), greeter(B, 2)
+    one, two = hello_protocol(A, 1), hello_protocol(B, 2)
     hellos(one, 0.0)  # two never hears these
     nonce = one.ports[0].nonce
     hear(two, forged(MALLORY, nonce=nonce), 0.0, mac=b"\x02mall\x00")
@@ -28,7 +28,7 @@ def test_x01_a_neighbour_that_heard_our_nonce_from_another_member_only_does_not_
 
 
 def test_x05_a_join_to_another_member_that_said_our_nonce_is_not_taken() -> None:
-    one, two = greeter(A, 1), greeter(B, 2)
+    one, two = hello_protocol(A, 1), hello_protocol(B, 2)
     greet(one, two, 0.0)
     ours = two.ports[0].nonce
     hear(one, forged(MALLORY, nonce=ours), 1.0, mac=b"\x02mall\x00")
@@ -39,14 +39,14 @@ def test_x05_a_join_to_another_member_that_said_our_nonce_is_not_taken() -> None
     join = Join(B.name, B.name, B.name, domain, frozenset(), 1_500, 5.0, b"", theirs.echo, 1, 0, ZERO, session)
     wire = join.to_wire(A.name, A.key)
     with pytest.raises(StatementError):
-        two.ports[0].take_join(Join.from_fields(parse(wire).fields), two.ports[0].neighbours[A.name])
+        two.ports[0].receive_join(Join.from_fields(parse(wire).fields), two.ports[0].neighbours[A.name])
 
 
 def test_x02_a_member_that_said_anothers_nonce_with_a_high_number_does_not_shut_it_out() -> None:
-    one, two = greeter(A, 1), greeter(B, 2)
+    one, two = hello_protocol(A, 1), hello_protocol(B, 2)
     (hello,) = hellos(two, 0.0)
     proof = (one.ports[0].echo,)  # a member on the link can be a neighbour
     hear(one, forged(MALLORY, sequence=2**63, heard=proof, nonce=two.ports[0].nonce), 0.0, mac=b"\x02mall\x00")
-    one.expire(2 * DEAD_S)  # the member falls silent, and its session is remembered
+    one.drop_silent(2 * DEAD_S)  # the member falls silent, and its session is remembered
     hear(one, hello, 2 * DEAD_S)
     assert B.name in one.ports[0].neighbours

@@ -21,7 +21,7 @@ from fog.enrolment.responder import OPENED_MAX, Responder
 from fog.enrolment.tickets import Report, Tickets
 from fog.host.bundle import TICKET_FILE, install, pack
 from fog.host.enrolment import enrol
-from fog.machine import Boot, MachineSpec
+from fog.machine import MachineBundle, MachineSpec
 from fog.providers.aws.provider import AwsProvider
 from fog.providers.cloud_init import Setup, placed, shell_script, user_data
 from fog.site import Site
@@ -486,9 +486,9 @@ class Told(Memory):
 
     def __init__(self) -> None:
         super().__init__()
-        self.boots: dict[str, Boot] = {}
+        self.boots: dict[str, MachineBundle] = {}
 
-    def create(self, spec: MachineSpec, boot: Boot) -> str:
+    def create(self, spec: MachineSpec, boot: MachineBundle) -> str:
         self.boots[spec.name] = boot
         return super().create(spec, boot)
 
@@ -533,7 +533,7 @@ def test_a52_a_machine_that_enrols_when_it_is_no_longer_wanted_is_revoked(
     assert responder.answer(Machine(provider.ticket("m1")).request(), time.time()) != REFUSED
     record = journal.machines("c")[0]
     journal.put(replace(record, released_unix_s=time.time()), time.time())
-    ours.look()
+    ours.reconcile()
     ours.close()
     assert site.revocations is not None
     assert len(list(site.revocations[0].glob("*.revoke"))) == 2

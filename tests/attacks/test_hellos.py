@@ -6,22 +6,22 @@ import hashlib
 
 import pytest
 
-from gdp.control import admission, greeter
-from gdp.control.frames import ControlSplitter
-from gdp.control.greeter import Greeter
+from gdp.control import admission, neighbor_discovery
+from gdp.control.fragments import ControlFragmenter
 from gdp.control.hello import NO_KEEPALIVES, Hello, Timing, echo_of
+from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import NeighbourState
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.keys import PublicKey
 from gdp.crypto.statements import parse
-from gdp.effects import Arrival
 from gdp.errors import DropReason, RemoteError
 from gdp.frame.codec import HEADER_BYTES, decode
 from gdp.frame.kinds import Kind
 from gdp.limits import HELLO_S
+from gdp.sansio import ReceivedFrame
 from tests.gdp.control.members import at, hello_in, node
-from tests.gdp.control.members import greeter as new_greeter
+from tests.gdp.control.members import hello_protocol as new_hello_protocol
 
 A, B = node("a"), node("b")
 MEMBERS = [node(f"m{number}", Role.PROXY) for number in range(40)]
@@ -48,14 +48,14 @@ class Link:
         drops: why it refused what came.
     """
 
-    def __init__(self, *ends: Greeter) -> None:
+    def __init__(self, *ends: HelloProtocol) -> None:
         self.ends = list(ends)
         self.now_s = 0.0
         self.sent = 0
         self.drops: list[DropReason] = []
 
-    def give(self, end: Greeter, mac: bytes, frame: bytes) -> None:
-        arrival, header = Arrival(0, mac, frame), decode(frame)
+    def give(self, end: HelloProtocol, mac: bytes, frame: bytes) -> None:
+        arrival, header = ReceivedFrame(0, mac, frame), decode(frame)
         try:
             if header.kind == Kind.COOKIE:
                 end.receive_cookie(arrival, header)
@@ -76,8 +76,8 @@ class Link:
         while self.now_s < end_s - 1e-9:
             self.now_s += STEP_S
             for end in self.ends:
-                end.expire(self.now_s)
-                for transmit in end.take(self.now_s):
+                end.drop_silent(self.now_s)
+                for transmit in end.hellos_to_send(self.now_s):
                     if end is self.ends[0]:
                         self.sent += sum(map(len, transmit.frames))
                     for other in self.ends:
@@ -87,7 +87,7 @@ class Link:
 
     def inject(self, statement: bytes, mac: bytes, pad: int = 0) -> int:
         """Play a hello to the first one; return its bytes."""
-        (frame,) = ControlSplitter(bytes(32), 9).split(Kind.HELLO, statement, 9_000)
+        (frame,) = ControlFragmenter(bytes(32), 9).split(Kind.HELLO, statement, 9_000)
         frame = frame.ljust(pad, b"\0")
         self.give(self.ends[0], mac, frame)
         return len(frame)
@@ -111,7 +111,7 @@ def verified(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def pair(timing: Timing = NO_KEEPALIVES) -> Link:
-    link = Link(new_greeter(A, 1), new_greeter(B, 2))
+    link = Link(new_hello_protocol(A, 1), new_hello_protocol(B, 2))
     for end in link.ends:
         end.set_timing(0, timing)
     link.run(1.0)
@@ -159,7 +159,7 @@ def test_a41_who_is_new_becomes_a_neighbour_in_a_flood_by_a_cookie() -> None:
 
     rain(2_000)
     assert link.ends[0].ports[0].admission.is_loaded(link.now_s)
-    other = new_greeter(new, 77)
+    other = new_hello_protocol(new, 77)
     other.ports[0].hello_at_s = link.now_s
     link.ends.append(other)
     rain(4_000)  # two seconds
@@ -169,7 +169,7 @@ def test_a41_who_is_new_becomes_a_neighbour_in_a_flood_by_a_cookie() -> None:
 
 def test_a41_a_cookie_counts_for_one_address_one_session_and_one_hello() -> None:
     link = pair()
-    cookies, port = admission.Cookies(new_greeter(A, 5)._random_bytes), link.ends[0].ports[0]
+    cookies, port = admission.Cookies(new_hello_protocol(A, 5)._random_bytes), link.ends[0].ports[0]
     mac, nonce = mac_of(1), b"n" * 8
     cookie = cookies.make(port.nonce, mac, 10.0)
 
@@ -206,7 +206,7 @@ def test_a20_what_goes_to_who_has_not_proved_itself_is_no_more_than_came(pad: in
 def test_a20_who_is_new_waits_no_longer_than_before() -> None:
     link = pair()
     link.run(3.0)
-    other = new_greeter(node("new", Role.PROXY), 77)
+    other = new_hello_protocol(node("new", Role.PROXY), 77)
     other.ports[0].hello_at_s = link.now_s
     link.ends.append(other)
     link.run(0.06)
@@ -215,8 +215,8 @@ def test_a20_who_is_new_waits_no_longer_than_before() -> None:
 
 
 def test_a21_recorded_hellos_displace_no_neighbour_from_the_list_of_heard_nonces() -> None:
-    members = [node(f"n{number}", Role.PROXY) for number in range(greeter.NEIGHBOURS_MAX)]
-    link = Link(new_greeter(A, 1))
+    members = [node(f"n{number}", Role.PROXY) for number in range(neighbor_discovery.NEIGHBOURS_MAX)]
+    link = Link(new_hello_protocol(A, 1))
     port = link.ends[0].ports[0]
     nonces = {number: b"up" + number.to_bytes(6, "big") for number in range(len(members))}
     for number, member in enumerate(members):
@@ -234,7 +234,7 @@ def test_a21_recorded_hellos_displace_no_neighbour_from_the_list_of_heard_nonces
 
 def test_a22_a_newcomer_is_accepted_while_recorded_hellos_are_played() -> None:
     link = pair()
-    other = new_greeter(node("new", Role.PROXY), 77)
+    other = new_hello_protocol(node("new", Role.PROXY), 77)
     for number in range(64):
         link.inject(said(MEMBERS[number % 40], number.to_bytes(8, "big")), mac_of(number))
     link.run(HELLO_S)
@@ -246,7 +246,7 @@ def test_a22_a_newcomer_is_accepted_while_recorded_hellos_are_played() -> None:
         link.run(STEP_S)
     assert bytes(other._identity.name) in link.up()
     assert bytes(B.name) in link.up()
-    assert len(link.ends[0].ports[0].candidates()) <= greeter.CANDIDATES_MAX
+    assert len(link.ends[0].ports[0].candidates()) <= neighbor_discovery.CANDIDATES_MAX
 
 
 def test_a22_a_hello_of_an_earlier_life_played_at_another_port_lets_no_neighbour_go() -> None:
@@ -257,12 +257,12 @@ def test_a22_a_hello_of_an_earlier_life_played_at_another_port_lets_no_neighbour
     link.run(6.0)
     old = Hello(b"n" * 8, 9, (), 1_500, bytes(8), B.membership, life=bytes(15) + b"\x01").to_wire(B.name, B.key)
     one.receive(hello_in(old, 1, mac_of(1)), parse(old), at(link.now_s))
-    one.expire(link.now_s)
+    one.drop_silent(link.now_s)
     (known,) = (each for each in one.ports[0].neighbours.values())
     assert known.state is NeighbourState.UP
 
 
-def test_a20_a_rival_that_has_not_proved_itself_draws_no_more_than_it_sent() -> None:
+def test_a20_a_conflict_that_has_not_proved_itself_draws_no_more_than_it_sent() -> None:
     calm, link = pair(FAST), pair(FAST)
     for each in (calm, link):
         each.run(4.0)

@@ -16,14 +16,16 @@ def test_a_hello_of_an_older_life_from_another_address_ends_no_switch() -> None:
     assert world.settle()
     insider, nuc1 = world.identities["nuc1/insider"], world.switches["nuc1"]
     world.network.connect("nuc1", "nuc1/insider").is_up = False  # a second port of it
-    port = max(nuc1.greeter.ports)
+    port = max(nuc1.hello_protocol.ports)
     hello = Hello(
-        b"a nonce!", 1, (nuc1.greeter.ports[port].echo,), 1_500, bytes(8), insider.membership, Timing(0, 0, 1)
+        b"a nonce!", 1, (nuc1.hello_protocol.ports[port].echo,), 1_500, bytes(8), insider.membership, Timing(0, 0, 1)
     )
     frame = control(Kind.HELLO, hello.to_wire(insider.name, insider.key), source=insider.name)
     world.network.inject("nuc1", port, frame)
     world.network.run(3)
-    assert nuc1.greeter._lateness_s == 0
-    assert {world.members[ROBOT].name, world.switches["nuc2"].name} <= {each.name for each in nuc1.greeter.all_up()}
+    assert nuc1.hello_protocol._lateness_s == 0
+    assert {world.members[ROBOT].name, world.switches["nuc2"].name} <= {
+        each.name for each in nuc1.hello_protocol.all_up()
+    }
     still_flows(flow)
     flow.outlive()

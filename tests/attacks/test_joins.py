@@ -10,19 +10,21 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
-from gdp.simulation.world import World
-from gdp.switch.machine import Switch
+from gdp.simulation.simulation import Simulation
+from gdp.switch.core import SwitchCore
 from gdp.switch.trees import Tree
 from tests.journeys.flows import SERVER, Flow, flowing, ring
 from tests.journeys.test_attacks import counted, still_flows
 
 
-def aside(world: World, flow: Flow) -> tuple[Switch, Tree, Neighbour, Identity]:
+def aside(world: Simulation, flow: Flow) -> tuple[SwitchCore, Tree, Neighbour, Identity]:
     """Return the reader's switch, its tree, a neighbour that is not on the tree's way, and whose that is."""
     reader = world.members[SERVER].name
-    (home,) = (each for each in world.switches.values() if any(a.claim.node == reader for a in each.attached.all()))
-    (tree,) = home.planter.trees.of_topic(flow.topic.name)
-    switches = [each for each in home.greeter.all_up() if each.role is Role.SWITCH]
+    (home,) = (
+        each for each in world.switches.values() if any(a.advertisement.node == reader for a in each.attached.all())
+    )
+    (tree,) = home.multicast.trees.of_topic(flow.topic.name)
+    switches = [each for each in home.hello_protocol.all_up() if each.role is Role.SWITCH]
     (liar,) = (each for each in switches if each.name != tree.above_name)
     (identity,) = (each for each in world.identities.values() if each.name == liar.name)
     return home, tree, liar, identity
@@ -39,10 +41,10 @@ def test_x03_a_join_that_leads_elsewhere_moves_no_tree(proof: str) -> None:
     shown = {"none": b"", "of the true place": tree.proof, "of another topic": identity.membership}[proof]
     join = Join(
         tree.topic, tree.publisher, lie, tree.domain, tree.allowed, 1_500, 7.0, tree.evidence,
-        home.greeter.ports[liar.port].echo, 1 << 60, version + 1_000, sender_session=liar.nonce, proof=shown,
+        home.hello_protocol.ports[liar.port].echo, 1 << 60, version + 1_000, sender_session=liar.nonce, proof=shown,
     )  # fmt: skip
     before = counted(world)
-    frames = world.switches["nuc1"]._splitter.split(Kind.JOIN, join.to_wire(identity.name, identity.key), 1_500)
+    frames = world.switches["nuc1"]._fragmenter.split(Kind.JOIN, join.to_wire(identity.name, identity.key), 1_500)
     for frame in frames:
         world.network.inject(label, liar.port, frame, liar.mac)
     assert (tree.above, tree.switch, tree.version) == (above, true_place, version)
@@ -52,7 +54,7 @@ def test_x03_a_join_that_leads_elsewhere_moves_no_tree(proof: str) -> None:
     flow.outlive()
 
 
-def test_x03_a_genuine_claim_of_the_publisher_says_where_it_is_only_under_its_own_number() -> None:
+def test_x03_a_genuine_advertisement_of_the_publisher_says_where_it_is_only_under_its_own_number() -> None:
     world = ring()
     flow = flowing(world)
     home, tree, liar, identity = aside(world, flow)
@@ -60,9 +62,10 @@ def test_x03_a_genuine_claim_of_the_publisher_says_where_it_is_only_under_its_ow
     version = tree.version
     join = Join(
         tree.topic, tree.publisher, tree.switch, tree.domain, tree.allowed, 1_500, 7.0, tree.evidence,
-        home.greeter.ports[liar.port].echo, 1 << 60, version + (1 << 40), sender_session=liar.nonce, proof=tree.proof,
+        home.hello_protocol.ports[liar.port].echo, 1 << 60, version + (1 << 40),
+        sender_session=liar.nonce, proof=tree.proof,
     )  # fmt: skip
-    for frame in world.switches["nuc1"]._splitter.split(Kind.JOIN, join.to_wire(identity.name, identity.key), 1_500):
+    for frame in world.switches["nuc1"]._fragmenter.split(Kind.JOIN, join.to_wire(identity.name, identity.key), 1_500):
         world.network.inject(label, liar.port, frame, liar.mac)
     assert tree.version == version
     still_flows(flow)

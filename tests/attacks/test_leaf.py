@@ -15,9 +15,9 @@ from gdp.crypto.validity import Validity
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
 from gdp.names import Name
-from gdp.simulation.memory import Cable
+from gdp.simulation.network import SimLink
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
-from gdp.simulation.world import World
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
 from tests.journeys.flows import Flow, Tap, flowing
@@ -28,7 +28,7 @@ LEASE_S = 2.5
 DEAR, CHEAP = 100, 1
 
 
-def detour(*, far: bool = False) -> World:
+def detour(*, far: bool = False) -> Simulation:
     """Return a world in which the cheap way between two switches leads through a leaf, the dear one through a third.
 
     ::
@@ -52,27 +52,27 @@ def detour(*, far: bool = False) -> World:
             *([Attachment("right", "rib", "rib")] if far else []),
         ),
     )  # fmt: skip
-    world = World(topology, lease_s=LEASE_S, leaves=("leaf",))
+    world = Simulation(topology, lease_s=LEASE_S, leaves=("leaf",))
     assert world.settle()
     return world
 
 
-def first_to(world: World, at: str, to: str) -> str | None:
+def first_to(world: Simulation, at: str, to: str) -> str | None:
     """Return the switch through which another one is reached, or None."""
     switch, target = world.switches[at], world.identities[to]
     way = switch._paths.to_switch(target.name, target.root.domain, switch._policy.transit | {target.root.domain})
     return next((label for label, each in world.switches.items() if way and each.name == way.first), None)
 
 
-def say(world: World, state: LinkState, liar: Identity, to: str, port: int) -> None:
+def say(world: Simulation, state: LinkState, liar: Identity, to: str, port: int) -> None:
     """Hand the liar's link state to a neighbour."""
     wire = state.to_wire(liar.key, liar.membership)
-    for frame in world.switches["leaf"]._splitter.split(Kind.LINK_STATE, wire, 1_500):
+    for frame in world.switches["leaf"]._fragmenter.split(Kind.LINK_STATE, wire, 1_500):
         world.network.inject(to, port, frame, mac_of(world, to, port))
     world.network.run(1.0)
 
 
-def state_of(world: World, switch: str) -> LinkState:
+def state_of(world: Simulation, switch: str) -> LinkState:
     """Return the newest link state of a switch in its domain, one number on."""
     machine = world.switches[switch]
     states = machine._flooding.link_states.states(Scope.DOMAIN)
@@ -148,7 +148,7 @@ def test_l03_where_the_only_way_leads_through_a_leaf_frames_stop_and_it_is_said(
     before, left = counted(world)[DropReason.THROUGH_LEAF], world.switches["left"]
     left.unicast.send([bytes(96)], world.switches["right"].name, left.name, world.network.now.mono_s)
     assert counted(world)[DropReason.THROUGH_LEAF] == before + 1
-    assert world.switches["right"].planter.drops[DropReason.THROUGH_LEAF] > 0  # it cannot join the talker's tree
+    assert world.switches["right"].multicast.drops[DropReason.THROUGH_LEAF] > 0  # it cannot join the talker's tree
     flow.outlive(ROBOT)  # the leaf's own node is reached as before
     world.network.set_link(world.cables[frozenset(("left", "middle"))], up=True)
     world.network.run(10)
@@ -163,16 +163,16 @@ def test_l04_a_leaf_that_joins_for_a_reader_elsewhere_gets_no_copies() -> None:
     flow = flowing(world, source=TALKER, readers=(LISTENER,))
     world.network.run(2)
     left, leaf = world.switches["left"], world.identities["leaf"]
-    (tree,) = left.planter.trees.of_topic(flow.topic.name)
-    neighbour = left.greeter.neighbour(1, leaf.name)
+    (tree,) = left.multicast.trees.of_topic(flow.topic.name)
+    neighbour = left.hello_protocol.neighbour(1, leaf.name)
     assert neighbour is not None
     join = Join(
         tree.topic, tree.publisher, left.name, left._policy.own, tree.allowed, 1_500, 5.0, tree.evidence,
-        left.greeter.ports[1].echo, 1 << 50, tree.version, sender_session=neighbour.nonce, proof=tree.proof,
+        left.hello_protocol.ports[1].echo, 1 << 50, tree.version, sender_session=neighbour.nonce, proof=tree.proof,
     )  # fmt: skip
     tap = Tap("left", "leaf")
     world.network.taps.append(tap)
-    for frame in world.switches["leaf"]._splitter.split(Kind.JOIN, join.to_wire(leaf.name, leaf.key), 1_500):
+    for frame in world.switches["leaf"]._fragmenter.split(Kind.JOIN, join.to_wire(leaf.name, leaf.key), 1_500):
         world.network.inject("left", 1, frame, mac_of(world, "left", 1))
     assert arrives(flow, LISTENER)
     assert left.drops()[DropReason.THROUGH_LEAF] == 1
@@ -183,7 +183,7 @@ def test_l05_a_leaf_is_no_border_and_no_neighbour_of_another_domain() -> None:
     world = detour(far=True)
     flow = flowing(world, source=TALKER, readers=(LISTENER, ROBOT))
     right, leaf = world.switches["right"], world.identities["leaf"]
-    assert right.greeter.neighbour(1, leaf.name) is None
+    assert right.hello_protocol.neighbour(1, leaf.name) is None
     assert right.drops()[DropReason.THROUGH_LEAF] > 0
     waits = right.waits((), world.network.now.mono_s)
     assert [wait.refused for wait in waits if wait.reason is WaitReason.STRANGER] == [DropReason.THROUGH_LEAF]
@@ -193,7 +193,7 @@ def test_l05_a_leaf_is_no_border_and_no_neighbour_of_another_domain() -> None:
     )  # fmt: skip
     before = right.drops()[DropReason.THROUGH_LEAF]
     wire = border.to_wire(leaf.key, leaf.membership)
-    for frame in world.switches["leaf"]._splitter.split(Kind.LINK_STATE, wire, 1_500):
+    for frame in world.switches["leaf"]._fragmenter.split(Kind.LINK_STATE, wire, 1_500):
         world.network.inject("right", 0, frame, mac_of(world, "right", 0))  # as if its neighbour passed it on
     assert right.drops()[DropReason.THROUGH_LEAF] > before
     assert not any(each.origin == leaf.name for each in right._flooding.link_states.states(Scope.BORDER))
@@ -205,7 +205,7 @@ def test_l05_a_leaf_is_no_border_and_no_neighbour_of_another_domain() -> None:
 def test_l06_a_leaf_hosts_no_rib_that_its_own_root_does_not_name(signed_by: str) -> None:
     world = detour(far=True)
     leaf, left = world.identities["leaf"], world.switches["left"]
-    keys = World(world.topology).identities["rib:home"] if signed_by == "a stranger's root" else None
+    keys = Simulation(world.topology).identities["rib:home"] if signed_by == "a stranger's root" else None
     rib = keys or world.identities["rib:away"]
     validity = Validity.lasting(world.network.now.unix_s, 600)
     proof = RtCert.make(rib, leaf.name, validity)  # the RIB's owner and the machine's tenant are one
@@ -233,15 +233,15 @@ def test_l07_frames_in_anothers_name_from_a_leaf_become_no_copies() -> None:
     flow.outlive()
 
 
-def test_l08_a_leaf_that_claims_for_another_switchs_node_is_refused_by_the_rib() -> None:
+def test_l08_a_leaf_that_advertisements_for_another_switchs_node_is_refused_by_the_rib() -> None:
     world = detour()
     flow = flowing(world, source=TALKER, readers=(LISTENER,))
     leaf = world.switches["leaf"]
-    claim = world.switches["left"].attached.get(flow.topic.name, flow.member.name)
-    assert claim is not None
+    advertisement = world.switches["left"].attached.get(flow.topic.name, flow.member.name)
+    assert advertisement is not None
     rib = world.ribs["home"]
     before = rib.drops()[DropReason.NOT_DELEGATED]
-    leaf.inquirer.relay(claim.claim.wire, world.network.now.mono_s)
+    leaf.rib_client.relay(advertisement.advertisement.wire, world.network.now.mono_s)
     world.network.touch("leaf")
     world.network.run(1)
     assert rib.drops()[DropReason.NOT_DELEGATED] == before + 1
@@ -257,7 +257,7 @@ def test_two_leaves_that_are_joined_reach_each_others_nodes_and_pass_nothing_on(
             Attachment("hub", "rib", "rib"), Attachment("hub", "proxy", "desk"), Attachment("one", "proxy", "first"),
         ),
     )  # fmt: skip
-    world = World(topology, lease_s=LEASE_S, leaves=("one", "two"))
+    world = Simulation(topology, lease_s=LEASE_S, leaves=("one", "two"))
     assert world.settle()
     assert first_to(world, "one", "two") == "two"
     assert first_to(world, "hub", "two") is None
@@ -293,7 +293,7 @@ def test_a_node_that_moves_to_a_leaf_and_on_keeps_its_reader() -> None:
     flow.outlive()
 
 
-def test_a_cable_to_a_leaf_from_a_second_switch_makes_no_way_through_it() -> None:
+def test_a_sim_link_to_a_leaf_from_a_second_switch_makes_no_way_through_it() -> None:
     world = detour()
     flow = flowing(world, source=TALKER, readers=(LISTENER,))
     topic = world.topic(flow.name, world.members[ROBOT], [Right.READ])
@@ -301,7 +301,7 @@ def test_a_cable_to_a_leaf_from_a_second_switch_makes_no_way_through_it() -> Non
     flow.got[ROBOT] = []
     world.network.touch(ROBOT)
     assert world.network.run(5, lambda: flow.is_read_by(2))
-    world.network.connect("middle", "leaf", Cable(), CHEAP)
+    world.network.connect("middle", "leaf", SimLink(), CHEAP)
     world.network.run(3)
     assert first_to(world, "left", "right") == first_to(world, "left", "middle") == "middle"
     assert world.switches["left"]._paths.domain_of(Name(world.switches["leaf"].name)) is not None

@@ -12,7 +12,7 @@ import pytest
 
 from fog.cluster import ClusterPlan
 from fog.host.bundle import read_programs
-from fog.host.notice import read_notice
+from fog.host.preemption_notice import read_notice
 from fog.host.status import Status
 from fog.launch.cloud_node import parameter_rule, parameters_in
 from fog.launch.load import load

@@ -11,10 +11,10 @@ import pytest
 
 from gdp.errors import RemoteError
 from proxy.serial.channel import Channel, RosVersion
+from proxy.serial.converter import MessageConverter, translated_channel
 from proxy.serial.empty import NoAnswer
 from proxy.serial.schema import DefinitionError
 from proxy.serial.serializer import Encoding, Serializer, canonical
-from proxy.serial.twin import Twin, twin_channel
 
 RULE = "=" * 80 + "\n"
 HOLLOW = f"A[] a\n{RULE}MSG: a/A\nN[65536] n\n{RULE}MSG: a/N\n"
@@ -45,11 +45,11 @@ def test_a60_a_message_of_hollow_items_is_refused_within_its_budget(count: int) 
 
 def test_a60_a_converted_message_of_hollow_items_is_refused_within_its_budget() -> None:
     source = channel(HOLLOW)
-    twin = Twin(source, twin_channel(source, 2))
+    converter = MessageConverter(source, translated_channel(source, 2))
 
     def convert() -> None:
         with pytest.raises(RemoteError):
-            twin.convert(struct.pack("<I", 60) + bytes(64))
+            converter.convert(struct.pack("<I", 60) + bytes(64))
 
     assert memory_of(convert) < 1 << 20
 

@@ -6,18 +6,18 @@ from collections.abc import Iterator
 
 import pytest
 
-from gdp.client.feed import FeedState
 from gdp.client.path_mtu import PLATEAUS, PathMtu
-from gdp.client.readers import READERS_MAX
+from gdp.client.reader_proxies import READERS_MAX
+from gdp.client.writer_proxy import WriterProxyState
+from gdp.crypto.control_seal import ControlSealer
 from gdp.crypto.envelope import seal_key
 from gdp.crypto.introduction import Introduction
-from gdp.crypto.note import NoteSealer
 from gdp.errors import DropReason
 from gdp.frame.codec import decode
 from gdp.frame.kinds import Kind
 from gdp.limits import EPOCH_GRACE_S, MTU_HOLD_S, MTU_NARROWINGS, NACKS_PER_REPORT
-from gdp.message.report import Missing, Report, ReportFlag
-from gdp.message.window import SendWindow
+from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
+from gdp.message.send_window import SendWindow
 from gdp.names import Name
 from tests.attacks.work import lines_run
 from tests.gdp.client.lives import Notes, key_of, name_of, reader_of, subject_of
@@ -26,16 +26,16 @@ from tests.gdp.client.pipe import SECRETS, TOPIC, End, Pipe, publisher_of
 TWO = {1: b"1" * 32, 2: b"2" * 32}
 AHEAD = 60_000
 LIES = (
-    Report(ReportFlag.NEW, 0, 0, ()),
-    Report(ReportFlag.NONE, 1_000, 0, (), 1_000),
-    Report(ReportFlag.NONE, 1, 0, (Missing(1, 0, 0xFFFF_FFFF),), 1),
-    Report(ReportFlag.BYE, 0, 0, ()),
+    AckNack(AckNackFlag.NEW, 0, 0, ()),
+    AckNack(AckNackFlag.NONE, 1_000, 0, (), 1_000),
+    AckNack(AckNackFlag.NONE, 1, 0, (MissingRange(1, 0, 0xFFFF_FFFF),), 1),
+    AckNack(AckNackFlag.BYE, 0, 0, ()),
 )
 
 
 def live(pipe: Pipe, label: bytes, incarnation: int = 7) -> End:
     end = pipe.join(label, incarnation=incarnation)
-    assert pipe.run(2.0, lambda: end.feed.state is FeedState.LIVE)
+    assert pipe.run(2.0, lambda: end.writer_proxy.state is WriterProxyState.LIVE)
     return end
 
 
@@ -44,12 +44,12 @@ def notes_of(pipe: Pipe, label: bytes, *, secrets: dict[int, bytes] | None = Non
     return Notes(reader_of(label), source, TOPIC, SECRETS if secrets is None else secrets, as_name=victim)
 
 
-def by_the_secret_alone(pipe: Pipe, end: End, number: int, report: Report) -> bytes:
+def by_the_secret_alone(pipe: Pipe, end: End, number: int, report: AckNack) -> bytes:
     """Return the note that proved a reader while the topic's secret was all that it took."""
     source, reader = pipe.source, end.reader
-    key = seal_key(SECRETS[1], Kind.REPORT, reader.name, reader.incarnation, source.name)
+    key = seal_key(SECRETS[1], Kind.ACKNACK, reader.name, reader.incarnation, source.name)
     to = source.name, TOPIC, source.incarnation
-    made = NoteSealer(key, 1, Kind.REPORT, reader.name, reader.incarnation, *to, iter([number]))
+    made = ControlSealer(key, 1, Kind.ACKNACK, reader.name, reader.incarnation, *to, iter([number]))
     return made.seal(report.to_wire())
 
 
@@ -89,7 +89,7 @@ def test_a33_a_reader_whose_state_was_lost_is_heard_again_at_once() -> None:
     pipe = Pipe(publisher_of())
     live(pipe, b"a")
     again = pipe.join(b"a", incarnation=8)
-    assert pipe.run(0.2, lambda: again.feed.state is FeedState.LIVE)
+    assert pipe.run(0.2, lambda: again.writer_proxy.state is WriterProxyState.LIVE)
     pipe.publish([b"for the new life"])
     assert pipe.run(1.0, lambda: again.messages == [b"for the new life"])
 
@@ -97,7 +97,7 @@ def test_a33_a_reader_whose_state_was_lost_is_heard_again_at_once() -> None:
 def test_a24_who_was_left_out_of_the_new_epoch_fills_no_place_and_speaks_for_nobody() -> None:
     pipe = Pipe(publisher_of())
     end = live(pipe, b"a")
-    end.feed.renew(TWO)
+    end.writer_proxy.renew(TWO)
     pipe.publisher.renew(TWO, pipe.now_s)
     for at in range(READERS_MAX):
         pipe.tell(*notes_of(pipe, b"left out %d" % at).hello())
@@ -122,7 +122,7 @@ def test_a24_a_reader_that_was_left_out_is_heard_for_a_grace_and_then_no_more() 
 def test_a24_a_reader_that_hears_nothing_of_a_new_epoch_during_the_grace_is_a_reader_again_after_it() -> None:
     pipe = Pipe(publisher_of())
     end = live(pipe, b"a")
-    end.feed.renew(TWO)
+    end.writer_proxy.renew(TWO)
     end.loss = 1.0
     pipe.publisher.renew(TWO, pipe.now_s)
     pipe.publish([b"one"])
@@ -140,7 +140,7 @@ def test_a24_epochs_that_change_all_the_time_lose_nothing() -> None:
     for epoch in range(2, 12):
         secrets = {epoch - 1: SECRETS[1] if epoch == 2 else bytes([epoch - 1]) * 32, epoch: bytes([epoch]) * 32}
         for end in ends:
-            end.feed.renew(secrets)
+            end.writer_proxy.renew(secrets)
         pipe.publisher.renew(secrets, pipe.now_s)
         for at in range(50):
             sent.append(b"%d in %d" % (at, epoch))
@@ -197,7 +197,7 @@ def snapshot(pipe: Pipe) -> object:
     publisher = pipe.publisher
     readers = {name: publisher._readers[name] for name in publisher._readers}
     states = {name: (each.incarnation, each.heard_s, each.sequence, each.lost) for name, each in readers.items()}
-    return states, publisher._window.acknowledged, publisher._window.readers, dict(publisher._statuses.starts)
+    return states, publisher._window.acknowledged, publisher._window.readers, dict(publisher._heartbeats.starts)
 
 
 def test_a56_a_reader_that_asks_for_everything_costs_a_bounded_share() -> None:
@@ -210,31 +210,31 @@ def test_a56_a_reader_that_asks_for_everything_costs_a_bounded_share() -> None:
     while window.sent[0] < 2:  # all of it is under way
         taken = len(window.frames_to_send(now_s))
         part = window.sent[1] if window.sent[0] < 2 else len(frames)
-        window.handle_report(reader, Report(ReportFlag.NONE, 1, max(part - 1, 0), ()), now_s)
+        window.handle_acknack(reader, AckNack(AckNackFlag.NONE, 1, max(part - 1, 0), ()), now_s)
         now_s += 0.01 if taken else 0.1
-    everything = tuple(Missing(1, 0, 0xFFFF_FFFF) for _ in range(NACKS_PER_REPORT))
-    greedy = Report(ReportFlag.NONE, 1, 0, everything)
+    everything = tuple(MissingRange(1, 0, 0xFFFF_FFFF) for _ in range(NACKS_PER_REPORT))
+    greedy = AckNack(AckNackFlag.NONE, 1, 0, everything)
     for _ in range(200):  # nothing is sent, as over a slow link: all that is looked at waits already
         now_s += 0.02
-        window.handle_report(reader, greedy, now_s)
+        window.handle_acknack(reader, greedy, now_s)
     with lines_run(2_000_000):  # each of 2,000 reports in a tenth of a second looked at 8,192 parts: 80 million
         for _ in range(2_000):
             now_s += 0.000_05
-            window.handle_report(reader, greedy, now_s)
+            window.handle_acknack(reader, greedy, now_s)
 
 
 @pytest.mark.parametrize("said", [(576, 9_000), tuple(range(8_999, 577, -7))])
 def test_a57_a_path_of_every_width_has_what_is_kept_sealed_anew_a_few_times_only(said: tuple[int, ...]) -> None:
     path, width, narrowed = PathMtu(), 9_000, 0
-    path.take(width, 0.0)
+    path.receive_mtu(width, 0.0)
     for turn in range(1_000):
-        now = path.take(said[turn % len(said)], turn * MTU_HOLD_S / 1_000)
+        now = path.receive_mtu(said[turn % len(said)], turn * MTU_HOLD_S / 1_000)
         if now < width:
             narrowed += 1
             path.count()
         width = now
     assert narrowed <= MTU_NARROWINGS + 1 + len(PLATEAUS)
-    assert path.take(9_000, 100 * MTU_HOLD_S) == 9_000
+    assert path.receive_mtu(9_000, 100 * MTU_HOLD_S) == 9_000
 
 
 def test_a57_a_join_of_a_small_mtu_opens_and_seals_nothing_before_it_is_sent() -> None:
@@ -245,7 +245,7 @@ def test_a57_a_join_of_a_small_mtu_opens_and_seals_nothing_before_it_is_sent() -
     for _ in range(30):
         pipe.publisher.publish(bytes(1_000_000))
     for _ in range(200):
-        pipe.publisher.take(pipe.now_s)
+        pipe.publisher.poll_frames(pipe.now_s)
         pipe.now_s += 0.001
     with lines_run(20_000):
         pipe.publisher.tree_stands(576)
@@ -258,7 +258,7 @@ def test_notes_fit_the_smallest_link() -> None:
     pipe = Pipe(publisher_of())
     end = live(pipe, b"a")
     notes = notes_of(pipe, b"b")
-    ranges = tuple(Missing(1, 0, 1) for _ in range(NACKS_PER_REPORT))
-    sizes = [len(notes.introduction()), len(notes.report(Report(ReportFlag.NONE, 1, 0, ranges)))]
+    ranges = tuple(MissingRange(1, 0, 1) for _ in range(NACKS_PER_REPORT))
+    sizes = [len(notes.introduction()), len(notes.report(AckNack(AckNackFlag.NONE, 1, 0, ranges)))]
     assert max(sizes) <= 576
-    assert decode(notes.introduction()).destination == end.feed.publisher
+    assert decode(notes.introduction()).destination == end.writer_proxy.publisher

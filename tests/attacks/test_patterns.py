@@ -7,13 +7,13 @@ import sys
 
 import pytest
 
-from proxy.rules.pattern import is_pattern
+from proxy.config.pattern import is_pattern
 
 _CPU_S = 5  # a thousand times what is measured; a pattern that backtracks needs hours
 
 _MATCH = f"""
 import resource, sys
-from proxy.rules.pattern import matches
+from proxy.config.pattern import matches
 resource.setrlimit(resource.RLIMIT_CPU, ({_CPU_S}, {_CPU_S}))
 print(matches(sys.argv[1], sys.argv[2]))
 """

@@ -12,13 +12,13 @@ from gdp.crypto.validity import Validity
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
 from gdp.names import Name
-from gdp.simulation.world import World
+from gdp.simulation.simulation import Simulation
 from gdp.trust.rtcert import RtCert
 from tests.journeys.flows import ROBOT, flowing, ring
 from tests.journeys.test_attacks import mac_of, still_flows
 
 
-def liar_of(world: World, switch: str) -> LinkState:
+def liar_of(world: Simulation, switch: str) -> LinkState:
     """Return the newest border link state of a switch, one number on."""
     machine = world.switches[switch]
     states = machine._flooding.link_states.states(Scope.BORDER)
@@ -26,10 +26,10 @@ def liar_of(world: World, switch: str) -> LinkState:
     return replace(own, sequence=own.sequence + 1)
 
 
-def say(world: World, state: LinkState, liar: Identity) -> None:
+def say(world: Simulation, state: LinkState, liar: Identity) -> None:
     """Hand the liar's link state to nuc1 as its neighbour nuc2 would."""
     wire = state.to_wire(liar.key, liar.membership)
-    frames = world.switches["nuc2"]._splitter.split(Kind.LINK_STATE, wire, 1_500)
+    frames = world.switches["nuc2"]._fragmenter.split(Kind.LINK_STATE, wire, 1_500)
     for frame in frames:
         world.network.inject("nuc1", 0, frame, mac_of(world, "nuc1"))
 

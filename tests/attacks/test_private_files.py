@@ -9,7 +9,7 @@ import pytest
 
 from fog.site import open_site
 from gdp.errors import LocalError
-from gdp.host.run_registry import Runs
+from gdp.host.run_registry import RunRegistry
 from gdp.nodes.config import ClusterConfig
 from gdp.stores.files import private, read_private, write_all
 from gdp.stores.issue import make_domain
@@ -95,7 +95,7 @@ def test_a49_a_folder_of_records_is_refused_by_the_same_rule(tmp_path: Path, mon
     (tmp_path / "runs").mkdir()
     give_away(tmp_path / "runs", monkeypatch)
     with pytest.raises(LocalError, match="must belong to this user alone"):
-        Runs(tmp_path / "runs")
+        RunRegistry(tmp_path / "runs")
 
 
 def test_a48_the_password_of_a_store_that_others_may_read_is_refused(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from gdp.control.frames import ControlSplitter
+from gdp.control.fragments import ControlFragmenter
 from gdp.control.join import Join
 from gdp.control.link_state import LinkState, Scope
 from gdp.control.query import Query
@@ -16,22 +16,22 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
-from gdp.effects import Instant
 from gdp.errors import DropReason, StatementError
 from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Kind
 from gdp.limits import ATTACHED_MAX, HOPS_MAX, QUESTIONS_BURST
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.rib.machine import Rib, RibSettings
+from gdp.rib.core import RibCore, RibSettings
 from gdp.rib.store import MemoryStore
-from gdp.simulation.world import World
-from gdp.switch.attached import Attached
-from gdp.trust.claim import Claim, make_claim
+from gdp.sansio import Timestamps
+from gdp.simulation.simulation import Simulation
+from gdp.switch.local_advertisements import LocalAdvertisements
+from gdp.trust.advertisement import Advertisement, sign_advertisement
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
-from tests.gdp.trust.world import CLOUD, DAY, GATEWAY, NOW, ROBOT, SCHOOL, SWITCH, claim, verifier
+from tests.gdp.trust.world import CLOUD, DAY, GATEWAY, NOW, ROBOT, SCHOOL, SWITCH, advertisement, verifier
 from tests.journeys.flows import ROBOT as ROBOT_AT
 from tests.journeys.flows import SERVER, Tap, advertise, flowing, ring
 from tests.journeys.test_attacks import mac_of, still_flows
@@ -39,18 +39,18 @@ from tests.journeys.test_attacks import mac_of, still_flows
 RIB = NodeKeys.generate(Role.RIB, "rib").join(SCHOOL, DAY)
 CLOUD_SWITCH = NodeKeys.generate(Role.SWITCH, "nuc4").join(CLOUD, DAY)
 CLOUD_PROXY = NodeKeys.generate(Role.PROXY, "elsewhere").join(CLOUD, DAY)
-START = Instant(0.0, NOW)
+START = Timestamps(0.0, NOW)
 ROOM = 64  # for branches, in a test of how it is shared
 
 
-def rib(**settings: int) -> Rib:
-    return Rib(RIB, Policy(SCHOOL.root, [CLOUD.root]), MemoryStore(), replace(RibSettings(), **settings))  # type: ignore[arg-type]
+def rib(**settings: int) -> RibCore:
+    return RibCore(RIB, Policy(SCHOOL.root, [CLOUD.root]), MemoryStore(), replace(RibSettings(), **settings))  # type: ignore[arg-type]
 
 
-def watch(at: Rib, by: Identity, number: int) -> None:
+def watch(at: RibCore, by: Identity, number: int) -> None:
     query = Query(Name(number.to_bytes(32, "big")), 3_600.0)
     at.receive(query.to_wire(by.name, by.key, by.membership), by.name, START)
-    at.take()
+    at.statements_to_send()
 
 
 def test_a14_a_greedy_asker_leaves_room_for_the_watches_of_others() -> None:
@@ -70,12 +70,12 @@ def test_a14_a_proxy_watches_nothing_at_a_rib() -> None:
 
 
 def test_a12_what_a_members_questions_draw_from_a_rib_is_paced_in_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gdp.rib.machine.ANSWER_BYTES_PER_S", 1_000.0)
-    monkeypatch.setattr("gdp.rib.machine.ANSWER_BYTES_BURST", 30_000.0)
+    monkeypatch.setattr("gdp.rib.core.ANSWER_BYTES_PER_S", 1_000.0)
+    monkeypatch.setattr("gdp.rib.core.ANSWER_BYTES_BURST", 30_000.0)
     at = rib()
     for number in range(3):
-        tell(at, claim(subject=_subject(f"/own{number}"), chain=[]))
-    at.take()
+        tell(at, advertisement(subject=_subject(f"/own{number}"), chain=[]))
+    at.statements_to_send()
     name = _subject("/own1").name
     for by in (SWITCH, CLOUD_SWITCH):
         drawn = said = 0
@@ -83,7 +83,7 @@ def test_a12_what_a_members_questions_draw_from_a_rib_is_paced_in_bytes(monkeypa
             wire = Query(name, 0.0).to_wire(by.name, by.key, by.membership)
             at.receive(wire, by.name, START)
             said += len(wire)
-            drawn += sum(len(letter.statement) for letter in at.take())
+            drawn += sum(len(outgoing.statement) for outgoing in at.statements_to_send())
         assert 15_000 < drawn <= 30_000 < said
     assert at.refusals[DropReason.QUOTA] >= 150
 
@@ -101,7 +101,7 @@ def test_a07_link_states_of_one_origin_are_flooded_at_a_pace(monkeypatch: pytest
             liar.name, liar.root.domain, Scope.BORDER, sequence + number, (), (), (),
             said_unix_s=int(world.network.now.unix_s),
         )  # fmt: skip
-        frames = ControlSplitter(liar.name, 1 << 40).split(
+        frames = ControlFragmenter(liar.name, 1 << 40).split(
             Kind.LINK_STATE, state.to_wire(liar.key, liar.membership), 1_400
         )
         for frame in frames:
@@ -113,23 +113,25 @@ def test_a07_link_states_of_one_origin_are_flooded_at_a_pace(monkeypatch: pytest
     flow.outlive()
 
 
-def test_a15_a_nodes_claims_are_bounded_and_cost_the_same_however_many_there_are() -> None:
-    attached = Attached()
-    one = verifier().verify(claim(subject=_subject("/own"), chain=[], lease_s=3_600.0), NOW)
+def test_a15_a_nodes_advertisements_are_bounded_and_cost_the_same_however_many_there_are() -> None:
+    attached = LocalAdvertisements()
+    one = verifier().verify(advertisement(subject=_subject("/own"), chain=[], lease_s=3_600.0), NOW)
     for number in range(1, ATTACHED_MAX // 2 + 1):
         attached.put(renamed(one, Name(number.to_bytes(32, "big"))), 0, b"m", 0.0)
     with pytest.raises(StatementError, match="quota"):
         attached.put(one, 0, b"m", 0.0)
     rtcert = RtCert.make(GATEWAY, SWITCH.name, DAY)
-    others = claim(node=GATEWAY, subject=_subject("/others", GATEWAY), chain=[], rtcert=rtcert)
+    others = advertisement(node=GATEWAY, subject=_subject("/others", GATEWAY), chain=[], rtcert=rtcert)
     attached.put(verifier().verify(others, NOW), 1, b"n", 0.0)
     assert len(attached.due(0.0)) == ATTACHED_MAX // 2 + 1
     assert attached.due(0.1) == []
 
 
-def test_a15_claims_and_withdrawals_beyond_a_neighbours_pace_draw_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gdp.switch.machine.CLAIMS_PER_S", 10.0)
-    monkeypatch.setattr("gdp.switch.machine.CLAIMS_BURST", 20.0)
+def test_a15_advertisements_and_withdrawals_beyond_a_neighbours_pace_draw_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("gdp.switch.core.CLAIMS_PER_S", 10.0)
+    monkeypatch.setattr("gdp.switch.core.CLAIMS_BURST", 20.0)
     world = ring()
     other = world.add_member("nuc1/other", "nuc1")
     assert world.network.run(5, lambda: other.attachment.is_attached)
@@ -144,11 +146,11 @@ def test_a15_claims_and_withdrawals_beyond_a_neighbours_pace_draw_nothing(monkey
     def say(numbers: range) -> int:
         before = len(tap.frames)
         for number in numbers:
-            wire = make_claim(
+            wire = sign_advertisement(
                 robot, Right.PUBLISH, _subject(f"/own{number}", robot), rtcert=rtcert, sequence=sequence + number,
                 incarnation=incarnation, lease_s=20.0, is_global=True,
             )  # fmt: skip
-            for frame in ControlSplitter(robot.name, number).split(Kind.ADVERTISE, wire, 1_400):
+            for frame in ControlFragmenter(robot.name, number).split(Kind.ADVERTISE, wire, 1_400):
                 world.network.inject("nuc1", port, frame, mac_of(world, "nuc1", port))
         return len(tap.frames) - before
 
@@ -161,7 +163,7 @@ def test_a15_claims_and_withdrawals_beyond_a_neighbours_pace_draw_nothing(monkey
     late.outlive()
 
 
-def renamed(one: Claim, name: Name) -> Claim:
+def renamed(one: Advertisement, name: Name) -> Advertisement:
     """Return a claim on another name, which nobody verified: what costs room is counted before."""
     subject = copy.copy(one.subject)
     object.__setattr__(subject, "name", name)
@@ -171,14 +173,14 @@ def renamed(one: Claim, name: Name) -> Claim:
 def test_a16_one_nodes_names_leave_room_for_the_other_nodes_of_its_switch() -> None:
     at = rib(names_per_sender=20)
     for number in range(30):
-        tell(at, claim(subject=_subject(f"/own{number}"), chain=[]))
+        tell(at, advertisement(subject=_subject(f"/own{number}"), chain=[]))
     assert (at.names, at.refusals) == (10, {DropReason.QUOTA: 20})
     rtcert = RtCert.make(GATEWAY, SWITCH.name, DAY)
-    tell(at, claim(node=GATEWAY, subject=_subject("/others", GATEWAY), chain=[], rtcert=rtcert))
+    tell(at, advertisement(node=GATEWAY, subject=_subject("/others", GATEWAY), chain=[], rtcert=rtcert))
     assert at.names == 11
 
 
-def tell(at: Rib, wire: bytes) -> None:
+def tell(at: RibCore, wire: bytes) -> None:
     relay = Relay(wire, (SCHOOL.root.domain,), SWITCH.membership)
     at.receive(relay.to_wire(SWITCH.name, SWITCH.key), SWITCH.name, START)
 
@@ -187,12 +189,12 @@ def _subject(name: str, by: Identity = ROBOT) -> Subject:
     return Subject.of(Metadata({"kind": "topic", "name": name}), by.key.public.compressed)
 
 
-def _frame(world: World, to: Name) -> bytes:
+def _frame(world: Simulation, to: Name) -> bytes:
     member = world.members[ROBOT_AT]
     return encode(Header(Kind.DATA, 0, HOPS_MAX, 0, 4, 1, 0, 1, 9, to, member.name)) + b"data"
 
 
-def _port_of(world: World, switch: str, label: str) -> int:
+def _port_of(world: Simulation, switch: str, label: str) -> int:
     ports = world.network._nodes[switch].ports
     return next(port for port, (_, _, far) in ports.items() if far.node == label)
 
@@ -213,7 +215,7 @@ def test_a17_a18_frames_to_invented_names_are_asked_for_within_a_budget_and_dela
     switch = world.switches["nuc1"]
     world.network.run(0.5)
     asked = QUESTIONS_BURST + 2 * 16 * 2
-    assert switch.drops()[DropReason.PARKED_FULL] >= 5_000 - asked
+    assert switch.drops()[DropReason.PENDING_FULL] >= 5_000 - asked
     late = advertise(world, "/late", "nuc1/other")
     late.read_by(SERVER)
     assert world.network.run(3, lambda: late.is_read_by(1))
@@ -222,19 +224,19 @@ def test_a17_a18_frames_to_invented_names_are_asked_for_within_a_budget_and_dela
 
 
 def test_a65_one_neighbours_branches_leave_room_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gdp.switch.planter.TREES_MAX", ROOM)
+    monkeypatch.setattr("gdp.switch.multicast.TREES_MAX", ROOM)
     world = ring()
-    planter = world.switches["nuc1"].planter
+    multicast = world.switches["nuc1"].multicast
     own = world.switches["nuc1"].name
     domain = world.authorities["school"].root.domain
-    greedy, modest = (each for each in world.switches["nuc1"].greeter.all_up() if each.role is Role.SWITCH)
+    greedy, modest = (each for each in world.switches["nuc1"].hello_protocol.all_up() if each.role is Role.SWITCH)
     through = frozenset(world.policy("school").transit)
     for number in range(1, ROOM // 2 + 1):
         topic = Name(number.to_bytes(32, "big"))
         join = Join(topic, own, own, domain, through, 1_400, 7.0, b"claim", b"", number)
-        planter.join(join, greedy, world.network.now.mono_s)
+        multicast.join(join, greedy, world.network.now.mono_s)
     with pytest.raises(StatementError, match="quota"):
-        planter.join(replace(join, topic=Name(b"s" * 32)), greedy, world.network.now.mono_s)
-    assert len(planter.trees) == ROOM // 2
-    planter.join(replace(join, topic=Name(b"t" * 32)), modest, world.network.now.mono_s)
-    assert len(planter.trees) == ROOM // 2 + 1
+        multicast.join(replace(join, topic=Name(b"s" * 32)), greedy, world.network.now.mono_s)
+    assert len(multicast.trees) == ROOM // 2
+    multicast.join(replace(join, topic=Name(b"t" * 32)), modest, world.network.now.mono_s)
+    assert len(multicast.trees) == ROOM // 2 + 1

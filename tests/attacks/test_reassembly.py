@@ -8,8 +8,8 @@ from gdp.crypto.envelope import Opener, Sealer, Signer
 from gdp.frame.codec import decode
 from gdp.frame.kinds import Kind
 from gdp.limits import JOIN_SOURCE_BYTES, JOIN_TOTAL_BYTES, MESSAGE_MAX_BYTES
-from gdp.message.join import Joined, Joiner
-from gdp.message.memory import Budget
+from gdp.message.reassembly import ReassembledMessage, Reassembler
+from gdp.message.reassembly_quota import ReassemblyQuota
 from tests.gdp.message.sealed import INCARNATION, OTHER, SECRET, WRITER
 
 TOTAL_BYTES = 96 << 10
@@ -21,10 +21,10 @@ MTU = 1_500
 class Stream:
     """One topic of one publisher, at a reader that has the topic's secret."""
 
-    def __init__(self, budget: Budget, source: bytes, topic: bytes = b"t" * 32) -> None:
+    def __init__(self, budget: ReassemblyQuota, source: bytes, topic: bytes = b"t" * 32) -> None:
         self.source = source
         self.topic = topic
-        self.joiner = Joiner(
+        self.reassembler = Reassembler(
             source, lambda _: Opener(SECRET, Kind.DATA, source, INCARNATION, topic), WRITER.public, budget
         )
 
@@ -32,8 +32,8 @@ class Stream:
         sealer = Sealer(SECRET, 1, Kind.DATA, self.source, INCARNATION, self.topic, signer, urandom)
         return list(sealer.seal(number, 0, message, MTU))
 
-    def give(self, frames: list[bytes]) -> list[Joined]:
-        got = [self.joiner.add(decode(frame), frame, 0.0) for frame in frames]
+    def give(self, frames: list[bytes]) -> list[ReassembledMessage]:
+        got = [self.reassembler.add(decode(frame), frame, 0.0) for frame in frames]
         return [joined for joined in got if joined is not None]
 
     def forge(self, numbers: range = range(10, 14)) -> None:
@@ -43,7 +43,7 @@ class Stream:
 
 
 def test_a58_forged_parts_in_two_publishers_names_leave_a_third_its_fair_part() -> None:
-    budget = Budget(TOTAL_BYTES, SOURCE_BYTES)
+    budget = ReassemblyQuota(TOTAL_BYTES, SOURCE_BYTES)
     forged = [Stream(budget, name * 32) for name in (b"a", b"b")]
     for stream in forged:
         stream.forge(range(10, 20))
@@ -54,10 +54,10 @@ def test_a58_forged_parts_in_two_publishers_names_leave_a_third_its_fair_part() 
 
 
 def test_a58_parts_that_keep_coming_do_not_push_out_who_holds_less() -> None:
-    budget = Budget(TOTAL_BYTES, SOURCE_BYTES)
+    budget = ReassemblyQuota(TOTAL_BYTES, SOURCE_BYTES)
     forged = [Stream(budget, name * 32) for name in (b"a", b"b")]
     third = Stream(budget, b"c" * 32)
-    got: list[Joined] = []
+    got: list[ReassembledMessage] = []
     for at, frame in enumerate(third.frames(1, IMAGE)):
         forged[at % 2].forge(range(10 + 4 * at, 14 + 4 * at))
         got += third.give([frame])
@@ -65,7 +65,7 @@ def test_a58_parts_that_keep_coming_do_not_push_out_who_holds_less() -> None:
 
 
 def test_a58_parts_forged_in_one_topic_leave_the_publishers_other_topics_alone() -> None:
-    budget = Budget(TOTAL_BYTES, SOURCE_BYTES)
+    budget = ReassemblyQuota(TOTAL_BYTES, SOURCE_BYTES)
     other = Stream(budget, b"a" * 32, b"u" * 32)
     forged = Stream(budget, b"a" * 32)
     forged.forge(range(10, 20))
@@ -73,23 +73,23 @@ def test_a58_parts_forged_in_one_topic_leave_the_publishers_other_topics_alone()
 
 
 def test_a58_no_source_holds_more_than_its_bound_and_nobody_all() -> None:
-    budget = Budget(TOTAL_BYTES, SOURCE_BYTES)
+    budget = ReassemblyQuota(TOTAL_BYTES, SOURCE_BYTES)
     streams = [Stream(budget, bytes([name]) * 32) for name in range(5)]
     for stream in streams:
         stream.forge(range(10, 20))
-        assert stream.joiner.unfinished_bytes <= SOURCE_BYTES
+        assert stream.reassembler.unfinished_bytes <= SOURCE_BYTES
         assert budget.held_bytes <= TOTAL_BYTES
-    held = [stream.joiner.unfinished_bytes for stream in streams]
+    held = [stream.reassembler.unfinished_bytes for stream in streams]
     assert min(held) > TOTAL_BYTES // 16
     assert sum(held) == budget.held_bytes
     for stream in streams:
-        stream.joiner.close()
+        stream.reassembler.close()
     assert budget.held_bytes == 0
 
 
 def test_a58_the_largest_message_of_a_lone_source_fits_and_so_do_three() -> None:
     assert MESSAGE_MAX_BYTES * 1.3 < JOIN_TOTAL_BYTES / 3 <= JOIN_SOURCE_BYTES
-    stream = Stream(Budget(), b"a" * 32)
+    stream = Stream(ReassemblyQuota(), b"a" * 32)
     message = bytes(MESSAGE_MAX_BYTES)
     sealer = Sealer(SECRET, 1, Kind.DATA, stream.source, INCARNATION, stream.topic, WRITER, urandom)
     (joined,) = stream.give(list(sealer.seal(1, 0, message, 9_000)))

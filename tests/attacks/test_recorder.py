@@ -10,21 +10,21 @@ from typing import Any, cast
 import pytest
 
 from gdp.client.delivery import Delivered
-from gdp.client.member import Member, Message, Topic
+from gdp.client.participant import Message, Participant, Topic
 from gdp.message.loss import Losses
 from gdp.names import Name
+from proxy.bridge.context import BridgeContext
+from proxy.bridge.counters import Traffic
+from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.endpoint_dispatch import EndpointDispatcher
+from proxy.bridge.faults import Fault, Faults
 from proxy.bridge.imported_topic import ImportedTopic
-from proxy.bridge.seat import Seat
-from proxy.bridge.site import Site
-from proxy.bridge.wishes import Wish
-from proxy.config import Rule
-from proxy.faults import Fault, Faults
-from proxy.parcel import CHANNELS_MAX, Description, Parcel
+from proxy.config.config import Rule
+from proxy.node.metrics_sources import Sources
 from proxy.recordings.endpoint import RecordingEndpoint
 from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import Channel, Qos, RosVersion
-from proxy.sources import Sources
-from proxy.traffic import Traffic
+from proxy.wire.message import CHANNELS_MAX, RosMessage, TopicDescription
 
 TOPIC = Name(b"t" * 32)
 NEVER = (9_223_372_036, 854_775_807)
@@ -58,13 +58,15 @@ class Recorder:
         member = SimpleNamespace(losses_of=lambda _: Losses())
         rule = SimpleNamespace(name="/chatter", max_hz=None, max_bytes=1 << 20)
         self.endpoint = RecordingEndpoint(cast(BagWriter, self.sink), [("/chatter", "a/msg/B")])
-        site = Site(cast(Member, member), Traffic(), self.faults)
-        wish = Wish(False, "/chatter", "a/msg/B", TOPIC, cast(Rule, rule))
-        self.flow = ImportedTopic(site, Seat(self.endpoint), wish, cast(Topic, SimpleNamespace(name=TOPIC)))
+        site = BridgeContext(cast(Participant, member), Traffic(), self.faults)
+        flow_spec = FlowSpec(False, "/chatter", "a/msg/B", TOPIC, cast(Rule, rule))
+        self.flow = ImportedTopic(
+            site, EndpointDispatcher(self.endpoint), flow_spec, cast(Topic, SimpleNamespace(name=TOPIC))
+        )
 
     @property
     def lost(self) -> int:
-        return self.flow.tally.lost
+        return self.flow.stats.lost
 
     def receive(self, description: bytes, *wires: bytes, publisher: bytes = b"p" * 32) -> None:
         for number, wire in enumerate(wires):
@@ -77,7 +79,7 @@ def _message(description: bytes, delivered: Delivered) -> Message:
 
 
 def described(*channels: Channel) -> bytes:
-    return Description("cdr", channels).to_wire()
+    return TopicDescription("cdr", channels).to_wire()
 
 
 def channel(topic: str = "/chatter", definition: str = "int8 a\n", depth: int = 1) -> Channel:
@@ -85,13 +87,13 @@ def channel(topic: str = "/chatter", definition: str = "int8 a\n", depth: int = 
     return Channel(topic, "a/msg/B", 2, definition=definition, definition_format="msg", qos=(qos,))
 
 
-def parcel(number: int = 0, body: bytes = b"\0\1\0\0x") -> bytes:
-    return Parcel(number, 0, body).to_wire()
+def ros_message(number: int = 0, body: bytes = b"\0\1\0\0x") -> bytes:
+    return RosMessage(number, 0, body).to_wire()
 
 
 def test_a25_a_recording_has_the_topic_of_the_rule_whatever_its_publisher_says() -> None:
     recorder = Recorder()
-    recorder.receive(described(channel("/emergency_stop")), parcel())
+    recorder.receive(described(channel("/emergency_stop")), ros_message())
     assert recorder.sink.written == [("/chatter", b"\0\1\0\0x")]
     assert [each.topic for each in recorder.sink.channels] == ["/chatter"]
 
@@ -99,7 +101,7 @@ def test_a25_a_recording_has_the_topic_of_the_rule_whatever_its_publisher_says()
 def test_a26_a_recorder_keeps_a_bounded_part_of_changing_descriptions() -> None:
     recorder = Recorder()
     for number in range(100):
-        recorder.receive(described(channel(definition=f"int8 a{number}\n" + "#\n" * 30_000)), parcel())
+        recorder.receive(described(channel(definition=f"int8 a{number}\n" + "#\n" * 30_000)), ros_message())
     sources = recorder.flow._sources
     assert len(sources) <= 8
     assert sources.held_bytes <= 1 << 20
@@ -108,9 +110,9 @@ def test_a26_a_recorder_keeps_a_bounded_part_of_changing_descriptions() -> None:
 def test_a26_a_publisher_has_a_bounded_number_of_channels_in_a_recording() -> None:
     recorder = Recorder()
     for depth in range(CHANNELS_MAX + 20):
-        recorder.receive(described(channel(depth=depth)), parcel())
+        recorder.receive(described(channel(depth=depth)), ros_message())
     assert len(recorder.sink.channels) == CHANNELS_MAX
-    recorder.receive(described(channel(depth=1_000)), parcel(), publisher=b"q" * 32)
+    recorder.receive(described(channel(depth=1_000)), ros_message(), publisher=b"q" * 32)
     assert len(recorder.sink.channels) == CHANNELS_MAX + 1
 
 
@@ -118,7 +120,7 @@ def test_a26_a_description_that_comes_again_after_it_was_forgotten_has_its_old_c
     recorder = Recorder()
     for round_ in range(2):
         for depth in range(20):
-            recorder.receive(described(channel(depth=depth)), parcel())
+            recorder.receive(described(channel(depth=depth)), ros_message())
         assert len(recorder.sink.channels) == 20, round_
     assert len(recorder.sink.written) == 40
 
@@ -137,7 +139,7 @@ def test_a26_descriptions_are_bounded_by_their_bytes_and_the_least_used_goes() -
 
 def test_a26_what_was_refused_costs_once_while_it_is_kept() -> None:
     recorder = Recorder()
-    recorder.receive(b"\xff" * 100, *[parcel()] * 50)
+    recorder.receive(b"\xff" * 100, *[ros_message()] * 50)
     assert recorder.faults.counts["malformed"] == 1
     assert recorder.lost == 50
 
@@ -146,7 +148,7 @@ def test_a54_a_far_publisher_writes_neither_lines_nor_escapes_into_the_log(caplo
     recorder = Recorder()
     evil = Channel("/chatter", "x\nERROR all is lost\x1b[2J", 2)
     with caplog.at_level(logging.DEBUG):
-        recorder.receive(described(evil), parcel())
+        recorder.receive(described(evil), ros_message())
     text = "".join(record.getMessage() for record in caplog.records)
     assert "all is lost" in text
     assert text.isprintable()
@@ -164,6 +166,6 @@ def test_a54_many_messages_that_cannot_be_taken_are_told_in_a_few_lines(caplog: 
 
 
 def test_a54_a_fault_tells_far_words_as_one_short_line(caplog: pytest.LogCaptureFixture) -> None:
-    Faults().tell("/t", Fault.OTHER_TYPE, "the far side sends \r\n\x1b]0;owned\x07\u202e" + "x" * 100_000)
+    Faults().report("/t", Fault.OTHER_TYPE, "the far side sends \r\n\x1b]0;owned\x07\u202e" + "x" * 100_000)
     assert caplog.messages[0].isprintable()
     assert len(caplog.messages[0]) < 400

@@ -22,8 +22,8 @@ from typer.testing import CliRunner
 
 from gdp.errors import ConfigError, GdpError
 from gdp.ports.confine import landlock, seccomp
-from proxy import replay_cli
-from proxy.config import ProxyConfig
+from proxy.cli import replay
+from proxy.config.config import ProxyConfig
 from proxy.recordings.limits import BagLimits
 from proxy.recordings.process import BagProcess, Cost, RecordingError
 from proxy.recordings.reader import BagReader
@@ -281,7 +281,7 @@ def test_b05_a_decoder_that_falls_silent_is_no_hang(tmp_path: Path) -> None:
     try:
         os.kill(child_of(os.getpid()), signal.SIGSTOP)
         with pytest.raises(RecordingError, match=rf"{path}: its decoder gave nothing for"):
-            process.take(1 << 30)
+            process.read(1 << 30)
     finally:
         process.close()
 
@@ -301,7 +301,7 @@ def test_b05_gdp_replay_says_so_in_one_line_and_exits_with_1(
     path = mcap(tmp_path / "a.mcap", "zstd", packed("zstd", 60 << 20), 60 << 20)
     if is_refused:
         path.write_bytes(b"no recording")
-    said = CliRunner().invoke(replay_cli.app, [str(path), "--config", "p.yaml", "--memory", "80", "--check"])
+    said = CliRunner().invoke(replay.app, [str(path), "--config", "p.yaml", "--memory", "80", "--check"])
     assert said.exit_code == (2 if is_refused else 1)
     assert said.stderr.count("\n") == 1
     assert str(path) in said.stderr

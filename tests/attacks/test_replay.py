@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from gdp.client.feed import FeedState
+from gdp.client.writer_proxy import WriterProxyState
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
 from gdp.names import Name
-from gdp.switch.machine import Switch
+from gdp.switch.core import SwitchCore
 from gdp.trust.right import Right
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 from tests.journeys.services import Party, outlive
@@ -39,15 +39,15 @@ def test_a10_commands_of_an_hour_ago_are_not_handed_to_a_restarted_reader(reliab
     assert world.network.run(10, lambda: reader.attachment.is_attached)
     reader.subscribe(world.topic(flow.name, reader, [Right.READ]))
     world.network.touch(SERVER)
-    assert world.network.run(10, lambda: bool(reader.feeds_of(flow.topic.name)))
-    for frame in [each for each in tap.frames if each[1] in (Kind.STATUS, Kind.DATA)] * 2:
+    assert world.network.run(10, lambda: bool(reader.writer_proxies_of(flow.topic.name)))
+    for frame in [each for each in tap.frames if each[1] in (Kind.HEARTBEAT, Kind.DATA)] * 2:
         world.network.inject(SERVER, 0, frame, mac_of(world, SERVER))
     world.network.run(1)
-    assert reader.take_messages() == []
-    assert [each.state for each in reader.feeds_of(flow.topic.name)] == [FeedState.NEW]
+    assert reader.poll_messages() == []
+    assert [each.state for each in reader.writer_proxies_of(flow.topic.name)] == [WriterProxyState.NEW]
     world.network.thaw(ROBOT)
     flow.got[SERVER] = []
-    assert world.network.run(20, lambda: reader.feeds_of(flow.topic.name)[0].state is FeedState.LIVE)
+    assert world.network.run(20, lambda: reader.writer_proxies_of(flow.topic.name)[0].state is WriterProxyState.LIVE)
     still_flows(flow)
     flow.outlive()
 
@@ -66,8 +66,8 @@ def test_a11_a_request_of_ten_minutes_ago_is_not_handed_to_a_restarted_server() 
     assert world.network.run(10, lambda: restarted.attachment.is_attached)
     server.got.clear()
     server.begin()
-    assert world.network.run(10, lambda: restarted.feeds_of(server.service) != [])
-    for frame in [each for each in tap.frames if each[1] in (Kind.STATUS, Kind.DATA)] * 2:
+    assert world.network.run(10, lambda: restarted.writer_proxies_of(server.service) != [])
+    for frame in [each for each in tap.frames if each[1] in (Kind.HEARTBEAT, Kind.DATA)] * 2:
         world.network.inject(SERVER, 0, frame, mac_of(world, SERVER))
     world.network.run(1)
     assert server.bodies() == []
@@ -103,7 +103,7 @@ def test_a09_an_old_gone_of_a_publisher_that_came_back_silences_no_topic() -> No
 
 
 @pytest.mark.parametrize("right", [Right.PUBLISH, Right.READ])
-def test_a39_a_recorded_claim_of_what_was_withdrawn_is_not_taken_again(right: Right) -> None:
+def test_a39_a_recorded_advertisement_of_what_was_withdrawn_is_not_taken_again(right: Right) -> None:
     world = ring()
     flow = flowing(world)
     member = world.members[ROBOT]
@@ -117,36 +117,40 @@ def test_a39_a_recorded_claim_of_what_was_withdrawn_is_not_taken_again(right: Ri
     world.network.touch(ROBOT)
     world.network.run(1)
     nuc1 = world.switches["nuc1"]
-    claims = [frame for header, frame in zip(tap.headers, tap.frames, strict=True) if header.kind == Kind.ADVERTISE]
-    assert _is_claimed(nuc1, topic.name, member.name)
+    advertisements = [
+        frame for header, frame in zip(tap.headers, tap.frames, strict=True) if header.kind == Kind.ADVERTISE
+    ]
+    assert _is_pending_advertisement(nuc1, topic.name, member.name)
     if right is Right.PUBLISH:
         member.withdraw(topic.name)
     else:
         member.unsubscribe(topic.name)
     world.network.touch(ROBOT)
     world.network.run(1)
-    assert not _is_claimed(nuc1, topic.name, member.name)
-    for frame in claims:
+    assert not _is_pending_advertisement(nuc1, topic.name, member.name)
+    for frame in advertisements:
         world.network.inject("nuc1", 2, frame, mac_of(world, "nuc1", 2))
-    assert not _is_claimed(nuc1, topic.name, member.name)
+    assert not _is_pending_advertisement(nuc1, topic.name, member.name)
     assert nuc1.drops()[DropReason.REPLAYED] > 0
     still_flows(flow)
 
 
-def test_a39_a_recorded_claim_of_an_earlier_life_of_an_attached_node_is_not_taken() -> None:
+def test_a39_a_recorded_advertisement_of_an_earlier_life_of_an_attached_node_is_not_taken() -> None:
     world = ring()
     tap = Tap(ROBOT, "nuc1")
     world.network.taps.append(tap)
     flow = flowing(world)
-    claims = [frame for header, frame in zip(tap.headers, tap.frames, strict=True) if header.kind == Kind.ADVERTISE]
+    advertisements = [
+        frame for header, frame in zip(tap.headers, tap.frames, strict=True) if header.kind == Kind.ADVERTISE
+    ]
     nuc1 = world.restart_switch("nuc1")
     member = world.restart_member(ROBOT)
     assert world.network.run(10, lambda: member.attachment.is_attached)
-    for frame in claims:
+    for frame in advertisements:
         world.network.inject("nuc1", 2, frame, mac_of(world, "nuc1", 2))
-    assert not _is_claimed(nuc1, flow.topic.name, member.name)
+    assert not _is_pending_advertisement(nuc1, flow.topic.name, member.name)
     assert nuc1.drops()[DropReason.REPLAYED] > 0
 
 
-def _is_claimed(switch: Switch, name: Name, node: Name) -> bool:
-    return switch.attached.get(name, node) is not None or bool(switch.planter.readers(name))
+def _is_pending_advertisement(switch: SwitchCore, name: Name, node: Name) -> bool:
+    return switch.attached.get(name, node) is not None or bool(switch.multicast.readers(name))

@@ -22,7 +22,7 @@ def test_a19_a_frame_in_a_publishers_name_from_below_it_becomes_no_copies() -> N
     data = next(frame for frame in tap.frames if frame[1] == Kind.DATA)
     tried = 0
     for switch in ("nuc1", "nuc5"):
-        (tree,) = world.switches[switch].planter.trees.of_topic(flow.topic.name)
+        (tree,) = world.switches[switch].multicast.trees.of_topic(flow.topic.name)
         for port in world.network._nodes[switch].ports:
             if is_side(tree.sides, port):
                 continue

@@ -20,7 +20,7 @@ from gdp.frame.kinds import Kind
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.nodes.revocation_upkeep import RevocationUpkeep
-from gdp.simulation.world import World
+from gdp.simulation.simulation import Simulation
 from gdp.trust.revocation import Revocation
 from gdp.trust.revocations import hash_of
 from gdp.trust.right import Right
@@ -31,7 +31,7 @@ THIEF = "nuc1/thief"
 MINE = SigningKey.generate()
 
 
-def until(world: World) -> int:
+def until(world: Simulation) -> int:
     return int(world.network.now.unix_s) + 100_000
 
 
@@ -41,28 +41,28 @@ def junk_of(key: SigningKey, number: int, until_s: int) -> bytes:
     return Revocation.make(key, subject, number.to_bytes(32, "big"), until_s)
 
 
-def by_root(world: World, label: str, fingerprint: bytes) -> bytes:
+def by_root(world: Simulation, label: str, fingerprint: bytes) -> bytes:
     root = world.authorities[label]
     return Revocation.make(root.key, root.root.subject, fingerprint, until(world))
 
 
-def school_of(world: World) -> Name:
+def school_of(world: Simulation) -> Name:
     return hash_of(world.authorities["school"].root.key.compressed)
 
 
-def say(world: World, wire: bytes, label: str, to: str, kind: Kind = Kind.REVOKE) -> None:
+def say(world: Simulation, wire: bytes, label: str, to: str, kind: Kind = Kind.REVOKE) -> None:
     """Hand a switch a statement as one of its attached members would."""
-    for frame in world.members[label].attachment.splitter.split(kind, wire, 1_500):
+    for frame in world.members[label].attachment.fragmenter.split(kind, wire, 1_500):
         world.network.inject(to, port_of(world, label), frame, mac_of(world, to, port_of(world, label)))
 
 
-def port_of(world: World, label: str) -> int:
+def port_of(world: Simulation, label: str) -> int:
     name = world.members[label].name
     switch = world.switches[label.split("/", maxsplit=1)[0]]
-    return next(each.port for each in switch.greeter.all_up() if each.name == name)
+    return next(each.port for each in switch.hello_protocol.all_up() if each.name == name)
 
 
-def with_thief(flow_of: World | None = None) -> tuple[World, Flow]:
+def with_thief(flow_of: Simulation | None = None) -> tuple[Simulation, Flow]:
     """Return the ring with a flow, and a member of the robot's switch that means no good."""
     world = flow_of or ring()
     world.add_member(THIEF, "nuc1")
@@ -70,7 +70,7 @@ def with_thief(flow_of: World | None = None) -> tuple[World, Flow]:
     return world, flowing(world)
 
 
-def revoke(world: World, flow: Flow, at: str = "nuc3") -> None:
+def revoke(world: Simulation, flow: Flow, at: str = "nuc3") -> None:
     """Have the owner take the publisher's delegation back, at one switch."""
     fingerprint = parse(flow.topic.delegation.chain[-1]).fingerprint
     wire = world.owner.revoke(flow.topic.delegation.subject, fingerprint, until(world))
@@ -92,7 +92,7 @@ def test_a03_inventions_of_one_member_keep_no_owners_revocation_out(matters: boo
     still_flows(flow)
     revoke(world, flow)
     world.network.run(1)
-    assert not world.members[SERVER].feeds_of(flow.topic.name)
+    assert not world.members[SERVER].writer_proxies_of(flow.topic.name)
     for switch in ("nuc1", "nuc5"):
         fingerprint = parse(flow.topic.delegation.chain[-1]).fingerprint
         assert world.switches[switch]._policy.revoked.has(fingerprint, world.owner.key.public.compressed)
@@ -123,7 +123,7 @@ def test_a04_a_switch_that_restarts_does_not_believe_a_revoked_member(tmp_path: 
     again.load(world.network.now)
     again.close()
     world.network.run(5)
-    assert flow.member.name not in {each.name for each in restarted.greeter.all_up()}
+    assert flow.member.name not in {each.name for each in restarted.hello_protocol.all_up()}
     assert restarted.drops()[DropReason.REVOKED] > 0
     assert restarted.attached.get(flow.topic.name, flow.member.name) is None
     flow.outlive(nobody=True)
@@ -142,7 +142,7 @@ def test_a04_a_restarted_switch_is_told_by_its_neighbour_whatever_junk_came_in_b
     world.network.run(2)
     restarted = world.restart_switch("nuc1")
     world.network.run(5)
-    assert flow.member.name not in {each.name for each in restarted.greeter.all_up()}
+    assert flow.member.name not in {each.name for each in restarted.hello_protocol.all_up()}
     assert restarted.attached.get(flow.topic.name, flow.member.name) is None
     flow.outlive(nobody=True)
 
@@ -166,19 +166,19 @@ def test_a05_a_junk_revocation_has_nothing_verified_again(monkeypatch: pytest.Mo
 
         monkeypatch.setattr(switch._verifier, what, counted)
     now = world.network.now
-    neighbour = next(each for each in switch.greeter.all_up() if each.name == world.members[THIEF].name)
+    neighbour = next(each for each in switch.hello_protocol.all_up() if each.name == world.members[THIEF].name)
     verified = [0]
     monkeypatch.setattr(Revocation, "verify", lambda *_: verified.__setitem__(0, verified[0] + 1))
     junk = [parse(junk_of(MINE, number, until(world))) for number in range(400)]
     begun_s = time.process_time()
     for statement in junk:
         with pytest.raises(Exception, match=r"unconcerned|quota"):
-            switch._revoker.take(statement, neighbour, now)
+            switch._revoker.receive_revocation(statement, neighbour, now)
     spent_s = time.process_time() - begun_s
     assert (looks, verified) == ([0], [0])
     assert spent_s / len(junk) < 0.005  # no benchmark: it was 46.6 ms
     wire = world.owner.revoke(flow.topic.delegation.subject, b"x" * 32, until(world))
-    switch._revoker.take(parse(wire), neighbour, now)  # an owner's, of something else
+    switch._revoker.receive_revocation(parse(wire), neighbour, now)  # an owner's, of something else
     assert looks == [0]
     flow.outlive()
 
@@ -194,7 +194,11 @@ def test_a05_a_real_revocation_has_only_what_rests_on_it_verified_again(monkeypa
     switch = world.switches["nuc1"]
     seen: list[object] = []
     before = switch._verifier.recheck
-    monkeypatch.setattr(switch._verifier, "recheck", lambda claim, at: (seen.append(claim.node), before(claim, at))[1])
+    monkeypatch.setattr(
+        switch._verifier,
+        "recheck",
+        lambda advertisement, at: (seen.append(advertisement.node), before(advertisement, at))[1],
+    )
     reader = world.members["nuc1/reader3"]
     delegation = reader.subscribed()[0].delegation
     wire = world.owner.revoke(delegation.subject, parse(delegation.chain[-1]).fingerprint, until(world))
@@ -208,7 +212,7 @@ def test_a05_a_real_revocation_has_only_what_rests_on_it_verified_again(monkeypa
 class Bytes:
     """Counts what goes from one node to another, keepalives and hellos apart."""
 
-    def __init__(self, world: World, a: str, b: str) -> None:
+    def __init__(self, world: Simulation, a: str, b: str) -> None:
         self.sent = 0
         self._ends = a, b
         world.network.taps.append(self)
@@ -233,10 +237,10 @@ def test_a06_fresh_hellos_draw_no_more_bytes_than_they_cost(echoes: bool) -> Non
     answered = Bytes(world, "nuc1", label)
     spent, numbers = 0, count(1)
     for _ in range(40):
-        link = world.switches["nuc1"].greeter.ports[port]
+        link = world.switches["nuc1"].hello_protocol.ports[port]
         nonce = b"fresh" + next(numbers).to_bytes(3, "big")
         hello = Hello(nonce, 1, (link.echo,) if echoes else (), 1_500, bytes(8), identity.membership)
-        for frame in world.members[label].attachment.splitter.split(
+        for frame in world.members[label].attachment.fragmenter.split(
             Kind.HELLO, hello.to_wire(identity.name, identity.key), 1_500
         ):
             spent += ETHER_BYTES + len(frame)
@@ -257,7 +261,7 @@ def test_a06_a_proven_neighbour_draws_twice_all_there_is_at_most(monkeypatch: py
     world.network.run(5)
     identity, port = world.identities[THIEF], port_of(world, THIEF)
     answered = Bytes(world, "nuc1", THIEF)
-    session = world.switches["nuc1"].greeter.ports[port].echo
+    session = world.switches["nuc1"].hello_protocol.ports[port].echo
     for number in range(6):
         said = Lacking(session, int(2e15) + number, school_of(world), (), ())
         say(world, said.to_wire(identity.name, identity.key), THIEF, "nuc1", Kind.REVOKED)
@@ -270,7 +274,7 @@ def test_a_recorded_digest_draws_nothing() -> None:
     world, flow = with_thief()
     identity, port = world.identities[THIEF], port_of(world, THIEF)
     school = school_of(world)
-    session = world.switches["nuc1"].greeter.ports[port].echo
+    session = world.switches["nuc1"].hello_protocol.ports[port].echo
     said = Revoked(session, int(2e15), ((school, 5, b"another!"),)).to_wire(identity.name, identity.key)
     for _ in range(20):
         say(world, said, THIEF, "nuc1", Kind.REVOKED)
@@ -311,7 +315,7 @@ def test_a_reader_of_a_topic_whose_switch_restarted_is_refused_by_what_its_rib_k
     world.network.run(3)
     world.restart_switch("nuc5")
     world.network.run(10)
-    assert world.switches["nuc5"].planter.readers(flow.topic.name) == []
+    assert world.switches["nuc5"].multicast.readers(flow.topic.name) == []
     flow.outlive(nobody=True)
 
 

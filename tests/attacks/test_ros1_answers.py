@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from proxy.endpoints.ros1.master import Master, MasterError, Watch
+from proxy.endpoints.ros1.master import Master, MasterError, MasterWatch
 
 SERVICES = Path(__file__).parents[2] / "proxy/endpoints/ros1/services.py"
 XML = "<?xml version='1.0'?><methodResponse><params><param><value>{}</value></param></params></methodResponse>"
@@ -68,7 +68,7 @@ def master(answer: bytes, head: bytes = b"HTTP/1.1 200 OK\r\nContent-Type: text/
 @pytest.mark.parametrize("answer", ANSWERS)
 def test_a66_an_answer_of_a_master_that_is_none_is_an_error_of_the_master(answer: str) -> None:
     with master(answer.encode()) as uri, pytest.raises(MasterError):
-        Watch(uri, "/me").look()
+        MasterWatch(uri, "/me").look()
 
 
 def test_a66_what_a_broken_answer_leaves_is_an_error_of_the_master() -> None:

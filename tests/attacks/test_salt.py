@@ -9,18 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from fog.cluster import Carried
-from fog.enrolment.robot_side import forget_rules, introduce
+from fog.cluster import ExportedInterface
+from fog.enrolment.robot_config import add_rules, remove_rules
 from fog.site import open_site
 from gdp.errors import ConfigError
 from gdp.metadata import Metadata
-from proxy.config import ProxyConfig
-from proxy.drop_ins import drop_in_directory
+from proxy.config.config import ProxyConfig
+from proxy.config.drop_ins import drop_in_directory
 from tests.gdp.cli.test_gdp import Run, gdp, keys
 
 __all__ = ["gdp", "keys"]
 
-PLAN = Carried("service", "/plan", "std_srvs/srv/Trigger")
+PLAN = ExportedInterface("service", "/plan", "std_srvs/srv/Trigger")
 NAME = "name --kind topic --name /a --json"
 SALTED = Metadata({"kind": "topic", "name": "/a", "salt": "unguessable"}).name().to_text()
 
@@ -95,8 +95,8 @@ def test_a68_fog_changes_neither_a_file_with_a_salt_nor_its_mode(tmp_path: Path,
         file.write(f"import:\n- {{name: /a, type: std_msgs/msg/Empty, owner: ../owner/owner.pub, {line}}}\n")
     path.chmod(mode)
     before = path.read_bytes(), path.stat()
-    introduce(path, site.authority, "c", [PLAN], days=1.0)
-    forget_rules(path, "c")
+    add_rules(path, site.authority, "c", [PLAN], days=1.0)
+    remove_rules(path, "c")
     assert (path.read_bytes(), path.stat()) == before
 
 
@@ -105,7 +105,7 @@ def test_a68_rules_of_fog_are_as_private_as_the_robots_file(tmp_path: Path, mode
     site = open_site(None, tmp_path / "state")
     path = site.robots[0]
     path.chmod(mode)
-    introduce(path, site.authority, "c", [PLAN], days=1.0)
+    add_rules(path, site.authority, "c", [PLAN], days=1.0)
     (rules,) = drop_in_directory(path).iterdir()
     assert (rules.stat().st_mode & 0o777, rules.parent.stat().st_mode & 0o777) == (mode, folder_mode)
 
@@ -114,6 +114,6 @@ def test_a68_rules_of_fog_with_a_salt_are_private(tmp_path: Path) -> None:
     site = open_site(None, tmp_path / "state")
     path = site.robots[0]
     path.chmod(0o644)
-    introduce(path, site.authority, "c", [replace(PLAN, options={"metadata": {"salt": "x"}})], days=1.0)
+    add_rules(path, site.authority, "c", [replace(PLAN, options={"metadata": {"salt": "x"}})], days=1.0)
     (rules,) = drop_in_directory(path).iterdir()
     assert rules.stat().st_mode & 0o777 == 0o600

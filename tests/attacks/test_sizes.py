@@ -6,27 +6,27 @@ from collections.abc import Iterator
 
 import pytest
 
+from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.boundary import ErrorBoundary
 from gdp.control.link_state import LINKS_MAX, MEMBERS_MAX, RIBS_MAX, Adjacency, AttachedRib, LinkState, Scope
-from gdp.control.verdict import Verdict
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason
 from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Flag, Kind
-from gdp.limits import CLAIM_MAX_BYTES, CONTROL_MAX_BYTES, HOPS_MAX, WITHDRAWAL_MAX_BYTES
+from gdp.limits import ADVERTISEMENT_MAX_BYTES, CONTROL_MAX_BYTES, HOPS_MAX, WITHDRAWAL_MAX_BYTES
 from gdp.names import ZERO, Name
-from gdp.simulation.world import World
-from gdp.trust.claim import make_claim
+from gdp.simulation.simulation import Simulation
+from gdp.trust.advertisement import sign_advertisement
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
 from tests.journeys.flows import ROBOT, flowing, ring
 from tests.journeys.test_attacks import control, mac_of, still_flows
 
-PADDINGS = (CLAIM_MAX_BYTES - 2_000, 12_000, 13_000, 14_000, 15_000)
+PADDINGS = (ADVERTISEMENT_MAX_BYTES - 2_000, 12_000, 13_000, 14_000, 15_000)
 
 
-def padded(world: World, wire: bytes, size: int) -> bytes:
+def padded(world: Simulation, wire: bytes, size: int) -> bytes:
     """Return a statement of the robot's with more in it, under a key that nobody reads."""
     statement, robot = parse(wire), world.identities[ROBOT]
     body = {**statement.body, "zz": b""}
@@ -34,7 +34,7 @@ def padded(world: World, wire: bytes, size: int) -> bytes:
     return sign(statement.type, {**body, "zz": bytes(max(size - len(wide) - 2, 0))}, robot.name, robot.key)
 
 
-def say(world: World, kind: Kind, wire: bytes, number: int) -> None:
+def say(world: Simulation, kind: Kind, wire: bytes, number: int) -> None:
     """Have the robot say a statement to its switch, in as many frames as that takes."""
     parts = [wire[at : at + 1_300] for at in range(0, len(wire), 1_300)]
     for part, chunk in enumerate(parts):
@@ -45,7 +45,7 @@ def say(world: World, kind: Kind, wire: bytes, number: int) -> None:
 
 
 @pytest.mark.parametrize("kind", [Kind.ADVERTISE, Kind.WITHDRAW])
-def test_a01_a02_a40_no_claim_or_withdrawal_of_any_size_ends_a_switch_or_a_rib(kind: Kind) -> None:
+def test_a01_a02_a40_no_advertisement_or_withdrawal_of_any_size_ends_a_switch_or_a_rib(kind: Kind) -> None:
     world = ring()
     flow = flowing(world)
     robot = world.identities[ROBOT]
@@ -53,7 +53,7 @@ def test_a01_a02_a40_no_claim_or_withdrawal_of_any_size_ends_a_switch_or_a_rib(k
     if kind is Kind.ADVERTISE:
         now_s = world.network.now.unix_s
         rtcert = RtCert.make(robot, world.identities["nuc1"].name, Validity.lasting(now_s, 600))
-        wire = make_claim(
+        wire = sign_advertisement(
             robot, Right.ATTACH, robot.subject, rtcert=rtcert, sequence=int(now_s * 1_000) + 60_000, incarnation=9,
             lease_s=20.0, is_global=True,
         )  # fmt: skip
@@ -61,7 +61,7 @@ def test_a01_a02_a40_no_claim_or_withdrawal_of_any_size_ends_a_switch_or_a_rib(k
         say(world, kind, padded(world, wire, size), number)
         world.network.run(0.2)
     world.network.run(1)
-    limit = CLAIM_MAX_BYTES if kind is Kind.ADVERTISE else WITHDRAWAL_MAX_BYTES
+    limit = ADVERTISEMENT_MAX_BYTES if kind is Kind.ADVERTISE else WITHDRAWAL_MAX_BYTES
     assert world.switches["nuc1"].drops()[DropReason.TOO_BIG] == sum(size > limit for size in PADDINGS)
     still_flows(flow)
     flow.outlive()
@@ -83,13 +83,13 @@ def test_a70_a_link_state_of_a_rib_called_zero_is_malformed() -> None:
 
 
 @pytest.mark.parametrize("sequence", [(1 << 64) - 1, 1 << 60])
-def test_a23_a71_a_verdict_of_a_giant_number_ends_no_proxy(sequence: int) -> None:
+def test_a23_a71_a_ack_of_a_giant_number_ends_no_proxy(sequence: int) -> None:
     world = ring()
     flow = flowing(world)
     rib, robot = world.identities["rib:school"], world.members[ROBOT]
-    verdict = Verdict(flow.topic.name, robot.name, DropReason.STALE, sequence)
-    wire = verdict.to_wire(rib.name, rib.key, rib.membership)
-    world.network.inject(ROBOT, 0, control(Kind.VERDICT, wire), mac_of(world, ROBOT))
+    ack = AdvertiseAck(flow.topic.name, robot.name, DropReason.STALE, sequence)
+    wire = ack.to_wire(rib.name, rib.key, rib.membership)
+    world.network.inject(ROBOT, 0, control(Kind.ADVERTISE_ACK, wire), mac_of(world, ROBOT))
     assert robot.drops()[DropReason.MALFORMED] == 1
     still_flows(flow)
     flow.outlive()
@@ -134,16 +134,16 @@ def test_an_error_of_ours_is_contained_counted_logged_once_and_its_sender_quaran
     def broken(*_: object) -> None:
         raise ZeroDivisionError("a fault of ours")
 
-    whole, nuc1._claims.take = nuc1._claims.take, broken  # type: ignore[method-assign]
+    whole, nuc1._advertisements.receive_advertisement = nuc1._advertisements.receive_advertisement, broken  # type: ignore[method-assign]
     robot = world.identities[ROBOT]
     wire = sign(StatementType.ADVERTISE, {}, robot.name, robot.key)
     for number in range(6):
         say(world, Kind.ADVERTISE, wire, (1 << 40) + number)
     assert nuc1.drops()[DropReason.INTERNAL] == 3
     assert nuc1.drops()[DropReason.QUARANTINED] == 3
-    (text,) = nuc1.boundary.take()
+    (text,) = nuc1.boundary.poll_tracebacks()
     assert "a fault of ours" in text
-    nuc1._claims.take = whole  # type: ignore[method-assign]
+    nuc1._advertisements.receive_advertisement = whole  # type: ignore[method-assign]
     still_flows(flow)
     world.network.run(11)
     say(world, Kind.ADVERTISE, wire, 1 << 41)

@@ -7,8 +7,8 @@ from os import urandom
 
 import pytest
 
+from gdp.crypto.control_seal import ControlSealer
 from gdp.crypto.envelope import SALT_BYTES, SIGNATURE_BYTES, Sealer
-from gdp.crypto.note import NoteSealer
 from gdp.frame.codec import HEADER_BYTES
 from gdp.frame.kinds import Kind
 from gdp.names import NAME_BYTES
@@ -46,7 +46,8 @@ def test_a32_what_was_drawn_before_the_snapshot_seals_nothing_after_it() -> None
 
 def test_a32_copies_of_a_reader_that_use_one_number_give_no_plaintext_away() -> None:
     made = [
-        NoteSealer(b"k" * 32, 1, Kind.REPORT, SOURCE, 5, TOPIC, TOPIC, 9, count(7)).seal(body) for body in (ONE, OTHER)
+        ControlSealer(b"k" * 32, 1, Kind.ACKNACK, SOURCE, 5, TOPIC, TOPIC, 9, count(7)).seal(body)
+        for body in (ONE, OTHER)
     ]
     bodies = [note[HEADER_BYTES + NAME_BYTES : -16] for note in made]
     assert made[0][:HEADER_BYTES] == made[1][:HEADER_BYTES]

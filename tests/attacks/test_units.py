@@ -22,8 +22,8 @@ import yaml
 
 from fog.host.bounded_log import BoundedLog
 from fog.host.bundle import pack, read_programs
-from fog.host.life import NODE_USER, Life
-from fog.machine import Boot, Program
+from fog.host.managed_process import NODE_USER, ManagedProcess
+from fog.machine import MachineBundle, Program
 from fog.providers.cloud_init import HOME, Setup, cloud_config, placed
 from tests.fog.enrolment.desk import made_desk
 from tests.pages import ROOT
@@ -114,7 +114,7 @@ def test_a53_only_the_middlewares_profile_is_open_to_the_nodes_user(tmp_path: Pa
     (home / "keys").mkdir(parents=True)
     for name in ("keys/own.key", "keys/x.xml", "proxy.yaml", "fastdds.xml"):
         (home / name).write_text("x")
-    text = cloud_config(pack(Boot({}, ())), Setup())
+    text = cloud_config(pack(MachineBundle({}, ())), Setup())
     for words in yaml.safe_load(text)["runcmd"]:
         if words[0] in ("chmod", "find"):
             subprocess.run([word.replace(HOME, str(home)) for word in words], check=True)
@@ -140,7 +140,7 @@ def looked(tmp_path: Path, *, is_users: bool) -> dict[str, object]:
     async def live() -> None:
         log = BoundedLog(tmp_path / "log")
         program = Program("node", ("/usr/bin/python3", "-c", LOOKS, str(key)), is_users=is_users)
-        life = Life(program, tmp_path, log, lambda: None)
+        life = ManagedProcess(program, tmp_path, log, lambda: None)
         await asyncio.wait_for(life.ended, 30)
         log.close()
 
@@ -173,7 +173,7 @@ def test_a53_a_user_that_is_not_there_is_said(tmp_path: Path, monkeypatch: pytes
 
     async def live() -> None:
         with contextlib.closing(BoundedLog(tmp_path / "log")) as log:
-            Life(Program("node", ("true",), is_users=True), tmp_path, log, lambda: None)
+            ManagedProcess(Program("node", ("true",), is_users=True), tmp_path, log, lambda: None)
 
     with pytest.raises(OSError, match="nobody-of-this-name"):
         asyncio.run(live())
@@ -183,11 +183,12 @@ def test_a53_a_user_that_is_not_there_is_said(tmp_path: Path, monkeypatch: pytes
 def test_a53_the_users_code_ends_with_the_machine_although_it_is_another_user(tmp_path: Path) -> None:
     code = (
         "import asyncio, pathlib, sys\n"
-        "from fog.host.bounded_log import BoundedLog\nfrom fog.host.life import Life\nfrom fog.machine import Program\n"
+        "from fog.host.bounded_log import BoundedLog\n"
+        "from fog.host.managed_process import ManagedProcess\nfrom fog.machine import Program\n"
         "async def live():\n"
         "    home = pathlib.Path(sys.argv[1])\n"
         "    program = Program('n', ('sleep', '1000'), is_users=True)\n"
-        "    life = Life(program, home, BoundedLog(home / 'log'), lambda: None)\n"
+        "    life = ManagedProcess(program, home, BoundedLog(home / 'log'), lambda: None)\n"
         "    await asyncio.sleep(1)\n"
         "    print(life.pid, flush=True)\n"
         "    await life.ended\n"

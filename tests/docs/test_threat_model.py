@@ -43,8 +43,8 @@ def _tests_of(path: str) -> frozenset[str]:
 
 def _named_in(path: str) -> set[str]:
     """Return the ids of attacks that a module's tests carry in their names: ``test_a01_a02_...``."""
-    heads = (re.match(r"test_((?:[a-z]\d\d_)+)", name) for name in _tests_of(path))
-    return {each for head in heads if head for each in _NAMED.findall(head[1].replace("_", " "))}
+    headers = (re.match(r"test_((?:[a-z]\d\d_)+)", name) for name in _tests_of(path))
+    return {each for head in headers if head for each in _NAMED.findall(head[1].replace("_", " "))}
 
 
 def test_every_answered_attack_names_a_test_that_exists() -> None:

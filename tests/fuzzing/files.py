@@ -20,7 +20,7 @@ from gdp.errors import ConfigError, LocalError, RemoteError, StoreError
 from gdp.nodes.config import SwitchConfig
 from gdp.nodes.yaml_source import read_yaml
 from gdp.stores.token_uri import TokenUri
-from proxy.config import ProxyConfig
+from proxy.config.config import ProxyConfig
 from proxy.recordings.channels import offered_qos
 from proxy.recordings.decoder import BagDecoder
 from proxy.recordings.source import Message

@@ -6,14 +6,14 @@ from collections.abc import Callable
 from typing import Final
 
 from gdp.errors import LocalError, RemoteError
-from proxy.exchange import Answer, Exchange, News, Outcome, Request, Stop
-from proxy.parcel import Description, Parcel
 from proxy.serial.cbor_bounds import check_bounds
 from proxy.serial.channel import Channel, Qos, RosVersion
+from proxy.serial.converter import MessageConverter, translated_channel
 from proxy.serial.schema import DefinitionError, parse
 from proxy.serial.serializer import Encoding, Serializer
 from proxy.serial.service import Service
-from proxy.serial.twin import Twin, twin_channel
+from proxy.wire.message import RosMessage, TopicDescription
+from proxy.wire.service import Answer, Exchange, News, Outcome, Request, Stop
 from tests.fuzzing.decoder import Decoder
 
 __all__ = ["DECODERS"]
@@ -98,19 +98,19 @@ def _read(ros: RosVersion) -> Decoder:
 
 def _converted() -> Decoder:
     source = _channel(1)
-    twin = Twin(source, twin_channel(source, 2))
-    return Decoder("twin", twin.convert, (_raw(1),), (RemoteError,), _SERIES)
+    converter = MessageConverter(source, translated_channel(source, 2))
+    return Decoder("twin", converter.convert, (_raw(1),), (RemoteError,), _SERIES)
 
 
 _HALF: Final = Channel("/s", "a/srv/S_Request", 2, definition="bool a\n", definition_format="msg")
 _SERVICE: Final = Service("/s", "a/srv/S", "", _HALF, _HALF)
 
 DECODERS: Final = (
-    Decoder("parcel", Parcel.from_wire, (Parcel(0, 1, b"x").to_wire(),), (RemoteError,)),
+    Decoder("parcel", RosMessage.from_wire, (RosMessage(0, 1, b"x").to_wire(),), (RemoteError,)),
     Decoder(
         "description",
-        Description.from_wire,
-        (Description("json", (_channel(2),)).to_wire(),),
+        TopicDescription.from_wire,
+        (TopicDescription("json", (_channel(2),)).to_wire(),),
         (RemoteError,),
         is_cbor=True,
     ),

@@ -7,39 +7,48 @@ from dataclasses import replace
 from itertools import count
 from typing import Final
 
-from gdp.control.frames import ControlJoiner, ControlSplitter
+from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.control.keepalive import open_keepalive, seal_keepalive
 from gdp.control.presence import Presence
 from gdp.control.replica import Digest, Entry, Fetch, Inventory, Item, Replicas
 from gdp.crypto import cbor
 from gdp.crypto.certificates import Root, Unverified
+from gdp.crypto.control_seal import ControlOpener, ControlSealer
 from gdp.crypto.envelope import Opener
 from gdp.crypto.introduction import Introduction
 from gdp.crypto.kem import KemPublicKey
 from gdp.crypto.keys import PublicKey
-from gdp.crypto.note import NoteOpener, NoteSealer
 from gdp.crypto.statements import Fields, Statement, parse
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
-from gdp.crypto.x509_form import read_request
+from gdp.crypto.x509_profile import read_request
 from gdp.errors import FrameError, LocalError, RemoteError, StatementError
 from gdp.frame import codec
 from gdp.frame.kinds import Flag, Kind
 from gdp.message import bundle
-from gdp.message.report import Missing, Report, ReportFlag
-from gdp.message.status import Start, Status
+from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
+from gdp.message.heartbeat import Heartbeat, StreamStart
 from gdp.names import Name
 from gdp.trust.adcert import AdCert
+from gdp.trust.advertisement import UnverifiedAdvertisement
 from gdp.trust.audit import BEGIN, AuditLine
-from gdp.trust.card import Card
-from gdp.trust.claim import ClaimBody
 from gdp.trust.delegation import Delegation
-from gdp.trust.enrolment import Answer, Application, Granted, Request, Seat, Ticket, request_head, seal_request
+from gdp.trust.enrolment import (
+    Application,
+    EnrolmentResponse,
+    Granted,
+    Request,
+    Seat,
+    Ticket,
+    request_head,
+    seal_request,
+)
+from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.revocation import Revocation
 from tests.fuzzing.decoder import Decoder
 from tests.gdp.control.test_bodies import BODIES
 from tests.gdp.message.sealed import INCARNATION, SECRET, SOURCE, TOPIC, seal
-from tests.gdp.trust.world import CAMERA, DAY, LAB, NOW, ROBOT, SCHOOL, adcert, claim
+from tests.gdp.trust.world import CAMERA, DAY, LAB, NOW, ROBOT, SCHOOL, adcert, advertisement
 
 __all__ = ["DECODERS"]
 
@@ -61,7 +70,7 @@ _READS: Final[dict[str, tuple[bytes, Callable[[Fields], object]]]] = {
 }
 _STATEMENTS: Final[dict[str, tuple[bytes, Callable[[Statement], object]]]] = {
     "adcert": (adcert(), AdCert.from_statement),
-    "claim": (claim(), ClaimBody.from_statement),
+    "claim": (advertisement(), UnverifiedAdvertisement.from_statement),
     "revocation": (Revocation.make(LAB.key, CAMERA, bytes(32), NOW), Revocation.from_statement),
 }
 _FRAMES: Final = seal(1, bytes(500))
@@ -89,17 +98,17 @@ def _of_statement(wire: bytes, read: Callable[[Statement], object]) -> Callable[
 
 def _control(data: bytes) -> object:
     """Take frames, each after two bytes of its length."""
-    joiner, at, got = ControlJoiner(), 0, []
+    reassembler, at, got = ControlReassembler(), 0, []
     while at + 2 <= len(data):
         end = at + 2 + int.from_bytes(data[at : at + 2], "big")
         frame = data[at + 2 : end]
         at = end
-        got.append(joiner.add(codec.decode(frame), frame, float(len(got))))
+        got.append(reassembler.add(codec.decode(frame), frame, float(len(got))))
     return got
 
 
 def _control_seed() -> bytes:
-    frames = ControlSplitter(_NODE.name, 7).split(Kind.HELLO, bytes(3_000), 1_500)
+    frames = ControlFragmenter(_NODE.name, 7).split(Kind.HELLO, bytes(3_000), 1_500)
     return b"".join(len(frame).to_bytes(2, "big") + frame for frame in frames)
 
 
@@ -108,19 +117,19 @@ def _envelope(data: bytes) -> object:
 
 
 def _note(data: bytes) -> object:
-    return NoteOpener(_KEY, TOPIC, 9).open(codec.decode(data), data)
+    return ControlOpener(_KEY, TOPIC, 9).open(codec.decode(data), data)
 
 
 def _note_seed() -> bytes:
-    return NoteSealer(_KEY, 1, Kind.REPORT, SOURCE, 5, TOPIC, TOPIC, 9, count(1)).seal(b"body")
+    return ControlSealer(_KEY, 1, Kind.ACKNACK, SOURCE, 5, TOPIC, TOPIC, 9, count(1)).seal(b"body")
 
 
 def _introduction() -> bytes:
     return Introduction.make(_NODE.subject, _NODE.key, 5, 1, _KEY)
 
 
-_REPORT: Final = Report(ReportFlag.NONE, 5, 1, (Missing(5, 1, 2),))
-_STATUS: Final = Status(1, 5, 0, {bytes(32): Start(1, 1, 1)}, b"description")
+_REPORT: Final = AckNack(AckNackFlag.NONE, 5, 1, (MissingRange(5, 1, 2),))
+_STATUS: Final = Heartbeat(1, 5, 0, {bytes(32): StreamStart(1, 1, 1)}, b"description")
 _TICKET: Final = Ticket(("tcp://a:1",), _NODE.kem.public, _KEY, (Seat("switch", _NODE.role, "a"),))
 _APPLICATION: Final = Application(b"csr", _NODE.kem.public, bytes(64))
 _GRANTED: Final = Granted(b"certificate", (b"delegation",))
@@ -149,7 +158,7 @@ DECODERS: Final = (
         "validity", _of_fields(Validity.from_fields), (cbor.encode(DAY.to_fields()),), (StatementError,), is_cbor=True
     ),
     Decoder("delegation", Delegation.from_wire, (cbor.encode({"format": ""}),), (StatementError,), is_cbor=True),
-    Decoder("card", Card.from_wire, (Card.make(_NODE),), (StatementError,)),
+    Decoder("card", NodeDescriptor.from_wire, (NodeDescriptor.make(_NODE),), (StatementError,)),
     Decoder("root", Root.from_wire, (SCHOOL.root.wire, _HEIR.root.to_pem()), (StatementError,)),
     Decoder("audit-line", AuditLine.from_line, (_AUDIT,), (LocalError,)),
     Decoder("membership", Unverified.from_wire, (_NODE.membership,), (StatementError,)),
@@ -182,13 +191,13 @@ DECODERS: Final = (
     ),
     Decoder(
         "enrol-answer",
-        Answer.from_wire,
-        (Answer(b"root", (_GRANTED,)).to_wire(),),
+        EnrolmentResponse.from_wire,
+        (EnrolmentResponse(b"root", (_GRANTED,)).to_wire(),),
         (StatementError,),
         is_cbor=True,
     ),
-    Decoder("report", Report.from_wire, (_REPORT.to_wire(),), (FrameError,)),
-    Decoder("status", Status.from_wire, (_STATUS.to_wire(),), (FrameError,)),
+    Decoder("report", AckNack.from_wire, (_REPORT.to_wire(),), (FrameError,)),
+    Decoder("status", Heartbeat.from_wire, (_STATUS.to_wire(),), (FrameError,)),
     Decoder("bundle", bundle.unpack, (bundle.pack([b"a", b"bc"]),), (FrameError,)),
     Decoder(
         "name", lambda data: Name.from_text(data.decode("latin-1")), (_A.to_text().encode(),), (LocalError, ValueError)

@@ -26,8 +26,8 @@ sys.meta_path.insert(0, Blocker())
 
 _NETWORK = """
 from gdp.simulation.topology import ring5
-from gdp.simulation.world import World
-assert World(ring5()).settle()
+from gdp.simulation.simulation import Simulation
+assert Simulation(ring5()).settle()
 """
 
 

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from itertools import count
 from typing import Any, Final
 
-from gdp.client.feed import FeedState
 from gdp.client.rib_host import RibHost
-from gdp.control.frames import ControlSplitter
-from gdp.control.hello import COOKIE_BYTES, COOKIES_MAX, HEARD_MAX, RIVALS_MAX, RTCERTS_MAX
+from gdp.client.writer_proxy import WriterProxyState
+from gdp.control.fragments import ControlFragmenter
+from gdp.control.hello import CONFLICTS_MAX, COOKIE_BYTES, COOKIES_MAX, HEARD_MAX, RTCERTS_MAX
 from gdp.control.keepalive import seal_keepalive
 from gdp.control.link_state import COST_MAX, LINKS_MAX, MEMBERS_MAX, RIBS_MAX
 from gdp.control.query import TRANSIT_MAX
@@ -31,14 +31,14 @@ from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import CHAIN_MAX, HOPS_MAX, NACKS_PER_REPORT, SEQUENCE_AHEAD_S
 from gdp.message import bundle
+from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
+from gdp.message.heartbeat import STARTS_MAX, Heartbeat, StreamStart
 from gdp.message.loss import GONE_MAX, LostRange
-from gdp.message.move import MOVES_MAX, Move
-from gdp.message.report import Missing, Report, ReportFlag
-from gdp.message.status import STARTS_MAX, Start, Status
+from gdp.message.renumbering import MOVES_MAX, Renumbering
 from gdp.names import ZERO, Name
-from gdp.switch.machine import Switch
+from gdp.switch.core import SwitchCore
 from gdp.trust.adcert import AdCert
-from gdp.trust.claim import Claim
+from gdp.trust.advertisement import Advertisement
 from gdp.trust.right import HEARS, Right
 from gdp.trust.rtcert import RtCert
 from tests.insiders.stage import PERSONAS, Persona, Place, Stage
@@ -51,7 +51,7 @@ _NUMBERS: Final = (0.0, -0.0, -1.0, 1e-9, 0.5, 1.0, 24.0, 3_599.5, 3_600.0, 3_60
 _TEXTS: Final = ("", "publish", "serve", "call", "read", "attach", "domain", "border", "x" * 300)
 _SIZES: Final = (900, 1_024, 1_025, 6_400, 6_500, 6_501, 12_000, 16_000, 16_300)
 _MAXIMA: Final = {
-    "h": HEARD_MAX, "u": RIVALS_MAX, "y": COOKIES_MAX,
+    "h": HEARD_MAX, "u": CONFLICTS_MAX, "y": COOKIES_MAX,
     "l": LINKS_MAX, "i": LINKS_MAX, "m": MEMBERS_MAX, "x": TRANSIT_MAX, "r": RIBS_MAX,
     "chain": CHAIN_MAX, "p": FETCH_PREFIXES_MAX, "k": FETCH_KEYS_MAX, "e": ENTRIES_MAX, "rights": 4,
 }  # fmt: skip
@@ -101,7 +101,7 @@ class Forge:
         self._old: deque[bytes] = deque(self._recorded(), maxlen=_REMEMBERED)
         self._numbers = count(int(world.network.now.unix_s * 1_000) + 100_000)
         self._counters = count(1 << 40)
-        self._splitters = {persona.node: ControlSplitter(stage.identity(persona).name, 77) for persona in PERSONAS}
+        self._splitters = {persona.node: ControlFragmenter(stage.identity(persona).name, 77) for persona in PERSONAS}
         self._sealers: dict[tuple[str, str, int], Any] = {}
 
     def utter(self, rng: random.Random) -> Utterance | None:
@@ -284,13 +284,13 @@ class Forge:
     def _recorded(self) -> list[bytes]:
         """Return statements that honest nodes made: claims that switches hold."""
         switches = self._stage.world.switches.values()
-        return [each.claim.wire for switch in switches for each in switch.attached.all()]
+        return [each.advertisement.wire for switch in switches for each in switch.attached.all()]
 
-    def _publishers(self) -> list[Claim]:
+    def _publishers(self) -> list[Advertisement]:
         """Return the claims, of honest nodes too, that a join can show."""
         switches = self._stage.world.switches.values()
-        claims = [each.claim for switch in switches for each in switch.attached.all()]
-        return [claim for claim in claims if claim.right in HEARS.values()]
+        advertisements = [each.advertisement for switch in switches for each in switch.attached.all()]
+        return [advertisement for advertisement in advertisements if advertisement.right in HEARS.values()]
 
     # -- honest bodies
 
@@ -307,8 +307,10 @@ class Forge:
     def _own_life(self, identity: Identity, rng: random.Random) -> bytes:
         """Return the life of the persona's machine most of the time, or an older or a newer one."""
         machine = next((each for each in self._stage.machines().values() if each.name == identity.name), None)
-        greeter = getattr(machine, "greeter", None) or getattr(getattr(machine, "attachment", None), "greeter", None)
-        life = bytes(16) if greeter is None else greeter._life
+        hello_protocol = getattr(machine, "hello_protocol", None) or getattr(
+            getattr(machine, "attachment", None), "hello_protocol", None
+        )
+        life = bytes(16) if hello_protocol is None else hello_protocol._life
         return life if rng.random() < 0.9 else rng.choice((bytes(16), b"\xff" * 16, rng.randbytes(16)))
 
     def _hello(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
@@ -355,18 +357,22 @@ class Forge:
     def _join(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         world = self._stage.world
         switch = rng.choice([each for each in self._identities() if each.role.value == "switch"])
-        claims = [each for each in self._old if b"read" in each or b"serve" in each or b"call" in each]
+        advertisements = [each for each in self._old if b"read" in each or b"serve" in each or b"call" in each]
         shown = self._publishers()
         if shown and rng.random() < 0.8:  # as an honest switch below says it
-            claim = rng.choice(shown)
-            topic, publisher, place_of = claim.name, claim.node, claim.switch
-            version, proof = claim.sequence, claim.wire
+            advertisement = rng.choice(shown)
+            topic, publisher, place_of = advertisement.name, advertisement.node, advertisement.switch
+            version, proof = advertisement.sequence, advertisement.wire
         else:
             topic, publisher, place_of = rng.choice(self._topics), rng.choice(self._nodes), switch.name
             version = rng.choice((0, int(world.network.now.unix_s * 1_000), next(self._numbers)))
             proof = rng.choice((b"", *(each.wire for each in shown)))
         right = rng.choice((Right.READ, Right.READ, Right.SERVE, Right.CALL))
-        evidence = rng.choice(claims) if claims and rng.random() < 0.3 else self._claim_of(rng, identity, topic, right)
+        evidence = (
+            rng.choice(advertisements)
+            if advertisements and rng.random() < 0.3
+            else self._advertisement_of(rng, identity, topic, right)
+        )
         return {
             "n": topic, "p": publisher,
             "w": place_of if rng.random() < 0.9 else switch.name, "d": switch.root.domain,
@@ -377,11 +383,13 @@ class Forge:
             "c": proof,
         }  # fmt: skip
 
-    def _claim(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+    def _advertisement(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         right = rng.choice(_RIGHTS)
-        return self._claim_body(rng, identity, rng.choice(self._topics), right, self._switch_at(rng, place))
+        return self._advertisement_body(rng, identity, rng.choice(self._topics), right, self._switch_at(rng, place))
 
-    def _claim_body(self, rng: random.Random, identity: Identity, topic: Name, right: Right, switch: Name) -> _Body:
+    def _advertisement_body(
+        self, rng: random.Random, identity: Identity, topic: Name, right: Right, switch: Name
+    ) -> _Body:
         """Return a claim on the node's own name, on a topic by its delegation, or on a name of its own making."""
         now = self._stage.world.network.now.unix_s
         subject, chain = identity.subject, []
@@ -412,8 +420,8 @@ class Forge:
             **({"prev": self._switch_at(rng, None)} if rng.random() < 0.2 else {}),
         }  # fmt: skip
 
-    def _claim_of(self, rng: random.Random, identity: Identity, topic: Name, right: Right) -> bytes:
-        body = self._claim_body(rng, identity, topic, right, self._switch_at(rng, None))
+    def _advertisement_of(self, rng: random.Random, identity: Identity, topic: Name, right: Right) -> bytes:
+        body = self._advertisement_body(rng, identity, topic, right, self._switch_at(rng, None))
         if rng.random() < 0.2:
             self._spoil(rng, body)
         return self._signed(StatementType.ADVERTISE, body, identity.name, identity.key) or b""
@@ -438,7 +446,7 @@ class Forge:
             body = self._withdraw(rng, other, Place("", 0, b""))
             return self._signed(StatementType.WITHDRAW, body, other.name, other.key) or b""
         switch = self._relay_switch(rng, identity)
-        body = self._claim_body(rng, other, rng.choice(self._topics), rng.choice(_RIGHTS), switch)
+        body = self._advertisement_body(rng, other, rng.choice(self._topics), rng.choice(_RIGHTS), switch)
         return self._signed(StatementType.ADVERTISE, body, other.name, other.key) or b""
 
     def _relay_switch(self, rng: random.Random, identity: Identity) -> Name:
@@ -456,24 +464,24 @@ class Forge:
         return {"n": rng.choice((*self._topics, self._name(rng))), "w": watch_s, "c": identity.membership}
 
     def _answer(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
-        claim, name, advertiser = b"", rng.choice((*self._topics, *self._nodes)), rng.choice(self._nodes)
+        advertisement, name, advertiser = b"", rng.choice((*self._topics, *self._nodes)), rng.choice(self._nodes)
         chance = rng.random()
         if chance < 0.6:
-            claim = self._inner(rng, identity)
+            advertisement = self._inner(rng, identity)
             try:
-                statement = parse(claim)
+                statement = parse(advertisement)
                 name, advertiser = Name(statement.fields.bytes_("name", 32)), statement.signer
             except StatementError:
                 pass
         elif chance < 0.8:
             advertiser = name
         return {
-            "n": name, "a": advertiser, "q": claim, "s": rng.choice((0, next(self._numbers))),
+            "n": name, "a": advertiser, "q": advertisement, "s": rng.choice((0, next(self._numbers))),
             "d": rng.choice(self._domains), "x": list(self._domains), "l": rng.choice((0.0, 0.5, 6.0, 3_600.0)),
             "c": identity.membership,
         }  # fmt: skip
 
-    def _verdict(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+    def _ack(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         return {
             "n": rng.choice((*self._topics, *self._nodes)), "a": rng.choice(self._nodes),
             "r": rng.choice((255, *(int(each) for each in DropReason), 200)), "s": next(self._numbers),
@@ -594,7 +602,7 @@ class Forge:
         world = self._stage.world
         if kind == Kind.RIB_REQUEST:
             return kind, rng.choice([host.name for host in world.ribs.values()])
-        hosts: list[Switch | RibHost] = [*world.switches.values()]
+        hosts: list[SwitchCore | RibHost] = [*world.switches.values()]
         if kind == Kind.RIB_ANSWER:
             hosts += world.ribs.values()
         return kind, rng.choice(hosts).name
@@ -607,8 +615,10 @@ class Forge:
     def _keepalive(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
         """Return a keepalive sealed with the key of the persona's own session."""
         machine = self._stage.machines().get(persona.node)
-        greeter = getattr(machine, "greeter", None) or getattr(getattr(machine, "attachment", None), "greeter", None)
-        sessions = [each.keepalives for each in greeter.all_up() if each.keepalives] if greeter else []
+        hello_protocol = getattr(machine, "hello_protocol", None) or getattr(
+            getattr(machine, "attachment", None), "hello_protocol", None
+        )
+        sessions = [each.keepalives for each in hello_protocol.all_up() if each.keepalives] if hello_protocol else []
         if not sessions:
             return []
         number = rng.choice((*_INTEGERS, next(self._counters)))
@@ -620,7 +630,7 @@ class Forge:
     def _miss(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
         """Return a frame to some name, in the persona's or another's name."""
         source = rng.choice((self._stage.identity(persona).name, self._name(rng)))
-        kind = rng.choice((Kind.DATA, Kind.REPORT, Kind.STATUS, Kind.RIB_REQUEST, Kind.ECHO_REPLY))
+        kind = rng.choice((Kind.DATA, Kind.ACKNACK, Kind.HEARTBEAT, Kind.RIB_REQUEST, Kind.ECHO_REPLY))
         payload = bytes(rng.choice((0, 1, 100, 1_300)))
         header = self._header(rng, kind, self._name(rng), source, len(payload))
         return [encode(header._replace(hops_left=rng.choice((0, 1, 2, HOPS_MAX, 255)))) + payload]
@@ -634,19 +644,21 @@ class Forge:
     def _report(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
         """Return a hostile note of a reader's own feed, by the key that it agreed with its publisher."""
         member = self._stage.world.members.get(persona.node)
-        feeds = [] if member is None else [each for each in member.feeds() if each.state is FeedState.LIVE]
-        if not feeds:
+        writer_proxies = (
+            [] if member is None else [each for each in member.writer_proxies() if each.state is WriterProxyState.LIVE]
+        )
+        if not writer_proxies:
             return []
         missing = tuple(
-            Missing(self._number(rng), *(rng.choice((0, 1, 1 << 17, 0xFFFF_FFFF)) for _ in range(2)))
+            MissingRange(self._number(rng), *(rng.choice((0, 1, 1 << 17, 0xFFFF_FFFF)) for _ in range(2)))
             for _ in range(rng.choice((0, 1, NACKS_PER_REPORT)))
         )
-        report = Report(
-            rng.choice(tuple(ReportFlag)), self._number(rng), rng.choice((0, 1, 0xFFFF_FFFF)), missing,
+        report = AckNack(
+            rng.choice(tuple(AckNackFlag)), self._number(rng), rng.choice((0, 1, 0xFFFF_FFFF)), missing,
             self._number(rng), self._number(rng),
         )  # fmt: skip
-        feed = rng.choice(feeds)
-        return [feed._sealer.seal(report)]
+        writer_proxy = rng.choice(writer_proxies)
+        return [writer_proxy._sealer.seal(report)]
 
     def _status(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
         """Return what a publisher or a server says of its stream."""
@@ -657,24 +669,24 @@ class Forge:
         topic, epoch, secret = found
         readers = [self._stage.world.members[label] for label in ("nuc2/reader", "nuc4/alien", "evil/guest")]
         starts = {
-            bytes(rng.choice(readers).name): Start(
+            bytes(rng.choice(readers).name): StreamStart(
                 rng.choice(readers).attachment._incarnation, self._number(rng), self._number(rng), self._number(rng)
             )
             for _ in range(rng.choice((0, 1, 3)))
         }
         if rng.random() < 0.05:
-            starts |= {rng.randbytes(32): Start(1, 1, 1) for _ in range(STARTS_MAX - len(starts))}
+            starts |= {rng.randbytes(32): StreamStart(1, 1, 1) for _ in range(STARTS_MAX - len(starts))}
         sent = self._number(rng)
-        status = Status(
+        status = Heartbeat(
             rng.choice((0, 1, sent, max(sent - 1, 0))), sent, rng.choice((0, 1, 0xFFFF_FFFF)), starts,
             rng.choice((b"", b"described", bytes(1_000))),
-            tuple(Move(self._number(rng) % (1 << 60), rng.choice((0, 1, 1 << 32)), self._number(rng) % (1 << 61))
+            tuple(Renumbering(self._number(rng) % (1 << 60), rng.choice((0, 1, 1 << 32)), self._number(rng) % (1 << 61))
                   for _ in range(rng.choice((0, 0, 1, MOVES_MAX)))),
             self._number(rng), self._number(rng),
             tuple(LostRange(first, first + rng.choice((0, 1, 1 << 40)), rng.randrange(1, 4))  # type: ignore[arg-type]
                   for first in (self._number(rng) % (1 << 62) for _ in range(rng.choice((0, 0, 1, GONE_MAX))))),
         )  # fmt: skip
-        return self._sealed(rng, identity, topic, epoch, secret, Kind.STATUS, status.to_wire())
+        return self._sealed(rng, identity, topic, epoch, secret, Kind.HEARTBEAT, status.to_wire())
 
     def _data(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
         identity = self._stage.identity(persona)
@@ -718,9 +730,9 @@ class Forge:
 _T = StatementType
 _Make = Callable[[Forge, random.Random, Identity, Place], _Body]
 _BODIES: Final[dict[StatementType, _Make]] = {
-    _T.HELLO: Forge._hello, _T.LINK_STATE: Forge._link_state, _T.JOIN: Forge._join, _T.ADVERTISE: Forge._claim,
+    _T.HELLO: Forge._hello, _T.LINK_STATE: Forge._link_state, _T.JOIN: Forge._join, _T.ADVERTISE: Forge._advertisement,
     _T.WITHDRAW: Forge._withdraw, _T.RELAY: Forge._relay, _T.QUERY: Forge._query, _T.ANSWER: Forge._answer,
-    _T.VERDICT: Forge._verdict, _T.PRESENCE: Forge._presence, _T.DIGEST: Forge._digest, _T.FETCH: Forge._fetch,
+    _T.ADVERTISE_ACK: Forge._ack, _T.PRESENCE: Forge._presence, _T.DIGEST: Forge._digest, _T.FETCH: Forge._fetch,
     _T.INVENTORY: Forge._inventory, _T.REPLICAS: Forge._replicas, _T.REVOKE: Forge._revoke,
     _T.OPEN: Forge._open, _T.ACCEPT: Forge._accept, _T.REVOKED: Forge._revoked, _T.LACKING: Forge._lacking,
     _T.ADCERT: Forge._adcert, _T.RTCERT: Forge._rtcert, _T.CARD: Forge._card, _T.GRANT: Forge._grant,
@@ -730,11 +742,12 @@ _KINDS: Final[dict[StatementType, tuple[Kind, ...]]] = {
     _T.HELLO: (_K.HELLO,), _T.LINK_STATE: (_K.LINK_STATE,), _T.JOIN: (_K.JOIN, _K.JOIN, _K.LEAVE),
     _T.ADVERTISE: (_K.ADVERTISE,), _T.WITHDRAW: (_K.WITHDRAW,),
     _T.RELAY: (_K.RIB_REQUEST, _K.RIB_REQUEST, _K.RELOCATE, _K.REDIRECT), _T.QUERY: (_K.RIB_REQUEST, _K.WHERE),
-    _T.ANSWER: (_K.RIB_ANSWER, _K.RIB_ANSWER, _K.VERDICT, _K.REDIRECT), _T.VERDICT: (_K.VERDICT, _K.RIB_ANSWER),
-    _T.PRESENCE: (_K.RIB_ANSWER, _K.RIB_REQUEST, _K.VERDICT), _T.DIGEST: (_K.RIB_REQUEST,),
+    _T.ANSWER: (_K.RIB_ANSWER, _K.RIB_ANSWER, _K.ADVERTISE_ACK, _K.REDIRECT),
+    _T.ADVERTISE_ACK: (_K.ADVERTISE_ACK, _K.RIB_ANSWER),
+    _T.PRESENCE: (_K.RIB_ANSWER, _K.RIB_REQUEST, _K.ADVERTISE_ACK), _T.DIGEST: (_K.RIB_REQUEST,),
     _T.FETCH: (_K.RIB_REQUEST,), _T.INVENTORY: (_K.RIB_REQUEST,), _T.REPLICAS: (_K.RIB_REQUEST,),
     _T.REVOKE: (_K.REVOKE,), _T.ADCERT: (_K.ADVERTISE,), _T.RTCERT: (_K.ADVERTISE,), _T.CARD: (_K.ADVERTISE,),
-    _T.GRANT: (_K.VERDICT,), _T.OPEN: (_K.RIB_REQUEST,), _T.ACCEPT: (_K.RIB_ANSWER,),
+    _T.GRANT: (_K.ADVERTISE_ACK,), _T.OPEN: (_K.RIB_REQUEST,), _T.ACCEPT: (_K.RIB_ANSWER,),
     _T.REVOKED: (_K.REVOKED,), _T.LACKING: (_K.REVOKED,),
 }  # fmt: skip
 _RARE: Final = {_T.ADCERT, _T.RTCERT, _T.CARD, _T.GRANT}

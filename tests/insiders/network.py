@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from gdp.effects import Transmit
 from gdp.frame.codec import ETHER_BYTES, HOPS_AT
-from gdp.simulation.memory import MemoryNetwork
+from gdp.sansio import OutgoingFrames
+from gdp.simulation.network import SimNetwork
 
 __all__ = ["Echo", "TracingNetwork"]
 
@@ -45,7 +45,7 @@ class Echo:
         return max(self.sent.values(), default=0)
 
 
-class TracingNetwork(MemoryNetwork):
+class TracingNetwork(SimNetwork):
     """Frames that a machine sends while it takes a traced frame are traced, too, wherever they lead.
 
     Attributes:
@@ -71,7 +71,7 @@ class TracingNetwork(MemoryNetwork):
         super()._arm(name)
         self.echo = echo
 
-    def _transmit(self, node: Any, transmit: Transmit) -> None:
+    def _transmit(self, node: Any, transmit: OutgoingFrames) -> None:
         self._is_machine = True
         super()._transmit(node, transmit)
         self._is_machine = False

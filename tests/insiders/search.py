@@ -117,4 +117,4 @@ def _found(trial: Trial, error: Exception) -> Found:
 
 def _kind(text: str) -> str:
     """Return an invariant's text without its numbers."""
-    return "".join(" " if letter.isdigit() else letter for letter in text)
+    return "".join(" " if outgoing.isdigit() else outgoing for outgoing in text)

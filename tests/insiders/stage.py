@@ -15,16 +15,16 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final
 
-from gdp.client.member import Member, Topic
+from gdp.client.participant import Participant, Topic
 from gdp.client.rib_host import RibHost
-from gdp.control.greeter import LinkPort
 from gdp.control.hello import ECHO_BYTES
+from gdp.control.neighbor_discovery import HelloPort
 from gdp.crypto.identity import Identity
 from gdp.limits import RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX
-from gdp.rib.machine import RibSettings
+from gdp.rib.core import RibSettings
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
-from gdp.simulation.world import World
-from gdp.switch.machine import Switch
+from gdp.switch.core import SwitchCore
 from gdp.trust.domain import Policy
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
@@ -90,7 +90,7 @@ class Persona:
 
     Args:
         node: what it is called in the network.
-        identity: label in ``World.identities``.
+        identity: label in ``Simulation.identities``.
         may_break: whether its office lets it hurt the good flow: RIBs of the flow's domains say where names are.
     """
 
@@ -137,13 +137,13 @@ class Stage:
 
     seed: int
     rib_limits: tuple[int, int] = (RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX)
-    world: World = field(init=False)
+    world: Simulation = field(init=False)
     flow: Flow = field(init=False)
     topics: dict[str, Topic] = field(default_factory=dict)
     _rib_nodes: dict[str, str] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.world = world = World(
+        self.world = world = Simulation(
             _TOPOLOGY,
             self.seed,
             hello_s=1.0,
@@ -181,9 +181,9 @@ class Stage:
     def take_part_again(self, label: str) -> None:
         """Let a member do what it is here for, as far as it does not."""
         member = self.world.members[label]
-        claimed = {each.right for each in member.attachment.claims}
+        pending_advertisement = {each.right for each in member.attachment.advertisements}
         for name, right in PARTS.get(label, ()):
-            if right in claimed:
+            if right in pending_advertisement:
                 continue
             topic = self.topics.get(f"{label} {right.value}") or self.world.topic(name, member, [right])
             self.topics[f"{label} {right.value}"] = topic
@@ -204,7 +204,7 @@ class Stage:
             publisher.publish(message)
         service = self.topics["nuc1/insider serve"].name
         for client in member.heard(service):
-            member.answer(service, client, message)
+            member.respond(service, client, message)
         member.flush(self.world.network.now.mono_s)
         self.world.network.touch("nuc1/insider")
 
@@ -226,13 +226,13 @@ class Stage:
     def places(self, node: str) -> list[Place]:
         """Return where a node's frames come in: a port of each of its neighbours."""
         ports = self.world.network._nodes[node].ports.values()
-        return [Place(far.node, far.port, own.mac) for cable, own, far in ports if cable.is_up]
+        return [Place(far.node, far.port, own.mac) for sim_link, own, far in ports if sim_link.is_up]
 
-    def machines(self) -> dict[str, Switch | RibHost | Member]:
+    def machines(self) -> dict[str, SwitchCore | RibHost | Participant]:
         """Return every machine that is alive, by node."""
         world = self.world
         ribs = {self._rib_nodes[label]: host for label, host in world.ribs.items()}
-        machines: dict[str, Switch | RibHost | Member] = {**world.switches, **ribs, **world.members}
+        machines: dict[str, SwitchCore | RibHost | Participant] = {**world.switches, **ribs, **world.members}
         return {node: each for node, each in machines.items() if world.network._nodes[node].is_alive}
 
     def nonce_at(self, place: Place) -> bytes:
@@ -256,14 +256,16 @@ class Stage:
         """Return whether a node believes a persona: its domain is trusted there, and it is not revoked."""
         domain = self.identity(persona).root.domain
         machine = self.machines().get(place.node)
-        holder = machine if isinstance(machine, Switch) or machine is None else machine.attachment
+        holder = machine if isinstance(machine, SwitchCore) or machine is None else machine.attachment
         policy: Policy | None = None if holder is None else holder._policy
         is_revoked = persona.node == "nuc2/outcast"
         return policy is not None and policy.trusts(domain) and not is_revoked
 
-    def _port_at(self, place: Place) -> LinkPort | None:
+    def _port_at(self, place: Place) -> HelloPort | None:
         machine = self.machines().get(place.node)
         if machine is None:
             return None
-        greeter = machine.greeter if isinstance(machine, Switch) else machine.attachment.greeter
-        return greeter.ports.get(place.port)
+        hello_protocol = (
+            machine.hello_protocol if isinstance(machine, SwitchCore) else machine.attachment.hello_protocol
+        )
+        return hello_protocol.ports.get(place.port)

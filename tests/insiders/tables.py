@@ -6,9 +6,9 @@ from collections import Counter, deque
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-from gdp.client.private_streams import STREAMS_MAX
-from gdp.client.readers import READERS_MAX
-from gdp.limits import JOIN_MESSAGES_MAX, PARKED_FRAMES_MAX, REPLAY_WINDOW_MESSAGES
+from gdp.client.reader_proxies import READERS_MAX
+from gdp.client.unicast_streams import STREAMS_MAX
+from gdp.limits import JOIN_MESSAGES_MAX, PENDING_FRAMES_MAX, REPLAY_WINDOW_MESSAGES
 from gdp.rib.replication import QUEUE_MAX
 from gdp.switch.name_queries import QUERIES_MAX, USED_NAMES_MAX
 
@@ -17,7 +17,7 @@ __all__ = ["GENERAL_MAX", "LIMITS", "sizes"]
 GENERAL_MAX: Final = 4_096  # what remembers peers, sessions or old statements keeps no more than this
 LIMITS: Final[Mapping[str, int]] = {
     "NameQueries._queries": QUERIES_MAX + USED_NAMES_MAX,
-    "Parked._by_name": PARKED_FRAMES_MAX,
+    "Parked._by_name": PENDING_FRAMES_MAX,
     "Readers._by_name": READERS_MAX,
     "PrivateStreams._streams": STREAMS_MAX,
     "_Peer.keys": QUEUE_MAX,

@@ -116,7 +116,7 @@ def prepared(seed: int) -> Iterator[None]:
     with ExitStack() as stack:
         stack.enter_context(reproducible_keys(seed))
         stack.enter_context(signing_oracle())
-        stack.enter_context(mock.patch("gdp.simulation.world.MemoryNetwork", TracingNetwork))
+        stack.enter_context(mock.patch("gdp.simulation.simulation.MemoryNetwork", TracingNetwork))
         yield
 
 
@@ -243,9 +243,9 @@ class Trial:
     def _heal(self) -> None:
         """Repair every cable and let leases end, so that all timers that were armed fire."""
         world, network = self.stage.world, self.stage.world.network
-        for cable in [*world.cables.values(), *world.leads.values()]:
-            if not cable.is_up:
-                network.set_link(cable, up=True)
+        for sim_link in [*world.cables.values(), *world.leads.values()]:
+            if not sim_link.is_up:
+                network.set_link(sim_link, up=True)
         network.run(_HEALED_S)
 
     # -- the journey
@@ -260,12 +260,12 @@ class Trial:
     def _hostile_member(self, rng: random.Random) -> str:
         return rng.choice((*PARTS, "x1/mallory"))
 
-    def _cut_cable(self, rng: random.Random) -> None:
+    def _cut_sim_link(self, rng: random.Random) -> None:
         world = self.stage.world
         cables = list(world.cables.values()) + list(world.leads.values())
         world.network.set_link(rng.choice(cables), up=False)
 
-    def _mend_cable(self, rng: random.Random) -> None:
+    def _mend_sim_link(self, rng: random.Random) -> None:
         world = self.stage.world
         down = [each for each in [*world.cables.values(), *world.leads.values()] if not each.is_up]
         if down:
@@ -273,9 +273,9 @@ class Trial:
 
     def _cut_insider(self, rng: random.Random) -> None:
         world = self.stage.world
-        cable = world.leads[self._hostile_member(rng)]
-        world.network.set_link(cable, up=False)
-        world.network.call(rng.choice((0.05, 1.0, 5.0)), lambda: world.network.set_link(cable, up=True))
+        sim_link = world.leads[self._hostile_member(rng)]
+        world.network.set_link(sim_link, up=False)
+        world.network.call(rng.choice((0.05, 1.0, 5.0)), lambda: world.network.set_link(sim_link, up=True))
 
     def _restart_insider(self, rng: random.Random) -> None:
         self.stage.world.restart_member(self._hostile_member(rng))
@@ -296,9 +296,9 @@ class Trial:
     def _leave(self, rng: random.Random) -> None:
         label = self._hostile_member(rng)
         member = self.stage.world.members[label]
-        for claimed in member.attachment.claims:
-            member.unsubscribe(claimed.subject.name)
-            member.withdraw(claimed.subject.name)
+        for pending_advertisement in member.attachment.advertisements:
+            member.unsubscribe(pending_advertisement.subject.name)
+            member.withdraw(pending_advertisement.subject.name)
         self.stage.world.network.touch(label)
 
     def _join_in(self, rng: random.Random) -> None:
@@ -326,9 +326,9 @@ _CALM_ACTS: Final[tuple[_Act, ...]] = (
 )  # fmt: skip
 _ACTS: Final[tuple[_Act, ...]] = (
     *_CALM_ACTS,
-    Trial._cut_cable,
-    Trial._mend_cable,
-    Trial._mend_cable,
+    Trial._cut_sim_link,
+    Trial._mend_sim_link,
+    Trial._mend_sim_link,
     Trial._restart_any,
 )
 

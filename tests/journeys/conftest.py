@@ -10,22 +10,22 @@ from collections.abc import Generator
 
 import pytest
 
-from gdp.simulation.world import World
+from gdp.simulation.simulation import Simulation
 
 LEASES = 3
-_WORLDS = pytest.StashKey[list[World]]()
+_WORLDS = pytest.StashKey[list[Simulation]]()
 
 
 @pytest.fixture(autouse=True)
 def _worlds_are_known(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     worlds = request.node.stash[_WORLDS] = []
-    made = World.__post_init__
+    made = Simulation.__post_init__
 
-    def note(world: World) -> None:
+    def note(world: Simulation) -> None:
         made(world)
         worlds.append(world)
 
-    monkeypatch.setattr(World, "__post_init__", note)
+    monkeypatch.setattr(Simulation, "__post_init__", note)
 
 
 @pytest.hookimpl(wrapper=True)
@@ -36,7 +36,7 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
         pytest.fail(complaint, pytrace=False)
 
 
-def too_short(worlds: list[World], marker: pytest.Mark | None) -> str:
+def too_short(worlds: list[Simulation], marker: pytest.Mark | None) -> str:
     """Return why a test does not outlive its leases; empty: it does, or need not."""
     if marker is not None:
         reasons = [reason for reason in marker.args if isinstance(reason, str) and reason.strip()]

@@ -8,12 +8,12 @@ from functools import partial
 from math import ceil
 
 from gdp.client.delivery import Delivered
-from gdp.client.member import Member, Topic
+from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.frame.codec import ETHER_BYTES, Header, decode
 from gdp.names import Name
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import ring5
-from gdp.simulation.world import World
 from gdp.trust.right import Right
 
 ROBOT, SERVER = "nuc1/robot", "nuc5/server"
@@ -25,7 +25,7 @@ STEP_S = 0.25  # between messages of a flow that is to outlive leases
 class Flow:
     """One publisher of a topic and its readers, by label."""
 
-    world: World
+    world: Simulation
     name: str
     source: str
     topic: Topic
@@ -33,7 +33,7 @@ class Flow:
     got: dict[str, list[Delivered]] = field(default_factory=dict)
 
     @property
-    def member(self) -> Member:
+    def member(self) -> Participant:
         """Return the member that publishes."""
         return self.world.members[self.source]
 
@@ -59,7 +59,7 @@ class Flow:
     def collect(self) -> None:
         """Take what came to each reader."""
         for label, got in self.got.items():
-            messages = self.world.members[label].take_messages()
+            messages = self.world.members[label].poll_messages()
             got += [each.delivered for each in messages if each.topic == self.topic.name]
 
     def numbers(self, label: str) -> list[int]:
@@ -121,15 +121,17 @@ class Tap:
         return sum(1 for each in self.headers if each.kind == kind and destination in (None, each.destination))
 
 
-def ring(seed: int = 1, transits: Mapping[str, tuple[str, ...]] | None = None, *, lease_s: float = LEASE_S) -> World:
+def ring(
+    seed: int = 1, transits: Mapping[str, tuple[str, ...]] | None = None, *, lease_s: float = LEASE_S
+) -> Simulation:
     """Return the ring of five, every member attached."""
-    world = World(ring5(), seed, transits=transits, lease_s=lease_s)
+    world = Simulation(ring5(), seed, transits=transits, lease_s=lease_s)
     assert world.settle()
     return world
 
 
 def advertise(
-    world: World,
+    world: Simulation,
     name: str = "/chatter",
     source: str = ROBOT,
     *,
@@ -149,7 +151,7 @@ def advertise(
 
 
 def flowing(
-    world: World,
+    world: Simulation,
     name: str = "/chatter",
     source: str = ROBOT,
     readers: tuple[str, ...] = (SERVER,),

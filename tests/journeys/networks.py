@@ -20,8 +20,8 @@ from hypothesis import strategies as st
 
 from gdp.crypto.keys import SigningKey, SoftwareKey
 from gdp.limits import DEAD_S, HELLO_S, JOIN_LEASE_S
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
-from gdp.simulation.world import World
 from tests.journeys.flows import Flow, advertise
 
 SWITCHES_MAX: Final = 40
@@ -177,7 +177,7 @@ def reproducible(seed: int) -> Iterator[None]:
     """Make keys the same for the same seed, and no lease longer than ``LEASE_S``."""
     with (
         reproducible_keys(seed),
-        mock.patch("gdp.switch.link_states.LINK_STATE_LEASE_S", LEASE_S),
+        mock.patch("gdp.switch.lsdb.LINK_STATE_LEASE_S", LEASE_S),
         mock.patch("gdp.switch.flooding.LINK_STATE_REFRESH_S", LEASE_S / 3),
     ):
         yield
@@ -192,14 +192,14 @@ class Trial:
 
     plan: Plan
     topology: Topology = field(init=False)
-    world: World = field(init=False)
+    world: Simulation = field(init=False)
     dead: set[str] = field(default_factory=set)
     cut: set[frozenset[str]] = field(default_factory=set)
 
     def __post_init__(self) -> None:
         self.topology = self.plan.topology()
         slower = max(1.0, len(self.topology.nodes) / _FAST_SWITCHES)
-        self.world = World(
+        self.world = Simulation(
             self.topology,
             self.plan.seed,
             hello_s=HELLO_S * slower,
@@ -276,7 +276,7 @@ class Trial:
         """Take what came to each member, who reads several of the flows."""
         of = {flow.topic.name: flow for flow in flows}
         for label, member in self.world.members.items():
-            for each in member.take_messages():
+            for each in member.poll_messages():
                 of[each.topic].got[label].append(each.delivered)
 
     def _check(self, flow: Flow, label: str, count: int) -> None:

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 from functools import partial
 from math import ceil
 
-from gdp.client.member import Member, Message
+from gdp.client.participant import Message, Participant
 from gdp.client.publisher import Publisher
 from gdp.names import Name
-from gdp.simulation.world import World
+from gdp.simulation.simulation import Simulation
 from gdp.trust.right import Right
 from tests.journeys.flows import STEP_S
 
@@ -20,7 +20,7 @@ SERVICE = "/add_two_ints"
 class Party:
     """One member that serves or calls a name: a server answers each request at once, by what it got and its label."""
 
-    world: World
+    world: Simulation
     label: str
     right: Right
     name: str = SERVICE
@@ -33,7 +33,7 @@ class Party:
         self.begin()
 
     @property
-    def member(self) -> Member:
+    def member(self) -> Participant:
         """Return the member, in its present life."""
         return self.world.members[self.label]
 
@@ -52,16 +52,18 @@ class Party:
 
     def answer(self, client: Name, message: bytes) -> None:
         """Answer one client."""
-        self.member.answer(self.service, client, message)
+        self.member.respond(self.service, client, message)
         self._flush()
 
     def collect(self) -> list[Message]:
         """Take, and answer, what has come; return all that came yet."""
-        messages = self.member.take_messages()
+        messages = self.member.poll_messages()
         self.got += messages
         if self.right is Right.SERVE and self.answers:
             for each in messages:
-                if Name(each.delivered.publisher) in {feed.publisher for feed in self.member.feeds_of(self.service)}:
+                if Name(each.delivered.publisher) in {
+                    writer_proxy.publisher for writer_proxy in self.member.writer_proxies_of(self.service)
+                }:
                     self.answer(Name(each.delivered.publisher), each.delivered.message + b" by " + self.label.encode())
         return self.got
 
@@ -74,7 +76,7 @@ class Party:
         self.world.network.touch(self.label)
 
 
-def outlive(world: World, client: Party, *servers: Party, leases: float = 3.25) -> None:
+def outlive(world: Simulation, client: Party, *servers: Party, leases: float = 3.25) -> None:
     """Ask at a steady rate until three leases are over; each server answers each request once, and in order."""
     client.collect()
     before, count = len(client.got), ceil(leases * world.lease_s / STEP_S)
@@ -92,7 +94,7 @@ def outlive(world: World, client: Party, *servers: Party, leases: float = 3.25) 
         assert [body for body in bodies if body.endswith(tail)] == [request + tail for request in asked]
 
 
-def meet(world: World, *parties: Party, within_s: float = 5.0) -> bool:
+def meet(world: Simulation, *parties: Party, within_s: float = 5.0) -> bool:
     """Let time go on until every client has met every server; return whether that came true."""
     servers = sum(party.right is Right.SERVE for party in parties)
     clients = len(parties) - servers
@@ -106,7 +108,7 @@ def meet(world: World, *parties: Party, within_s: float = 5.0) -> bool:
     return world.network.run(within_s, have_met)
 
 
-def work(world: World, *parties: Party, until_s: float, have: int = 0) -> bool:
+def work(world: Simulation, *parties: Party, until_s: float, have: int = 0) -> bool:
     """Let servers answer for a while; return whether so many messages have come to the last party."""
 
     def is_done() -> bool:

@@ -12,15 +12,15 @@ from typing import Any
 
 import pytest
 
-from gdp.effects import Arrival
 from gdp.errors import DropReason
 from gdp.frame.codec import ETHER_BYTES, HOPS_AT, KIND_AT
 from gdp.frame.kinds import Kind
 from gdp.names import Name
-from gdp.simulation import world as worlds
-from gdp.simulation.memory import Cable, MemoryNetwork
+from gdp.sansio import ReceivedFrame
+from gdp.simulation import simulation as worlds
+from gdp.simulation.network import SimLink, SimNetwork
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import chain
-from gdp.simulation.world import World
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.unicast import Unicast
 from tests.journeys.flows import Tap, advertise, flowing
@@ -33,8 +33,8 @@ SIZE = 1_000  # of a message: it fits one frame, so that frames are messages
 ON_THE_WAY = (
     DropReason.NO_ROUTE,
     DropReason.NO_READER,
-    DropReason.PARKED_FULL,
-    DropReason.PARKED_EXPIRED,
+    DropReason.PENDING_FULL,
+    DropReason.PENDING_EXPIRED,
     DropReason.HOPS_EXPIRED,
     DropReason.UNKNOWN_SENDER,
 )
@@ -44,7 +44,7 @@ def is_data(frame: bytes) -> bool:
     return frame[ETHER_BYTES + KIND_AT] == Kind.DATA
 
 
-class Ledger(MemoryNetwork):
+class Ledger(SimNetwork):
     """Notes what became of DATA frames: dropped by a plane, lost by chance, cut off with their cable, still flying."""
 
     def __init__(self, seed: int = 1) -> None:
@@ -60,23 +60,23 @@ class Ledger(MemoryNetwork):
             self.taken["lost"] += self.lost - lost
             self.taken["flying"] += self.drops == drops and self.lost == lost
 
-    def _arrive(self, cable: Cable, end: Any, frame: bytes) -> None:
+    def _arrive(self, sim_link: SimLink, end: Any, frame: bytes) -> None:
         if is_data(frame):
             self.taken["flying"] -= 1
-            self.taken["cut"] += not cable.is_up
-        super()._arrive(cable, end, frame)
+            self.taken["cut"] += not sim_link.is_up
+        super()._arrive(sim_link, end, frame)
 
     def _deliver(self, end: Any, frame: bytes) -> None:
         node = self._nodes[end.node]
         if is_data(frame) and not node.is_alive:
             self.taken["dead"] += 1
         elif is_data(frame) and node.table is not None:
-            mtus = {port: cable.mtu for port, (cable, _, _) in node.ports.items() if cable.is_up}
-            verdict = decide(frame, node.table.entries, mtus, node.table.sides, end.port)
-            if isinstance(verdict, Drop):
-                self.dropped[verdict.reason] += 1
-            elif isinstance(verdict, Forward):
-                self.dropped += Counter(verdict.lost)
+            mtus = {port: sim_link.mtu for port, (sim_link, _, _) in node.ports.items() if sim_link.is_up}
+            ack = decide(frame, node.table.entries, mtus, node.table.sides, end.port)
+            if isinstance(ack, Drop):
+                self.dropped[ack.reason] += 1
+            elif isinstance(ack, Forward):
+                self.dropped += Counter(ack.lost)
         super()._deliver(end, frame)
 
 
@@ -115,7 +115,7 @@ class Books:
 
     def __init__(self, others: Counter[DropReason]) -> None:
         self._others = others
-        self.world = World(chain(5))
+        self.world = Simulation(chain(5))
         assert self.world.settle()
         self.flow = flowing(self.world, source=A, readers=(B,), reliable=False)
         self.network = self.world.network
@@ -144,9 +144,9 @@ class Books:
         self.network.run(3)
         self.flow.collect()
         world = self.world
-        parked = sum(switch.resolver.pending_frames for switch in world.switches.values())
-        ends = {"delivered": len(self.flow.got[B]), "parked": parked, **self.ledger.taken}
-        assert self.ledger.taken["flying"] == parked == 0
+        pending = sum(switch.resolver.pending_frames for switch in world.switches.values())
+        ends = {"delivered": len(self.flow.got[B]), "parked": pending, **self.ledger.taken}
+        assert self.ledger.taken["flying"] == pending == 0
         assert self._attempts == sum(ends.values()) + sum(self.reasons().values()), (ends, self.reasons())
 
     def _machines(self) -> Counter[DropReason]:
@@ -161,7 +161,7 @@ class Books:
 @pytest.fixture
 def books(monkeypatch: pytest.MonkeyPatch) -> Books:
     """A flow that is at work, with its books open."""
-    monkeypatch.setattr(worlds, "MemoryNetwork", Ledger)
+    monkeypatch.setattr(worlds, "SimNetwork", Ledger)
     return Books(note_others(monkeypatch))
 
 
@@ -172,8 +172,8 @@ def test_when_nothing_goes_wrong_all_is_delivered(books: Books) -> None:
 
 
 def test_loss_by_chance_adds_up(books: Books) -> None:
-    for cable in books.world.cables.values():
-        cable.loss = 0.05
+    for sim_link in books.world.cables.values():
+        sim_link.loss = 0.05
     books.stream(500)
     books.settle()
     assert 0 < books.ledger.taken["lost"] < 500
@@ -182,10 +182,10 @@ def test_loss_by_chance_adds_up(books: Books) -> None:
 
 @pytest.mark.parametrize("down_s", [0.02, 0.3])
 def test_a_link_that_is_pulled_under_a_stream_adds_up(books: Books, down_s: float) -> None:
-    cable = books.world.cables[MIDDLE]
+    sim_link = books.world.cables[MIDDLE]
     books.stream(1_000)
-    books.network.call(0.1, partial(books.network.set_link, cable, False))
-    books.network.call(0.1 + down_s, partial(books.network.set_link, cable, True))
+    books.network.call(0.1, partial(books.network.set_link, sim_link, False))
+    books.network.call(0.1 + down_s, partial(books.network.set_link, sim_link, True))
     books.settle()
     assert len(books.flow.got[B]) < 1_000
 
@@ -282,7 +282,7 @@ def test_every_frame_that_a_reader_is_handed_is_delivered_or_dropped_for_a_reaso
         ]
     before, delivered = sum(member.drops().values()), len(flow.got[B])
     for frame in given:
-        member.receive([Arrival(0, b"\x02evil\x00", frame)], now)
+        member.receive([ReceivedFrame(0, b"\x02evil\x00", frame)], now)
     flow.collect()
     assert len(flow.got[B]) == delivered
     assert sum(member.drops().values()) - before == len(given)
@@ -292,9 +292,9 @@ def test_reliable_messages_that_were_published_all_come_whatever_the_books_say_o
     flow = advertise(books.world, "/reliable", A)
     flow.read_by(B)
     assert books.network.run(5, lambda: flow.is_read_by(1))
-    for cable in books.world.cables.values():
-        cable.loss = 0.05
+    for sim_link in books.world.cables.values():
+        sim_link.loss = 0.05
     flow.stream(200, 0.002, 5_000)
     assert books.network.run(20, lambda: flow.has(B, 200))
-    (feed,) = books.world.members[B].feeds_of(flow.topic.name)
-    assert (flow.numbers(B), feed.lost) == (list(range(200)), 0)
+    (writer_proxy,) = books.world.members[B].writer_proxies_of(flow.topic.name)
+    assert (flow.numbers(B), writer_proxy.lost) == (list(range(200)), 0)

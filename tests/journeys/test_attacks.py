@@ -8,21 +8,21 @@ from collections.abc import Callable, Iterable
 
 import pytest
 
-from gdp.client.member import Member
+from gdp.client.participant import Participant
 from gdp.client.rib_host import RibHost
+from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.join import Join
-from gdp.control.query import Answer
-from gdp.control.verdict import Verdict
+from gdp.control.query import Response
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import StatementType, sign
-from gdp.effects import Arrival
 from gdp.errors import DropReason
 from gdp.frame.codec import HEADER_BYTES, Header, decode, encode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import CONTROL_JOIN_BYTES, CONTROL_PATIENCE_S, HOPS_MAX
 from gdp.names import ZERO, Name
-from gdp.simulation.world import World
-from gdp.switch.machine import Switch
+from gdp.sansio import ReceivedFrame
+from gdp.simulation.simulation import Simulation
+from gdp.switch.core import SwitchCore
 from gdp.switch.name_queries import QUERIES_MAX
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 
@@ -30,10 +30,10 @@ Injector = Callable[[bytes], None]
 NODES = ("nuc1", "nuc3", ROBOT, SERVER, "nuc2/rib")
 
 
-def counted(world: World) -> Counter[DropReason]:
+def counted(world: Simulation) -> Counter[DropReason]:
     """Return everything that was dropped anywhere, by reason."""
     total = Counter(world.network.drops)
-    machines: list[Switch | RibHost | Member] = [*world.switches.values(), *world.ribs.values()]
+    machines: list[SwitchCore | RibHost | Participant] = [*world.switches.values(), *world.ribs.values()]
     for machine in [*machines, *world.members.values()]:
         total += Counter(machine.drops())
     return total
@@ -67,7 +67,7 @@ def control(kind: int, payload: bytes, *, number: int = 1, parts: int = 1, sourc
     return encode(Header(kind, flags, HOPS_MAX, 0, len(payload), number, 0, parts, 9, ZERO, source)) + payload
 
 
-def mac_of(world: World, node: str, port: int = 0) -> bytes:
+def mac_of(world: Simulation, node: str, port: int = 0) -> bytes:
     """Return the address from which a node's neighbour on a port speaks."""
     return world.network._nodes[node].ports[port][2].mac
 
@@ -135,18 +135,18 @@ def test_a_flood_of_beginnings_is_bounded_and_given_back() -> None:
     world = flow.world
     frames = (control(Kind.HELLO, bytes(1_000), number=n, parts=3, source=n.to_bytes(32, "big")) for n in range(3_000))
     attack(flow, frames, ("nuc1",))
-    assert 0 < world.switches["nuc1"].greeter.held_bytes <= CONTROL_JOIN_BYTES
+    assert 0 < world.switches["nuc1"].hello_protocol.held_bytes <= CONTROL_JOIN_BYTES
     world.network.run(CONTROL_PATIENCE_S + 1)
-    assert world.switches["nuc1"].greeter.held_bytes == 0
+    assert world.switches["nuc1"].hello_protocol.held_bytes == 0
     flow.outlive()
 
 
 def test_for_strangers_no_statement_but_a_hello_is_begun() -> None:
     flow = flowing(ring())
-    frames = [control(kind, bytes(1_000), parts=3) for kind in range(Kind.LINK_STATE, Kind.VERDICT + 1)]
+    frames = [control(kind, bytes(1_000), parts=3) for kind in range(Kind.LINK_STATE, Kind.ADVERTISE_ACK + 1)]
     found = attack(flow, frames, ("nuc1", "nuc3"))
     assert found == {DropReason.UNKNOWN_SENDER: 2 * len(frames)}
-    assert flow.world.switches["nuc1"]._joiner.held_bytes == 0
+    assert flow.world.switches["nuc1"]._reassembler.held_bytes == 0
     flow.outlive()
 
 
@@ -166,13 +166,13 @@ def test_a_neighbour_that_looks_for_everything_is_bounded() -> None:
     flow = flowing(ring())
     world = flow.world
     nuc1 = world.switches["nuc1"]
-    port = next(i for i, p in nuc1.greeter.ports.items() if world.members[ROBOT].name in p.neighbours)
+    port = next(i for i, p in nuc1.hello_protocol.ports.items() if world.members[ROBOT].name in p.neighbours)
     mac = mac_of(world, "nuc1", port)
     for number in range(2 * QUERIES_MAX):
         header = Header(Kind.DATA, Flag.LAST, HOPS_MAX, 1, 0, 1, 0, 1, 9, number.to_bytes(32, "big"), b"e" * 32)
-        world.network._nodes["nuc1"].machine.receive([Arrival(port, mac, encode(header))], world.network.now)
+        world.network._nodes["nuc1"].machine.receive([ReceivedFrame(port, mac, encode(header))], world.network.now)
     assert nuc1.resolver.open_queries <= QUERIES_MAX + 8
-    assert nuc1.drops()[DropReason.PARKED_FULL] > 0
+    assert nuc1.drops()[DropReason.PENDING_FULL] > 0
     world.network.touch("nuc1")
     world.network.run(6)
     assert nuc1.resolver.pending_frames == 0
@@ -230,7 +230,7 @@ def test_recorded_leaves_played_back_again_and_again_cut_no_branch() -> None:
     flow.outlive()
 
 
-def test_a_recorded_withdrawal_takes_nothing_down_once_the_name_is_claimed_anew() -> None:
+def test_a_recorded_withdrawal_takes_nothing_down_once_the_name_is_pending_advertisement_anew() -> None:
     world = ring()
     tap = Tap(ROBOT, "nuc1")
     world.network.taps.append(tap)
@@ -265,14 +265,14 @@ def test_a_statement_altered_anywhere_is_not_believed(kind: Kind) -> None:
     world.network.run(31)
     sample = recorded(tap, kind)[-1]
     state = world.switches["nuc1"]
-    neighbours = [(n.name, n.mac) for n in state.greeter.all_up()]
-    trees = [(tree.key, sorted(tree.branches)) for tree in state.planter.trees.all()]
+    neighbours = [(n.name, n.mac) for n in state.hello_protocol.all_up()]
+    trees = [(tree.key, sorted(tree.branches)) for tree in state.multicast.trees.all()]
     for at in regions(sample):
         altered = bytearray(sample)
         altered[at] ^= 0x41
         world.network.inject("nuc1", 0, bytes(altered), mac_of(world, "nuc1"))
-    assert [(n.name, n.mac) for n in state.greeter.all_up()] == neighbours
-    assert [(tree.key, sorted(tree.branches)) for tree in state.planter.trees.all()] == trees
+    assert [(n.name, n.mac) for n in state.hello_protocol.all_up()] == neighbours
+    assert [(tree.key, sorted(tree.branches)) for tree in state.multicast.trees.all()] == trees
     assert sum(state.drops().values()) > 0
     still_flows(flow)
     flow.outlive()
@@ -303,14 +303,14 @@ def test_a_join_without_evidence_plants_nothing() -> None:
     flow = flowing(world)
     nuc2, nuc1 = world.identities["nuc2"], world.switches["nuc1"]
     secret = Name(b"t" * 32)
-    session = nuc1.greeter.ports[0].echo
+    session = nuc1.hello_protocol.ports[0].echo
     domains = frozenset(nuc1._policy.transit)
     join = Join(
         secret, world.members[ROBOT].name, nuc1.name, nuc1._policy.own, domains, 1_500, 5.0, b"", session, 1 << 60,
-        sender_session=nuc1.greeter.neighbour(0, nuc2.name).nonce,
+        sender_session=nuc1.hello_protocol.neighbour(0, nuc2.name).nonce,
     )  # fmt: skip
     world.network.inject("nuc1", 0, control(Kind.JOIN, join.to_wire(nuc2.name, nuc2.key)), mac_of(world, "nuc1"))
-    assert nuc1.planter.trees.of_topic(secret) == []
+    assert nuc1.multicast.trees.of_topic(secret) == []
     assert nuc1.drops()[DropReason.MALFORMED] == 1
     still_flows(flow)
 
@@ -320,40 +320,40 @@ def test_a_join_with_evidence_of_another_topic_plants_nothing() -> None:
     world = ring()
     flow = flowing(world)
     nuc2, nuc1 = world.identities["nuc2"], world.switches["nuc1"]
-    evidence = nuc1.planter.trees.of_topic(flow.topic.name)[0].evidence
-    secret, session = Name(b"t" * 32), nuc1.greeter.ports[0].echo
+    evidence = nuc1.multicast.trees.of_topic(flow.topic.name)[0].evidence
+    secret, session = Name(b"t" * 32), nuc1.hello_protocol.ports[0].echo
     domains = frozenset(nuc1._policy.transit)
     join = Join(
         secret, world.members[ROBOT].name, nuc1.name, nuc1._policy.own, domains, 1_500, 5.0, evidence, session, 1 << 60,
-        sender_session=nuc1.greeter.neighbour(0, nuc2.name).nonce,
+        sender_session=nuc1.hello_protocol.neighbour(0, nuc2.name).nonce,
     )  # fmt: skip
     world.network.inject("nuc1", 0, control(Kind.JOIN, join.to_wire(nuc2.name, nuc2.key)), mac_of(world, "nuc1"))
-    assert nuc1.planter.trees.of_topic(secret) == []
+    assert nuc1.multicast.trees.of_topic(secret) == []
     assert nuc1.drops()[DropReason.NOT_DELEGATED] == 1
     still_flows(flow)
 
 
-def test_a_verdict_of_a_member_that_may_not_judge_is_not_believed() -> None:
+def test_a_ack_of_a_member_that_may_not_judge_is_not_believed() -> None:
     world = ring()
     flow = flowing(world)
     liar = world.identity(Role.PROXY, "liar", "school")
     robot = world.members[ROBOT]
-    verdict = Verdict(flow.topic.name, robot.name, DropReason.REVOKED, 1).to_wire(liar.name, liar.key, liar.membership)
-    world.network.inject(ROBOT, 0, control(Kind.VERDICT, verdict), mac_of(world, ROBOT))
+    ack = AdvertiseAck(flow.topic.name, robot.name, DropReason.REVOKED, 1).to_wire(liar.name, liar.key, liar.membership)
+    world.network.inject(ROBOT, 0, control(Kind.ADVERTISE_ACK, ack), mac_of(world, ROBOT))
     assert robot.drops()[DropReason.BAD_CERTIFICATE] == 1
     assert robot.attachment.is_attached
-    assert all(each.refused is None for each in robot.attachment.claims)
+    assert all(each.refused is None for each in robot.attachment.advertisements)
     still_flows(flow)
     flow.outlive()
 
 
-def test_a_verdict_from_another_address_than_the_switch_is_from_nobody() -> None:
+def test_a_ack_from_another_address_than_the_switch_is_from_nobody() -> None:
     world = ring()
     flow = flowing(world)
     rib = world.identities["rib:school"]
     robot = world.members[ROBOT]
-    verdict = Verdict(flow.topic.name, robot.name, DropReason.REVOKED, 1).to_wire(rib.name, rib.key, rib.membership)
-    world.network.inject(ROBOT, 0, control(Kind.VERDICT, verdict))
+    ack = AdvertiseAck(flow.topic.name, robot.name, DropReason.REVOKED, 1).to_wire(rib.name, rib.key, rib.membership)
+    world.network.inject(ROBOT, 0, control(Kind.ADVERTISE_ACK, ack))
     assert robot.drops()[DropReason.UNKNOWN_SENDER] == 1
     still_flows(flow)
     flow.outlive()
@@ -366,7 +366,7 @@ def test_an_answer_from_no_rib_of_ones_own_is_not_believed(role: Role, domain: s
     liar = world.identity(role, "liar", domain)
     nuc1 = world.switches["nuc1"]
     name = flow.topic.name
-    answer = Answer(name, name, b"", liar.root.domain, (), 2.0).to_wire(liar.name, liar.key, liar.membership)
+    answer = Response(name, name, b"", liar.root.domain, (), 2.0).to_wire(liar.name, liar.key, liar.membership)
     header = Header(Kind.RIB_ANSWER, Flag.LAST, HOPS_MAX, 0, len(answer), 1, 0, 1, 9, nuc1.name, liar.name)
     world.network.inject("nuc1", 0, encode(header) + answer, mac_of(world, "nuc1"))
     assert nuc1.drops()[DropReason.WRONG_DOMAIN] == 1
@@ -415,7 +415,7 @@ def test_a_hello_of_a_stranger_is_not_answered() -> None:
     flow.outlive()
 
 
-def recorded_hello(world: World) -> bytes:
+def recorded_hello(world: Simulation) -> bytes:
     """Return a hello of another network's switch, whose root nobody here knows."""
     tap = Tap("nuc2", "nuc1")
     world.network.taps.append(tap)

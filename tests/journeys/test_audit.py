@@ -9,7 +9,7 @@ from tests.journeys.flows import SERVER, Flow, flowing, ring
 
 
 def lines(policy: Policy) -> list[AuditLine]:
-    return policy.audit.take(0.0, 0.0, 0, BEGIN)
+    return policy.audit.poll_lines(0.0, 0.0, 0, BEGIN)
 
 
 def audited() -> tuple[Flow, list[Policy], list[Policy]]:

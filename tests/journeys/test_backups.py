@@ -5,15 +5,15 @@ from __future__ import annotations
 import pytest
 
 from gdp.frame.kinds import Kind
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
-from gdp.simulation.world import World
 from tests.journeys.flows import LEASE_S, Flow, Tap, flowing
 
 P, R, NEAR, HERE = "s1/robot", "s4/reader", "s2/near", "s1/here"
 PERIOD_S = 0.002
 
 
-def square(mtu: int = 1_500) -> World:
+def square(mtu: int = 1_500) -> Simulation:
     """Return ``P - s1 - s2 - s4 - R`` with a dearer way by s3, settled."""
     topology = Topology(
         (Link("s1", "s2", 10), Link("s2", "s4", 10), Link("s1", "s3", 12, mtu=mtu), Link("s3", "s4", 10)),
@@ -26,19 +26,19 @@ def square(mtu: int = 1_500) -> World:
             Attachment("s1", "proxy", "here"),
         ),
     )
-    world = World(topology, lease_s=LEASE_S)
+    world = Simulation(topology, lease_s=LEASE_S)
     assert world.settle()
     return world
 
 
-def protected(world: World, *readers: str) -> Flow:
+def protected(world: Simulation, *readers: str) -> Flow:
     """Return a best-effort flow whose trees have asked for their backups."""
     flow = flowing(world, source=P, readers=readers or (R,), reliable=False)
     world.network.run(3.0)
     return flow
 
 
-def frames(world: World, a: str, b: str) -> Tap:
+def frames(world: Simulation, a: str, b: str) -> Tap:
     """Return what passes a link from now on."""
     tap = Tap(a, b)
     world.network.taps.append(tap)
@@ -89,7 +89,7 @@ def test_each_reader_has_its_messages_once_whichever_branch_is_lost(cut: tuple[s
 def test_a_backup_that_messages_would_not_fit_protects_nothing_and_narrows_nothing() -> None:
     world = square(mtu=700)
     flow = protected(world)
-    assert all(not tree.protection for tree in world.switches["s1"].planter.trees.all())
+    assert all(not tree.protection for tree in world.switches["s1"].multicast.trees.all())
     straight = frames(world, "s1", "s2")
     flow.stream(1, PERIOD_S, size=1_300)
     world.network.run(0.5)
@@ -100,10 +100,10 @@ def test_a_backup_that_messages_would_not_fit_protects_nothing_and_narrows_nothi
 def test_a_reader_that_leaves_takes_its_backup_along() -> None:
     world = square()
     flow = protected(world)
-    assert [len(world.switches[each].planter.trees) > 0 for each in ("s1", "s2", "s3", "s4")] == [True] * 4
+    assert [len(world.switches[each].multicast.trees) > 0 for each in ("s1", "s2", "s3", "s4")] == [True] * 4
     topic = flow.topic.name
     world.members[R].unsubscribe(topic)
     world.network.touch(R)
     world.network.run(1.0)
-    assert all(not switch.planter.trees.of_topic(topic) for switch in world.switches.values())
+    assert all(not switch.multicast.trees.of_topic(topic) for switch in world.switches.values())
     flow.outlive(nobody=True)

@@ -6,8 +6,8 @@ from functools import partial
 
 import pytest
 
-from gdp.client.feed import Feed
 from gdp.client.publisher import Publisher
+from gdp.client.writer_proxy import WriterProxy
 from gdp.frame.kinds import Flag, Kind
 from gdp.names import Name
 from tests.journeys.flows import ROBOT, SERVER, Tap, advertise, flowing, ring
@@ -31,7 +31,7 @@ def test_bursts_of_many_topics_arrive_once_and_in_order_under_few_seals() -> Non
         world.network.call(at * 0.1, partial(burst, at * 50))
     world.network.run(3)
     got: dict[Name, list[int]] = {flow.topic.name: [] for flow in flows}
-    for each in world.members[SERVER].take_messages():
+    for each in world.members[SERVER].poll_messages():
         got[each.topic].append(int.from_bytes(each.delivered.message[:4], "big"))
     assert all(numbers == list(range(200)) for numbers in got.values())
     assert tap.count(Kind.DATA) < TOPICS * 200 / 5
@@ -42,8 +42,8 @@ def test_bursts_of_many_topics_arrive_once_and_in_order_under_few_seals() -> Non
 def test_bundles_survive_loss_and_links_that_narrow() -> None:
     flow = flowing(ring())
     network = flow.world.network
-    for cable in flow.world.cables.values():
-        cable.loss = 0.02
+    for sim_link in flow.world.cables.values():
+        sim_link.loss = 0.02
 
     def burst(first: int) -> None:
         for number in range(first, first + 500):
@@ -77,18 +77,18 @@ def test_a_step_asks_only_topics_that_have_something_to_do(monkeypatch: pytest.M
     flow.outlive()
 
 
-def test_a_feed_that_was_closed_says_nothing_after_its_goodbye() -> None:
+def test_a_writer_proxy_that_was_closed_says_nothing_after_its_goodbye() -> None:
     flow = flowing(ring())
     network, reader = flow.world.network, flow.world.members[SERVER]
     tap = Tap(SERVER, "nuc5")
-    feeds: list[Feed] = list(reader.feeds())
+    writer_proxies: list[WriterProxy] = list(reader.writer_proxies())
     reader.leave()
     network.touch(SERVER)
     network.run(0.01)
     network.taps.append(tap)
     network.run(5)
-    assert tap.count(Kind.REPORT) == 0
-    assert [feed.next_timeout() for feed in feeds] == [float("inf")]
+    assert tap.count(Kind.ACKNACK) == 0
+    assert [writer_proxy.get_timer() for writer_proxy in writer_proxies] == [float("inf")]
     flow.outlive(nobody=True)
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from gdp.client.member import Topic
+from gdp.client.participant import Topic
 from gdp.frame.codec import ETHER_BYTES, decode
 from gdp.frame.kinds import Kind
-from gdp.trust.card import Card
+from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.right import Right
 from tests.journeys.flows import ROBOT, SERVER, Flow, advertise, flowing, ring
 
@@ -17,7 +17,7 @@ def topic(flow: Flow, label: str, right: Right, epochs: list[int]) -> Topic:
     world, identity = flow.world, flow.world.identities[label]
     metadata = flow.topic.delegation.metadata
     assert metadata is not None
-    card = Card.from_wire(Card.make(identity))
+    card = NodeDescriptor.from_wire(NodeDescriptor.make(identity))
     given = world.owner.delegate(card, metadata, [right], epochs, world.validity)
     return Topic(given, {epoch: grant.secret for epoch, grant in given.open(identity).items()})
 

@@ -6,8 +6,8 @@ import pytest
 
 from gdp.frame.kinds import Kind
 from gdp.limits import DEAD_S, JOIN_LEASE_S
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import ring5
-from gdp.simulation.world import World
 from gdp.trust.right import Right
 from tests.journeys.flows import LEASE_S, ROBOT, SERVER, Tap, advertise, flowing, ring
 
@@ -92,7 +92,7 @@ def test_a_rib_that_starts_anew_disturbs_no_flow_and_is_refilled(label: str) -> 
     flow.outlive()
 
 
-def test_a_late_joiner_of_a_latched_topic_gets_the_last_messages() -> None:
+def test_a_late_reassembler_of_a_latched_topic_gets_the_last_messages() -> None:
     flow = advertise(ring(), depth=3)
     for number in range(5):
         flow.publish(b"%d" % number)
@@ -148,18 +148,18 @@ def test_two_readers_cost_a_shared_link_one_copy() -> None:
 def test_a_tree_without_readers_is_taken_down() -> None:
     flow = flowing(ring())
     world = flow.world
-    assert any(switch.planter.trees.all() for switch in world.switches.values())
+    assert any(switch.multicast.trees.all() for switch in world.switches.values())
     world.members[SERVER].leave()
     world.network.touch(SERVER)
     world.network.run(JOIN_LEASE_S + 1)
-    assert not any(switch.planter.trees.all() for switch in world.switches.values())
+    assert not any(switch.multicast.trees.all() for switch in world.switches.values())
     flow.outlive(nobody=True)
 
 
 def test_loss_on_every_link_costs_no_message() -> None:
     flow = flowing(ring())
-    for cable in flow.world.cables.values():
-        cable.loss = 0.02
+    for sim_link in flow.world.cables.values():
+        sim_link.loss = 0.02
     flow.stream(200, 0.01)
     assert flow.world.network.run(30, lambda: flow.has(SERVER, 200))
     assert flow.numbers(SERVER) == list(range(200))
@@ -169,8 +169,8 @@ def test_loss_on_every_link_costs_no_message() -> None:
 
 def test_frames_that_overtake_each_other_arrive_in_order() -> None:
     flow = flowing(ring())
-    for cable in flow.world.cables.values():
-        cable.jitter_s = 0.005
+    for sim_link in flow.world.cables.values():
+        sim_link.jitter_s = 0.005
     flow.stream(200, 0.005, size=5_000)
     assert flow.world.network.run(30, lambda: flow.has(SERVER, 200))
     assert flow.numbers(SERVER) == list(range(200))
@@ -178,9 +178,9 @@ def test_frames_that_overtake_each_other_arrive_in_order() -> None:
 
 
 def test_the_network_settles_with_loss_from_the_beginning() -> None:
-    world = World(ring5(), lease_s=LEASE_S)
-    for cable in world.cables.values():
-        cable.loss = 0.1
+    world = Simulation(ring5(), lease_s=LEASE_S)
+    for sim_link in world.cables.values():
+        sim_link.loss = 0.1
     assert world.settle(30)
     world.network.run(3.25 * world.lease_s)
     assert world.settle(1)
@@ -192,20 +192,20 @@ def test_a_dead_neighbour_is_let_go_after_its_silence() -> None:
     world = ring()
     world.network.stop("nuc3")
     world.network.run(DEAD_S + 0.5)
-    assert all(n.name != world.identities["nuc3"].name for n in world.switches["nuc2"].greeter.all_up())
+    assert all(n.name != world.identities["nuc3"].name for n in world.switches["nuc2"].hello_protocol.all_up())
 
 
 def test_best_effort_over_loss_goes_on_without_what_is_lost() -> None:
     flow = flowing(ring(), reliable=False)
-    for cable in flow.world.cables.values():
-        cable.loss = 0.05
+    for sim_link in flow.world.cables.values():
+        sim_link.loss = 0.05
     flow.stream(200, 0.01, size=100)
     flow.world.network.run(5)
     numbers = flow.numbers(SERVER)
     assert 100 < len(numbers) < 200
     assert numbers == sorted(set(numbers))
-    for cable in flow.world.cables.values():
-        cable.loss = 0.0
+    for sim_link in flow.world.cables.values():
+        sim_link.loss = 0.0
     flow.outlive()
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from gdp.frame.kinds import Kind
-from gdp.simulation.memory import Cable
+from gdp.simulation.network import SimLink
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
-from gdp.simulation.world import World
 from tests.journeys.flows import Flow, Tap, flowing
 
 LEASE_S = 2.5
@@ -15,7 +15,7 @@ ROBOT, DESK, CROWD = "leaf/robot", "desk/operator", "lift/screen"
 OVERLAP_S, EVERY_S = 1.0, 0.02
 
 
-def corridor() -> World:
+def corridor() -> Simulation:
     """Return a row of switches; a robot's leaf hangs on the first one: desk (RIB) -- hall -- lift, leaf at hall."""
     topology = Topology(
         links=(Link("desk", "hall"), Link("hall", "lift"), Link("hall", "leaf")),
@@ -25,23 +25,23 @@ def corridor() -> World:
             Attachment("lift", "proxy", "screen"), Attachment("leaf", "proxy", "robot"),
         ),
     )  # fmt: skip
-    world = World(topology, lease_s=LEASE_S, leaves=("leaf",))
+    world = Simulation(topology, lease_s=LEASE_S, leaves=("leaf",))
     assert world.settle()
     return world
 
 
-def drive(world: World, flows: list[Flow], stops: tuple[str, ...]) -> None:
+def drive(world: Simulation, flows: list[Flow], stops: tuple[str, ...]) -> None:
     """Join the leaf to one stop after the other; the cable before is pulled ``OVERLAP_S`` after the next is put in."""
-    network, cable = world.network, world.cables[frozenset(("hall", "leaf"))]
+    network, sim_link = world.network, world.cables[frozenset(("hall", "leaf"))]
     count = int((len(stops) + 1) * 3.0 / EVERY_S)
     for flow in flows:
         flow.stream(count, EVERY_S, size=100)
     network.run(1.0)
     for stop in stops:
-        joined = network.connect("leaf", stop, Cable(0.0005))
+        joined = network.connect("leaf", stop, SimLink(0.0005))
         network.run(OVERLAP_S)
-        network.set_link(cable, up=False)
-        cable = joined
+        network.set_link(sim_link, up=False)
+        sim_link = joined
         network.run(2.0)
     for flow in flows:
         for reader in flow.got:
@@ -62,8 +62,8 @@ def test_a_leaf_that_roams_with_both_links_up_loses_nothing_of_its_nodes(stops: 
 def test_between_two_uplinks_a_leaf_passes_nothing_even_where_that_is_shorter() -> None:
     world = corridor()
     others = flowing(world, "/news", DESK, (CROWD,))
-    world.network.connect("leaf", "desk", Cable(0.0005), 1)
-    world.network.connect("leaf", "lift", Cable(0.0005), 1)  # desk - leaf - lift costs 2, desk - hall - lift 20
+    world.network.connect("leaf", "desk", SimLink(0.0005), 1)
+    world.network.connect("leaf", "lift", SimLink(0.0005), 1)  # desk - leaf - lift costs 2, desk - hall - lift 20
     world.network.run(2.0)
     taps = [Tap("leaf", to) for to in ("desk", "hall", "lift")]
     world.network.taps += taps

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from gdp.limits import CLAIM_LEASE_S, READER_GRACE_S, READER_LEASE_S
+from gdp.limits import ADVERTISEMENT_LEASE_S, READER_GRACE_S, READER_LEASE_S
 from gdp.message.loss import LossReason
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import chain
-from gdp.simulation.world import World
 from tests.journeys.flows import Flow, advertise, flowing
 
 SOURCE, READER = "s1/left", "s2/right"
@@ -15,7 +15,7 @@ EVERY_S = 0.25
 
 
 def flow_of(*, reliable: bool = True) -> Flow:
-    world = World(chain(2))
+    world = Simulation(chain(2))
     assert world.settle()
     flow = flowing(world, source=SOURCE, readers=(READER,), reliable=reliable)
     world.network.run(1)
@@ -25,7 +25,7 @@ def flow_of(*, reliable: bool = True) -> Flow:
 def away(flow: Flow, label: str, away_s: float) -> None:
     """Stream for three claim leases, while a member is unplugged for some of the time."""
     network, lead = flow.world.network, flow.world.leads[label]
-    count = round(max(3 * CLAIM_LEASE_S, away_s + 20) / EVERY_S)
+    count = round(max(3 * ADVERTISEMENT_LEASE_S, away_s + 20) / EVERY_S)
     flow.stream(count, EVERY_S, 100)
     network.call(2.0, lambda: network.set_link(lead, up=False))
     network.call(2.0 + away_s, lambda: network.set_link(lead, up=True))
@@ -42,7 +42,7 @@ def assert_complete(flow: Flow) -> None:
 
 
 @pytest.mark.parametrize("label", [SOURCE, READER])
-@pytest.mark.parametrize("away_s", [3.0, CLAIM_LEASE_S + 6.0])
+@pytest.mark.parametrize("away_s", [3.0, ADVERTISEMENT_LEASE_S + 6.0])
 def test_who_is_away_within_the_grace_time_costs_a_reliable_topic_nothing(label: str, away_s: float) -> None:
     flow = flow_of()
     away(flow, label, away_s)
@@ -83,9 +83,9 @@ def test_what_a_publisher_says_in_a_new_life_before_its_reader_is_back_is_lost()
     world.network.run(2)
     member = world.restart_member(SOURCE)
     again = Flow(world, flow.name, SOURCE, flow.topic, member.advertise(flow.topic, b"", reliable=True), flow.got)
-    again.stream(round(3 * CLAIM_LEASE_S), 1.0, 100)
+    again.stream(round(3 * ADVERTISEMENT_LEASE_S), 1.0, 100)
     again.publish(b"\xff" * 4)
-    world.network.run(3 * CLAIM_LEASE_S + 5)
+    world.network.run(3 * ADVERTISEMENT_LEASE_S + 5)
     losses = world.members[READER].losses_of(flow.topic.name)
     assert losses.counts.keys() == {LossReason.PUBLISHER_RESTARTED}
     assert losses.ranges[0].first == 1
@@ -103,7 +103,7 @@ def test_a_reader_that_starts_again_counts_what_came_between() -> None:
     first = len(flow.numbers(READER))
     world.restart_member(READER)
     flow.read_by(READER)
-    world.network.run(3 * CLAIM_LEASE_S)
+    world.network.run(3 * ADVERTISEMENT_LEASE_S)
     losses = world.members[READER].losses_of(flow.topic.name)
     assert losses.counts.keys() == {LossReason.READER_RESTARTED}
     assert first + losses.total + len(flow.numbers(READER)) == flow.publisher.messages
@@ -118,18 +118,18 @@ def test_reading_again_on_purpose_is_no_loss() -> None:
     world.network.touch(READER)
     world.network.run(3)
     flow.read_by(READER)
-    world.network.run(3 * CLAIM_LEASE_S)
+    world.network.run(3 * ADVERTISEMENT_LEASE_S)
     assert world.members[READER].losses_of(flow.topic.name).total == 0
     assert 10 < len(flow.numbers(READER)) < 40
 
 
 def test_a_latched_topic_that_nobody_read_yet_has_lost_nothing_for_its_first_reader() -> None:
-    world = World(chain(2))
+    world = Simulation(chain(2))
     assert world.settle()
     flow = advertise(world, source=SOURCE, depth=2)
     for number in range(5):
         flow.publish(number.to_bytes(4, "big"))
     flow.read_by(READER)
-    world.network.run(3 * CLAIM_LEASE_S + 1)
+    world.network.run(3 * ADVERTISEMENT_LEASE_S + 1)
     assert flow.numbers(READER) == [3, 4]
     assert world.members[READER].losses_of(flow.topic.name).total == 0

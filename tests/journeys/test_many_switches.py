@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import random
 
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
-from gdp.simulation.world import World
 from tests.journeys.flows import flowing
 
 DOMAINS, SWITCHES = 8, 25
@@ -41,7 +41,7 @@ def wide(seed: int = 1) -> Topology:
 
 
 def test_two_hundred_switches_settle_and_deliver() -> None:
-    world = World(wide(), hello_s=5.0, dead_s=18.0, lease_s=5.0)
+    world = Simulation(wide(), hello_s=5.0, dead_s=18.0, lease_s=5.0)
     assert len(world.switches) == 200
     assert world.settle(30)
     label = f"d{DOMAINS - 1}s{SWITCHES - 1}/proxy"

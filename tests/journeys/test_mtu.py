@@ -11,8 +11,8 @@ import pytest
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
 from gdp.limits import MTU_HOLD_S, MTU_NARROWINGS
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Topology, chain, ring5
-from gdp.simulation.world import World
 from tests.journeys.flows import LEASE_S, ROBOT, SERVER, Flow, Tap, advertise, flowing, ring
 
 MIDDLE = frozenset(("nuc2", "nuc3"))
@@ -39,11 +39,11 @@ def too_big(flow: Flow) -> int:
     return flow.world.network.drops[DropReason.TOO_BIG]
 
 
-def wide(topology: Topology, mtu: int = JUMBO, **links: int) -> World:
+def wide(topology: Topology, mtu: int = JUMBO, **links: int) -> Simulation:
     """Return a network of wide links, but for those given as ``a_b=mtu``."""
     narrow = {frozenset(ends.split("_")): size for ends, size in links.items()}
     made = tuple(replace(link, mtu=narrow.get(link.ends(), mtu)) for link in topology.links)
-    world = World(replace(topology, links=made), lead_mtu=mtu, lease_s=LEASE_S)
+    world = Simulation(replace(topology, links=made), lead_mtu=mtu, lease_s=LEASE_S)
     assert world.settle()
     return world
 
@@ -93,8 +93,8 @@ def test_links_that_change_one_after_the_other_are_all_followed() -> None:
     flow = flowing(wide(chain(4), USUAL), source="s1/left", readers=("s4/right",))
     network, seen = flow.world.network, []
     for mtu in (JUMBO, 1_000):
-        for cable in [*flow.world.cables.values(), *flow.world.leads.values()]:
-            network.set_mtu(cable, mtu)
+        for sim_link in [*flow.world.cables.values(), *flow.world.leads.values()]:
+            network.set_mtu(sim_link, mtu)
         network.run(NEWS_S)
         seen.append(largest(flow))
     assert seen == [JUMBO, 1_000]
@@ -103,12 +103,12 @@ def test_links_that_change_one_after_the_other_are_all_followed() -> None:
 
 def test_a_detour_over_a_narrower_link_is_known_with_its_first_join() -> None:
     flow = flowing(wide(ring5(), nuc1_nuc5=1_200))
-    network, cable = flow.world.network, flow.world.cables[MIDDLE]
+    network, sim_link = flow.world.network, flow.world.cables[MIDDLE]
     before = largest(flow)
-    network.set_link(cable, up=False)
+    network.set_link(sim_link, up=False)
     network.run(2 * NEWS_S)
     over = largest(flow)
-    network.set_link(cable, up=True)
+    network.set_link(sim_link, up=True)
     network.run(3)
     assert (before, over, largest(flow)) == (JUMBO, 1_200, JUMBO)
     assert {each.hops for each in flow.got[SERVER]} == {5, 2}
@@ -169,9 +169,9 @@ def test_a_narrow_reader_whose_link_is_lost_no_longer_counts() -> None:
 
 def test_frames_too_large_for_a_link_that_shrank_under_them_are_counted() -> None:
     flow = flowing(ring(), reliable=False)
-    network, cable = flow.world.network, flow.world.cables[frozenset(("nuc4", "nuc5"))]
+    network, sim_link = flow.world.network, flow.world.cables[frozenset(("nuc4", "nuc5"))]
     flow.publish(bytes(20_000))
-    network.call(0.001, partial(network.set_mtu, cable, 1_000))  # they have passed two links of five by then
+    network.call(0.001, partial(network.set_mtu, sim_link, 1_000))  # they have passed two links of five by then
     network.run(NEWS_S)
     parts = -(-(20_000 + 64) // (USUAL - 96 - 16))
     assert (too_big(flow), flow.numbers(SERVER)) == (parts - 1, [])  # the last part is a small one
@@ -180,10 +180,10 @@ def test_frames_too_large_for_a_link_that_shrank_under_them_are_counted() -> Non
 
 def test_a_stream_goes_on_while_links_shrink_and_grow_between_its_messages() -> None:
     flow = flowing(wide(ring5()))
-    network, cable = flow.world.network, flow.world.cables[MIDDLE]
+    network, sim_link = flow.world.network, flow.world.cables[MIDDLE]
     flow.stream(60, 0.1, size=20_000)
     for at_s, mtu in ((1.05, USUAL), (2.05, 700), (3.05, JUMBO), (4.05, 1_280)):
-        network.call(at_s, partial(network.set_mtu, cable, mtu))
+        network.call(at_s, partial(network.set_mtu, sim_link, mtu))
     assert network.run(20, lambda: flow.has(SERVER, 60))
     assert flow.numbers(SERVER) == list(range(60))
     assert [flow.got[SERVER][at].parts for at in (5, 15, 25, 35, 45)] == [3, 15, 35, 3, 18]
@@ -194,14 +194,14 @@ def test_a_stream_goes_on_while_links_shrink_and_grow_between_its_messages() -> 
 @pytest.mark.parametrize("where", ["links", "leads"])
 def test_of_news_that_overtake_each_other_the_newest_counts(where: str) -> None:
     flow = flowing(wide(ring5()))
-    world, network, cable = flow.world, flow.world.network, flow.world.cables[frozenset(("nuc4", "nuc5"))]
+    world, network, sim_link = flow.world, flow.world.network, flow.world.cables[frozenset(("nuc4", "nuc5"))]
     world.leads[ROBOT].jitter_s = 0.02 if where == "leads" else 0.0
     world.cables[MIDDLE].jitter_s = 0.02 if where == "links" else 0.0
     seen = []
     for last in (JUMBO, 1_280, JUMBO, 800):
         network.run(MTU_HOLD_S * MTU_NARROWINGS)  # so often it may narrow again
         for mtu in (1_000, USUAL, SMALL, JUMBO, 700, last):
-            network.set_mtu(cable, mtu)
+            network.set_mtu(sim_link, mtu)
             network.run(0.0015)
         network.run(NEWS_S)
         seen.append(largest(flow))
@@ -214,9 +214,9 @@ def test_of_news_that_overtake_each_other_the_newest_counts(where: str) -> None:
 
 def test_what_was_sealed_too_large_for_its_link_arrives_all_the_same() -> None:
     flow = flowing(wide(ring5()))
-    network, cable = flow.world.network, flow.world.cables[MIDDLE]
+    network, sim_link = flow.world.network, flow.world.cables[MIDDLE]
     flow.stream(20, 0.0005, size=20_000)
-    network.call(0.004, partial(network.set_mtu, cable, 1_000))
+    network.call(0.004, partial(network.set_mtu, sim_link, 1_000))
     assert network.run(3, lambda: flow.has(SERVER, 20))  # sooner than a standing reader is let go
     assert flow.numbers(SERVER) == list(range(20))
     assert too_big(flow) > 0
@@ -237,7 +237,7 @@ def test_of_two_readers_neither_gets_a_message_twice_that_had_to_be_split_anew()
     flow.outlive()
 
 
-def test_a_late_joiner_behind_a_narrow_link_gets_what_was_kept_for_it() -> None:
+def test_a_late_reassembler_behind_a_narrow_link_gets_what_was_kept_for_it() -> None:
     world = wide(ring5())
     world.lead_mtu = 1_000
     world.add_member("nuc3/narrow", "nuc3")
@@ -255,10 +255,10 @@ def test_a_late_joiner_behind_a_narrow_link_gets_what_was_kept_for_it() -> None:
 
 def test_links_that_shrink_again_and_again_under_a_flow_cost_nothing_but_time() -> None:
     flow = flowing(wide(ring5()))
-    network, cable = flow.world.network, flow.world.cables[MIDDLE]
+    network, sim_link = flow.world.network, flow.world.cables[MIDDLE]
     flow.stream(200, 0.005, size=20_000)
     for at, mtu in enumerate((USUAL, 1_000, SMALL, JUMBO, USUAL, JUMBO, JUMBO, 700)):
-        network.call(0.1003 + at * 0.1, partial(network.set_mtu, cable, mtu))
+        network.call(0.1003 + at * 0.1, partial(network.set_mtu, sim_link, mtu))
     assert network.run(10, lambda: flow.has(SERVER, 200))
     assert flow.numbers(SERVER) == list(range(200))
     flow.outlive()
@@ -266,9 +266,9 @@ def test_links_that_shrink_again_and_again_under_a_flow_cost_nothing_but_time() 
 
 def test_a_detour_over_a_narrower_link_loses_nothing_of_a_flow() -> None:
     flow = flowing(wide(ring5(), nuc1_nuc5=1_200))
-    network, cable = flow.world.network, flow.world.cables[MIDDLE]
+    network, sim_link = flow.world.network, flow.world.cables[MIDDLE]
     flow.stream(100, 0.005, size=20_000)
-    network.call(0.2, partial(network.set_link, cable, up=False))
+    network.call(0.2, partial(network.set_link, sim_link, up=False))
     assert network.run(5, lambda: flow.has(SERVER, 100))
     assert flow.numbers(SERVER) == list(range(100))
     flow.outlive()
@@ -276,10 +276,10 @@ def test_a_detour_over_a_narrower_link_loses_nothing_of_a_flow() -> None:
 
 def test_reports_of_many_gaps_fit_the_smallest_link() -> None:
     flow = flowing(wide(ring5(), SMALL))
-    network, cable = flow.world.network, flow.world.cables[MIDDLE]
-    cable.loss = 0.4
+    network, sim_link = flow.world.network, flow.world.cables[MIDDLE]
+    sim_link.loss = 0.4
     flow.stream(3, 0.01, size=300_000)
-    network.call(0.05, partial(setattr, cable, "loss", 0.0))
+    network.call(0.05, partial(setattr, sim_link, "loss", 0.0))
     assert network.run(2, lambda: flow.has(SERVER, 3))
     assert too_big(flow) == 0
     flow.outlive()

@@ -6,8 +6,8 @@ import pytest
 
 from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import Kind
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import ring5
-from gdp.simulation.world import World
 from gdp.trust.right import Right
 from tests.journeys.flows import SERVER, Tap, advertise, flowing, ring
 
@@ -44,7 +44,7 @@ def test_reports_keep_to_the_allowed_way_too() -> None:
     flow = flowing(world)
     flow.stream(20, 0.01)
     assert world.network.run(5, lambda: flow.has(SERVER, 20))
-    assert tap.count(Kind.REPORT) == 0
+    assert tap.count(Kind.ACKNACK) == 0
     flow.outlive()
 
 
@@ -75,10 +75,12 @@ def test_the_allowed_way_is_taken_again_when_it_is_back() -> None:
 
 @pytest.mark.momentary("hellos have no lease of a name")
 def test_a_border_of_an_untrusted_domain_is_no_neighbour() -> None:
-    world = World(ring5(), trusts=WITHOUT_BACKBONE)
+    world = Simulation(ring5(), trusts=WITHOUT_BACKBONE)
     world.network.run(3)
     border = world.switches["nuc2"]
-    assert {n.name for n in border.greeter.all_up()} == {world.identities[label].name for label in ("nuc1", "nuc2/rib")}
+    assert {n.name for n in border.hello_protocol.all_up()} == {
+        world.identities[label].name for label in ("nuc1", "nuc2/rib")
+    }
     assert border.drops()[DropReason.WRONG_DOMAIN] > 0
 
 
@@ -103,7 +105,7 @@ def test_a_reader_whose_delegation_is_anothers_gets_nothing() -> None:
     world.network.taps.append(tap)
     flow.stream(20, 0.01)
     assert world.network.run(5, lambda: flow.has(SERVER, 20))
-    assert (thief.take_messages(), tap.count(Kind.DATA), flow.publisher.readers) == ([], 0, 1)
+    assert (thief.poll_messages(), tap.count(Kind.DATA), flow.publisher.readers) == ([], 0, 1)
     flow.outlive()
 
 

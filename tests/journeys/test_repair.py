@@ -9,9 +9,9 @@ import pytest
 
 from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Kind
-from gdp.simulation.memory import Cable
+from gdp.simulation.network import SimLink
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import DomainPlan, Link, Topology
-from gdp.simulation.world import World
 from tests.journeys.flows import LEASE_S
 
 SQUARE = Topology(
@@ -22,14 +22,14 @@ SQUARE = Topology(
 DETECT_S = 0.21
 
 
-def square() -> World:
+def square() -> Simulation:
     """Return four switches in a ring, with their alternates."""
-    world = World(SQUARE, lease_s=LEASE_S)
+    world = Simulation(SQUARE, lease_s=LEASE_S)
     world.network.run(3.0)
     return world
 
 
-def stays(world: World, holds: Callable[[], bool]) -> None:
+def stays(world: Simulation, holds: Callable[[], bool]) -> None:
     """Check that something holds until three leases are over."""
     for _ in range(ceil(3.25 * world.lease_s / 0.5)):
         assert holds()
@@ -37,28 +37,28 @@ def stays(world: World, holds: Callable[[], bool]) -> None:
     assert holds()
 
 
-def cable(world: World, one: str, two: str) -> Cable:
+def sim_link(world: Simulation, one: str, two: str) -> SimLink:
     return world.cables[frozenset((one, two))]
 
 
-def neighbours(world: World, switch: str) -> set[str]:
+def neighbours(world: Simulation, switch: str) -> set[str]:
     """Return who is up at a switch."""
     label_of = {each.name: label for label, each in world.switches.items()}
-    return {label_of[each.name] for each in world.switches[switch].greeter.all_up()}
+    return {label_of[each.name] for each in world.switches[switch].hello_protocol.all_up()}
 
 
-def is_whole(world: World) -> bool:
+def is_whole(world: Simulation) -> bool:
     """Return whether every switch of the square has both its neighbours."""
     return [neighbours(world, each) for each in "abcd"] == [{"b", "c"}, {"a", "d"}, {"a", "d"}, {"b", "c"}]
 
 
-def echo(world: World) -> bytes:
+def echo(world: Simulation) -> bytes:
     """Return a frame for switch d in the name of switch a."""
     a, d = (world.switches[each].name for each in "ad")
     return encode(Header(Kind.ECHO_REQUEST, 0, 64, 0, 0, 1, 0, 1, 7, d, a))
 
 
-def passed(world: World, one: str, two: str) -> list[float]:
+def passed(world: Simulation, one: str, two: str) -> list[float]:
     """Return, from now on, when echo requests pass a link."""
     seen: list[float] = []
 
@@ -70,7 +70,7 @@ def passed(world: World, one: str, two: str) -> list[float]:
     return seen
 
 
-def send_to_d(world: World) -> None:
+def send_to_d(world: Simulation) -> None:
     """Let a frame come in at a as one of its neighbour c."""
     port, (_, own, far) = next(
         (port, wired) for port, wired in world.network._nodes["a"].ports.items() if wired[2].node == "c"
@@ -81,14 +81,14 @@ def send_to_d(world: World) -> None:
 
 def test_a_silent_cut_is_noticed_by_both_ends_within_the_detection_time() -> None:
     world = square()
-    cable(world, "a", "b").loss = 1.0
+    sim_link(world, "a", "b").loss = 1.0
     world.network.run(DETECT_S + 0.02)
     stays(world, lambda: (neighbours(world, "a"), neighbours(world, "b")) == ({"c"}, {"d"}))
 
 
 def test_a_link_that_loses_frames_one_way_is_given_up_by_both_ends() -> None:
     world = square()
-    wire = cable(world, "a", "b")
+    wire = sim_link(world, "a", "b")
     send = world.network._send
     a = world.network._nodes["a"]
 
@@ -128,14 +128,14 @@ def test_frames_take_the_alternate_before_the_switch_itself_knows_of_the_cut() -
     send_to_d(world)
     world.network.run(0.5)
     assert (len(by_b), len(by_c)) == (1, 0)
-    cable(world, "a", "b").is_up = False  # the port is down; nobody has told the machine
+    sim_link(world, "a", "b").is_up = False  # the port is down; nobody has told the machine
     send_to_d(world)
     assert (len(by_b), len(by_c)) == (1, 1)
 
 
 def test_a_link_that_flaps_is_left_out_until_it_stays() -> None:
     world = square()
-    wire = cable(world, "a", "b")
+    wire = sim_link(world, "a", "b")
     for _ in range(8):
         world.network.set_link(wire, up=False)
         world.network.run(0.1)

@@ -6,14 +6,14 @@ from functools import partial
 
 import pytest
 
-from gdp.client.feed import FeedState
-from gdp.client.private import private_name
+from gdp.client.unicast_stream import private_name
+from gdp.client.writer_proxy import WriterProxyState
 from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import Kind
-from gdp.limits import CALL_LAG_S, CALL_QUIET_S, CLAIM_LEASE_S, FLIGHT_START_BYTES
+from gdp.limits import ADVERTISEMENT_LEASE_S, CALL_LAG_S, CALL_QUIET_S, FLIGHT_START_BYTES
 from gdp.names import Name
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology, chain
-from gdp.simulation.world import World
 from gdp.trust.right import Right
 from tests.journeys.flows import LEASE_S, Tap
 from tests.journeys.services import Party, meet, outlive, work
@@ -22,9 +22,9 @@ CLIENT = "s1/left"
 SERVERS = ("s3/a", "s3/b", "s3/c")
 
 
-def cluster(*labels: str, lease_s: float = LEASE_S) -> tuple[World, Party, list[Party]]:
+def cluster(*labels: str, lease_s: float = LEASE_S) -> tuple[Simulation, Party, list[Party]]:
     """Return a client and servers at the other end of a chain, which answer nothing, and have met."""
-    world = World(chain(3), lease_s=lease_s)
+    world = Simulation(chain(3), lease_s=lease_s)
     for label in labels:
         world.add_member(label, "s3")
     assert world.settle()
@@ -59,7 +59,7 @@ class Load:
 
     def look(self) -> None:
         for server in self._servers:
-            for each in server.member.take_messages():
+            for each in server.member.poll_messages():
                 number = int.from_bytes(each.delivered.message[:4], "big")
                 waited_s = self._network.now.mono_s - self._sent_s[number]
                 assert self.waits_s[server.label].setdefault(number, waited_s) == waited_s
@@ -95,11 +95,11 @@ def test_a_request_to_one_server_reaches_that_one_alone_and_at_once() -> None:
 @pytest.mark.parametrize("first", [Right.SERVE, Right.CALL])
 @pytest.mark.parametrize("lossy", [False, True])
 def test_a_request_to_a_server_that_has_just_become_a_peer_is_not_lost(first: Right, *, lossy: bool) -> None:
-    world = World(chain(3), lease_s=LEASE_S)
+    world = Simulation(chain(3), lease_s=LEASE_S)
     assert world.settle()
     if lossy:
-        for cable in world.cables.values():
-            cable.loss, cable.jitter_s = 0.1, 0.002
+        for sim_link in world.cables.values():
+            sim_link.loss, sim_link.jitter_s = 0.1, 0.002
     labels = {Right.SERVE: "s3/right", Right.CALL: CLIENT}
     rights = sorted(labels, key=lambda right: right is not first)
     parties = {right: Party(world, labels[right], right) for right in rights}
@@ -113,8 +113,8 @@ def test_a_request_to_a_server_that_has_just_become_a_peer_is_not_lost(first: Ri
 
 def test_requests_to_one_server_are_complete_and_in_order_over_links_that_lose() -> None:
     world, client, (one, _) = cluster(*SERVERS[:2])
-    for cable in world.cables.values():
-        cable.loss, cable.jitter_s = 0.05, 0.002
+    for sim_link in world.cables.values():
+        sim_link.loss, sim_link.jitter_s = 0.05, 0.002
     sent = [b"%d" % number * 700 for number in range(100)]
     for message in sent:
         ask(client, one, message)
@@ -131,11 +131,11 @@ def test_who_is_not_heard_cannot_be_asked() -> None:
     with pytest.raises(LocalError, match="no call of"):
         one.member.ask(client.service, client.member.name, b"?")
     with pytest.raises(LocalError, match="no serve of"):
-        client.member.answer(client.service, one.member.name, b"?")
+        client.member.respond(client.service, one.member.name, b"?")
     gone = one.member.name
     one.member.withdraw(one.service)
     world.network.touch(one.label)
-    assert world.network.run(1, lambda: len(client.member.feeds_of(client.service)) == 1)
+    assert world.network.run(1, lambda: len(client.member.writer_proxies_of(client.service)) == 1)
     with pytest.raises(LocalError, match="is not heard"):
         client.member.ask(client.service, gone, b"?")
 
@@ -161,18 +161,18 @@ def test_requests_to_a_former_life_of_a_server_do_not_reach_the_new_one() -> Non
 
 def test_what_a_client_may_ask_before_it_has_said_what_its_requests_are_is_bounded() -> None:
     world, client, (one,) = cluster(SERVERS[0])
-    (public,) = one.member.feeds_of(one.service)
-    public.state = FeedState.NEW  # as if its first status had been lost
+    (public,) = one.member.writer_proxies_of(one.service)
+    public.state = WriterProxyState.NEW  # as if its first status had been lost
     public._schedule.due_s = float("inf")
     messages = 40
     for number in range(messages):
         ask(client, one, bytes([number]) * 20_000)
     world.network.run(2)
-    (private,) = [feed for feed in one.member.feeds() if feed is not public]
+    (private,) = [writer_proxy for writer_proxy in one.member.writer_proxies() if writer_proxy is not public]
     assert len(private._delivery) * 20_000 <= FLIGHT_START_BYTES + 20_000
     assert private.drops[DropReason.MEMORY_FULL] > 0
     public._schedule.due_s = world.network.now.mono_s
-    public.state = FeedState.LIVE
+    public.state = WriterProxyState.LIVE
     client.publish(b"?")
     assert work(world, one, until_s=5, have=messages + 1)
     assert [each.delivered.message[0] for each in one.got if each.private] == list(range(messages))
@@ -182,9 +182,9 @@ def test_what_a_client_may_ask_before_it_has_said_what_its_requests_are_is_bound
 @pytest.mark.momentary("two names are compared, nothing is sent")
 def test_the_two_directions_of_two_nodes_are_two_streams() -> None:
     _, client, (one,) = cluster(SERVERS[0])
-    (feed,) = client.member.feeds_of(client.service)
-    (back,) = one.member.feeds_of(one.service)
-    server, caller = ((each.publisher, each.incarnation) for each in (feed, back))
+    (writer_proxy,) = client.member.writer_proxies_of(client.service)
+    (back,) = one.member.writer_proxies_of(one.service)
+    server, caller = ((each.publisher, each.incarnation) for each in (writer_proxy, back))
     assert len({private_name(client.service, *ends) for ends in ((server, caller), (caller, server))}) == 2  # type: ignore[arg-type]
 
 
@@ -258,7 +258,7 @@ def test_a_client_that_had_no_time_does_not_take_its_servers_for_silent() -> Non
     world, client, _ = cluster(*SERVERS[:2])
     world.network.freeze(client.label)
     world.network.run(CALL_QUIET_S + 1)
-    client.member.timeout(world.network.now)  # before it has read what came meanwhile
+    client.member.handle_timer(world.network.now)  # before it has read what came meanwhile
     assert len(client.member.peers(client.service)) == 2
 
 
@@ -273,7 +273,7 @@ def test_the_only_server_keeps_its_requests_as_long_as_ever() -> None:
 
 
 def test_a_server_that_starts_anew_is_a_peer_again_as_soon_as_it_is_there() -> None:
-    world, client, servers = cluster(*SERVERS, lease_s=CLAIM_LEASE_S)
+    world, client, servers = cluster(*SERVERS, lease_s=ADVERTISEMENT_LEASE_S)
     load = Load(client, servers, size=100)
     again = servers[2]
     world.network.call(0.5, partial(world.network.stop, again.label))
@@ -290,7 +290,7 @@ def test_a_server_that_starts_anew_is_a_peer_again_as_soon_as_it_is_there() -> N
 @pytest.mark.parametrize("replicas", [1, 2, 4])
 def test_the_clients_link_carries_one_copy_of_a_request_whatever_the_number_of_servers(replicas: int) -> None:
     names = [f"r{number}" for number in range(replicas)]
-    world = World(
+    world = Simulation(
         Topology(
             links=(Link("robot", "gateway"), *(Link("gateway", name) for name in names)),
             domains=(DomainPlan("one", ("robot", "gateway", *names)),),
@@ -319,15 +319,17 @@ def test_the_clients_link_carries_one_copy_of_a_request_whatever_the_number_of_s
 
 
 @pytest.mark.parametrize("seed", [22, 28, 29, 34])
-def test_a_new_server_is_a_peer_at_once_though_its_claims_and_questions_about_it_overtake_each_other(seed: int) -> None:
+def test_a_new_server_is_a_peer_at_once_though_its_advertisements_and_questions_about_it_overtake_each_other(
+    seed: int,
+) -> None:
     star = Topology(
         links=(Link("r", "g"), Link("g", "m1"), Link("g", "m2")),
         domains=(DomainPlan("d", ("r", "g", "m1", "m2")),),
         attachments=(Attachment("r", "rib", "rib"),),
     )
-    world = World(star, seed=seed)
-    for cable in world.cables.values():
-        cable.jitter_s = 0.003
+    world = Simulation(star, seed=seed)
+    for sim_link in world.cables.values():
+        sim_link.jitter_s = 0.003
     for label in ("r/proxy", "r/watch", "m1/old"):
         world.add_member(label, label.partition("/")[0])
     spare = world.cables[frozenset(("g", "m2"))]

@@ -7,8 +7,8 @@ import pytest
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
-from gdp.simulation.world import World
 from gdp.trust.delegation import Delegation
 from gdp.trust.revocation import Revocation
 from tests.journeys.flows import LEASE_S, ROBOT, SERVER, Tap, flowing, ring
@@ -18,7 +18,7 @@ WITHIN_S = 1.0
 TIERS = {"t": ("t1",), "m": ("m1",), "n": ("n1",), "l": ("l1",), "r": ("r1",)}
 
 
-def three_tiers() -> World:
+def three_tiers() -> Simulation:
     """Return a publisher and a reader in two bottom domains, each below a middle one, and these below the top."""
     uppers = {"m": "t", "n": "t", "l": "m", "r": "n"}
     topology = Topology(
@@ -30,12 +30,12 @@ def three_tiers() -> World:
             Attachment("r1", "proxy", "server"),
         ),
     )
-    world = World(topology, lease_s=LEASE_S)
+    world = Simulation(topology, lease_s=LEASE_S)
     assert world.settle()
     return world
 
 
-def keeps(world: World, fingerprint: bytes, key: bytes) -> set[str]:
+def keeps(world: Simulation, fingerprint: bytes, key: bytes) -> set[str]:
     """Return who keeps a revocation: switches by name, RIBs by domain in capitals, members."""
     who = {node for node, switch in world.switches.items() if switch._policy.revoked.has(fingerprint, key)}
     who |= {label.upper() for label, host in world.ribs.items() if host.rib._policy.revoked.has(fingerprint, key)}
@@ -68,14 +68,14 @@ def test_a_revocation_closes_a_flow_in_all_of_three_tiers(end: str, at: str) -> 
         expected = {*world.switches, *(label.upper() for label in world.ribs), *world.members}
     assert keeps(world, fingerprint, key) >= expected
     if end != "reader":
-        assert not reader.feeds_of(flow.topic.name)
+        assert not reader.writer_proxies_of(flow.topic.name)
         stored = [host.rib._store.routes(flow.topic.name) for host in world.ribs.values()]
         assert not any(stored)
-    assert not any(switch.planter.trees.all() for switch in world.switches.values())
+    assert not any(switch.multicast.trees.all() for switch in world.switches.values())
     flow.outlive(nobody=True)
 
 
-def revoke(world: World, delegation: Delegation) -> None:
+def revoke(world: Simulation, delegation: Delegation) -> None:
     """Take a delegation's AdCert back, at one switch."""
     fingerprint = parse(delegation.chain[-1]).fingerprint
     until = int(world.network.now.unix_s) + 100_000
@@ -90,8 +90,8 @@ def test_a_publisher_whose_delegation_is_revoked_is_gone_from_every_tier() -> No
     revoke(world, flow.topic.delegation)
     world.network.run(WITHIN_S)
     assert {label: host.rib.names for label, host in world.ribs.items()} == {k: n - 1 for k, n in before.items()}
-    assert not world.members[SERVER].feeds_of(flow.topic.name)
-    assert not any(switch.planter.trees.all() for switch in world.switches.values())
+    assert not world.members[SERVER].writer_proxies_of(flow.topic.name)
+    assert not any(switch.multicast.trees.all() for switch in world.switches.values())
     flow.outlive(nobody=True)
 
 
@@ -105,7 +105,7 @@ def test_what_a_revoked_publisher_still_sends_reaches_nobody() -> None:
     flow.outlive(nobody=True)
 
 
-def test_a_revoked_publisher_that_claims_again_is_refused() -> None:
+def test_a_revoked_publisher_that_advertisements_again_is_refused() -> None:
     flow = flowing(ring())
     world = flow.world
     revoke(world, flow.topic.delegation)
@@ -156,7 +156,7 @@ def test_a_revoked_member_is_cut_off_by_its_switch() -> None:
     world.network.touch("nuc4")
     world.network.run(1.5)  # a hello, and the silence that follows it
     assert world.ribs["backbone"].rib.names == 1
-    assert flow.member.name not in {each.name for each in world.switches["nuc1"].greeter.all_up()}
+    assert flow.member.name not in {each.name for each in world.switches["nuc1"].hello_protocol.all_up()}
     flow.outlive(nobody=True)
 
 
@@ -186,5 +186,5 @@ def test_the_whole_way_to_another_reader_stands_while_one_is_taken_back(revoked:
     world.switches["nuc5"].revoke(world.owner.revoke(reader.delegation.subject, fingerprint, until), world.network.now)
     world.network.touch("nuc5")
     way = [world.switches[node] for node in ("nuc1", "nuc2", "nuc3", "nuc4", "nuc5")]
-    assert not world.network.run(3, lambda: not all(switch.planter.trees.all() for switch in way))
+    assert not world.network.run(3, lambda: not all(switch.multicast.trees.all() for switch in way))
     flow.outlive(readers[1 - revoked])

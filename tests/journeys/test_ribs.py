@@ -6,25 +6,25 @@ from dataclasses import replace
 from functools import partial
 
 from gdp.control.query import Query
-from gdp.limits import CLAIM_LEASE_S
+from gdp.limits import ADVERTISEMENT_LEASE_S
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, ring5
-from gdp.simulation.world import World
 from tests.journeys.flows import ROBOT, SERVER, advertise, flowing
 
-LEASES_S = 3 * CLAIM_LEASE_S
+LEASES_S = 3 * ADVERTISEMENT_LEASE_S
 RIBS = ["school", "school#2", "backbone", "backbone#2", "cloud", "cloud#2"]
 
 
-def doubled() -> World:
+def doubled() -> Simulation:
     """Return the ring with two RIBs in each domain."""
     ring = ring5()
     second = (Attachment("nuc1", "rib", "rib2"), Attachment("nuc3", "rib", "rib2"), Attachment("nuc5", "rib", "rib2"))
-    world = World(replace(ring, attachments=ring.attachments + second))
+    world = Simulation(replace(ring, attachments=ring.attachments + second))
     assert world.settle()
     return world
 
 
-def agree(world: World, domain: str) -> bool:
+def agree(world: Simulation, domain: str) -> bool:
     one, two = (world.ribs[label].rib for label in (domain, f"{domain}#2"))
     hashes = {digests.total for rib in (one, two) if (digests := rib._store.digests) is not None}
     return len(hashes) == 1 and one.names > 0
@@ -85,7 +85,7 @@ def test_a_watch_at_one_rib_hears_what_another_took() -> None:
     query = Query(flow.topic.name, 20.0)
     identity = world.identities["nuc1"]
     asked.receive(query.to_wire(identity.name, identity.key, identity.membership), watcher.name, world.network.now)
-    asked.take()
+    asked.statements_to_send()
     answers = asked.answers
     assert world.network.run(1, lambda: asked.answers > answers)
     world.network.run(LEASES_S)

@@ -10,16 +10,16 @@ from gdp.crypto.statements import parse
 from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.rib.route import Route
-from gdp.simulation.world import World
-from gdp.trust.claim import ClaimBody
+from gdp.simulation.simulation import Simulation
+from gdp.trust.advertisement import UnverifiedAdvertisement
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 
 
-def place_in(world: World, rib: str, name: Name, node: Name) -> str:
+def place_in(world: Simulation, rib: str, name: Name, node: Name) -> str:
     """Return the switch at which a RIB believes a node to be attached."""
     route = world.ribs[rib].rib._store.get(name, node)
     assert isinstance(route, Route)
-    switch = parse(ClaimBody.from_statement(parse(route.claim)).rtcert).fields.name("switch")
+    switch = parse(UnverifiedAdvertisement.from_statement(parse(route.advertisement)).rtcert).fields.name("switch")
     return next(label for label, each in world.switches.items() if each.name == switch)
 
 
@@ -90,7 +90,7 @@ def test_the_old_branch_is_left_at_once() -> None:
     assert world.network.run(1, lambda: flow.has(SERVER, 1))
     assert flow.hops(SERVER) == [1]
     assert tap.count(Kind.DATA) == 0
-    assert not world.switches["nuc3"].planter.trees.all()
+    assert not world.switches["nuc3"].multicast.trees.all()
     flow.outlive()
 
 

@@ -6,13 +6,13 @@ from functools import partial
 
 import pytest
 
-from gdp.client.member import Topic
+from gdp.client.participant import Topic
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.validity import Validity
 from gdp.limits import CLOCK_SKEW_S
-from gdp.simulation.world import World
-from gdp.trust.card import Card
+from gdp.simulation.simulation import Simulation
 from gdp.trust.domain import Policy
+from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.owner import Owner
 from gdp.trust.right import Right
 from tests.journeys.flows import ROBOT, SERVER, Flow, flowing, ring
@@ -24,11 +24,11 @@ RETIRES_S = 50  # of the old root, clocks' differences included
 SKEW_S = int(CLOCK_SKEW_S)
 
 
-def unix_s(world: World) -> int:
+def unix_s(world: Simulation) -> int:
     return int(world.network.now.unix_s)
 
 
-def renew_all(world: World, lasts_s: int) -> None:
+def renew_all(world: Simulation, lasts_s: int) -> None:
     """Issue every membership anew, by the present root of its domain."""
     for identity in world.identities.values():
         authority = next(each for each in world.authorities.values() if each.root.domain == identity.member.domain)
@@ -36,7 +36,7 @@ def renew_all(world: World, lasts_s: int) -> None:
         identity.renew(authority.renew(identity.member, validity), authority.root)
 
 
-def policies(world: World) -> list[Policy]:
+def policies(world: Simulation) -> list[Policy]:
     switches = [each._policy for each in world.switches.values()]
     ribs = [each.attachment._policy for each in world.ribs.values()]
     return [*switches, *ribs, *(each.attachment._policy for each in world.members.values())]
@@ -113,7 +113,9 @@ def given(flow: Flow, owner: Owner, label: str, right: Right) -> Topic:
     """Return the flow's topic for a member, as this owner delegates it."""
     identity, metadata = flow.world.identities[label], flow.topic.delegation.metadata
     assert metadata is not None
-    delegation = owner.delegate(Card.from_wire(Card.make(identity)), metadata, [right], [1], flow.world.validity)
+    delegation = owner.delegate(
+        NodeDescriptor.from_wire(NodeDescriptor.make(identity)), metadata, [right], [1], flow.world.validity
+    )
     return Topic(delegation, {epoch: grant.secret for epoch, grant in delegation.open(identity).items()})
 
 

@@ -6,13 +6,13 @@ from functools import partial
 
 import pytest
 
-from gdp.client.private import IDLE_S
+from gdp.client.unicast_stream import IDLE_S
 from gdp.crypto.statements import parse
-from gdp.effects import Arrival
 from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import Kind
-from gdp.limits import CLAIM_LEASE_S, READER_LEASE_S
-from gdp.simulation.world import World
+from gdp.limits import ADVERTISEMENT_LEASE_S, READER_LEASE_S
+from gdp.sansio import ReceivedFrame
+from gdp.simulation.simulation import Simulation
 from gdp.trust.adcert import AdCert
 from gdp.trust.right import Right
 from tests.journeys.flows import ROBOT, SERVER, Tap, ring
@@ -21,7 +21,7 @@ from tests.journeys.services import SERVICE, Party, meet, outlive, work
 OTHER = "nuc4/other"
 
 
-def ring_of_three() -> World:
+def ring_of_three() -> Simulation:
     """Return the ring with a third member."""
     world = ring()
     world.add_member(OTHER, "nuc4")
@@ -29,7 +29,7 @@ def ring_of_three() -> World:
     return world
 
 
-def pair(world: World) -> tuple[Party, Party]:
+def pair(world: Simulation) -> tuple[Party, Party]:
     server, client = Party(world, SERVER, Right.SERVE), Party(world, ROBOT, Right.CALL)
     assert meet(world, server, client)
     return server, client
@@ -102,9 +102,9 @@ def test_a_server_that_dies_is_no_peer_any_more_and_its_private_stream_ends() ->
     _, client = pair(world)
     world.network.stop(SERVER)
     assert world.network.run(READER_LEASE_S + 2, lambda: not client.member.peers(client.service))
-    assert world.network.run(40, lambda: not list(client.member.feeds()))
+    assert world.network.run(40, lambda: not list(client.member.writer_proxies()))
     world.network.run(3.25 * world.lease_s)
-    assert list(client.member.feeds()) == []
+    assert list(client.member.writer_proxies()) == []
 
 
 def test_a_server_that_withdraws_is_no_peer_at_once() -> None:
@@ -112,10 +112,10 @@ def test_a_server_that_withdraws_is_no_peer_at_once() -> None:
     server, client = pair(world)
     server.member.withdraw(server.service)
     world.network.touch(SERVER)
-    assert world.network.run(1, lambda: not list(client.member.feeds()))
+    assert world.network.run(1, lambda: not list(client.member.writer_proxies()))
     assert client.member.peers(client.service) == []
     with pytest.raises(LocalError):
-        server.member.answer(server.service, client.member.name, b"too late")
+        server.member.respond(server.service, client.member.name, b"too late")
     world.network.run(3.25 * world.lease_s)
     assert client.member.peers(client.service) == []
 
@@ -155,15 +155,15 @@ def test_a_lost_part_of_an_answer_is_repaired() -> None:
     world = ring()
     server, client = pair(world)
     server.answers = False
-    for cable in world.cables.values():
-        cable.loss = 0.1
+    for sim_link in world.cables.values():
+        sim_link.loss = 0.1
     large = bytes(range(256)) * 400
     for _ in range(20):
         server.answer(client.member.name, large)
     assert work(world, client, until_s=20, have=20)
     assert client.bodies() == [large] * 20
-    for cable in world.cables.values():
-        cable.loss = 0.0  # claims of these short leases do not live long on such links
+    for sim_link in world.cables.values():
+        sim_link.loss = 0.0  # claims of these short leases do not live long on such links
     outlive(world, client, server)
 
 
@@ -191,8 +191,8 @@ def test_replayed_answers_are_dropped() -> None:
     frames = [frame for header, frame in zip(tap.headers, tap.frames, strict=True) if header.kind == Kind.DATA]
     assert frames
     dropped = client.member.drops()[DropReason.LATE]
-    client.member.receive([Arrival(neighbour.port, neighbour.mac, frame) for frame in frames], world.network.now)
-    assert client.member.take_messages() == []
+    client.member.receive([ReceivedFrame(neighbour.port, neighbour.mac, frame) for frame in frames], world.network.now)
+    assert client.member.poll_messages() == []
     assert client.member.drops()[DropReason.LATE] > dropped
     outlive(world, client, server)
 
@@ -205,19 +205,19 @@ def test_a_node_without_the_right_to_serve_or_call_does_neither() -> None:
     with pytest.raises(LocalError, match="no delegation to serve"):
         member.serve(caller, b"")
     with pytest.raises(LocalError, match="no serve of"):
-        member.answer(caller.name, world.members[SERVER].name, b"")
+        member.respond(caller.name, world.members[SERVER].name, b"")
     with pytest.raises(LocalError, match="no delegation to call"):
         member.call(world.topic(SERVICE, member, [Right.SERVE], kind="service"), b"")
 
 
-def test_who_may_only_call_is_heard_by_no_client_however_it_claims() -> None:
+def test_who_may_only_call_is_heard_by_no_client_however_it_advertisements() -> None:
     world = ring()
     server, client = pair(world)
     world.add_member(OTHER, "nuc4")
     liar = world.members[OTHER]
     assert world.settle()
     topic = world.topic(SERVICE, liar, [Right.CALL], kind="service")
-    liar.attachment.claim(topic.delegation.subject, Right.SERVE, topic.delegation.chain, is_global=True)
+    liar.attachment.advertisement(topic.delegation.subject, Right.SERVE, topic.delegation.chain, is_global=True)
     world.network.touch(OTHER)
     world.network.run(2)
     assert liar.attachment.refusals[DropReason.NOT_DELEGATED] >= 1
@@ -252,7 +252,7 @@ def test_two_hundred_calls_at_once_are_all_answered_once() -> None:
 
 @pytest.mark.momentary("the lease of a reader ends, that of its claim does not")
 def test_a_client_that_was_cut_off_for_longer_than_its_lease_goes_on_and_loses_nothing() -> None:
-    world = ring(lease_s=CLAIM_LEASE_S)
+    world = ring(lease_s=ADVERTISEMENT_LEASE_S)
     server, client = pair(world)
     server.answer(client.member.name, b"before")
     assert work(world, client, until_s=2, have=1)
@@ -264,10 +264,10 @@ def test_a_client_that_was_cut_off_for_longer_than_its_lease_goes_on_and_loses_n
     server.answer(client.member.name, b"after")
     assert work(world, client, until_s=3, have=3)
     assert client.bodies() == [b"before", b"meanwhile", b"after"]
-    assert sum(feed.lost for feed in client.member.feeds()) == 0
+    assert sum(writer_proxy.lost for writer_proxy in client.member.writer_proxies()) == 0
 
 
-def test_a_client_whose_claim_ended_meanwhile_goes_on_and_counts_what_it_lost() -> None:
+def test_a_client_whose_advertisement_ended_meanwhile_goes_on_and_counts_what_it_lost() -> None:
     world = ring()
     server, client = pair(world)
     server.answer(client.member.name, b"before")
@@ -280,7 +280,7 @@ def test_a_client_whose_claim_ended_meanwhile_goes_on_and_counts_what_it_lost() 
     server.answer(client.member.name, b"after")
     assert work(world, client, until_s=3, have=2)
     assert client.bodies() == [b"before", b"after"]
-    assert sum(feed.lost for feed in client.member.feeds()) == 1
+    assert sum(writer_proxy.lost for writer_proxy in client.member.writer_proxies()) == 1
     outlive(world, client, server)
 
 
@@ -302,8 +302,12 @@ def test_a_private_stream_that_nobody_uses_is_forgotten_and_goes_on_above_its_nu
     streams = server.member._publications._private[server.service]
     assert len(streams) == 1
     world.network.run(1)
-    (feed,) = [feed for feed in client.member.feeds() if feed not in client.member.feeds_of(client.service)]
-    feed._schedule.due_s = float("inf")  # it says nothing any more
+    (writer_proxy,) = [
+        writer_proxy
+        for writer_proxy in client.member.writer_proxies()
+        if writer_proxy not in client.member.writer_proxies_of(client.service)
+    ]
+    writer_proxy._schedule.due_s = float("inf")  # it says nothing any more
     world.network.run(READER_LEASE_S + 1.5 * IDLE_S)
     assert len(streams) == 0
     server.answer(client.member.name, b"2")
@@ -358,8 +362,8 @@ def test_a_client_whose_delegation_is_revoked_is_answered_no_more() -> None:
     world = ring()
     server, client = pair(world)
     delegation = world.topic(SERVICE, client.member, [Right.CALL], kind="service").delegation
-    claimed = next(each for each in client.member.attachment.claims if each.right is Right.CALL)
-    link = AdCert.from_statement(parse(claimed.chain[0]))
+    pending_advertisement = next(each for each in client.member.attachment.advertisements if each.right is Right.CALL)
+    link = AdCert.from_statement(parse(pending_advertisement.chain[0]))
     world.switches["nuc5"].revoke(
         world.owner.revoke(delegation.subject, link.fingerprint, link.validity.not_after_unix_s), world.network.now
     )
@@ -375,8 +379,8 @@ def test_calls_over_links_that_lose_and_reorder_are_all_answered_once() -> None:
     # A claim of seven frames crosses three such links half of the time: a lease has to last for many tries.
     world = ring(lease_s=8.0)
     server, client = pair(world)
-    for cable in [*world.cables.values(), *world.leads.values()]:
-        cable.loss, cable.jitter_s = 0.03, 0.002
+    for sim_link in [*world.cables.values(), *world.leads.values()]:
+        sim_link.loss, sim_link.jitter_s = 0.03, 0.002
     for number in range(100):
         world.network.call(0.01 * number, partial(client.publish, b"%d" % number))
     assert work(world, server, client, until_s=30, have=100)

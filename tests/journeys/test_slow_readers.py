@@ -8,14 +8,14 @@ from functools import partial
 
 import pytest
 
-from gdp.client.member import Member
-from gdp.effects import Arrival, Instant, Transmit
+from gdp.client.participant import Participant
 from gdp.errors import DropReason
 from gdp.frame.codec import decode
 from gdp.frame.kinds import CONTROL_FROM
 from gdp.limits import READER_LEASE_S, WINDOW_BYTES
+from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import chain
-from gdp.simulation.world import World
 from tests.journeys.flows import LEASE_S, Flow, flowing
 
 SOURCE, NEAR, FAR, SLOW = "s1/left", "s1/near", "s3/right", "s2/slow"
@@ -31,17 +31,17 @@ class Behind:
         dropped: frames that found the queue full.
     """
 
-    def __init__(self, member: Member, frames_s: float) -> None:
+    def __init__(self, member: Participant, frames_s: float) -> None:
         self._member = member
-        self._queue = deque[Arrival]()
+        self._queue = deque[ReceivedFrame]()
         self._at_s = 0.0
         self.frames_s = frames_s
         self.dropped = 0
 
-    def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Instant) -> None:
+    def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Timestamps) -> None:
         self._member.add_port(index, mac, mtu, cost, now)
 
-    def receive(self, arrivals: Sequence[Arrival], now: Instant) -> None:
+    def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
         for arrival in arrivals:
             if decode(arrival.frame).kind >= CONTROL_FROM:
                 self._member.receive([arrival], now)
@@ -51,28 +51,28 @@ class Behind:
             else:
                 self.dropped += 1
 
-    def port_changed(self, port: int, up: bool, now: Instant) -> None:
+    def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
         self._member.port_changed(port, up, now)
 
-    def timeout(self, now: Instant) -> None:
+    def handle_timer(self, now: Timestamps) -> None:
         while self._queue and self.frames_s and self._at_s <= now.mono_s:
             self._at_s += 1 / self.frames_s
             self._member.receive([self._queue.popleft()], now)
-        self._member.timeout(now)
+        self._member.handle_timer(now)
 
-    def next_timeout(self) -> float | None:
-        due_s = self._member.next_timeout()
+    def get_timer(self) -> float | None:
+        due_s = self._member.get_timer()
         if not self._queue or not self.frames_s:
             return due_s
         return self._at_s if due_s is None else min(due_s, self._at_s)
 
-    def take(self) -> list[Transmit]:
-        return self._member.take()
+    def take(self) -> list[OutgoingFrames]:
+        return self._member.frames_to_send()
 
 
-def world_with_a_slow_one(frames_s: float) -> tuple[World, Behind]:
+def world_with_a_slow_one(frames_s: float) -> tuple[Simulation, Behind]:
     """Return three switches, a source with a reader beside it, a far reader, and a slow one on the way."""
-    world = World(chain(3), lease_s=LEASE_S)
+    world = Simulation(chain(3), lease_s=LEASE_S)
     world.add_member(NEAR, "s1")
     slow = Behind(world.add_member(SLOW, "s2"), frames_s)
     world.network.replace(SLOW, slow)
@@ -106,8 +106,8 @@ def test_best_effort_a_slow_reader_makes_the_others_neither_lose_nor_wait() -> N
     got = flow.numbers(SLOW)
     assert got == sorted(set(got))
     assert len(got) + slow.dropped == 400
-    (feed,) = world.members[SLOW].feeds()
-    assert feed.lost == 400 - len(got) > 0
+    (writer_proxy,) = world.members[SLOW].writer_proxies()
+    assert writer_proxy.lost == 400 - len(got) > 0
     flow.outlive()
 
 
@@ -142,13 +142,13 @@ def test_reliable_after_the_lease_the_slow_one_holds_nothing_and_is_told_what_it
     world.network.run(2)  # it takes what still waits for it
     flow.publish((1_000).to_bytes(4, "big"))
     assert world.network.run(10, lambda: all(flow.numbers(label)[-1:] == [1_000] for label in (NEAR, FAR, SLOW)))
-    (feed,) = world.members[SLOW].feeds()
-    assert len(flow.got[SLOW]) + feed.lost == 201
+    (writer_proxy,) = world.members[SLOW].writer_proxies()
+    assert len(flow.got[SLOW]) + writer_proxy.lost == 201
     assert flow.numbers(NEAR) == flow.numbers(FAR) == [*range(200), 1_000]
     flow.outlive()
 
 
-def test_reliable_a_reader_that_lagged_holds_its_publisher_again_only_after_a_penance() -> None:
+def test_reliable_a_reader_that_lagged_holds_its_publisher_again_only_after_a_suspension() -> None:
     world, slow = world_with_a_slow_one(frames_s=1e6)
     flow = flowing(world, source=SOURCE, readers=(NEAR, SLOW))
     slow.frames_s = 0

@@ -7,12 +7,12 @@ from functools import partial
 import pytest
 
 from gdp.frame.kinds import Kind
-from gdp.limits import CLAIM_LEASE_S
+from gdp.limits import ADVERTISEMENT_LEASE_S
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
-from gdp.simulation.world import World
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 
-LONG_S = 3 * CLAIM_LEASE_S + 8
+LONG_S = 3 * ADVERTISEMENT_LEASE_S + 8
 LEASE_S = 6.0  # of names, where the real one would only cost time: that of readers is as long
 SHORT_S = 3 * LEASE_S + 8
 
@@ -37,11 +37,11 @@ def test_any_link_of_the_ring_may_fail_for_ever(cut: tuple[str, str]) -> None:
     complete(back, ROBOT, count, 10)
 
 
-def restart_rib(world: World, label: str) -> None:
+def restart_rib(world: Simulation, label: str) -> None:
     world.restart_rib(label)
 
 
-def restart_switch(world: World, name: str) -> None:
+def restart_switch(world: Simulation, name: str) -> None:
     world.restart_switch(name)
 
 
@@ -66,9 +66,9 @@ def three_sites() -> Topology:
 A, C = "a1/robot", "c2/server"
 
 
-def sites(lease_s: float = LEASE_S) -> World:
+def sites(lease_s: float = LEASE_S) -> Simulation:
     """Return the sites, settled."""
-    world = World(three_sites(), lease_s=lease_s)
+    world = Simulation(three_sites(), lease_s=lease_s)
     assert world.settle()
     return world
 
@@ -108,7 +108,7 @@ def test_both_ends_may_move_at_once() -> None:
 @pytest.mark.parametrize("to", ["a2", "b2"])
 @pytest.mark.parametrize("who", [A, C])
 def test_a_node_moves_while_all_ribs_are_dead(who: str, to: str) -> None:
-    world = sites(CLAIM_LEASE_S)
+    world = sites(ADVERTISEMENT_LEASE_S)
     there, back = flowing(world, source=A, readers=(C,)), flowing(world, "/answers", C, (A,))
     count = int(LONG_S / 0.1)
     there.stream(count, 0.1, size=100)
@@ -121,7 +121,7 @@ def test_a_node_moves_while_all_ribs_are_dead(who: str, to: str) -> None:
 
 
 def test_established_flows_go_on_while_all_ribs_are_dead_for_ten_minutes() -> None:
-    world = sites(CLAIM_LEASE_S)
+    world = sites(ADVERTISEMENT_LEASE_S)
     flow = flowing(world, source=A, readers=(C,))
     for label in world.ribs:
         world.kill_rib(label)
@@ -130,7 +130,7 @@ def test_established_flows_go_on_while_all_ribs_are_dead_for_ten_minutes() -> No
 
 
 def test_ribs_that_were_dead_for_long_come_back_without_a_flow_noticing() -> None:
-    world = sites(CLAIM_LEASE_S)
+    world = sites(ADVERTISEMENT_LEASE_S)
     flow = flowing(world, source=A, readers=(C,))
     flow.stream(1_000, 0.1, size=100)
     for label in world.ribs:
@@ -150,7 +150,7 @@ def test_a_transit_domain_needs_no_rib_of_its_own() -> None:
             Attachment("b1", "proxy", "server"),
         ),
     )
-    world = World(topology)
+    world = Simulation(topology)
     assert world.settle()
     world.network.run(9)
     flow = flowing(world, source="a1/robot", readers=("b1/server",))
@@ -199,7 +199,7 @@ def test_a_switch_at_the_border_of_a_domain_that_never_rests_stays_in_its_own() 
         (DomainPlan("a", ("a1", "a2", "a3")), DomainPlan("b", ("b1", "b2", "b3"), upper="a")),
         (Attachment("a1", "rib", "rib"), Attachment("b1", "rib", "rib")),
     )
-    world = World(plan, lease_s=LEASE_S)
+    world = Simulation(plan, lease_s=LEASE_S)
     world.network.run(5)
     ribs = {world.ribs[domain].name for domain in ("a", "b")}
     for _ in range(9):  # each time something changes at the border, and nothing in a3's own part of the domain

@@ -8,7 +8,7 @@ import pytest
 
 from gdp.crypto.keys import SigningKey
 from gdp.nodes.yaml_source import ConfigFileError
-from proxy.config import ProxyConfig, Rule
+from proxy.config.config import ProxyConfig, Rule
 
 OWNER = SigningKey.generate()
 OTHER = SigningKey.generate()

@@ -9,7 +9,7 @@ import pytest
 from gdp.errors import LocalError
 from gdp.metadata import Metadata
 from gdp.service.replication import Mode, Replication
-from proxy.rules.choice import choose, imported
+from proxy.config.matching import choose, imported
 from tests.proxy.rule_files import OTHER, OWNER, furnish, proxy, refusals, rule, rules
 
 IMAGE = "sensor_msgs/msg/Image"

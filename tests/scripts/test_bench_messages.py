@@ -29,7 +29,7 @@ from testbed import row
 
 from proxy.serial.channel import Channel
 from proxy.serial.serializer import Encoding, Serializer
-from proxy.serial.standard import standard_definition
+from proxy.serial.standard_types import standard_definition
 
 LOAD = Load((100, 10_000), 5)
 

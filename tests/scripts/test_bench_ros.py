@@ -20,7 +20,7 @@ from ros_stage import DIRECT, Bench, Options, parse
 from gdp.metadata import Metadata
 from gdp.stores.issue import make_owner
 from gdp.stores.keyring import OWNER_PUBLIC
-from proxy.rules.rule import Rule
+from proxy.config.rule import Rule
 
 
 @pytest.fixture

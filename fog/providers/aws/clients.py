@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from threading import Lock
 from typing import TYPE_CHECKING
 
-from fog.providers.aws.faults import asking
+from fog.providers.aws.errors import asking
 from gdp.errors import LocalError
 
 if TYPE_CHECKING:

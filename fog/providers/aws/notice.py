@@ -25,8 +25,8 @@ from urllib.request import ProxyHandler, Request, build_opener
 
 import typer
 
-from fog.host.notice import write_notice
-from fog.providers.aws.reading import DRAIN
+from fog.host.preemption_notice import write_notice
+from fog.providers.aws.instances import DRAIN
 
 __all__ = ["Metadata", "Watch", "main"]
 

@@ -18,15 +18,15 @@ from typing import TYPE_CHECKING, Final
 
 from fog.hardware import Hardware
 from fog.host.bundle import pack
-from fog.machine import Boot, Machine, MachineSpec, Program
+from fog.machine import Machine, MachineBundle, MachineSpec, Program
 from fog.offer import Offer
 from fog.providers.aws.clients import Clients, filters
 from fog.providers.aws.config import AwsConfig
-from fog.providers.aws.faults import asking, is_code
-from fog.providers.aws.ground import ground_of
-from fog.providers.aws.order import order
+from fog.providers.aws.errors import asking, is_code
+from fog.providers.aws.instances import CLUSTER, DRAIN, MACHINE, machine_of
 from fog.providers.aws.prices import spot_prices
-from fog.providers.aws.reading import CLUSTER, DRAIN, MACHINE, machine_of
+from fog.providers.aws.region import ground_of
+from fog.providers.aws.run_request import order
 from fog.providers.cloud_init import lines_of, user_data
 from gdp.errors import LocalError
 
@@ -78,7 +78,7 @@ class AwsProvider:
             lines = [line for part in self._threads.map(self._priced, by_region.values()) for line in part]
         return sorted(lines, key=lambda each: each.usd_per_hour)
 
-    def create(self, spec: MachineSpec, boot: Boot) -> str:
+    def create(self, spec: MachineSpec, boot: MachineBundle) -> str:
         """Run one instance; asking again for the same machine returns the one that there is.
 
         Raises:

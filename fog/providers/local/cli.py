@@ -11,9 +11,9 @@ from typing import Annotated
 
 import typer
 
-from fog.providers.local import trouble
+from fog.providers.local import fault_injection
 from gdp.cli.node import failing_clearly
-from gdp.host.run_registry import Runs
+from gdp.host.run_registry import RunRegistry
 
 __all__ = ["local_app"]
 
@@ -34,30 +34,30 @@ def local_app(directory: Callable[[], Path]) -> typer.Typer:
     def notice(machine: Machine, seconds: Seconds = 120.0) -> None:
         """Give notice: the machine is taken after some seconds."""
         with failing_clearly():
-            trouble.notice(Runs(directory()), machine, seconds)
+            fault_injection.notice(RunRegistry(directory()), machine, seconds)
 
     @app.command()
     def kill(machine: Machine) -> None:
         """Kill all of the machine at once."""
         with failing_clearly():
-            trouble.kill(Runs(directory()), machine)
+            fault_injection.kill(RunRegistry(directory()), machine)
 
     @app.command()
     def freeze(machine: Machine, off: Off = False) -> None:
         """Stop the machine where it is."""
         with failing_clearly():
-            (trouble.thaw if off else trouble.freeze)(Runs(directory()), machine)
+            (fault_injection.thaw if off else fault_injection.freeze)(RunRegistry(directory()), machine)
 
     @app.command()
     def slow(machine: Machine, share: Share = 0.1) -> None:
         """Let the machine have a share of one processor."""
         with failing_clearly():
-            trouble.slow(Runs(directory()), machine, share or None)
+            fault_injection.slow(RunRegistry(directory()), machine, share or None)
 
     @app.command()
     def delay(machine: Machine, ms: Ms = 100.0) -> None:
         """Make the machine's link longer."""
         with failing_clearly():
-            trouble.delay(Runs(directory()), machine, ms)
+            fault_injection.delay(RunRegistry(directory()), machine, ms)
 
     return app

@@ -54,7 +54,7 @@ class DelayLine:
         self._room_bytes -= len(frame)
         self._waiting.append((arrived_ns + self._delay_ns, 1 - side, frame))
 
-    def take(self, now_ns: int) -> list[tuple[int, bytes]]:
+    def poll_frames(self, now_ns: int) -> list[tuple[int, bytes]]:
         """Return what is due: the side to leave by, and the frame."""
         due = []
         while self._waiting and self._waiting[0][0] <= now_ns:
@@ -99,7 +99,7 @@ def _relay(sides: tuple[socket.socket, socket.socket], line: DelayLine) -> None:
                     break
                 seconds, ns = _STAMP.unpack_from(extra[0][2])
                 line.put(seconds * 1_000_000_000 + ns, sides.index(source), frame)
-        for side, frame in line.take(time.time_ns()):
+        for side, frame in line.poll_frames(time.time_ns()):
             try:
                 sides[side].send(frame)
             except BlockingIOError:

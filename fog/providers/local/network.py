@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Final
 
 from fog.host.bundle import install
-from fog.machine import Boot
-from fog.providers.local.begin import begin
-from fog.providers.local.wire import (
+from fog.machine import MachineBundle
+from fog.providers.local.netlinks import (
     MACHINES,
     SEGMENT,
     UP,
@@ -31,16 +30,17 @@ from fog.providers.local.wire import (
     plug,
     space_path,
 )
+from fog.providers.local.spawn import spawn_detached
 from fog.topology import Gateway
 from gdp.errors import LocalError, StoreError
 from gdp.host.processes import Process
-from gdp.host.run_registry import Record, Run, Runs
+from gdp.host.run_registry import Record, Run, RunRegistry
 
 __all__ = ["GatewayBoot", "Network"]
 
 log = logging.getLogger(__name__)
 
-GatewayBoot = Callable[[str, Sequence[str]], Boot]
+GatewayBoot = Callable[[str, Sequence[str]], MachineBundle]
 
 _FILE: Final = "network.json"
 
@@ -78,7 +78,9 @@ class Network:
         robot: the namespace of that end; None: that of whoever opens the network.
     """
 
-    def __init__(self, runs: Runs, topology: Gateway, boot: GatewayBoot, uplink: str, robot: Path | None) -> None:
+    def __init__(
+        self, runs: RunRegistry, topology: Gateway, boot: GatewayBoot, uplink: str, robot: Path | None
+    ) -> None:
         self._runs = runs
         self._topology = topology
         self._boot = boot
@@ -186,4 +188,4 @@ class Network:
             (home / "process.json").write_text(json.dumps([process.pid, process.started]), encoding="ascii")
 
         argv = ["fog.host.cli", "--home", str(home), "--await-go"]
-        begin(run, standing.space(gateway.gateway), argv, home / "logs" / "machine.log", note)
+        spawn_detached(run, standing.space(gateway.gateway), argv, home / "logs" / "machine.log", note)

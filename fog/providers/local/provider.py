@@ -23,18 +23,18 @@ from fog.catalog.local import LOCAL_REGIONS, local_offers
 from fog.hardware import Hardware
 from fog.host.bounded_log import last_lines
 from fog.host.bundle import install
-from fog.machine import Boot, Machine, MachineSpec, MachineState
+from fog.machine import Machine, MachineBundle, MachineSpec, MachineState
 from fog.offer import Offer
-from fog.providers.local.begin import begin
+from fog.providers.local.fault_injection import hold, kill
 from fog.providers.local.machine_file import MachineFile
+from fog.providers.local.machine_handle import LocalMachine, find, list_machines
+from fog.providers.local.netlinks import MACHINE_DEVICE, UP, UPLINK_BRIDGE, delete, exists, join, make_space, plug
 from fog.providers.local.network import GatewayBoot, Network
-from fog.providers.local.standing import Standing, find, standing
-from fog.providers.local.trouble import hold, kill
-from fog.providers.local.wire import MACHINE_DEVICE, UP, UPLINK_BRIDGE, delete, exists, join, make_space, plug
+from fog.providers.local.spawn import spawn_detached
 from fog.topology import AUTOMATIC, Gateway
 from gdp.errors import LocalError, StoreError
 from gdp.host.processes import end_all
-from gdp.host.run_registry import Run, Runs
+from gdp.host.run_registry import Run, RunRegistry
 
 __all__ = ["UPLINK", "LocalProvider"]
 
@@ -77,7 +77,7 @@ class LocalProvider:
         regions: Sequence[str] = (),
     ) -> None:
         self._directory = directory
-        self._runs = Runs(directory)
+        self._runs = RunRegistry(directory)
         self._network = Network(self._runs, topology, gateway_boot, uplink, robot)
         named = [region for gateway in topology.walk() for region in gateway.regions]
         self._regions = tuple(dict.fromkeys((*LOCAL_REGIONS, *named, *regions)))
@@ -102,7 +102,7 @@ class LocalProvider:
 
     def sweep(self) -> list[str]:
         """Remove what ended, or was begun by somebody who is gone; return the ids."""
-        gone = [each.id for each in standing(self._runs) if not each.is_alive]
+        gone = [each.id for each in list_machines(self._runs) if not each.is_alive]
         self._end(gone)
         with self._alone():
             return [*gone, *self._runs.sweep()]
@@ -115,12 +115,12 @@ class LocalProvider:
         fitting = [each for each in everything if each.is_spot == spot and hardware.fits(each.hardware)]
         return sorted(fitting, key=lambda each: each.usd_per_hour)
 
-    def create(self, spec: MachineSpec, boot: Boot) -> str:
+    def create(self, spec: MachineSpec, boot: MachineBundle) -> str:
         """Make a machine on this host and start its programs; return its id."""
         if not _NAME.fullmatch(spec.name):
             raise LocalError(f"machine {spec.name!r}: a name has letters, digits, '-' and '_'")
         with self._alone():
-            for each in standing(self._runs, spec.cluster):
+            for each in list_machines(self._runs, spec.cluster):
                 if each.file.spec.name == spec.name:
                     return each.id  # asked for again by somebody who was killed before noting it
             gateway = self._network.gateway(spec.offer.region)
@@ -141,7 +141,7 @@ class LocalProvider:
         """Return the machines of a cluster as they are now."""
         now_unix_s = time.time()
         told = []
-        for each in standing(self._runs, cluster):
+        for each in list_machines(self._runs, cluster):
             machine = each.describe()
             if machine.state is MachineState.GONE:
                 if self._is_forgotten(each, now_unix_s):
@@ -178,7 +178,7 @@ class LocalProvider:
     def detach_uplink(self, machine: str) -> None:
         """Take the uplink from a machine."""
         with self._alone():
-            for each in standing(self._runs):
+            for each in list_machines(self._runs):
                 if each.id == machine:
                     delete(each.gateway, each.uplink_plug)
                     each.gateway_mark.unlink(missing_ok=True)
@@ -199,12 +199,12 @@ class LocalProvider:
         """Nothing is held."""
 
     @property
-    def runs(self) -> Runs:
+    def runs(self) -> RunRegistry:
         """Return the records of this site, for ``trouble``."""
         return self._runs
 
-    def _make(self, run: Run, file: MachineFile, boot: Boot) -> None:
-        machine = Standing(run.record, file)
+    def _make(self, run: Run, file: MachineFile, boot: MachineBundle) -> None:
+        machine = LocalMachine(run.record, file)
         run.plan_namespace(machine.space)
         make_space(machine.space, machine.address)
         join(machine.gateway, machine.plug, machine.space, MACHINE_DEVICE)
@@ -225,9 +225,9 @@ class LocalProvider:
             replace(file, is_bounded=is_bounded).write(run.directory)
 
         argv = ["fog.host.cli", "--home", str(machine.home), "--await-go"]
-        begin(run, machine.space, argv, machine.home / "logs" / "machine.log", confine)
+        spawn_detached(run, machine.space, argv, machine.home / "logs" / "machine.log", confine)
 
-    def _is_forgotten(self, machine: Standing, now_unix_s: float) -> bool:
+    def _is_forgotten(self, machine: LocalMachine, now_unix_s: float) -> bool:
         """Note when it was first seen to be gone, and remove it some time after."""
         if machine.file.gone_unix_s is None:
             with suppress(OSError):  # somebody else removes it
@@ -240,7 +240,7 @@ class LocalProvider:
 
     def _end(self, ids: Sequence[str]) -> None:
         """Let machines end, all at once, and remove what is left of them. Others may be at it, too."""
-        machines = [each for each in standing(self._runs) if each.id in ids]
+        machines = [each for each in list_machines(self._runs) if each.id in ids]
         if new := [each.id for each in machines if not (each.record.kept or each.record.dead)]:
             raise StoreError(f"just being made: {', '.join(new)}")
         for each in machines:

@@ -17,7 +17,7 @@ from typing import Final
 
 from fog.hardware import Hardware
 from fog.host.bundle import pack
-from fog.machine import Boot, Machine, MachineSpec
+from fog.machine import Machine, MachineBundle, MachineSpec
 from fog.offer import Offer
 from fog.providers.cloud_init import lines_of, shell_script
 from fog.providers.skypilot.config import SkyPilotConfig
@@ -76,7 +76,7 @@ class SkyPilotProvider:
                     lines.append(Offer(self.name, place, each.instance_type, has, is_spot=spot, usd_per_hour=usd))
         return sorted(lines, key=lambda each: each.usd_per_hour)
 
-    def create(self, spec: MachineSpec, boot: Boot) -> str:
+    def create(self, spec: MachineSpec, boot: MachineBundle) -> str:
         """Ask for a machine. That there is none to be had is not known yet: it then is not described any more.
 
         Raises:
@@ -88,7 +88,7 @@ class SkyPilotProvider:
             self._sky.launch(self._task(spec, boot), cluster_name=name)
         return name
 
-    def dry_run(self, spec: MachineSpec, boot: Boot) -> None:
+    def dry_run(self, spec: MachineSpec, boot: MachineBundle) -> None:
         """Let SkyPilot check all that it checks before it asks a cloud.
 
         Raises:
@@ -152,7 +152,7 @@ class SkyPilotProvider:
     def close(self) -> None:
         """Nothing is held; the API server goes on."""
 
-    def _task(self, spec: MachineSpec, boot: Boot) -> object:
+    def _task(self, spec: MachineSpec, boot: MachineBundle) -> object:
         offer = spec.offer
         resources = self._sky.Resources(
             infra=offer.region,

@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
 from gdp.errors import LocalError
-from gdp.ports.kernel.loaded import PROGRAM
+from gdp.ports.kernel.loaded_program import PROGRAM
 from gdp.ports.kernel.syscall import BpfError, attached, create_link, name_of
-from gdp.ports.netlink import CLSACT_EGRESS, CLSACT_INGRESS, Questions
+from gdp.ports.netlink import CLSACT_EGRESS, CLSACT_INGRESS, NetlinkSocket
 
 if TYPE_CHECKING:
     from pyroute2 import IPRoute
@@ -67,7 +67,7 @@ class LinkAttachment:
         LocalError: a live switch has the device.
     """
 
-    def __init__(self, program: int, ifindex: int, ask: Questions) -> None:
+    def __init__(self, program: int, ifindex: int, ask: NetlinkSocket) -> None:
         _refuse_second(ask, ifindex)
         self._link = create_link(program, ifindex, _TCX_INGRESS)
 
@@ -91,7 +91,7 @@ class FilterAttachment:
         LocalError: refused, or a live switch has the device.
     """
 
-    def __init__(self, program: int, ifindex: int, ask_briefly: Questions) -> None:
+    def __init__(self, program: int, ifindex: int, ask_briefly: NetlinkSocket) -> None:
         _refuse_second(ask_briefly, ifindex)
         self._ifindex = ifindex
         self._ask_briefly = ask_briefly
@@ -135,7 +135,7 @@ class FilterAttachment:
         return not any(_filters(ask, self._ifindex, parent) for parent in (CLSACT_INGRESS, CLSACT_EGRESS))
 
 
-def _refuse_second(ask: Questions, ifindex: int) -> None:
+def _refuse_second(ask: NetlinkSocket, ifindex: int) -> None:
     """Two switches on one device would each forward by half of what they are told.
 
     A link stands only while its process holds it, so its program is a live one's. Where others' programs may not be

@@ -15,9 +15,9 @@ from collections.abc import Iterable
 from typing import Final
 
 from gdp.ports.kernel.syscall import BpfError, attached
-from gdp.ports.netlink import CLSACT_EGRESS, ROOT, TRAFFIC_GROUP, LinkAttribute, Questions, listen, nested
+from gdp.ports.netlink import CLSACT_EGRESS, ROOT, TRAFFIC_GROUP, LinkAttribute, NetlinkSocket, listen, nested
 
-__all__ = ["QueueWatch", "Refusals", "has_free_peer"]
+__all__ = ["QueueWatch", "TxDrops", "peer_is_bare"]
 
 _INFO_KIND: Final = 1  # IFLA_INFO_KIND
 _TCX_EGRESS: Final = 47
@@ -30,7 +30,7 @@ _TX_DROPPED_AT: Final = 7 * 8
 _READ_BYTES: Final = 1 << 16
 
 
-def has_free_peer(ask: Questions, ifindex: int) -> bool:
+def peer_is_bare(ask: NetlinkSocket, ifindex: int) -> bool:
     """Say whether nothing stands between this device and the other end of its pair, in another namespace.
 
     Raises:
@@ -57,7 +57,7 @@ def _has_programs(ifindex: int) -> bool:
         raise
 
 
-def _has_driver_xdp(ask: Questions, facts: dict[int, bytes]) -> bool:
+def _has_driver_xdp(ask: NetlinkSocket, facts: dict[int, bytes]) -> bool:
     """Whether the other end, or what cannot be found there, is not to be passed by."""
     if LinkAttribute.LINK not in facts:
         return True
@@ -92,7 +92,7 @@ class QueueWatch:
         self._socket.close()
 
 
-class Refusals:
+class TxDrops:
     """Frames that devices and their queues would not send, which nobody tells a program that redirects.
 
     A device counts what anybody sends: where others use it too, theirs are among them.
@@ -107,7 +107,7 @@ class Refusals:
         """Frames refused since each device was first looked at."""
         return self._total
 
-    def look(self, ask: Questions, ifindexes: Iterable[int]) -> None:
+    def look(self, ask: NetlinkSocket, ifindexes: Iterable[int]) -> None:
         """Ask about these devices, and forget the others. Costs a dump of all queues: 4 ms where there are 32 ports.
 
         Raises:

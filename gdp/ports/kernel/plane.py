@@ -18,13 +18,13 @@ from contextlib import ExitStack, closing
 from typing import Final
 
 from gdp.errors import DropReason, LocalError
+from gdp.ports.kernel.abi import ENTRIES_DEFAULT, PortFlag
 from gdp.ports.kernel.attach import Attachment, FilterAttachment, LinkAttachment, has_links
-from gdp.ports.kernel.device import QueueWatch, Refusals, has_free_peer
-from gdp.ports.kernel.loaded import Loaded
-from gdp.ports.kernel.mirror import EntryCounts, Mirror
-from gdp.ports.kernel.shapes import ENTRIES_DEFAULT, PortFlag
-from gdp.ports.netlink import Questions
-from gdp.ports.plane import Arrival, Counters, Port
+from gdp.ports.kernel.device import QueueWatch, TxDrops, peer_is_bare
+from gdp.ports.kernel.loaded_program import LoadedProgram
+from gdp.ports.kernel.map_sync import EntryCounts, MapSync
+from gdp.ports.netlink import NetlinkSocket
+from gdp.ports.plane import Counters, Port, ReceivedFrame
 from gdp.ports.raw import RawPlane
 from gdp.switch.table import Table
 
@@ -64,13 +64,13 @@ class KernelPlane(RawPlane):
         self._attachments: dict[int, Attachment] = {}
         self._table = table
         self._next_upkeep_s = 0.0
-        self._refusals = Refusals()
+        self._refusals = TxDrops()
         self._unread = 0  # frames that came up to a full socket
         with ExitStack() as opened:
-            self._loaded = opened.enter_context(closing(Loaded(entries_max, leased=clsact or not has_links())))
-            self._questions = opened.enter_context(closing(Questions()))
+            self._loaded = opened.enter_context(closing(LoadedProgram(entries_max, leased=clsact or not has_links())))
+            self._questions = opened.enter_context(closing(NetlinkSocket()))
             self._queues = opened.enter_context(closing(QueueWatch()))
-            self._mirror = Mirror(table, *self._loaded.of_entries)
+            self._mirror = MapSync(table, *self._loaded.of_entries)
             super().__init__(ifnames, table, bypass_qdisc=bypass_qdisc)
             opened.pop_all()  # from now on ``close`` does it
         self.watch(self._queues, self._review_queues)
@@ -93,7 +93,7 @@ class KernelPlane(RawPlane):
             here.frames_in + there.frames_in,
             here.frames_out + there.frames_out,
             here.forwarded + there.forwarded,
-            here.handed_up,
+            here.punted,
             drops,
         )
 
@@ -106,7 +106,7 @@ class KernelPlane(RawPlane):
         """Return frames and bytes that the kernel forwarded by the busiest entries. Safe in any thread."""
         return self._mirror.counts(most)
 
-    def poll(self, timeout_s: float | None) -> list[Arrival]:
+    def poll(self, timeout_s: float | None) -> list[ReceivedFrame]:
         """Renew the lease of the program and read its counts when due, then as ``Plane.poll``."""
         if self._loaded.is_leased:
             timeout_s = _UPKEEP_S if timeout_s is None else min(timeout_s, _UPKEEP_S)
@@ -167,7 +167,7 @@ class KernelPlane(RawPlane):
 
     def _has_free_peer(self, ifindex: int) -> bool:
         try:
-            return has_free_peer(self._questions, ifindex)
+            return peer_is_bare(self._questions, ifindex)
         except LocalError:  # who cannot know takes the way that is always right; the next upkeep asks again
             return False
 

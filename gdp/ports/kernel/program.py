@@ -27,8 +27,7 @@ from gdp.errors import DropReason
 from gdp.frame.codec import ETHER_BYTES, OVERHEAD_BYTES, layout
 from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION, Flag
 from gdp.names import NAME_BYTES
-from gdp.ports.kernel.assembler import Assembler, Reg
-from gdp.ports.kernel.shapes import (
+from gdp.ports.kernel.abi import (
     BRANCH_BYTES,
     BRANCHES_MAX,
     GROUP,
@@ -40,6 +39,7 @@ from gdp.ports.kernel.shapes import (
     PortFlag,
     Total,
 )
+from gdp.ports.kernel.assembler import Assembler, Reg
 from gdp.switch.table import MACS_BYTES
 
 __all__ = ["DROP", "LICENCE", "REDIRECT", "UP", "Descriptors", "forwarder"]
@@ -86,7 +86,7 @@ class Descriptors:
     lease: int | None = None
 
 
-class _Story(Assembler):
+class ForwarderProgram(Assembler):
     """The program, one method a step."""
 
     def __init__(self, maps: Descriptors, side: int) -> None:
@@ -372,4 +372,4 @@ class _Story(Assembler):
 
 def forwarder(maps: Descriptors, side: int = 0) -> bytes:
     """Return the instructions of the program for a port; ``side``: its bit in an entry's mask."""
-    return _Story(maps, side).tell()
+    return ForwarderProgram(maps, side).tell()

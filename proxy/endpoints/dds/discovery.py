@@ -18,14 +18,14 @@ from cyclonedds.builtin import (
 from cyclonedds.core import InstanceState, ReadCondition
 from cyclonedds.internal import SampleInfo
 
+from proxy.endpoints.dds.graph_cache import GraphCache, Peer
 from proxy.endpoints.dds.naming import hash_in, identity_in, named, user_data
 from proxy.endpoints.dds.node import ANY_STATE, Node, Sample
 from proxy.endpoints.dds.node_info import INFO_HASH, INFO_TOPIC, INFO_TYPE, read_info
 from proxy.endpoints.dds.policies import Announced, announced
 from proxy.endpoints.dds.profile import requested
-from proxy.endpoints.dds.survey import Peer, Survey
-from proxy.endpoints.dds.watch import News
-from proxy.qos import default
+from proxy.endpoints.dds.wait_thread import News
+from proxy.endpoints.qos import default
 
 __all__ = ["Discovery"]
 
@@ -41,7 +41,7 @@ class Discovery:
         changed: is called in the caller's thread after each batch of news.
     """
 
-    def __init__(self, node: Node, survey: Survey, changed: News) -> None:
+    def __init__(self, node: Node, survey: GraphCache, changed: News) -> None:
         self._node = node
         self._survey = survey
         self._changed = changed

@@ -12,9 +12,9 @@ from typing import TypeVar
 
 from gdp.errors import LocalError
 from proxy.endpoints.dds.discovery import Discovery
+from proxy.endpoints.dds.graph_cache import GraphCache
 from proxy.endpoints.dds.node import Node
 from proxy.endpoints.dds.services import Client, Server
-from proxy.endpoints.dds.survey import Survey
 from proxy.endpoints.dds.topics import Publication, Subscription
 from proxy.endpoints.dds.types import hash_of, known_channel
 from proxy.endpoints.endpoint import Event, Graph, GraphChanged, Role
@@ -47,7 +47,7 @@ class DdsEndpoint:
         self._is_taking = False
         self._open: dict[int, _Open] = {}
         self._numbers = count(1)
-        self._survey = Survey()
+        self._survey = GraphCache()
         self._shown: Graph = frozenset()
         self._node = Node(domain, node)
         self._discovery = Discovery(self._node, self._survey, self._follow)
@@ -76,7 +76,7 @@ class DdsEndpoint:
         """Return a descriptor that is readable while ``take`` has something."""
         return self._node.watch.fileno()
 
-    def take(self) -> Sequence[Event]:
+    def poll_events(self) -> Sequence[Event]:
         """Return, once, what happened, in order."""
         self._is_taking = True
         self._node.watch.catch_up()
@@ -143,7 +143,7 @@ class DdsEndpoint:
         return self._find(handle, Publication).subscribers
 
     def serve(self, service: Service) -> int:
-        """Be a server for clients that speak Cyclone DDS; others are told of as ``Faulted``.
+        """Be a server for clients that speak Cyclone DDS; others are told of as ``EndpointError``.
 
         Raises:
             LocalError: it is not ROS 2's.
@@ -164,8 +164,8 @@ class DdsEndpoint:
         """Answer {success: false, message: reason} where the response has these; ROS 2 knows no other way."""
         self._find(handle, Server).refuse(ticket, reason)
 
-    def dial(self, name: str, type_name: str) -> int:
-        """Be a client of a service of servers that speak Cyclone DDS; others are told of as ``Faulted``."""
+    def create_client(self, name: str, type_name: str) -> int:
+        """Be a client of a service of servers that speak Cyclone DDS; others are told of as ``EndpointError``."""
         handle = next(self._numbers)
         hashed = next((peer.hash for peer in self._survey.peers(Role.SERVES, name, type_name)), "")
         client = Client(self._node, self._survey, handle, self._tell, name, type_name, hashed)
@@ -183,7 +183,7 @@ class DdsEndpoint:
         """End a subscription, publisher, server or client."""
         self._open.pop(handle).close()
 
-    def shut(self) -> None:
+    def remove_entity(self) -> None:
         """Leave the graph and free everything."""
         self._discovery.close()
         self._open.clear()

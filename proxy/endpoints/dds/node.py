@@ -23,8 +23,8 @@ from proxy.endpoints.dds.naming import user_data
 from proxy.endpoints.dds.node_info import GID_BYTES, INFO_HASH, INFO_TOPIC, INFO_TYPE, write_info
 from proxy.endpoints.dds.opaque import OpaqueTopic
 from proxy.endpoints.dds.profile import offered
-from proxy.endpoints.dds.watch import News, Watch
-from proxy.qos import default
+from proxy.endpoints.dds.wait_thread import News, WaitThread
+from proxy.endpoints.qos import default
 
 __all__ = ["ANY_STATE", "Node", "Reader", "Sample", "Writer"]
 
@@ -123,7 +123,7 @@ class Node:
         self.gid = bytes(self.participant.guid.bytes)
         self.publisher = Publisher(self.participant)
         self.subscriber = Subscriber(self.participant)
-        self.watch = Watch(self.participant)
+        self.watch = WaitThread(self.participant)
         self._readers: dict[bytes, Reader] = {}
         self._writers: dict[bytes, Writer] = {}
         self._wide = GID_BYTES[0]

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 from cyclonedds.__library__ import library_path
 
-from proxy.qos import NEVER
+from proxy.endpoints.qos import NEVER
 from proxy.serial.channel import Qos
 
 __all__ = ["Announced", "announced"]

@@ -13,12 +13,12 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from proxy.endpoints.dds import library
+from proxy.endpoints.dds.graph_cache import GraphCache
 from proxy.endpoints.dds.naming import CYCLONE, dds_type, identity, identity_in, user_data, vendor
 from proxy.endpoints.dds.node import Node, Sample
 from proxy.endpoints.dds.profile import offered, requested
-from proxy.endpoints.dds.survey import Survey
-from proxy.endpoints.endpoint import Answered, Asked, Event, Failed, Faulted, Role
-from proxy.qos import default
+from proxy.endpoints.endpoint import CallFailed, EndpointError, Event, RequestReceived, ResponseReceived, Role
+from proxy.endpoints.qos import default
 from proxy.serial.empty import NoAnswer
 
 __all__ = ["Client", "Server"]
@@ -68,7 +68,7 @@ class Server(_Halves):
     def __init__(
         self,
         node: Node,
-        survey: Survey,
+        survey: GraphCache,
         handle: int,
         tell: Callable[[Event], None],
         name: str,
@@ -141,7 +141,7 @@ class Server(_Halves):
         elif client.gid.startswith(CYCLONE) and len(raw) >= _PREFIX + _HEADER:  # of others ``follow`` has told
             ticket = self._tickets()
             self._asks[ticket] = _Ask(raw[_PREFIX : _PREFIX + _HEADER], sample.writer)
-            self._tell(Asked(self._handle, ticket, raw[:_PREFIX] + raw[_PREFIX + _HEADER :]))
+            self._tell(RequestReceived(self._handle, ticket, raw[:_PREFIX] + raw[_PREFIX + _HEADER :]))
 
     def _can_hear(self, ask: _Ask) -> bool:
         client = self._survey.peer(ask.client)
@@ -150,7 +150,7 @@ class Server(_Halves):
     def _say(self, ask: _Ask, raw: bytes) -> None:
         code = self.writer.write(raw[:_PREFIX] + ask.header + raw[_PREFIX:])
         if code < 0:
-            self._tell(Faulted(self._handle, f"a response could not be sent (code {code})"))
+            self._tell(EndpointError(self._handle, f"a response could not be sent (code {code})"))
 
 
 class _Call(NamedTuple):
@@ -164,7 +164,7 @@ class Client(_Halves):
     def __init__(
         self,
         node: Node,
-        survey: Survey,
+        survey: GraphCache,
         handle: int,
         tell: Callable[[Event], None],
         name: str,
@@ -191,7 +191,7 @@ class Client(_Halves):
         for sequence, call in list(self._calls.items()):
             if not call.servers & servers:
                 self._forget(sequence)
-                self._tell(Failed(self._handle, call.number, "the server is gone"))
+                self._tell(CallFailed(self._handle, call.number, "the server is gone"))
         self.matched()
 
     def call(self, number: int, raw: bytes) -> None:
@@ -201,7 +201,7 @@ class Client(_Halves):
         """
         servers = self._servers()
         if self._fault or not servers:
-            self._tell(Failed(self._handle, number, self._fault or "no server"))
+            self._tell(CallFailed(self._handle, number, self._fault or "no server"))
             return
         self._last += 1
         self._calls[self._last] = _Call(number, servers)
@@ -231,7 +231,7 @@ class Client(_Halves):
                 continue
             call = self._forget(int.from_bytes(raw[_PREFIX + 8 : _PREFIX + _HEADER], "little"))
             if call is not None:
-                self._tell(Answered(self._handle, call.number, raw[:_PREFIX] + raw[_PREFIX + _HEADER :]))
+                self._tell(ResponseReceived(self._handle, call.number, raw[:_PREFIX] + raw[_PREFIX + _HEADER :]))
 
     def _send(self, sequence: int, message: bytes) -> None:
         call = self._calls.get(sequence)
@@ -241,7 +241,7 @@ class Client(_Halves):
         if self._fault or code < 0:
             self._forget(sequence)
             reason = self._fault or f"the request could not be sent (code {code})"
-            self._tell(Failed(self._handle, call.number, reason))
+            self._tell(CallFailed(self._handle, call.number, reason))
 
     def _forget(self, sequence: int) -> _Call | None:
         call = self._calls.pop(sequence, None)
@@ -257,7 +257,9 @@ class Client(_Halves):
         return frozenset(peer.gid for peer in peers if peer.gid.startswith(CYCLONE))
 
 
-def _tell_fault(survey: Survey, role: Role, name: str, before: str, handle: int, tell: Callable[[Event], None]) -> str:
+def _tell_fault(
+    survey: GraphCache, role: Role, name: str, before: str, handle: int, tell: Callable[[Event], None]
+) -> str:
     """Say once that a peer of another vendor is there; return what is wrong now."""
     others = {vendor(peer.gid) for peer in survey.peers(role, name) if not peer.gid.startswith(CYCLONE)}
     if not others:
@@ -268,5 +270,5 @@ def _tell_fault(survey: Survey, role: Role, name: str, before: str, handle: int,
         " use endpoint ros2"
     )
     if fault != before:
-        tell(Faulted(handle, fault))
+        tell(EndpointError(handle, fault))
     return fault

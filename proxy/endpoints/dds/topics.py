@@ -10,13 +10,13 @@ from dataclasses import replace
 
 from gdp.errors import LocalError
 from proxy.endpoints.dds import library
+from proxy.endpoints.dds.graph_cache import GraphCache
 from proxy.endpoints.dds.naming import dds_type, user_data
 from proxy.endpoints.dds.node import Node, Sample
 from proxy.endpoints.dds.profile import offered, requested
-from proxy.endpoints.dds.survey import Survey
 from proxy.endpoints.dds.types import known_channel
-from proxy.endpoints.endpoint import Described, Event, Faulted, Heard, Role
-from proxy.qos import default
+from proxy.endpoints.endpoint import EndpointError, Event, MessageReceived, Role, TypeResolved
+from proxy.endpoints.qos import default
 from proxy.serial.channel import Channel, Qos
 
 __all__ = ["Publication", "Subscription"]
@@ -28,7 +28,7 @@ class Subscription:
     def __init__(
         self,
         node: Node,
-        survey: Survey,
+        survey: GraphCache,
         handle: int,
         tell: Callable[[Event], None],
         topic: str,
@@ -56,7 +56,7 @@ class Subscription:
             self._describe(hashes[0] if hashes else "")
         fault = f"publishers disagree about {type_name}: {', '.join(hashes)}" if len(hashes) > 1 else ""
         if fault and fault != self._fault:
-            self._tell(Faulted(self._handle, fault))
+            self._tell(EndpointError(self._handle, fault))
         self._fault = fault
 
     def close(self) -> None:
@@ -69,11 +69,11 @@ class Subscription:
             known = replace(self._bare, hash=peers_hash)
         if known != self._channel:
             self._channel = known
-            self._tell(Described(self._handle, known))
+            self._tell(TypeResolved(self._handle, known))
 
     def _hear(self, samples: list[Sample]) -> None:
         for raw, _, stamp_ns in samples:
-            self._tell(Heard(self._handle, stamp_ns, raw))
+            self._tell(MessageReceived(self._handle, stamp_ns, raw))
 
 
 class Publication:
@@ -84,7 +84,13 @@ class Publication:
     """
 
     def __init__(
-        self, node: Node, survey: Survey, handle: int, tell: Callable[[Event], None], channel: Channel, type_hash: str
+        self,
+        node: Node,
+        survey: GraphCache,
+        handle: int,
+        tell: Callable[[Event], None],
+        channel: Channel,
+        type_hash: str,
     ) -> None:
         topic, type_name = channel.topic, channel.type_name
         roles = (Role.PUBLISHES, Role.SUBSCRIBES)
@@ -109,7 +115,7 @@ class Publication:
         code = self._writer.write(raw)
         if code < 0 and not self._is_late:
             why = "its readers do not keep up" if code == library.TIMED_OUT else f"Cyclone DDS refuses it (code {code})"
-            self._tell(Faulted(self._handle, f"a message of {len(raw)} bytes was not published: {why}"))
+            self._tell(EndpointError(self._handle, f"a message of {len(raw)} bytes was not published: {why}"))
         self._is_late = code < 0
 
     def close(self) -> None:

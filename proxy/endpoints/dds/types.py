@@ -8,7 +8,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 from proxy.serial.channel import Channel
-from proxy.serial.standard import standard_definition, type_hash
+from proxy.serial.standard_types import standard_definition, type_hash
 
 __all__ = ["hash_of", "known_channel"]
 

@@ -12,14 +12,14 @@ import sys
 
 from gdp.errors import LocalError
 from proxy.endpoints.ros1.install import rospy_folder
-from proxy.endpoints.ros1.link import Kind, Link
+from proxy.endpoints.ros1.ipc import IpcLink, Kind
 
 
 def main() -> None:
     """Serve the link, until it ends."""
     descriptor, master, node, life, delay_s = sys.argv[1:]
     woken = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-    link = Link(socket.socket(fileno=int(descriptor)), lambda: os.eventfd_write(woken, 1))
+    link = IpcLink(socket.socket(fileno=int(descriptor)), lambda: os.eventfd_write(woken, 1))
     try:
         # First: a ROS 2 of this interpreter has packages of the same names.
         sys.path.insert(0, rospy_folder())

@@ -23,20 +23,20 @@ import cbor2
 
 from gdp.errors import LocalError, RemoteError
 from proxy.endpoints.endpoint import (
-    Answered,
-    Asked,
-    Described,
-    End,
+    CallFailed,
+    EndpointError,
     Event,
-    Failed,
-    Faulted,
     Graph,
     GraphChanged,
-    Heard,
+    GraphEntity,
+    MessageReceived,
+    RequestReceived,
+    ResponseReceived,
     Role,
+    TypeResolved,
 )
 from proxy.endpoints.ros1.install import rospy_folder
-from proxy.endpoints.ros1.link import Frame, Kind, Link, LinkEndedError
+from proxy.endpoints.ros1.ipc import Frame, IpcLink, Kind, LinkEndedError
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
 
@@ -121,7 +121,7 @@ class Ros1Endpoint:
         """Return a descriptor that is readable while ``take`` has something."""
         return self._epoll.fileno()
 
-    def take(self) -> Sequence[Event]:
+    def poll_events(self) -> Sequence[Event]:
         """Return, once, what happened, in order."""
         self._pump()
         if self._events:
@@ -152,7 +152,7 @@ class Ros1Endpoint:
         return self._hold(_Held(Kind.SUBSCRIBE, topic.encode()))
 
     def advertise(self, channel: Channel) -> int:
-        """Be a publisher; if something local contradicts, ``Faulted`` follows."""
+        """Be a publisher; if something local contradicts, ``EndpointError`` follows."""
         if channel.ros != 1 or not (channel.hash or channel.definition):
             here = self.channel(channel.topic, channel.type_name)
             channel = Channel(
@@ -175,7 +175,7 @@ class Ros1Endpoint:
         return self._held[handle].subscribers
 
     def serve(self, service: Service) -> int:
-        """Be a server; if something local contradicts, ``Faulted`` follows."""
+        """Be a server; if something local contradicts, ``EndpointError`` follows."""
         if service.ros != 1:
             service = self.service(service.name, service.type_name)
         return self._hold(_Held(Kind.SERVE, service.to_wire()))
@@ -188,7 +188,7 @@ class Ros1Endpoint:
         """Fail a request: its client gets a ``ServiceException`` with the reason."""
         self._link.send(Kind.REFUSE, handle, ticket, reason.encode())
 
-    def dial(self, name: str, type_name: str) -> int:
+    def create_client(self, name: str, type_name: str) -> int:
         """Be a client of a local service; nothing but its type's name need be known."""
         return self._hold(_Held(Kind.DIAL, cbor2.dumps([name, type_name])))
 
@@ -211,7 +211,7 @@ class Ros1Endpoint:
             self._link.send(Kind.CLOSE, handle)
             self._events = [event for event in self._events if getattr(event, "handle", None) != handle]
 
-    def shut(self) -> None:
+    def remove_entity(self) -> None:
         """Leave the graph; may wait two seconds for the process to say farewell to the master."""
         self._link.close()
         self._ended.append(self._process)
@@ -246,7 +246,7 @@ class Ros1Endpoint:
                 env=environment,
                 start_new_session=True,  # Ctrl-C is for the proxy, which then closes the link
             )
-        self._link = Link(ours, self._watch_room)
+        self._link = IpcLink(ours, self._watch_room)
         self._epoll.register(ours, select.EPOLLIN)
         for handle, held in self._held.items():
             self._establish(handle, held)
@@ -308,27 +308,27 @@ class Ros1Endpoint:
     def _happen(self, kind: Kind, handle: int, number: int, payload: bytes) -> None:
         held = self._held[handle]
         if kind is Kind.HEARD:
-            self._events.append(Heard(handle, number, payload))
+            self._events.append(MessageReceived(handle, number, payload))
         elif kind is Kind.ASKED:
-            self._events.append(Asked(handle, number, payload))
+            self._events.append(RequestReceived(handle, number, payload))
         elif kind is Kind.ANSWERED and number in held.calls:
             held.calls.discard(number)
-            self._events.append(Answered(handle, number, payload))
+            self._events.append(ResponseReceived(handle, number, payload))
         elif kind is Kind.FAILED:
             self._fail(handle, number, payload.decode())
         elif kind is Kind.FAULTED:
-            self._events.append(Faulted(handle, payload.decode()))
+            self._events.append(EndpointError(handle, payload.decode()))
         elif kind is Kind.COUNTED:
             held.subscribers = number
         elif kind is Kind.DESCRIBED:
             try:
-                self._events.append(Described(handle, Channel.from_wire(payload)))
+                self._events.append(TypeResolved(handle, Channel.from_wire(payload)))
             except RemoteError as error:
-                self._events.append(Faulted(handle, f"its publisher describes it badly: {error}"))
+                self._events.append(EndpointError(handle, f"its publisher describes it badly: {error}"))
 
     def _look(self, payload: bytes) -> None:
         ends = frozenset(
-            End(Role(role), name, type_name, node, node, md5)
+            GraphEntity(Role(role), name, type_name, node, node, md5)
             for role, name, type_name, node, md5 in cbor2.loads(payload)
         )
         if ends != self._graph or self._is_graph_old:
@@ -344,18 +344,18 @@ class Ros1Endpoint:
         self._held[handle] = held
         self._establish(handle, held)
         if self._trouble:
-            self._tell(Faulted(handle, self._trouble, is_graph=True))
+            self._tell(EndpointError(handle, self._trouble, is_graph=True))
         return handle
 
     def _suffer(self, reason: str) -> None:
         if not self._trouble:
-            self._events += [Faulted(handle, reason, is_graph=True) for handle in self._held]
+            self._events += [EndpointError(handle, reason, is_graph=True) for handle in self._held]
         self._trouble = reason
 
     def _fail(self, handle: int, call: int, reason: str) -> None:
         if call in self._held[handle].calls:
             self._held[handle].calls.discard(call)
-            self._tell(Failed(handle, call, reason))
+            self._tell(CallFailed(handle, call, reason))
 
     def _tell(self, event: Event) -> None:
         self._events.append(event)
@@ -393,7 +393,7 @@ class Ros1Endpoint:
         return answer
 
 
-def _wait(link: Link, patience_s: float) -> None:
+def _wait(link: IpcLink, patience_s: float) -> None:
     poller = select.poll()
     poller.register(link, select.POLLIN | (select.POLLOUT if link.is_behind else 0))
     poller.poll(patience_s * 1000)

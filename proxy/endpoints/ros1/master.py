@@ -21,7 +21,7 @@ from typing import Any, Final, NamedTuple
 from urllib.parse import urlsplit
 from xml.parsers.expat import ExpatError
 
-__all__ = ["LocalEnd", "Look", "Master", "MasterError", "Watch"]
+__all__ = ["GraphSnapshot", "LocalEnd", "Master", "MasterError", "MasterWatch"]
 
 PERIOD_S: Final = 0.4
 _PATIENCE_S: Final = 2.0
@@ -68,7 +68,7 @@ class LocalEnd(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class GraphSnapshot:
     """What one look at the master showed.
 
     Args:
@@ -132,7 +132,7 @@ class Master:
             raise MasterError(str(error)[:_REASON_MAX] or type(error).__name__) from error
 
 
-class Watch:
+class MasterWatch:
     """The graph, looked at again and again."""
 
     def __init__(self, uri: str, node: str) -> None:
@@ -143,7 +143,7 @@ class Watch:
         self._dead: frozenset[str] = frozenset()
         self._next_liveness_s = 0.0
 
-    def look(self) -> Look:
+    def look(self) -> GraphSnapshot:
         """Ask the master, and new servers for their types.
 
         Raises:
@@ -172,9 +172,11 @@ class Watch:
             server = self._services.get((service, node))
             if server is not None and server.type_name:
                 ends.append(LocalEnd("serves", service, server.type_name, node, server.md5))
-        return Look(frozenset(ends), dict(offered), ours)
+        return GraphSnapshot(frozenset(ends), dict(offered), ours)
 
-    def run(self, stopped: threading.Event, seen: Callable[[Look], None], failed: Callable[[str], None]) -> None:
+    def run(
+        self, stopped: threading.Event, seen: Callable[[GraphSnapshot], None], failed: Callable[[str], None]
+    ) -> None:
         """Look until ``stopped``; ``failed`` is told once of every silence."""
         is_silent = False
         while not stopped.is_set():

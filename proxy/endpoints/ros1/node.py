@@ -21,8 +21,8 @@ from rospy.impl import masterslave, tcpros_base
 from rospy.impl.registration import get_service_manager, get_topic_manager
 
 from gdp.errors import LocalError, RemoteError
-from proxy.endpoints.ros1.link import Frame, Kind, Link, LinkEndedError
-from proxy.endpoints.ros1.master import LocalEnd, Look, Master, MasterError, Watch
+from proxy.endpoints.ros1.ipc import Frame, IpcLink, Kind, LinkEndedError
+from proxy.endpoints.ros1.master import GraphSnapshot, LocalEnd, Master, MasterError, MasterWatch
 from proxy.endpoints.ros1.raw import (
     installed_message,
     installed_service,
@@ -31,8 +31,8 @@ from proxy.endpoints.ros1.raw import (
     ros1_name,
     ros2_name,
 )
-from proxy.endpoints.ros1.services import Dial, Server, tickets
-from proxy.endpoints.ros1.topics import Inlet, Outlet
+from proxy.endpoints.ros1.services import Client, Server, tickets
+from proxy.endpoints.ros1.topics import Publisher, Subscriber
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 
@@ -48,7 +48,7 @@ _BACKLOG: Final = 128
 class Node:
     """One node on one master."""
 
-    def __init__(self, link: Link, woken: int, master: str, node: str, life: int, delay_s: float) -> None:
+    def __init__(self, link: IpcLink, woken: int, master: str, node: str, life: int, delay_s: float) -> None:
         self._link = link
         self._woken = woken
         self._master = master
@@ -56,13 +56,13 @@ class Node:
         self._id = f"/{node}"
         self._delay_s = delay_s
         self._tickets = tickets(life)
-        self._inlets: dict[int, Inlet] = {}
-        self._outlets: dict[int, Outlet] = {}
+        self._inlets: dict[int, Subscriber] = {}
+        self._outlets: dict[int, Publisher] = {}
         self._servers: dict[int, Server] = {}
-        self._dials: dict[int, Dial] = {}
+        self._dials: dict[int, Client] = {}
         self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._refused: dict[int, str] = {}  # not on the graph, and why; the registrar's
-        self._look: Look | None = None
+        self._look: GraphSnapshot | None = None
         self._stopped = threading.Event()
         self._lost = 0
 
@@ -113,14 +113,14 @@ class Node:
 
     def _make(self, kind: Kind, handle: int, payload: bytes) -> None:
         if kind is Kind.SUBSCRIBE:
-            inlet = self._inlets[handle] = Inlet(self._link, handle, payload.decode(), self._id)
+            inlet = self._inlets[handle] = Subscriber(self._link, handle, payload.decode(), self._id)
             self._todo.put(inlet.register)
         elif kind is Kind.DIAL:
             name, type_name = cbor2.loads(payload)
-            self._dials[handle] = Dial(self._link, handle, name, type_name)
+            self._dials[handle] = Client(self._link, handle, name, type_name)
         elif kind is Kind.ADVERTISE:
             channel = Channel.from_wire(payload)
-            self._outlets[handle] = Outlet(self._link, handle, channel, known_message(channel), self._id)
+            self._outlets[handle] = Publisher(self._link, handle, channel, known_message(channel), self._id)
             self._todo.put(lambda: self._join(handle))
         elif kind is Kind.SERVE:
             service = Service.from_wire(payload)
@@ -176,7 +176,7 @@ class Node:
         rospy.init_node(self._name, argv=["gdp"], disable_rosout=True, disable_rostime=True, disable_signals=True)
         # 50 clients may come at once, and rospy lets five queue.
         tcpros_base._tcpros_server.tcp_ros_server.server_sock.listen(_BACKLOG)
-        watch = Watch(self._master, self._id)
+        watch = MasterWatch(self._master, self._id)
         threading.Thread(
             target=watch.run, args=(self._stopped, self._seen, self._silent), name="watch", daemon=True
         ).start()
@@ -212,7 +212,7 @@ class Node:
     def _forget(self, handle: int) -> None:
         self._refused.pop(handle, None)
 
-    def _against(self, subject: Outlet | Server) -> str:
+    def _against(self, subject: Publisher | Server) -> str:
         look = self._look
         if isinstance(subject, Server):
             other = look.servers.get(subject.name) if look is not None else None
@@ -231,7 +231,7 @@ class Node:
 
     # the watch
 
-    def _seen(self, look: Look) -> None:
+    def _seen(self, look: GraphSnapshot) -> None:
         if rospy.is_shutdown():
             self._end("the node was shut down from outside")
         if not look.is_ours_known:

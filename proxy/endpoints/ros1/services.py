@@ -19,10 +19,10 @@ from rospy.exceptions import ROSInternalException, TransportInitError
 from rospy.impl.tcpros_base import TCPROSTransport
 from rospy.impl.tcpros_service import ServiceProxy
 
-from proxy.endpoints.ros1.link import Kind, Link
+from proxy.endpoints.ros1.ipc import IpcLink, Kind
 from proxy.endpoints.ros1.raw import KnownMessage, KnownService, Raw, raw_service, ros1_name
 
-__all__ = ["Dial", "Server", "tickets"]
+__all__ = ["Client", "Server", "tickets"]
 
 _WORKERS: Final = 64  # calls of one service under way at once; more wait their turn
 _CONNECT_S: Final = 5.0
@@ -35,7 +35,7 @@ _CANNOT: Final = "service cannot process request: "
 class Server:
     """One virtual server."""
 
-    def __init__(self, link: Link, handle: int, name: str, known: KnownService, tickets: Iterator[int]) -> None:
+    def __init__(self, link: IpcLink, handle: int, name: str, known: KnownService, tickets: Iterator[int]) -> None:
         self.name = name
         self.known = known
         self._link = link
@@ -81,10 +81,10 @@ class Server:
         return self._class._response_class(response)
 
 
-class Dial:
+class Client:
     """One client."""
 
-    def __init__(self, link: Link, handle: int, name: str, type_name: str) -> None:
+    def __init__(self, link: IpcLink, handle: int, name: str, type_name: str) -> None:
         self._link = link
         self._handle = handle
         self._name = name

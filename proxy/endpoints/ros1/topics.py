@@ -1,6 +1,7 @@
 """Subscriptions and publishers of the rospy process.
 
-Place: imports rospy. rospy calls ``Inlet`` from a thread for each connection; ``Outlet`` is fed by the main thread and
+Place: imports rospy. rospy calls ``Subscriber`` from a thread for each connection; ``Publisher`` is fed by the main
+thread and
 put on the graph by the registering one.
 """
 
@@ -17,11 +18,11 @@ import rospy
 from rospy.impl.registration import get_topic_manager
 
 from proxy.endpoints.endpoint import is_proxy_node
-from proxy.endpoints.ros1.link import Kind, Link
+from proxy.endpoints.ros1.ipc import IpcLink, Kind
 from proxy.endpoints.ros1.raw import KnownMessage, Raw, raw_class, ros2_name
 from proxy.serial.channel import Channel
 
-__all__ = ["Inlet", "Outlet"]
+__all__ = ["Publisher", "Subscriber"]
 
 _QUEUE: Final = 100  # messages that wait for one slow subscriber
 
@@ -31,10 +32,10 @@ class _Connection(Protocol):
     endpoint_id: str
 
 
-class Inlet:
+class Subscriber:
     """One subscription: says what the messages are, then hands them up."""
 
-    def __init__(self, link: Link, handle: int, topic: str, node: str) -> None:
+    def __init__(self, link: IpcLink, handle: int, topic: str, node: str) -> None:
         self._link = link
         self._handle = handle
         self._topic = topic
@@ -110,10 +111,10 @@ class Inlet:
             self._link.send(Kind.DESCRIBED, self._handle, 0, channel.to_wire())
 
 
-class Outlet(rospy.SubscribeListener):  # type: ignore[misc]  # rospy is untyped
+class Publisher(rospy.SubscribeListener):  # type: ignore[misc]  # rospy is untyped
     """One publisher. A latched one keeps its last messages for every newcomer, which rospy itself does for one only."""
 
-    def __init__(self, link: Link, handle: int, channel: Channel, known: KnownMessage, node: str) -> None:
+    def __init__(self, link: IpcLink, handle: int, channel: Channel, known: KnownMessage, node: str) -> None:
         self.topic = channel.topic
         self.known = known
         self._link = link

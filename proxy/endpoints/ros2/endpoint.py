@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from typing import Final, cast
 
 from gdp.errors import LocalError
-from proxy.endpoints.endpoint import Event, Failed, Graph, Role
-from proxy.endpoints.ros2.ends import Dialling, Hearing, Publishing, Serving
-from proxy.endpoints.ros2.own import OwnMessages
+from proxy.endpoints.endpoint import CallFailed, Event, Graph, Role
+from proxy.endpoints.ros2.entities import ClientEntity, PublisherEntity, ServiceEntity, SubscriptionEntity
+from proxy.endpoints.ros2.loopback_filter import LoopbackFilter
 from proxy.endpoints.ros2.qos import conflict, filled, service_profile, to_profile
 from proxy.endpoints.ros2.session import (
     ClientHandle,
@@ -25,10 +25,10 @@ from proxy.endpoints.ros2.session import (
     translated,
 )
 from proxy.endpoints.ros2.types import channel_of, class_of, service_of
-from proxy.endpoints.ros2.waiting import Waiting
+from proxy.endpoints.ros2.wait_thread import WaitThread
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
-from proxy.serial.standard import type_hash
+from proxy.serial.standard_types import type_hash
 
 __all__ = ["Ros2Endpoint"]
 
@@ -51,12 +51,12 @@ class Ros2Endpoint:
         self.label = f"ros2 domain {domain}"
         self._session = open_session(domain, node)
         self._node = self._session.node
-        self._waiting = Waiting(self._session)
+        self._waiting = WaitThread(self._session)
         self._numbers = 0
-        self._hearing: dict[int, Hearing] = {}
-        self._publishing: dict[int, Publishing] = {}
-        self._serving: dict[int, Serving] = {}
-        self._dialling: dict[int, Dialling] = {}
+        self._subscription_entity: dict[int, SubscriptionEntity] = {}
+        self._publisher_entity: dict[int, PublisherEntity] = {}
+        self._serving: dict[int, ServiceEntity] = {}
+        self._client_entity: dict[int, ClientEntity] = {}
 
     @property
     def dropped(self) -> int:
@@ -65,8 +65,8 @@ class Ros2Endpoint:
     def fileno(self) -> int:
         return self._waiting.fileno()
 
-    def take(self) -> Sequence[Event]:
-        return self._waiting.take()
+    def poll_events(self) -> Sequence[Event]:
+        return self._waiting.poll_events()
 
     def graph(self) -> Graph:
         return self._waiting.graph
@@ -92,11 +92,11 @@ class Ros2Endpoint:
                 event_callbacks=self._session.silence(publisher=False),
             )
         handle = cast("SubscriptionHandle", entity.handle)
-        hearing = Hearing(self._number(), topic, message, requested, channel, entity, handle)
-        self._hearing[hearing.number] = hearing
+        subscription_entity = SubscriptionEntity(self._number(), topic, message, requested, channel, entity, handle)
+        self._subscription_entity[subscription_entity.number] = subscription_entity
         self._tell_apart(topic)
-        self._waiting.add(hearing)
-        return hearing.number
+        self._waiting.add(subscription_entity)
+        return subscription_entity.number
 
     def advertise(self, channel: Channel) -> int:
         known = self._checked(channel)
@@ -109,24 +109,25 @@ class Ros2Endpoint:
                 event_callbacks=self._session.silence(publisher=True),
             )
         handle = cast("PublisherHandle", entity.handle)
-        publishing = Publishing(self._number(), channel.topic, offered, known, entity, handle)
+        publisher_entity = PublisherEntity(self._number(), channel.topic, offered, known, entity, handle)
         if offered.durability == "transient_local":
-            publishing.kept = deque(maxlen=offered.depth)
-        self._publishing[publishing.number] = publishing
+            publisher_entity.kept = deque(maxlen=offered.depth)
+        self._publisher_entity[publisher_entity.number] = publisher_entity
         self._tell_apart(channel.topic)
-        self._waiting.add(publishing)
-        return publishing.number
+        self._waiting.add(publisher_entity)
+        return publisher_entity.number
 
     def publish(self, handle: int, raw: bytes) -> None:
-        self._publishing[handle].publish(raw)
+        self._publisher_entity[handle].publish(raw)
 
     def subscribers(self, handle: int) -> int:
-        publishing = self._publishing[handle]
+        publisher_entity = self._publisher_entity[handle]
         ours = sum(
-            hearing.topic == publishing.topic and not conflict(publishing.qos, hearing.qos)
-            for hearing in self._hearing.values()
+            subscription_entity.topic == publisher_entity.topic
+            and not conflict(publisher_entity.qos, subscription_entity.qos)
+            for subscription_entity in self._subscription_entity.values()
         )
-        return max(0, publishing.handle.get_subscription_count() - ours)
+        return max(0, publisher_entity.handle.get_subscription_count() - ours)
 
     def serve(self, service: Service) -> int:
         known = service_of(service.name, service.type_name)
@@ -137,7 +138,7 @@ class Ros2Endpoint:
             entity = self._node.create_service(
                 kind, service.name, _ignore, qos_profile=service_profile(), callback_group=self._session.group()
             )
-        serving = Serving(self._number(), cast("ServiceType", kind), entity, cast("ServiceHandle", entity.handle))
+        serving = ServiceEntity(self._number(), cast("ServiceType", kind), entity, cast("ServiceHandle", entity.handle))
         self._serving[serving.number] = serving
         self._waiting.add(serving)
         return serving.number
@@ -162,7 +163,7 @@ class Ros2Endpoint:
         else:
             serving.send(ticket, refusal)
 
-    def dial(self, name: str, type_name: str) -> int:
+    def create_client(self, name: str, type_name: str) -> int:
         service_of(name, type_name)
         kind = class_of(type_name)
         with translated(f"{name}: cannot be dialled"):
@@ -170,43 +171,43 @@ class Ros2Endpoint:
                 kind, name, qos_profile=service_profile(), callback_group=self._session.group()
             )
         handle = cast("ClientHandle", entity.handle)
-        dialling = Dialling(self._number(), name, cast("ServiceType", kind), entity, handle)
-        self._dialling[dialling.number] = dialling
-        self._waiting.add(dialling)
-        return dialling.number
+        client_entity = ClientEntity(self._number(), name, cast("ServiceType", kind), entity, handle)
+        self._client_entity[client_entity.number] = client_entity
+        self._waiting.add(client_entity)
+        return client_entity.number
 
     def call(self, handle: int, call: int, raw: bytes) -> None:
         from rclpy.serialization import deserialize_message
 
-        dialling = self._dialling[handle]
+        client_entity = self._client_entity[handle]
         try:
-            request = deserialize_message(raw, dialling.request)
+            request = deserialize_message(raw, client_entity.request)
         except (RuntimeError, ValueError) as error:
-            self._waiting.tell(Failed(handle, call, f"a request that cannot be read: {error}"))
+            self._waiting.tell(CallFailed(handle, call, f"a request that cannot be read: {error}"))
             return
-        is_there = any(end.role is Role.SERVES and end.name == dialling.name for end in self.graph())
-        failed = dialling.begin(call, request, is_there=is_there, now_s=time.monotonic())
+        is_there = any(end.role is Role.SERVES and end.name == client_entity.name for end in self.graph())
+        failed = client_entity.begin(call, request, is_there=is_there, now_s=time.monotonic())
         if failed is not None:
             self._waiting.tell(failed)
-        elif dialling.is_holding:
+        elif client_entity.is_holding:
             self._waiting.wake()
 
     def drop(self, handle: int, call: int) -> None:
-        self._dialling[handle].drop(call)
+        self._client_entity[handle].drop(call)
 
     def close(self, handle: int) -> None:
         self._waiting.remove(handle)
-        if hearing := self._hearing.pop(handle, None):
-            self._node.destroy_subscription(hearing.entity)
-            self._tell_apart(hearing.topic)
-        elif publishing := self._publishing.pop(handle, None):
-            self._node.destroy_publisher(publishing.entity)
+        if subscription_entity := self._subscription_entity.pop(handle, None):
+            self._node.destroy_subscription(subscription_entity.entity)
+            self._tell_apart(subscription_entity.topic)
+        elif publisher_entity := self._publisher_entity.pop(handle, None):
+            self._node.destroy_publisher(publisher_entity.entity)
         elif serving := self._serving.pop(handle, None):
             self._node.destroy_service(serving.entity)
-        elif dialling := self._dialling.pop(handle, None):
-            self._node.destroy_client(dialling.entity)
+        elif client_entity := self._client_entity.pop(handle, None):
+            self._node.destroy_client(client_entity.entity)
 
-    def shut(self) -> None:
+    def remove_entity(self) -> None:
         self._waiting.close()
         self._session.close()
 
@@ -229,15 +230,15 @@ class Ros2Endpoint:
 
     def _tell_apart(self, topic: str) -> None:
         """Have our publishers of a topic leave word with our subscriptions to it, so that these skip what they hear."""
-        publishing = [end for end in self._publishing.values() if end.topic == topic]
-        hearing = [end for end in self._hearing.values() if end.topic == topic]
-        for ear in hearing if publishing else ():
+        publisher_entity = [end for end in self._publisher_entity.values() if end.topic == topic]
+        subscription_entity = [end for end in self._subscription_entity.values() if end.topic == topic]
+        for ear in subscription_entity if publisher_entity else ():
             if ear.own is None:
-                ear.own = OwnMessages()
-                for raw in (raw for end in publishing for raw in end.kept):
+                ear.own = LoopbackFilter()
+                for raw in (raw for end in publisher_entity for raw in end.kept):
                     ear.own.add(raw, time.monotonic())
-        echoes = tuple(ear.own for ear in hearing if ear.own is not None)
-        for end in publishing:
+        echoes = tuple(ear.own for ear in subscription_entity if ear.own is not None)
+        for end in publisher_entity:
             end.echoes = echoes
 
 

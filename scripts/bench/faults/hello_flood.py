@@ -19,8 +19,8 @@ from typing import Final
 from peers.jsonl import say
 
 from gdp.errors import DROP_COUNTERS
-from gdp.ports.batch import make_batch
-from gdp.ports.sockets import hear_nothing, open_port
+from gdp.ports.mmsg import make_batch
+from gdp.ports.sockets import attach_drop_all_filter, open_port
 
 __all__: list[str] = []
 
@@ -41,7 +41,7 @@ def main() -> None:
     sources = [bytes.fromhex(told["source"])] if told["source"] else []
     sources = sources or [b"\x06" + os.urandom(5) for _ in range(_ADDRESSES)]
     sink, drops = open_port(told["iface"]), [0] * DROP_COUNTERS
-    hear_nothing(sink)
+    attach_drop_all_filter(sink)
     batch, at, sent = make_batch(2_000), 0, 0
     say(ready=True)
     begun_s = time.monotonic()

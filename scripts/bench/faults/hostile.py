@@ -23,8 +23,8 @@ from typing import Any, Final
 from peers.jsonl import say
 from priority_endpoint import End
 
-from gdp.client.feed import FeedState
-from gdp.control.frames import ControlSplitter
+from gdp.client.writer_proxy import WriterProxyState
+from gdp.control.fragments import ControlFragmenter
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.envelope import Sealer
@@ -32,14 +32,14 @@ from gdp.errors import DROP_COUNTERS
 from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import HOPS_MAX, NACKS_PER_REPORT
-from gdp.message.report import Missing, Report, ReportFlag
+from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
 from gdp.nodes.config import SwitchConfig
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.nodes.runtime import Runtime
-from gdp.ports.batch import make_batch
+from gdp.ports.mmsg import make_batch
 from gdp.ports.raw import RawPlane
-from gdp.ports.sockets import hear_nothing, open_port
-from gdp.switch.machine import Switch
+from gdp.ports.sockets import attach_drop_all_filter, open_port
+from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
 from gdp.trust.revocation import Revocation
 
@@ -62,18 +62,18 @@ class HostileSwitch:
         self._identity, policy = load_member(config.identity, config.domain, Role.SWITCH)
         settings = NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes)
         table = Table()
-        self._switch = Switch(self._identity, policy, table, settings)
-        self._splitter = ControlSplitter(self._identity.name, secrets.randbits(64))
+        self._switch = SwitchCore(self._identity, policy, table, settings)
+        self._fragmenter = ControlFragmenter(self._identity.name, secrets.randbits(64))
         self.plane = RawPlane([port.iface for port in config.ports], table)
         self.runtime = Runtime(self._switch, self.plane)
 
     def is_ready(self) -> bool:
         """Return whether it has a tree through the neighbour that it will flood."""
-        return any(tree.above is not None for tree in self._switch.planter.trees.all())
+        return any(tree.above is not None for tree in self._switch.multicast.trees.all())
 
     def neighbour(self) -> bytes:
         """Return the address of the switch that it will flood."""
-        port = self._switch.greeter.ports[next(iter(self.plane.ports))]
+        port = self._switch.hello_protocol.ports[next(iter(self.plane.ports))]
         return next(each.mac for each in port.neighbours.values())
 
     def names(self) -> _Frames:
@@ -86,11 +86,11 @@ class HostileSwitch:
 
     def joins(self) -> _Frames:
         """Yield joins of a tree that it is part of, each a new one that holds."""
-        planter = self._switch.planter
-        tree = next(each for each in planter.trees.all() if each.above is not None)
+        multicast = self._switch.multicast
+        tree = next(each for each in multicast.trees.all() if each.above is not None)
         while tree.above is not None and tree.above_name is not None:
-            planter._say(tree, tree.above, tree.above_name, _MTU, _LEASE_S, tree.evidence)
-            for transmit in self._switch.take():
+            multicast._say(tree, tree.above, tree.above_name, _MTU, _LEASE_S, tree.evidence)
+            for transmit in self._switch.frames_to_send():
                 yield from transmit.frames
 
     def revocations(self) -> _Frames:
@@ -98,7 +98,7 @@ class HostileSwitch:
         until = int(time.time()) + 3_600
         while True:
             wire = Revocation.make(self._identity.key, self._identity.subject, secrets.token_bytes(32), until)
-            yield from self._splitter.split(Kind.REVOKE, wire, _MTU)
+            yield from self._fragmenter.split(Kind.REVOKE, wire, _MTU)
 
 
 class HostileProxy:
@@ -113,20 +113,22 @@ class HostileProxy:
 
     def is_ready(self) -> bool:
         """Return whether it reads, and is read."""
-        feeds = self._end.member.feeds_of(self._topic)
-        return any(feed.state is FeedState.LIVE for feed in feeds) and self._publisher.readers > 0
+        writer_proxies = self._end.member.writer_proxies_of(self._topic)
+        return any(feed.state is WriterProxyState.LIVE for feed in writer_proxies) and self._publisher.readers > 0
 
     def neighbour(self) -> bytes:
         """Return the address of its switch."""
-        return self._end.member.attachment.greeter.all_up()[0].mac
+        return self._end.member.attachment.hello_protocol.all_up()[0].mac
 
     def reports(self) -> _Frames:
         """Yield reports of a reader that lacks everything, under the key that it has agreed with the publisher."""
-        feed = next(each for each in self._end.member.feeds_of(self._topic) if each.state is FeedState.LIVE)
+        feed = next(
+            each for each in self._end.member.writer_proxies_of(self._topic) if each.state is WriterProxyState.LIVE
+        )
         note = feed._sealer.sealer(feed._sealer.epoch)
         for number in count(1):
-            missing = tuple(Missing(number + each, 0, 1 << 17) for each in range(NACKS_PER_REPORT))
-            yield note.seal(Report(ReportFlag.NONE, number, 0, missing, number, 0).to_wire())
+            missing = tuple(MissingRange(number + each, 0, 1 << 17) for each in range(NACKS_PER_REPORT))
+            yield note.seal(AckNack(AckNackFlag.NONE, number, 0, missing, number, 0).to_wire())
 
     def parts(self) -> _Frames:
         """Yield the first part of one large message after the other."""
@@ -145,7 +147,7 @@ def _flood(node: HostileSwitch | HostileProxy, frames: list[bytes], rate: float,
     port = next(iter(node.plane.ports.values()))
     macs = node.neighbour() + port.mac
     sink, drops, batch = open_port(port.ifname), [0] * DROP_COUNTERS, make_batch(2_000)
-    hear_nothing(sink)
+    attach_drop_all_filter(sink)
     at = sent = 0
     begun_s = due_s = last_s = time.monotonic()
     while (now_s := time.monotonic()) < begun_s + seconds and not node.runtime.is_stopped:

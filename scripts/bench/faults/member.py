@@ -24,12 +24,12 @@ from peers.jsonl import say
 from priority_endpoint import End
 
 from faults.records import Kind, RecordWriter
-from gdp.client.member import Message
+from gdp.client.participant import Message
 from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
 from gdp.message.loss import LossReason
 from gdp.names import Name
-from gdp.nodes.allocator import settle_memory
+from gdp.nodes.memory_tuning import tune_memory
 from gdp.service.dispatch import Ask, Dispatch, Failure
 
 __all__: list[str] = []
@@ -102,7 +102,7 @@ class Caller:
 
     def next_s(self) -> float:
         """Return the monotonic second of what is due next."""
-        timer_s = self._dispatch.next_timeout()
+        timer_s = self._dispatch.get_timer()
         return self.due_s if timer_s is None else min(self.due_s, timer_s)
 
     def go_on(self, now_s: float) -> None:
@@ -112,7 +112,7 @@ class Caller:
             self._dispatch.gone(server, now_s, "gone")
         for server in peers:
             self._dispatch.came(server, now_s)
-        self._dispatch.timeout(now_s)
+        self._dispatch.handle_timer(now_s)
         if now_s >= self.due_s:
             self.due_s = max(self.due_s + self._every_s, now_s - _BEHIND_S)
             self._begin(now_s)
@@ -149,7 +149,7 @@ class Caller:
         self._note(Kind.FAILED, call)
 
     def _send(self, now_s: float) -> None:
-        for effect in self._dispatch.take():
+        for effect in self._dispatch.poll_effects():
             if not isinstance(effect, Ask):
                 continue  # servers answer at once: there is nothing to stop
             if effect.servers is None:
@@ -205,7 +205,7 @@ class Serving:
         body = message.delivered.message
         if body[: len(self._token)] == self._token:
             try:
-                self._station.member.answer(self._name, Name(message.delivered.publisher), body)
+                self._station.member.respond(self._name, Name(message.delivered.publisher), body)
             except LocalError as error:
                 print(f"not answered: {error}", file=sys.stderr, flush=True)
 
@@ -246,8 +246,8 @@ def main() -> None:
     for each in told["serve"]:
         name = station.serve(each["name"])
         takers[name] = Serving(station, name, tokens[each["channel"]])
-    callers = [Caller(station, each, tokens[each["channel"]], life, out) for each in told["call"]]
-    for each, caller in zip(told["call"], callers, strict=True):
+    remote_clients = [Caller(station, each, tokens[each["channel"]], life, out) for each in told["call"]]
+    for each, caller in zip(told["call"], remote_clients, strict=True):
         takers[station.name_of(each["name"])] = caller
     who = told["index"], life
     sources = [Source(station, each, tokens[each["channel"]], who, out) for each in told["publish"]]
@@ -272,24 +272,24 @@ def main() -> None:
             takers[station.subscribe(each["name"])] = Reading(each["channel"], token, out)
 
     signal.signal(signal.SIGUSR1, begin_spare)
-    settle_memory()
+    tune_memory()
     with station.runtime.signals():
         say(event="ready")
         while not station.runtime.is_stopped:
             now_s = time.monotonic()
             for source in sources:
                 source.go_on(now_s)
-            for each in (*callers, *churn):
+            for each in (*remote_clients, *churn):
                 each.go_on(now_s)
             for name, taker in takers.items():
                 if isinstance(taker, Reading):
                     taker.look(station, name, now_s)
             station.member.flush(now_s)
             out.flush()
-            due = [each.due_s for each in (*sources, *churn)] + [caller.next_s() for caller in callers]
+            due = [each.due_s for each in (*sources, *churn)] + [caller.next_s() for caller in remote_clients]
             station.runtime.step(min([*due, now_s + _LOOK_S]))
             now_s = time.monotonic()
-            for message in station.member.take_messages():
+            for message in station.member.poll_messages():
                 takers[message.topic].take(message, now_s)
         out.flush()
         station.leave()

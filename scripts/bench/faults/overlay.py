@@ -36,7 +36,7 @@ from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, ROOT_CERTIFICATE, load_domain, load_identity
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
-from ring.materials import Materials
+from ring.materials import OverlayCredentials
 
 __all__ = ["Overlay"]
 
@@ -86,7 +86,7 @@ class Overlay:
         self._frozen: set[str] = set()
         self._records: dict[tuple[str, int], RecordReader] = {}
         self.spaces = Namespaces(plan.topology, run)
-        self._materials = Materials(plan.topology, run.directory, metrics=False)
+        self._materials = OverlayCredentials(plan.topology, run.directory, metrics=False)
         self._clocks: dict[str, Clock] = {}
         if has_clocks:
             (run.directory / "clocks").mkdir()

@@ -1,6 +1,6 @@
 """The one measurement: a message goes from A to B, a small answer comes back, the next one goes.
 
-Place: of A's and B's processes; reads clocks, the way there is the contender's (``Way``).
+Place: of A's and B's processes; reads clocks, the way there is the contender's (``Path``).
 
 The message is a ``sensor_msgs/msg/Image`` in CDR of exactly so many bytes, its last eight a number. The answer has 16
 bytes: the number, how many bytes came, and, where the number asks for it, their CRC (once for every size).

@@ -19,14 +19,14 @@ from pathlib import Path
 from typing import Final, Protocol, get_args
 
 import gdp
-from gdp.client.member import Member, Topic
+from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError
-from gdp.nodes.allocator import settle_memory
 from gdp.nodes.config import RibConfig
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
+from gdp.nodes.memory_tuning import tune_memory
 from gdp.nodes.runtime import Runtime
 from gdp.ports.raw import RawPlane
 from gdp.stores.keyring import load_delegations
@@ -34,7 +34,7 @@ from peers.exchange import IMAGE, PATIENCE_S, answer_to, exchange
 from peers.jsonl import EndSettings, say
 from proxy.serial.channel import Channel
 from proxy.serial.serializer import Encoding, Serializer
-from proxy.serial.standard import standard_definition
+from proxy.serial.standard_types import standard_definition
 
 __all__ = ["PONG", "main", "ping_topic"]
 
@@ -70,7 +70,7 @@ class LibraryEndpoint:
     """A session of the library."""
 
     def __init__(self, config: Path, spin_s: float) -> None:
-        self.session = gdp.open(config, spin_us=round(spin_s * 1e6), timeout_s=PATIENCE_S)
+        self.session = gdp.open(config, busy_poll_us=round(spin_s * 1e6), timeout_s=PATIENCE_S)
         self._publishers: dict[str, gdp.Publisher] = {}
         self._subscriptions: dict[str, gdp.Subscription] = {}
 
@@ -110,7 +110,7 @@ class InternalEndpoint:
     def __init__(self, config: Path, spin_s: float) -> None:
         settings = RibConfig.load(config)  # identity, domain and iface are all that an end needs
         identity, policy = load_member(settings.identity, settings.domain, Role.PROXY)
-        self._member = Member(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes))
+        self._member = Participant(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes))
         self._runtime = Runtime(self._member, RawPlane([settings.iface]), spin_s=spin_s)
         self._publishers: dict[str, Publisher] = {}
         self._topics: dict[str, Topic] = {}
@@ -149,7 +149,7 @@ class InternalEndpoint:
             if time.monotonic() >= deadline_s:
                 return None
             self._runtime.step(deadline_s)
-            for each in self._member.take_messages():
+            for each in self._member.poll_messages():
                 self._arrived.append((self._labels[each.topic], each.delivered.message))
         return self._arrived.popleft()
 
@@ -186,7 +186,7 @@ def _serializer(encoding: Encoding) -> Serializer:
 def _ping(end: Endpoint, encodings: list[Encoding], settings: EndSettings) -> None:
     senders = {encoding: end.advertise(ping_topic(encoding)) for encoding in encodings}
     end.subscribe(PONG)
-    settle_memory()
+    tune_memory()
     end.wait_for_readers(time.monotonic() + PATIENCE_S)
     pids = {"sender": [os.getpid()], **settings.pids}
     for encoding, send in senders.items():
@@ -199,7 +199,7 @@ def _pong(end: Endpoint, encodings: list[Encoding]) -> None:
     serializers = {ping_topic(encoding): _serializer(encoding) for encoding in encodings}
     for topic in serializers:
         end.subscribe(topic)
-    settle_memory()
+    tune_memory()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # the bench ends it so; there is nothing to give back
     say(event="ready")
     while True:

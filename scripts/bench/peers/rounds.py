@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from report import Rounds, percentile, progress
 
-from gdp.host.run_registry import Runs
+from gdp.host.run_registry import RunRegistry
 from peers.baseline import Baseline, Measured
 from peers.chain import Chain
 from peers.exchange import Load
@@ -63,7 +63,7 @@ class Turns:
         self._seen: set[str] = set()
         self._absent: set[str] = set()
 
-    def run(self, runs: Runs) -> None:
+    def run(self, runs: RunRegistry) -> None:
         """Lay a row for each MTU, run all rounds, take the rows down."""
         with ExitStack() as stack:
             chains = []

@@ -17,7 +17,7 @@ from fog.cli.views import stage
 from fog.cluster import ClusterPlan
 from fog.site import open_site
 from fog.supervisor.journal import LAST_WORDS, Journal
-from fog.supervisor.record import Ending
+from fog.supervisor.record import Outcome
 from tests.fog.supervisor.machines import record, serving
 from tests.fog.supervisor.test_journal import PLAN
 from tests.pages import ROOT
@@ -73,7 +73,7 @@ def test_the_machine_that_is_the_gateway_is_told(fog: Run, journal: Journal) -> 
     journal.want(PLAN, time.time())
     for each in (replace(serving("m1"), gateway="edge"), serving("m2")):
         journal.put(each, time.time())
-    gone = replace(serving("m3"), gateway="edge").ended(Ending.TAKEN, "killed", time.time())
+    gone = replace(serving("m3"), gateway="edge").ended(Outcome.TAKEN, "killed", time.time())
     journal.put(gone, time.time())
     told = json.loads(fog("status", "--all", "--json").output)
     assert [each["gateway"] for each in told["members"]] == ["edge", None, None]
@@ -148,7 +148,7 @@ def test_a_launch_file_that_is_not_there_is_told(fog: Run) -> None:
 
 def test_the_last_words_of_a_machine_that_is_gone_are_shown(fog: Run, journal: Journal) -> None:
     up(journal)
-    gone = serving("m3").ended(Ending.TAKEN, "killed", time.time())
+    gone = serving("m3").ended(Outcome.TAKEN, "killed", time.time())
     journal.put(gone, time.time(), "taken", "killed", time.time() - 0.25)
     journal.tell(time.time(), "c", "m3", LAST_WORDS, "node", lines="one\nout of memory")
     said = fog("logs", "m3", "node", "-n", "1").output.splitlines()

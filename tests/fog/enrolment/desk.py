@@ -10,8 +10,8 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from fog.cluster import Carried, CloudNode, ClusterPlan, Wanted
-from fog.enrolment.boots import machine_boot, machine_seats
+from fog.cluster import CloudNode, ClusterPlan, ExportedInterface, MachineRequest
+from fog.enrolment.bootstrap import machine_boot, machine_seats
 from fog.enrolment.listener import Listener, bind_unix
 from fog.enrolment.members import Authority
 from fog.enrolment.responder import Responder
@@ -19,24 +19,26 @@ from fog.enrolment.tickets import Tickets
 from fog.hardware import Hardware
 from fog.host.bundle import install
 from fog.host.enrolment import enrol
-from fog.machine import Boot
+from fog.machine import MachineBundle
 from gdp.crypto.identity import NodeKeys
 from gdp.stores.issue import make_domain, make_owner
 from gdp.trust.enrolment import (
     ANSWER_HEAD_BYTES,
     ANSWER_SECRET_BYTES,
     TOKEN_BYTES,
-    Answer,
     Application,
+    EnrolmentResponse,
     Ticket,
     apply,
     open_answer,
     seal_request,
 )
 
-PLAN = Carried("service", "/plan", "nav_msgs/srv/GetPlan", {"timeout_s": 9.0}, {"encoding": "cbor"})
-MAP = Carried("topic", "/map", "nav_msgs/msg/OccupancyGrid")
-CLUSTER = ClusterPlan("c", (CloudNode("p", "e", environment={"X": "1"}),), (Wanted(Hardware(cpus=1)),), (PLAN, MAP))
+PLAN = ExportedInterface("service", "/plan", "nav_msgs/srv/GetPlan", {"timeout_s": 9.0}, {"encoding": "cbor"})
+MAP = ExportedInterface("topic", "/map", "nav_msgs/msg/OccupancyGrid")
+CLUSTER = ClusterPlan(
+    "c", (CloudNode("p", "e", environment={"X": "1"}),), (MachineRequest(Hardware(cpus=1)),), (PLAN, MAP)
+)
 DAY_S = 86_400.0
 
 
@@ -66,7 +68,7 @@ class Desk:
             until_unix_s=now_s + DAY_S,
         )
 
-    def boot(self, name: str = "m7", ticket: Ticket | None = None, *, shares_host: bool = True) -> Boot:
+    def boot(self, name: str = "m7", ticket: Ticket | None = None, *, shares_host: bool = True) -> MachineBundle:
         return machine_boot(
             self.authority,
             CLUSTER,
@@ -106,7 +108,7 @@ class Machine:
     def request(self, applications: Sequence[Application] | None = None) -> bytes:
         return seal_request(self.ticket, applications or self.applications(), self.secret)
 
-    def opened(self, request: bytes, answer: bytes) -> Answer:
+    def opened(self, request: bytes, answer: bytes) -> EnrolmentResponse:
         return open_answer(self.ticket.token, request, self.secret, answer[ANSWER_HEAD_BYTES:])
 
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from fog.cluster import Carried
-from fog.enrolment.boots import gateway_boot
+from fog.cluster import ExportedInterface
+from fog.enrolment.bootstrap import gateway_boot
 from fog.enrolment.listener import bind_tcp
 from fog.enrolment.members import Authority, metadata_of
-from fog.enrolment.revoking import take_back
-from fog.enrolment.robot_side import forget_rules, introduce, reload_proxy
+from fog.enrolment.revoking import revoke_credentials
+from fog.enrolment.robot_config import add_rules, reload_proxy, remove_rules
 from fog.host.bundle import install
 from fog.host.enrolment import enrol
 from fog.site import open_site
@@ -26,8 +26,8 @@ from gdp.nodes.membership import load_member
 from gdp.stores.keyring import load_identity, load_owner
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
-from proxy.config import ProxyConfig
-from proxy.drop_ins import drop_in_directory
+from proxy.config.config import ProxyConfig
+from proxy.config.drop_ins import drop_in_directory
 from tests.fog.enrolment.desk import CLUSTER, MAP, PLAN, Desk, made_desk
 
 
@@ -150,16 +150,16 @@ def test_the_robot_gets_a_rule_a_name_and_none_is_left_when_the_cluster_is_gone(
     with path.open("a") as file:
         file.write(own)
     first = path.read_text()
-    introduce(path, site.authority, "c", CLUSTER.carried, days=1.0)
+    add_rules(path, site.authority, "c", CLUSTER.carried, days=1.0)
     config = ProxyConfig.load(path)
     assert {"/plan", "/map"} <= {rule.name for rule in config.imports}
     assert next(rule for rule in config.imports if rule.name == "/plan").timeout_s == 9.0
     held = DelegationStore(config.delegations, load_identity(config.identity, time.time()))
     assert sorted(right.value for topic in held for right in topic.delegation.rights) == ["call", "read"]
     assert path.read_text() == first
-    assert forget_rules(path, "c")
+    assert remove_rules(path, "c")
     assert {rule.name for rule in ProxyConfig.load(path).imports} == ({"/own"} if own == OWN else set())
-    assert not forget_rules(path, "c")
+    assert not remove_rules(path, "c")
 
 
 def test_a_rule_that_the_robot_has_already_is_enough(tmp_path: Path) -> None:
@@ -167,15 +167,15 @@ def test_a_rule_that_the_robot_has_already_is_enough(tmp_path: Path) -> None:
     path = site.robots[0]
     with path.open("a") as file:
         file.write('import:\n- {name: "/**", kind: service, owner: ../owner/owner.pub}\n')
-    introduce(path, site.authority, "c", [PLAN], days=1.0)
+    add_rules(path, site.authority, "c", [PLAN], days=1.0)
     assert not drop_in_directory(path).exists()
 
 
 def test_further_names_of_a_cluster_are_added_to_its_file(tmp_path: Path) -> None:
     site = open_site(None, tmp_path / "state")
     path = site.robots[0]
-    introduce(path, site.authority, "c", [PLAN], days=1.0)
-    introduce(path, site.authority, "c", [PLAN, MAP], days=1.0)
+    add_rules(path, site.authority, "c", [PLAN], days=1.0)
+    add_rules(path, site.authority, "c", [PLAN, MAP], days=1.0)
     assert [rule.name for rule in ProxyConfig.load(path).imports] == [PLAN.name, MAP.name]
     assert [file.name for file in drop_in_directory(path).iterdir()] == ["fog-c.yaml"]
 
@@ -188,7 +188,7 @@ def test_a_rule_that_conflicts_with_the_robots_is_refused_and_leaves_no_file(tmp
             f"expose:\n- {{name: {PLAN.name}, kind: service, type: {PLAN.type_name}, owner: ../owner/owner.pub}}\n"
         )
     with pytest.raises(ConfigError, match=r"proxy\.yaml\.d/fog-c\.yaml:3:.*import\[0\]"):
-        introduce(path, site.authority, "c", [PLAN], days=1.0)
+        add_rules(path, site.authority, "c", [PLAN], days=1.0)
     assert not list(drop_in_directory(path).iterdir())
 
 
@@ -198,11 +198,11 @@ def test_what_is_gone_is_revoked_once_and_forgotten_when_it_would_have_run_out(
     folder, now_s = tmp_path / "revocations", time.time()
     folder.mkdir()
     first, second = "ab" * 32, "cd" * 32
-    assert take_back(authority.domain, folder, [first], until_unix_s=now_s + 60, unix_s=now_s)
-    assert not take_back(authority.domain, folder, [first], until_unix_s=now_s + 60, unix_s=now_s)
+    assert revoke_credentials(authority.domain, folder, [first], until_unix_s=now_s + 60, unix_s=now_s)
+    assert not revoke_credentials(authority.domain, folder, [first], until_unix_s=now_s + 60, unix_s=now_s)
     (path,) = folder.iterdir()
     assert Revocation.from_statement(parse(path.read_bytes())).fingerprint == bytes.fromhex(first)
-    assert take_back(authority.domain, folder, [second], until_unix_s=now_s + 90_000, unix_s=now_s + 80_000)
+    assert revoke_credentials(authority.domain, folder, [second], until_unix_s=now_s + 90_000, unix_s=now_s + 80_000)
     assert [path.name for path in folder.iterdir()] == [f"{second[:32]}.revoke"]
 
 
@@ -246,9 +246,9 @@ def test_two_launches_change_the_robots_file_one_after_the_other(tmp_path: Path)
     names = [f"c{number}" for number in range(4)]
     with ThreadPoolExecutor() as pool:
         for number, name in enumerate(names):
-            service = Carried("service", f"/plan{number}", "nav_msgs/srv/GetPlan")
-            pool.submit(introduce, path, site.authority, name, [service], days=1.0)
+            service = ExportedInterface("service", f"/plan{number}", "nav_msgs/srv/GetPlan")
+            pool.submit(add_rules, path, site.authority, name, [service], days=1.0)
     assert {rule.name for rule in ProxyConfig.load(path).imports} == {f"/plan{number}" for number in range(4)}
     with ThreadPoolExecutor() as pool:
-        assert all(pool.map(lambda name: forget_rules(path, name), names))
+        assert all(pool.map(lambda name: remove_rules(path, name), names))
     assert not ProxyConfig.load(path).imports

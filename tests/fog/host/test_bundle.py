@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from fog.host.bundle import install, pack, unpack
-from fog.machine import Boot, Program
+from fog.machine import MachineBundle, Program
 from gdp.errors import LocalError
 
-BOOT = Boot(
+BOOT = MachineBundle(
     {"switch/identity.key": b"secret", "proxy.yaml": b"iface: proxy0"},
     (
         Program("switch", ("{python}", "-m", "gdp.cli.switch"), " is up"),
@@ -33,13 +33,13 @@ def test_an_installed_boot_is_for_its_owner_alone(tmp_path: Path) -> None:
 @pytest.mark.parametrize("path", ["/etc/passwd", "../outside", "a/../../b", "boot.json", ""])
 def test_a_file_outside_of_the_folder_is_refused(path: str) -> None:
     with pytest.raises(LocalError, match="no place"):
-        pack(Boot({path: b""}, ()))
+        pack(MachineBundle({path: b""}, ()))
 
 
 @pytest.mark.parametrize("names", [("a", "a"), ("a/b",), ("",)])
 def test_programs_without_a_usable_name_of_their_own_are_refused(names: tuple[str, ...]) -> None:
     with pytest.raises(LocalError, match="different names"):
-        pack(Boot({}, tuple(Program(name, ("true",)) for name in names)))
+        pack(MachineBundle({}, tuple(Program(name, ("true",)) for name in names)))
 
 
 @pytest.mark.parametrize("content", [b"", b"[]", b'{"programs": [{"name": 1}]}', b'{"programs": 3}', b"\xff"])

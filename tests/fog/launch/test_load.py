@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from fog.cluster import Carried, CloudNode, Wanted
+from fog.cluster import CloudNode, ExportedInterface, MachineRequest
 from fog.hardware import Hardware
 from fog.launch.load import key_values, load
 from fog.launch.robot_node import RobotNode
@@ -64,10 +64,10 @@ def test_the_first_listing_of_the_paper_runs(tmp_path: Path) -> None:
     assert asked == [(detector,)] or asked == [[detector]]
     assert loaded.plan.nodes == (detector,)
     assert loaded.plan.machines == (
-        Wanted(Hardware(cpus=16), "us-west-1"),
-        Wanted(Hardware(gpu="T4", gpus=1), "us-east-1", is_spot=True),
+        MachineRequest(Hardware(cpus=16), "us-west-1"),
+        MachineRequest(Hardware(gpu="T4", gpus=1), "us-east-1", is_spot=True),
     )
-    assert loaded.plan.carried == (Carried("service", "/detect", "std_srvs/srv/SetBool"),)
+    assert loaded.plan.carried == (ExportedInterface("service", "/detect", "std_srvs/srv/SetBool"),)
     assert loaded.robot_nodes == (RobotNode(CloudNode("robot", "robot_client"), "log"),)
 
 

@@ -1,6 +1,6 @@
 import pytest
 
-from fog.cluster import Wanted
+from fog.cluster import MachineRequest
 from fog.hardware import Hardware
 from fog.launch.machines import CloudMachine, SpotMachine, filled
 from gdp.errors import LocalError
@@ -9,8 +9,8 @@ from gdp.errors import LocalError
 def test_the_listed_machines_are_the_replicas() -> None:
     machines, notes = filled([CloudMachine("us-west-1", "cpu:16"), SpotMachine("us-east-1", "T4")], None)
     assert machines == (
-        Wanted(Hardware(cpus=16), "us-west-1", is_spot=False),
-        Wanted(Hardware(gpu="T4", gpus=1), "us-east-1", is_spot=True),
+        MachineRequest(Hardware(cpus=16), "us-west-1", is_spot=False),
+        MachineRequest(Hardware(gpu="T4", gpus=1), "us-east-1", is_spot=True),
     )
     assert notes == ()
 

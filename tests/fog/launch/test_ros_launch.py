@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from fog.cluster import CloudNode, ClusterPlan, Wanted
+from fog.cluster import CloudNode, ClusterPlan, MachineRequest
 from fog.hardware import Hardware
+from fog.launch.lazy_names import has_ros_launch
 from fog.launch.load import load
 from fog.launch.robot_node import RobotNode
-from fog.launch.words import has_ros_launch
 from gdp.errors import LocalError
 from tests.fog.launch.test_load import LISTING, WITH_ARGUMENTS, written
 
@@ -200,7 +200,7 @@ def test_the_first_listing_means_the_same_with_ros_2_installed(tmp_path: Path) -
     assert has_ros_launch()
     loaded = load(written(tmp_path, LISTING), {})
     assert loaded.plan.nodes == (CloudNode("detection", "detector"),)
-    assert loaded.plan.machines[1] == Wanted(Hardware(gpu="T4", gpus=1), "us-east-1", is_spot=True)
+    assert loaded.plan.machines[1] == MachineRequest(Hardware(gpu="T4", gpus=1), "us-east-1", is_spot=True)
     assert loaded.robot_nodes == (RobotNode(CloudNode("robot", "robot_client"), "log"),)
 
 

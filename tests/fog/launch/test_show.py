@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from fog.cli import launch
-from fog.cli.launch import Priced, loaded_from, priced, show_plan
+from fog.cli import launch_view
+from fog.cli.launch_view import Priced, loaded_from, priced, show_plan
 from fog.hardware import Hardware
 from fog.latency.known import Latency
 from fog.launch.load import Loaded
@@ -31,15 +31,15 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_dry_run_starts_nothing_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(launch, "offered", pytest.fail)
+    monkeypatch.setattr(launch_view, "offered", pytest.fail)
     loaded = loaded_from(written(tmp_path, LISTING), [], dry_run=True)
     assert priced(of(loaded, OFFER, OFFER))["carried"] is None
 
 
 def test_a_dry_run_shows_what_was_found_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = (("service", "/detect", "std_srvs/srv/SetBool"),)
-    monkeypatch.setattr(launch, "kept", lambda _: found)
-    monkeypatch.setattr(launch, "offered", lambda _: found)
+    monkeypatch.setattr(launch_view, "kept", lambda _: found)
+    monkeypatch.setattr(launch_view, "offered", lambda _: found)
     loaded = loaded_from(written(tmp_path, LISTING), [], dry_run=True)
     assert priced(of(loaded, OFFER, OFFER))["carried"] == [
         {"kind": "service", "name": "/detect", "type": "std_srvs/srv/SetBool"}

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from fog.cluster import Wanted
+from fog.cluster import MachineRequest
 from fog.hardware import Hardware
 from fog.offer import Offer
 from fog.plan.choice import BY_PRICE, Weights, choose
@@ -16,11 +16,11 @@ def offer(region: str, usd: float, cpus: int = 4, gpu: str = "", *, spot: bool =
     )
 
 
-def regions(offers: list[Offer], wanted: list[Wanted], **more: object) -> list[str]:
+def regions(offers: list[Offer], wanted: list[MachineRequest], **more: object) -> list[str]:
     return [choice.offer.region for choice in choose(offers, wanted, **more)]  # type: ignore[arg-type]
 
 
-FOUR = Wanted(Hardware(4), is_spot=True)
+FOUR = MachineRequest(Hardware(4), is_spot=True)
 LIST = [offer("east", 0.10), offer("west", 0.12), offer("far", 0.05), offer("far", 0.04, cpus=2)]
 
 
@@ -44,7 +44,7 @@ def test_a_region_that_nobody_measured_counts_as_the_slowest() -> None:
 
 
 def test_a_region_that_is_asked_for_is_taken_and_the_others_keep_away_from_it() -> None:
-    assert regions(LIST, [FOUR, Wanted(Hardware(4), "far", True)]) == ["east", "far"]
+    assert regions(LIST, [FOUR, MachineRequest(Hardware(4), "far", True)]) == ["east", "far"]
 
 
 def test_regions_in_use_and_regions_to_avoid_come_last() -> None:
@@ -62,20 +62,20 @@ def test_a_choice_says_why() -> None:
 @pytest.mark.parametrize(
     ("wanted", "said"),
     [
-        (Wanted(Hardware(8), is_spot=True), "the nearest is type4 in far"),
-        (Wanted(Hardware(4, gpu="T4", gpus=1), is_spot=True), "the nearest"),
-        (Wanted(Hardware(4)), "nothing at all"),
-        (Wanted(Hardware(4), "mars", True), "there is in east, far, west"),
+        (MachineRequest(Hardware(8), is_spot=True), "the nearest is type4 in far"),
+        (MachineRequest(Hardware(4, gpu="T4", gpus=1), is_spot=True), "the nearest"),
+        (MachineRequest(Hardware(4)), "nothing at all"),
+        (MachineRequest(Hardware(4), "mars", True), "there is in east, far, west"),
     ],
 )
-def test_where_nothing_fits_the_nearest_is_named(wanted: Wanted, said: str) -> None:
+def test_where_nothing_fits_the_nearest_is_named(wanted: MachineRequest, said: str) -> None:
     with pytest.raises(LocalError, match=said):
         choose(LIST, [wanted])
 
 
 def test_another_gpu_is_nearer_than_none() -> None:
     with pytest.raises(LocalError, match="type4T4"):
-        choose([*LIST, offer("east", 0.5, gpu="T4")], [Wanted(Hardware(4, gpu="A100", gpus=1), is_spot=True)])
+        choose([*LIST, offer("east", 0.5, gpu="T4")], [MachineRequest(Hardware(4, gpu="A100", gpus=1), is_spot=True)])
 
 
 def test_two_spot_machines_are_compared_with_one_on_demand() -> None:

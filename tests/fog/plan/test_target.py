@@ -6,13 +6,13 @@ import pytest
 
 from fog.catalog.local import local_offers
 from fog.catalog.measured import measured
-from fog.cluster import Wanted
+from fog.cluster import MachineRequest
 from fog.hardware import Hardware
 from fog.plan.target import machines_for
 from gdp.errors import LocalError
 
-SPOT = Wanted(Hardware(cpus=1), is_spot=True)
-STEADY = Wanted(Hardware(cpus=1))
+SPOT = MachineRequest(Hardware(cpus=1), is_spot=True)
+STEADY = MachineRequest(Hardware(cpus=1))
 OFFERS = tuple(local_offers())
 
 
@@ -26,7 +26,7 @@ OFFERS = tuple(local_offers())
         (0.9999, [STEADY, SPOT], 3),
     ],
 )
-def test_as_many_machines_as_the_target_takes(availability: float, listed: list[Wanted], count: int) -> None:
+def test_as_many_machines_as_the_target_takes(availability: float, listed: list[MachineRequest], count: int) -> None:
     target = machines_for(availability, listed, OFFERS, measured())
     assert len(target.machines) == count
     assert target.p_system <= 1 - availability

@@ -16,7 +16,7 @@ import sky
 from sky import check, core, execution
 
 from fog.hardware import Hardware
-from fog.machine import Boot, MachineSpec, Program
+from fog.machine import MachineBundle, MachineSpec, Program
 from fog.providers.skypilot.config import SkyPilotConfig
 from fog.providers.skypilot.provider import SkyPilotProvider
 from gdp.errors import GdpError
@@ -56,7 +56,7 @@ def main() -> None:
     provider = SkyPilotProvider(SkyPilotConfig(), Unserved())  # type: ignore[arg-type]
     offers = provider.offers(Hardware.from_text("cpu:16"), spot=True)
     spec = MachineSpec("a-demo", "m1", offers[0])
-    boot = Boot({"own.key": b"\x00"}, (Program("switch", ("gdp-switch",)),))
+    boot = MachineBundle({"own.key": b"\x00"}, (Program("switch", ("gdp-switch",)),))
 
     def dry_run(**changes: str) -> str:
         return outcome(lambda: provider.dry_run(replace(spec, offer=replace(spec.offer, **changes)), boot))

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from fog.hardware import Hardware
-from fog.machine import Boot, MachineSpec, MachineState, Program
+from fog.machine import MachineBundle, MachineSpec, MachineState, Program
 from fog.offer import Offer
 from fog.providers.aws.config import AwsConfig, Ssh
 from fog.providers.aws.provider import AwsProvider
@@ -24,7 +24,7 @@ moto_server = pytest.importorskip("moto.server", reason="moto[ec2,server] of the
 EAST, WEST = "us-east-1", "us-west-1"
 UBUNTU = "099720109477"  # moto's account has none of Debian's
 OFFER = Offer("aws", EAST, "c5.xlarge", Hardware(4, 8.0), is_spot=False, usd_per_hour=0.17)
-BOOT = Boot({"keys/own.key": b"\x00\xff", "proxy.yaml": b"rules: []\n"}, (Program("switch", ("gdp-switch",)),))
+BOOT = MachineBundle({"keys/own.key": b"\x00\xff", "proxy.yaml": b"rules: []\n"}, (Program("switch", ("gdp-switch",)),))
 
 
 @dataclass(frozen=True)

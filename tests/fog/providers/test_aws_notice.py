@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from fog.host.bundle import install
-from fog.host.notice import read_notice
-from fog.machine import Boot
+from fog.host.preemption_notice import read_notice
+from fog.machine import MachineBundle
 from fog.providers.aws.notice import DRAIN_BEFORE_S, Metadata, Watch
 from fog.providers.aws.provider import WATCHER
 
@@ -161,7 +161,7 @@ def test_a_machine_ends_well_when_its_owner_drains_it(service: Service, tmp_path
     service.told[DRAIN] = "1"
     home = tmp_path / "machine"
     watcher = replace(WATCHER, argv=(*WATCHER.argv, "--url", service.url, "--poll-s", "0.01"))
-    install(home, Boot({}, (watcher,)))
+    install(home, MachineBundle({}, (watcher,)))
     command = [sys.executable, "-m", "fog.host.cli", "--home", str(home), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
     assert json.loads(done.stdout)["reason"] == "drained"

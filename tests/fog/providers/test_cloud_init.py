@@ -17,7 +17,7 @@ import yaml
 from pydantic import ValidationError
 
 from fog.host.bundle import pack
-from fog.machine import Boot, Program
+from fog.machine import MachineBundle, Program
 from fog.providers.cloud_init import (
     USER_DATA_MAX_BYTES,
     Setup,
@@ -31,7 +31,7 @@ from gdp.errors import LocalError
 
 SCHEMA = Path(sys.prefix) / "share/cloud-init/schema.json"
 FILES = pack(
-    Boot(
+    MachineBundle(
         {"keys/own.key": bytes(range(256)), "proxy.yaml": "rules: []  # käse\n".encode(), "a.txt": b"x: 'y'\n\ttab\n"},
         (Program("switch", ("gdp-switch", "--config", "{home}/switch.yaml"), ready="is up"),),
     )

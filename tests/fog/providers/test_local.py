@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 
 from fog.hardware import Hardware
-from fog.host.notice import write_notice
+from fog.host.preemption_notice import write_notice
 from fog.host.status import Status
-from fog.machine import Boot, MachineSpec, MachineState
+from fog.machine import MachineBundle, MachineSpec, MachineState
 from fog.offer import Offer
-from fog.providers.local import trouble
+from fog.providers.local import fault_injection
 from fog.providers.local.delay import DelayLine
 from fog.providers.local.machine_file import MachineFile
+from fog.providers.local.machine_handle import find, list_machines
 from fog.providers.local.provider import LocalProvider
-from fog.providers.local.standing import find, standing
 from fog.topology import Gateway
 from gdp.errors import LocalError
 from gdp.host.processes import Process
@@ -32,7 +32,9 @@ _MS = 1_000_000
 @pytest.fixture
 def provider(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> LocalProvider:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    return LocalProvider(tmp_path / "local", lambda _, __: Boot({}, ()), Gateway(gateway="a", regions=("moon-1",)))
+    return LocalProvider(
+        tmp_path / "local", lambda _, __: MachineBundle({}, ()), Gateway(gateway="a", regions=("moon-1",))
+    )
 
 
 def machine(provider: LocalProvider, process: Process | None = None) -> Run:
@@ -118,14 +120,14 @@ def test_a_machine_is_found_by_its_name_where_only_one_has_it(provider: LocalPro
 def test_nothing_befalls_a_machine_that_does_not_run(provider: LocalProvider) -> None:
     run = machine(provider)
     with pytest.raises(LocalError, match="does not run"):
-        trouble.notice(provider.runs, run.id, 1.0)
+        fault_injection.notice(provider.runs, run.id, 1.0)
 
 
 def test_what_is_gone_already_may_be_given_back(provider: LocalProvider) -> None:
     provider.terminate(["123456"])
     run = machine(provider)
     provider.terminate([run.id, run.id])
-    assert standing(provider.runs) == []
+    assert list_machines(provider.runs) == []
 
 
 def test_every_region_is_pretended_the_cheapest_first(provider: LocalProvider) -> None:
@@ -138,7 +140,7 @@ def test_every_region_is_pretended_the_cheapest_first(provider: LocalProvider) -
 @pytest.mark.parametrize("name", ["", "a/b", "../a", "-a"])
 def test_a_machine_needs_a_name_that_a_file_can_have(provider: LocalProvider, name: str) -> None:
     with pytest.raises(LocalError, match="a name has letters"):
-        provider.create(MachineSpec("c", name, SPEC.offer), Boot({}, ()))
+        provider.create(MachineSpec("c", name, SPEC.offer), MachineBundle({}, ()))
 
 
 def test_only_the_logs_of_programs_are_shown(provider: LocalProvider) -> None:
@@ -153,9 +155,9 @@ def test_a_frame_is_due_after_the_delay_at_the_other_side() -> None:
     line.put(10 * _MS, 0, b"a")
     line.put(12 * _MS, 1, b"b")
     assert line.pause_s(11 * _MS) == pytest.approx(0.004)
-    assert line.take(15 * _MS - 1) == []
-    assert line.take(15 * _MS) == [(1, b"a")]
-    assert line.take(99 * _MS) == [(0, b"b")]
+    assert line.poll_frames(15 * _MS - 1) == []
+    assert line.poll_frames(15 * _MS) == [(1, b"a")]
+    assert line.poll_frames(99 * _MS) == [(0, b"b")]
     assert line.pause_s(99 * _MS) is None
 
 
@@ -164,6 +166,6 @@ def test_what_a_delay_has_no_room_for_is_dropped_and_counted() -> None:
     line.put(0, 0, b"aa")
     line.put(0, 0, b"bb")
     assert line.dropped == 1
-    line.take(_MS)
+    line.poll_frames(_MS)
     line.put(0, 0, b"bbb")
     assert line.dropped == 1

@@ -18,7 +18,7 @@ from types import SimpleNamespace
 import pytest
 
 from fog.hardware import Hardware
-from fog.machine import Boot, MachineSpec, MachineState, Program
+from fog.machine import MachineBundle, MachineSpec, MachineState, Program
 from fog.offer import Offer
 from fog.providers.skypilot.config import SkyPilotConfig
 from fog.providers.skypilot.provider import SkyPilotProvider
@@ -28,7 +28,7 @@ from gdp.errors import LocalError, StoreError
 EAST = "aws/us-east-1"
 OFFER = Offer("skypilot", EAST, "g4dn.xlarge", Hardware(4, 16.0, "T4", 1), is_spot=True, usd_per_hour=0.16)
 SPEC = MachineSpec("a-demo", "m1", OFFER)
-BOOT = Boot({"keys/own.key": b"\x00\xff"}, (Program("switch", ("gdp-switch",)),))
+BOOT = MachineBundle({"keys/own.key": b"\x00\xff"}, (Program("switch", ("gdp-switch",)),))
 
 
 class State(enum.Enum):

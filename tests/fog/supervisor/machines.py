@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from fog.cluster import Wanted
-from fog.enrolment.papers import Papers
+from fog.cluster import MachineRequest
+from fog.enrolment.credentials import IssuedCredentials
 from fog.hardware import Hardware
 from fog.machine import Machine, MachineSpec, MachineState
 from fog.offer import Offer
-from fog.supervisor.decide import Drain, Launch, Patience, Release, decide
-from fog.supervisor.place import place
+from fog.supervisor.placement import place
+from fog.supervisor.reconcile import Drain, Launch, Release, Timeouts, decide
 from fog.supervisor.record import Record, learn
 
 NOW_S = 1_000_000.0
-SPOT = Wanted(Hardware(cpus=2), is_spot=True)
+SPOT = MachineRequest(Hardware(cpus=2), is_spot=True)
 REGIONS = ("east", "west", "south")
 
 
@@ -26,10 +26,14 @@ def offer(region: str = "east", *, is_spot: bool = True, usd: float = 0.1) -> Of
 OFFERS = [offer(region) for region in REGIONS]
 
 
-def record(name: str, region: str = "east", *, asked_s: float = NOW_S - 100.0, papers_s: float = 1e6) -> Record:
+def record(
+    name: str, region: str = "east", *, asked_s: float = NOW_S - 100.0, credential_renewal_s: float = 1e6
+) -> Record:
     """Return a machine that was asked for."""
     spec = MachineSpec("c", name, offer(region))
-    return Record(spec, SPOT, Papers(f"proxy-{name}", NOW_S + papers_s), asked_s, id=f"id-{name}")
+    return Record(
+        spec, SPOT, IssuedCredentials(f"proxy-{name}", NOW_S + credential_renewal_s), asked_s, id=f"id-{name}"
+    )
 
 
 def serving(name: str, region: str = "east", **more: float) -> Record:
@@ -69,7 +73,7 @@ class World:
             and name not in self.drained
         }
 
-    def step(self, wanted: tuple[Wanted, ...], patience: Patience, seconds: float = 0.2) -> list[object]:
+    def step(self, wanted: tuple[MachineRequest, ...], patience: Timeouts, seconds: float = 0.2) -> list[object]:
         """Let time pass, look, and do what is decided; return that."""
         self.now_s += seconds
         for name, machine in list(self.machines.items()):
@@ -98,7 +102,7 @@ class World:
                     self.made += 1
                     name = f"m{self.made}"
                     spec = MachineSpec("c", name, choice.offer)
-                    papers = Papers(f"proxy-{name}", self.now_s + 1e6)
+                    papers = IssuedCredentials(f"proxy-{name}", self.now_s + 1e6)
                     self.records[name] = Record(spec, wanted, papers, self.now_s, id=f"id-{name}")
                     self.machines[name] = Machine(f"id-{name}", spec, MachineState.BOOTING, self.now_s)
             case Drain(name, reason):

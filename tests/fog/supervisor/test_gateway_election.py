@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import pytest
 
-from fog.supervisor.decide import Patience, Release, decide
 from fog.supervisor.gateway_election import elect, is_settling
-from fog.supervisor.record import Ending, Record
+from fog.supervisor.reconcile import Release, Timeouts, decide
+from fog.supervisor.record import Outcome, Record
 from tests.fog.supervisor.machines import NOW_S, SPOT, offer, record, serving
 
-PATIENCE = Patience()
+PATIENCE = Timeouts()
 LONG_AGO_S = NOW_S - 80.0
 
 
@@ -20,14 +20,14 @@ def gateway(machine: Record, since_s: float = LONG_AGO_S) -> Record:
 
 
 def silent(machine: Record, since_s: float) -> Record:
-    return replace(machine, unheard_unix_s=since_s)
+    return replace(machine, unreachable_unix_s=since_s)
 
 
 def on_demand(machine: Record) -> Record:
     return replace(machine, spec=replace(machine.spec, offer=offer(is_spot=False)))
 
 
-GONE = gateway(serving("m1")).ended(Ending.TAKEN, "killed", NOW_S)
+GONE = gateway(serving("m1")).ended(Outcome.TAKEN, "killed", NOW_S)
 NOTICED = replace(gateway(serving("m1")), noticed_unix_s=NOW_S - 1, reason="preempted")
 DRAINED = replace(gateway(serving("m1")), drained_unix_s=NOW_S - 1, reason="not needed")
 RELEASED = replace(gateway(serving("m1")), released_unix_s=NOW_S - 1, reason="not needed")
@@ -90,7 +90,7 @@ def test_the_gateway_stays(group: list[Record]) -> None:
 
 
 def test_behind_a_silent_gateway_each_machine_is_tried_once() -> None:
-    began_s = NOW_S - PATIENCE.unheard_s
+    began_s = NOW_S - PATIENCE.unreachable_s
     group = [silent(each, began_s) for each in (gateway(serving("m1")), serving("m2"), serving("m3"))]
     now_s, tried = NOW_S, []
     for _ in range(20):

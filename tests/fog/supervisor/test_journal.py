@@ -6,13 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from fog.cluster import Carried, CloudNode, ClusterPlan
+from fog.cluster import CloudNode, ClusterPlan, ExportedInterface
 from fog.supervisor.journal import Journal
-from fog.supervisor.record import Ending
+from fog.supervisor.record import Outcome
 from gdp.errors import LocalError, StoreError
 from tests.fog.supervisor.machines import NOW_S, SPOT, record, serving
 
-PLAN = ClusterPlan("c", (CloudNode("p", "e"),), (SPOT, SPOT), (Carried("service", "/s", "std_srvs/srv/SetBool"),))
+PLAN = ClusterPlan(
+    "c", (CloudNode("p", "e"),), (SPOT, SPOT), (ExportedInterface("service", "/s", "std_srvs/srv/SetBool"),)
+)
 
 
 @pytest.fixture
@@ -30,7 +32,7 @@ def test_what_is_written_another_process_reads(journal: Journal, tmp_path: Path)
 
 
 def test_a_machine_comes_back_as_it_was(journal: Journal) -> None:
-    ended = serving("m2").ended(Ending.TAKEN, "preempted", NOW_S)
+    ended = serving("m2").ended(Outcome.TAKEN, "preempted", NOW_S)
     for each in (record("m1"), ended, replace(record("m10"), id="")):
         journal.put(each, NOW_S)
         assert each in journal.machines("c")

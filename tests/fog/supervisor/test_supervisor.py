@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from fog.cluster import Carried, CloudNode, ClusterPlan
+from fog.cluster import CloudNode, ClusterPlan, ExportedInterface
 from fog.enrolment.tickets import Tickets
 from fog.hardware import Hardware
-from fog.machine import Boot, Machine, MachineSpec, MachineState
+from fog.machine import Machine, MachineBundle, MachineSpec, MachineState
 from fog.offer import Offer
 from fog.site import Site, open_site
 from fog.supervisor.journal import Journal
@@ -21,7 +21,7 @@ from fog.supervisor.supervisor import Supervisor
 from gdp.errors import StoreError
 from tests.fog.supervisor.machines import OFFERS, SPOT
 
-PLAN = ClusterPlan("c", (CloudNode("p", "e"),), (SPOT, SPOT), (Carried("topic", "/t", "std_msgs/msg/Empty"),))
+PLAN = ClusterPlan("c", (CloudNode("p", "e"),), (SPOT, SPOT), (ExportedInterface("topic", "/t", "std_msgs/msg/Empty"),))
 
 
 class Memory:
@@ -39,7 +39,7 @@ class Memory:
     def offers(self, hardware: Hardware, *, spot: bool) -> list[Offer]:
         return OFFERS
 
-    def create(self, spec: MachineSpec, boot: Boot) -> str:
+    def create(self, spec: MachineSpec, boot: MachineBundle) -> str:
         if self.refuses:
             self.refuses -= 1
             raise StoreError("no room")
@@ -76,7 +76,7 @@ class Grouped(Memory):
         self.ports: dict[str, list[object]] = {}
         self.fails = 0  # so many more
 
-    def create(self, spec: MachineSpec, boot: Boot) -> str:
+    def create(self, spec: MachineSpec, boot: MachineBundle) -> str:
         self.ports[spec.name] = yaml.safe_load(boot.files["switch.yaml"])["ports"]
         return super().create(spec, boot)
 
@@ -131,7 +131,7 @@ def work(each: Supervisor, is_met: Callable[[], object]) -> None:
     end_s = time.monotonic() + 20.0
     while not is_met():
         assert time.monotonic() < end_s
-        each.look()
+        each.reconcile()
         each.wait()
 
 
@@ -167,7 +167,7 @@ def test_a_machine_whose_supervisor_died_before_noting_its_id_is_found_again(sit
 
 def test_a_machine_that_no_journal_knows_is_given_back(site: Site, journal: Journal) -> None:
     provider = Memory()
-    provider.create(MachineSpec("c", "m99", OFFERS[0]), Boot({}, ()))
+    provider.create(MachineSpec("c", "m99", OFFERS[0]), MachineBundle({}, ()))
     ours = supervisor(site, journal, provider)
     journal.want(PLAN, time.time())
     work(ours, lambda: len(serving(journal)) == 2 and "m99" not in provider.machines)
@@ -216,7 +216,7 @@ def test_a_cluster_that_nobody_calls_is_ended_and_one_that_is_called_is_not(
     for later_s, count in ((40.0, 2), (80.0, 3), (120.0, 3)):
         received.append(count)
         monkeypatch.setattr(time, "time", lambda at_s=now_s + later_s: at_s)
-        ours.look()
+        ours.reconcile()
         assert journal.cluster("c").is_up
     monkeypatch.setattr(time, "time", lambda: now_s + 145.0)
     work(ours, lambda: ours.is_done)
@@ -255,7 +255,7 @@ def test_what_a_machine_that_was_given_back_said_is_not_kept(site: Site, journal
 def test_after_its_start_a_supervisor_says_when_all_was_looked_at(site: Site, journal: Journal) -> None:
     ours = supervisor(site, journal, Memory())
     journal.want(PLAN, time.time())
-    ours.look()
+    ours.reconcile()
     begun_s = time.time() - 1.5
     ours.reconciled(begun_s)
     ours.close()
@@ -286,7 +286,7 @@ def test_of_machines_elsewhere_the_robots_counters_decide_and_without_them_a_clu
     work(ours, lambda: len(serving(journal)) == 2)
     for later_s in (30.0, 60.0, 100.0):
         monkeypatch.setattr(time, "time", lambda at_s=now_s + later_s: at_s)
-        ours.look()
+        ours.reconcile()
     ours.close()
     assert journal.cluster("c").is_up is is_up
 
@@ -309,7 +309,7 @@ def test_a_lost_gateway_is_succeeded_in_the_same_look(site: Site, journal: Journ
     work(ours, lambda: len(serving(journal)) == 2 and provider.gateways())
     (lost,) = elected(journal)
     provider.machines[lost] = replace(provider.machines[lost], state=MachineState.GONE, reason="killed")
-    ours.look()
+    ours.reconcile()
     assert elected(journal) == [({"m1", "m2"} - {lost}).pop()]
     work(ours, lambda: provider.gateways() == elected(journal))
     ours.close()

@@ -6,17 +6,17 @@ import hashlib
 from functools import cache
 from os import urandom
 
+from gdp.client.control_keys import ControlKeys
 from gdp.client.identities import ReaderIdentity, WriterIdentity
 from gdp.client.key_epochs import Secrets
-from gdp.client.note_keys import NoteKeys
+from gdp.crypto.control_seal import ControlSealer, note_key
 from gdp.crypto.envelope import Signer, seal_key
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
 from gdp.crypto.introduction import Introduction
 from gdp.crypto.keys import SigningKey
-from gdp.crypto.note import NoteSealer, note_key
 from gdp.crypto.subject import Subject
 from gdp.frame.kinds import Kind
-from gdp.message.report import Report, ReportFlag
+from gdp.message.acknack import AckNack, AckNackFlag
 from gdp.names import Name
 
 
@@ -34,8 +34,8 @@ def name_of(label: bytes) -> Name:
     return subject_of(label).name
 
 
-def note_keys() -> NoteKeys:
-    return NoteKeys(ExchangeKey.from_random(urandom(EXCHANGE_KEY_BYTES)))
+def note_keys() -> ControlKeys:
+    return ControlKeys(ExchangeKey.from_random(urandom(EXCHANGE_KEY_BYTES)))
 
 
 def source_of(name: Name, incarnation: int, signer: Signer) -> WriterIdentity:
@@ -73,19 +73,19 @@ class Notes:
         sealer = self._sealer(key, epoch, Kind.INTRODUCTION, life)
         return sealer.seal(self._reader.introduction() if wire is None else wire)
 
-    def report(self, report: Report, epoch: int = 1, *, incarnation: int | None = None) -> bytes:
+    def report(self, report: AckNack, epoch: int = 1, *, incarnation: int | None = None) -> bytes:
         life = self._reader.incarnation if incarnation is None else incarnation
         publisher = self._publisher
         shared = self._reader.notes.shared(publisher.notes.public)
         ends = self._name, life, publisher.name, publisher.incarnation
-        key = note_key(shared, self._secrets[epoch], Kind.REPORT, *ends, self._topic)
-        return self._sealer(key, epoch, Kind.REPORT, life).seal(report.to_wire())
+        key = note_key(shared, self._secrets[epoch], Kind.ACKNACK, *ends, self._topic)
+        return self._sealer(key, epoch, Kind.ACKNACK, life).seal(report.to_wire())
 
     def hello(self, epoch: int = 1) -> list[bytes]:
         """Return the frames by which a reader begins."""
-        return [self.introduction(epoch), self.report(Report(ReportFlag.NEW, 0, 0, ()), epoch)]
+        return [self.introduction(epoch), self.report(AckNack(AckNackFlag.NEW, 0, 0, ()), epoch)]
 
-    def _sealer(self, key: bytes, epoch: int, kind: Kind, life: int) -> NoteSealer:
+    def _sealer(self, key: bytes, epoch: int, kind: Kind, life: int) -> ControlSealer:
         publisher = self._publisher
         to = publisher.name, self._topic, publisher.incarnation
-        return NoteSealer(key, epoch, kind, self._name, life, *to, self._reader.note_numbers)
+        return ControlSealer(key, epoch, kind, self._name, life, *to, self._reader.note_numbers)

@@ -10,14 +10,14 @@ from itertools import count
 from random import Random
 
 from gdp.client.delivery import Delivered
-from gdp.client.feed import Feed
 from gdp.client.identities import ReaderIdentity, WriterIdentity
 from gdp.client.key_epochs import Secrets
 from gdp.client.publisher import Publisher
+from gdp.client.writer_proxy import WriterProxy
 from gdp.crypto.keys import SigningKey
 from gdp.frame.codec import decode
 from gdp.frame.kinds import Kind
-from gdp.message.memory import Budget
+from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.names import Name
 from tests.gdp.client.lives import reader_of, source_of
 
@@ -48,8 +48,8 @@ class End:
     """A reader at the end of the pipe."""
 
     reader: ReaderIdentity
-    feed: Feed
-    budget: Budget
+    writer_proxy: WriterProxy
+    budget: ReassemblyQuota
     loss: float = 0.0
     mtu: int = 65_535  # what the link to it takes
     deaf: bool = False  # hears nothing
@@ -88,8 +88,8 @@ class Pipe:
         return self.attach(reader_of(name, incarnation), loss=loss, secrets=secrets)
 
     def attach(self, reader: ReaderIdentity, *, loss: float = 0.0, secrets: Secrets = SECRETS) -> End:
-        budget = Budget()
-        feed = Feed(
+        budget = ReassemblyQuota()
+        writer_proxy = WriterProxy(
             topic=TOPIC,
             reader=reader,
             publisher=Name(b"p" * 32),
@@ -100,7 +100,7 @@ class Pipe:
             budget=budget,
             now_s=self.now_s,
         )
-        end = self.ends[reader.name] = End(reader, feed, budget, loss)
+        end = self.ends[reader.name] = End(reader, writer_proxy, budget, loss)
         return end
 
     def publish(self, messages: Sequence[bytes]) -> None:
@@ -123,24 +123,24 @@ class Pipe:
             self.now_s = max(self.now_s, at_s)
             while self._events and self._events[0][0] <= self.now_s:
                 heapq.heappop(self._events)[2]()
-            self.publisher.timeout(self.now_s)
+            self.publisher.handle_timer(self.now_s)
             for each in self.ends.values():
-                each.feed.timeout(self.now_s)
+                each.writer_proxy.handle_timer(self.now_s)
         return True
 
     def _next_s(self) -> float:
-        times = [self.publisher.next_timeout(), *(end.feed.next_timeout() for end in self.ends.values())]
+        times = [self.publisher.get_timer(), *(end.writer_proxy.get_timer() for end in self.ends.values())]
         times.append(self._events[0][0] if self._events else None)
         return min((each for each in times if each is not None), default=float("inf"))
 
     def _flush(self) -> None:
-        for frame in self.publisher.take(self.now_s):
+        for frame in self.publisher.poll_frames(self.now_s):
             self.seen.append(frame)
             for end in self.ends.values():
                 if not end.deaf and len(frame) <= end.mtu:
                     self._send(frame, end, self._to_reader(end, frame))
         for end in self.ends.values():
-            notes = end.feed.take_notes(self.now_s)
+            notes = end.writer_proxy.control_to_send(self.now_s)
             for note in [] if end.mute else notes:
                 self.seen.append(note)
                 self._send(note, end, partial(self.tell, note))
@@ -154,9 +154,9 @@ class Pipe:
     def _to_reader(self, end: End, frame: bytes) -> Callable[[], None]:
         def arrive() -> None:
             header = decode(frame)
-            assert header.kind in (Kind.DATA, Kind.STATUS)
-            end.feed.receive(header, frame, self.now_s)
-            end.delivered += end.feed.take_delivered()
+            assert header.kind in (Kind.DATA, Kind.HEARTBEAT)
+            end.writer_proxy.receive(header, frame, self.now_s)
+            end.delivered += end.writer_proxy.poll_delivered()
 
         return arrive
 
@@ -167,4 +167,4 @@ class Pipe:
             if header.kind == Kind.INTRODUCTION:
                 self.publisher.receive_introduction(header, note)
             else:
-                self.publisher.receive_report(header, note, self.now_s)
+                self.publisher.receive_acknack(header, note, self.now_s)

@@ -4,47 +4,49 @@ from __future__ import annotations
 
 import pytest
 
-from gdp.client.attachment import Claimed
-from gdp.client.member import Topic
+from gdp.client.attachment import PendingAdvertisement
+from gdp.client.participant import Topic
 from gdp.crypto.subject import Subject
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
-from gdp.limits import CLAIM_LEASE_S
+from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.metadata import Metadata
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import ring5
-from gdp.simulation.world import World
 from gdp.trust.right import Right
 from tests.journeys.flows import ROBOT, SERVER, Tap, advertise, ring
 
 
-def claim_without_delegation(world: World) -> None:
+def advertisement_without_delegation(world: Simulation) -> None:
     """Let the robot claim a name of an owner who gave it nothing."""
     subject = world.owner.subject(Metadata({"kind": "topic", "name": "/not/mine"}))
-    world.members[ROBOT].attachment.claim(subject, Right.PUBLISH, (), is_global=True)
+    world.members[ROBOT].attachment.advertisement(subject, Right.PUBLISH, (), is_global=True)
     world.network.touch(ROBOT)
 
 
-def of(world: World, right: Right) -> Claimed:
-    return next(each for each in world.members[ROBOT].attachment.claims if each.right is right)
+def of(world: Simulation, right: Right) -> PendingAdvertisement:
+    return next(each for each in world.members[ROBOT].attachment.advertisements if each.right is right)
 
 
-def test_a_refused_claim_is_judged_and_says_why() -> None:
+def test_a_refused_advertisement_is_judged_and_says_why() -> None:
     world = ring()
-    claim_without_delegation(world)
-    assert world.network.run(2, lambda: of(world, Right.PUBLISH).is_judged)
-    claimed = of(world, Right.PUBLISH)
-    assert (claimed.is_taken, claimed.refused) == (False, DropReason.NOT_DELEGATED)
+    advertisement_without_delegation(world)
+    assert world.network.run(2, lambda: of(world, Right.PUBLISH).is_acknowledged)
+    pending_advertisement = of(world, Right.PUBLISH)
+    assert (pending_advertisement.is_taken, pending_advertisement.refused) == (False, DropReason.NOT_DELEGATED)
     assert world.members[ROBOT].attachment.is_attached
 
 
 @pytest.mark.parametrize("reason", list(DropReason))
 def test_every_reason_counts_as_a_judgement(reason: DropReason) -> None:
-    assert Claimed(Subject(bytes(32), b""), Right.READ, (), is_global=False, refused=reason).is_judged
+    assert PendingAdvertisement(
+        Subject(bytes(32), b""), Right.READ, (), is_global=False, refused=reason
+    ).is_acknowledged
 
 
-def test_a_refused_claim_is_not_made_again_at_once() -> None:
+def test_a_refused_advertisement_is_not_made_again_at_once() -> None:
     world = ring()
-    claim_without_delegation(world)
+    advertisement_without_delegation(world)
     tap = Tap(ROBOT, "nuc1")
     world.network.taps.append(tap)
     world.network.run(world.lease_s / 3 - 0.05)
@@ -52,9 +54,9 @@ def test_a_refused_claim_is_not_made_again_at_once() -> None:
     assert len(first) <= 3
 
 
-def test_claims_are_renewed_before_their_lease_ends() -> None:
+def test_advertisements_are_renewed_before_their_lease_ends() -> None:
     world = ring()
-    world.network.run(3 * CLAIM_LEASE_S)
+    world.network.run(3 * ADVERTISEMENT_LEASE_S)
     assert world.switches["nuc1"].attached.get(world.members[ROBOT].name, world.members[ROBOT].name) is not None
     assert world.ribs["school"].rib.names == 1
 
@@ -92,13 +94,13 @@ def test_who_leaves_is_gone_in_every_tier() -> None:
 def test_who_falls_silent_is_gone_when_its_lease_ends() -> None:
     world = ring()
     world.network.stop(ROBOT)
-    world.network.run(CLAIM_LEASE_S + 1)
+    world.network.run(ADVERTISEMENT_LEASE_S + 1)
     assert [host.rib.names for host in world.ribs.values()] == [0, 1, 1]
 
 
 @pytest.mark.parametrize("lease_s", [2.0, 60.0])
 def test_the_lease_is_what_the_settings_say(lease_s: float) -> None:
-    world = World(ring5(), lease_s=lease_s)
+    world = Simulation(ring5(), lease_s=lease_s)
     assert world.settle()
     world.network.run(lease_s + 1)
     assert world.ribs["school"].rib.names == 1  # it was renewed

@@ -6,8 +6,8 @@ from os import urandom
 
 import pytest
 
-from gdp.client.pasts import Past
 from gdp.client.publisher import Publisher
+from gdp.client.sequence_numbers import SequenceState
 from gdp.crypto.envelope import SIGNATURE_BYTES, Sealer, part_room
 from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import Header, decode
@@ -52,7 +52,7 @@ def test_messages_that_wait_together_come_in_order_under_few_numbers(reliable: b
     assert len({header.number for header in data(pipe)}) < len(SMALL) / 10
     if reliable or not loss:
         assert end.messages == SMALL
-        assert pipe.publisher.acknowledged == pipe.publisher.messages == end.feed.delivered == len(SMALL)
+        assert pipe.publisher.acknowledged == pipe.publisher.messages == end.writer_proxy.delivered == len(SMALL)
 
 
 def test_a_message_alone_is_sealed_alone_and_at_once() -> None:
@@ -104,11 +104,11 @@ def test_what_waits_for_its_seal_is_not_for_a_reader_that_comes_later() -> None:
     pipe, (end,) = live(publisher_of())
     publish(pipe.publisher, SMALL[:10])
     late = pipe.join(b"b")
-    pipe.tell(*late.feed.take_notes(pipe.now_s))
+    pipe.tell(*late.writer_proxy.control_to_send(pipe.now_s))
     publish(pipe.publisher, SMALL[10:20])
     pipe.run(2.0)
     assert (end.messages, late.messages) == (SMALL[:20], SMALL[10:20])
-    assert late.feed.lost == 0
+    assert late.writer_proxy.lost == 0
 
 
 def test_what_publish_returns_is_confirmed_when_so_many_are() -> None:
@@ -167,7 +167,7 @@ def test_bundles_that_no_longer_fit_the_path_are_bundles_under_their_new_numbers
     assert [each for each in end.messages if len(each) < 20_000] == SMALL
     assert end.messages == other.messages
     assert publisher.acknowledged == publisher.messages == len(end.messages)
-    assert end.feed.lost == 0 or not reliable  # numbers that were sealed but never sent look like a loss
+    assert end.writer_proxy.lost == 0 or not reliable  # numbers that were sealed but never sent look like a loss
 
 
 @pytest.mark.parametrize("body", [b"", pack([b"x"]) + b"y", pack([b"x" * 9])[:-1]], ids=["empty", "trailing", "cut"])
@@ -176,9 +176,9 @@ def test_a_bundle_that_is_not_exact_is_counted_and_nothing_of_it_delivered(body:
     sealer = Sealer(SECRETS[1], 1, Kind.DATA, Name(b"p" * 32), 1, TOPIC, WRITER, urandom)
     for number, message, flags in ((1, body, Flag.RELIABLE | Flag.BUNDLE), (2, b"next", Flag.RELIABLE)):
         for frame in sealer.seal(number, int(flags), sequenced(number, message), 1_500):
-            end.feed.receive(decode(frame), frame, pipe.now_s)
-    assert [each.message for each in end.feed.take_delivered()] == [b"next"]
-    drops = end.feed.drops
+            end.writer_proxy.receive(decode(frame), frame, pipe.now_s)
+    assert [each.message for each in end.writer_proxy.poll_delivered()] == [b"next"]
+    drops = end.writer_proxy.drops
     assert drops[DropReason.MALFORMED] + drops[DropReason.TRUNCATED] == 1
 
 
@@ -191,13 +191,13 @@ def test_a_bundle_that_is_lost_counts_as_a_loss() -> None:
     publish(pipe.publisher, [b"here"] * 5)
     pipe.run(0.1)
     assert end.messages == [b"here"] * 5
-    assert 1 <= end.feed.lost <= 5
+    assert 1 <= end.writer_proxy.lost <= 5
 
 
 def test_a_publisher_that_goes_on_where_another_ended_bundles_and_counts_from_its_own_first_message() -> None:
     source = source_of(Name(b"p" * 32), 1, WRITER)
     publisher = Publisher(
-        topic=TOPIC, source=source, secrets=SECRETS, description=b"again", reliable=True, past=Past(1_000, 50)
+        topic=TOPIC, source=source, secrets=SECRETS, description=b"again", reliable=True, past=SequenceState(1_000, 50)
     )
     publisher.tree_stands(1_500)
     pipe, (end,) = live(publisher)

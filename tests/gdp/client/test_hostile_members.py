@@ -6,16 +6,16 @@ from os import urandom
 
 import pytest
 
-from gdp.client.feed import FeedState
+from gdp.client.writer_proxy import WriterProxyState
 from gdp.crypto.envelope import Sealer, Signer
 from gdp.crypto.keys import SigningKey
 from gdp.errors import DropReason
 from gdp.frame.codec import decode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import JOIN_PATIENCE_S, JOIN_SOURCE_BYTES, JOIN_TOTAL_BYTES, NACKS_PER_REPORT
-from gdp.message.move import Move
-from gdp.message.report import Missing, Report, ReportFlag
-from gdp.message.status import Status
+from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
+from gdp.message.heartbeat import Heartbeat
+from gdp.message.renumbering import Renumbering
 from gdp.names import Name
 from tests.gdp.client.lives import Notes, reader_of
 from tests.gdp.client.pipe import SECRETS, TOPIC, WRITER, End, Pipe, publisher_of, sequenced
@@ -34,10 +34,10 @@ def forge(
 
 def give(pipe: Pipe, end: End, frames: list[bytes]) -> None:
     for frame in frames:
-        end.feed.receive(decode(frame), frame, pipe.now_s)
+        end.writer_proxy.receive(decode(frame), frame, pipe.now_s)
 
 
-def notes_of(pipe: Pipe, label: bytes, reports: list[Report]) -> list[bytes]:
+def notes_of(pipe: Pipe, label: bytes, reports: list[AckNack]) -> list[bytes]:
     notes = Notes(reader_of(label), pipe.source, TOPIC, SECRETS)
     return [notes.introduction(), *(notes.report(each) for each in reports)]
 
@@ -45,7 +45,7 @@ def notes_of(pipe: Pipe, label: bytes, reports: list[Report]) -> list[bytes]:
 def live() -> tuple[Pipe, End]:
     pipe = Pipe(publisher_of())
     end = pipe.join(b"a")
-    assert pipe.run(2.0, lambda: end.feed.state is FeedState.LIVE)
+    assert pipe.run(2.0, lambda: end.writer_proxy.state is WriterProxyState.LIVE)
     return pipe, end
 
 
@@ -68,19 +68,19 @@ def test_a_forged_part_far_ahead_does_not_make_a_reader_ask_for_ever() -> None:
     assert pipe.run(1.0, lambda: end.messages == [b"real"])
 
 
-def test_absurd_numbers_before_the_first_status_do_not_stop_a_feed() -> None:
+def test_absurd_numbers_before_the_first_status_do_not_stop_a_writer_proxy() -> None:
     pipe = Pipe(publisher_of())
     end = pipe.join(b"a")
     end.mute = True
     give(pipe, end, forge(1 << 63, b"x", signer=WRITER))
     give(pipe, end, forge((1 << 63) + 1, bytes(5_000))[:1])
-    give(pipe, end, forge((1 << 63) + 1, bytes(5_000), kind=Kind.STATUS)[:1])
+    give(pipe, end, forge((1 << 63) + 1, bytes(5_000), kind=Kind.HEARTBEAT)[:1])
     pipe.run(JOIN_PATIENCE_S + 1.0)
     end.mute = False
     pipe.run(1.0)
     pipe.publish([b"one", b"two"])
     assert pipe.run(2.0, lambda: end.messages == [b"one", b"two"])
-    assert end.feed.lost == 0
+    assert end.writer_proxy.lost == 0
 
 
 def test_messages_that_come_before_the_first_status_are_kept_within_bounds() -> None:
@@ -90,8 +90,8 @@ def test_messages_that_come_before_the_first_status_are_kept_within_bounds() -> 
     for number in range(1, 80):
         give(pipe, end, list(sealer.seal(number, Flag.RELIABLE, sequenced(number, bytes(1 << 20)), 65_000)))
         assert end.budget.held_bytes <= JOIN_SOURCE_BYTES
-    assert end.feed.drops[DropReason.MEMORY_FULL] > 0
-    end.feed.close()
+    assert end.writer_proxy.drops[DropReason.MEMORY_FULL] > 0
+    end.writer_proxy.close()
     assert end.budget.held_bytes == 0
 
 
@@ -101,56 +101,56 @@ def test_messages_behind_a_gap_that_is_never_filled_are_kept_within_bounds() -> 
     for number in range(2, 80):
         give(pipe, end, list(sealer.seal(number, Flag.RELIABLE, sequenced(number, bytes(1 << 20)), 65_000)))
         assert end.budget.held_bytes <= JOIN_TOTAL_BYTES
-    assert [each.number for each in end.feed.take_delivered()][:3] == [2, 3, 4]
-    assert end.feed.lost == 1
+    assert [each.number for each in end.writer_proxy.poll_delivered()][:3] == [2, 3, 4]
+    assert end.writer_proxy.lost == 1
 
 
 def test_a_status_of_giant_numbers_costs_a_report_of_the_usual_size() -> None:
     pipe, end = live()
-    status = Status(0, (1 << 64) - 1, 0, {}, b"").to_wire()
-    give(pipe, end, forge(500, status, kind=Kind.STATUS, signer=WRITER))
-    (report,) = end.feed.take_notes(pipe.now_s)
+    status = Heartbeat(0, (1 << 64) - 1, 0, {}, b"").to_wire()
+    give(pipe, end, forge(500, status, kind=Kind.HEARTBEAT, signer=WRITER))
+    (report,) = end.writer_proxy.control_to_send(pipe.now_s)
     assert len(report) < 3_000
     pipe.publish([b"still here"])
     assert pipe.run(1.0, lambda: end.messages == [b"still here"])
 
 
-def test_a_status_whose_oldest_is_giant_ends_its_own_feed_and_no_more() -> None:
+def test_a_status_whose_oldest_is_giant_ends_its_own_writer_proxy_and_no_more() -> None:
     pipe, end = live()
-    status = Status((1 << 64) - 2, (1 << 64) - 1, 0, {}, b"").to_wire()
-    give(pipe, end, forge(500, status, kind=Kind.STATUS, signer=WRITER))
+    status = Heartbeat((1 << 64) - 2, (1 << 64) - 1, 0, {}, b"").to_wire()
+    give(pipe, end, forge(500, status, kind=Kind.HEARTBEAT, signer=WRITER))
     pipe.publish([b"x"])
     pipe.run(2.0)
     assert end.messages == []
-    assert end.feed.drops[DropReason.LATE] > 0
+    assert end.writer_proxy.drops[DropReason.LATE] > 0
 
 
 @pytest.mark.parametrize("reliable", [Flag.RELIABLE, Flag.NONE])
 def test_a_message_whose_number_has_no_next_is_refused_and_ends_nobody(reliable: Flag) -> None:
     pipe, end = live()
-    status = Status((1 << 64) - 2, (1 << 64) - 1, 0, {}, b"").to_wire()
-    give(pipe, end, forge(500, status, kind=Kind.STATUS, signer=WRITER))
+    status = Heartbeat((1 << 64) - 2, (1 << 64) - 1, 0, {}, b"").to_wire()
+    give(pipe, end, forge(500, status, kind=Kind.HEARTBEAT, signer=WRITER))
     for number in ((1 << 64) - 2, (1 << 64) - 1):
         sealer = Sealer(SECRETS[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, WRITER, urandom)
         give(pipe, end, list(sealer.seal(number, reliable, sequenced(number, b"last"), 1_500)))
-    assert end.feed.take_notes(pipe.now_s) != []
-    assert end.feed.drops[DropReason.MALFORMED] == 1
+    assert end.writer_proxy.control_to_send(pipe.now_s) != []
+    assert end.writer_proxy.drops[DropReason.MALFORMED] == 1
 
 
 def test_a_move_beyond_all_numbers_is_refused() -> None:
     pipe, end = live()
-    move = Move(0, (1 << 64) - 3, (1 << 64) - 1)
-    status = Status(0, 0, 0, {}, b"", (move,)).to_wire()
-    give(pipe, end, forge(500, status, kind=Kind.STATUS, signer=WRITER))
-    assert end.feed.drops[DropReason.MALFORMED] == 1
+    move = Renumbering(0, (1 << 64) - 3, (1 << 64) - 1)
+    status = Heartbeat(0, 0, 0, {}, b"", (move,)).to_wire()
+    give(pipe, end, forge(500, status, kind=Kind.HEARTBEAT, signer=WRITER))
+    assert end.writer_proxy.drops[DropReason.MALFORMED] == 1
     pipe.publish([b"still here"])
     assert pipe.run(1.0, lambda: end.messages == [b"still here"])
 
 
 def test_a_signed_status_that_makes_no_sense_is_counted() -> None:
     pipe, end = live()
-    give(pipe, end, forge(500, b"\xff" * 40, kind=Kind.STATUS, signer=WRITER))
-    assert end.feed.drops[DropReason.MALFORMED] == 1
+    give(pipe, end, forge(500, b"\xff" * 40, kind=Kind.HEARTBEAT, signer=WRITER))
+    assert end.writer_proxy.drops[DropReason.MALFORMED] == 1
 
 
 def test_a_reader_that_asks_for_everything_again_and_again_gets_a_flight_in_a_round_trip() -> None:
@@ -159,13 +159,13 @@ def test_a_reader_that_asks_for_everything_again_and_again_gets_a_flight_in_a_ro
     pipe.run(1.0)
     pipe.publish([bytes(500_000)] * 40)
     assert pipe.run(30.0, lambda: len(honest.delivered) == 40)
-    everything = tuple(Missing(number, 0, 0xFFFF_FFFF) for number in range(1, NACKS_PER_REPORT))
-    greedy = [Report(ReportFlag.NEW, 0, 0, ())] + [Report(ReportFlag.NONE, 1, 0, everything)] * 400
+    everything = tuple(MissingRange(number, 0, 0xFFFF_FFFF) for number in range(1, NACKS_PER_REPORT))
+    greedy = [AckNack(AckNackFlag.NEW, 0, 0, ())] + [AckNack(AckNackFlag.NONE, 1, 0, everything)] * 400
     sent = 0
     begun_s = pipe.now_s
     for note in notes_of(pipe, b"m", greedy):
         pipe.tell(note)
-        sent += sum(map(len, pipe.publisher.take(pipe.now_s)))
+        sent += sum(map(len, pipe.publisher.poll_frames(pipe.now_s)))
         pipe.now_s += 0.0001
     rounds = (pipe.now_s - begun_s) / 0.01 + 1
     assert sent <= rounds * (4 << 20)
@@ -175,16 +175,16 @@ def test_a_reader_that_asks_for_everything_again_and_again_gets_a_flight_in_a_ro
 def test_readers_that_say_they_are_new_again_and_again_get_one_status_in_a_while() -> None:
     pipe, _ = live()
     sent = []
-    for note in notes_of(pipe, b"m", [Report(ReportFlag.NEW, 0, 0, ())] * 1_000):
+    for note in notes_of(pipe, b"m", [AckNack(AckNackFlag.NEW, 0, 0, ())] * 1_000):
         pipe.tell(note)
-        sent += pipe.publisher.take(pipe.now_s)
+        sent += pipe.publisher.poll_frames(pipe.now_s)
     assert len(sent) <= 1
 
 
 def test_more_names_than_the_publisher_takes_are_refused() -> None:
     pipe, end = live()
     for at in range(1_100):
-        pipe.tell(*notes_of(pipe, at.to_bytes(32, "big"), [Report(ReportFlag.NEW, 0, 0, ())]))
+        pipe.tell(*notes_of(pipe, at.to_bytes(32, "big"), [AckNack(AckNackFlag.NEW, 0, 0, ())]))
     assert pipe.publisher.readers == 1_024
     assert pipe.publisher.drops[DropReason.QUOTA] == 77
     pipe.publish([b"goes on"])
@@ -199,7 +199,7 @@ def test_what_an_outsider_sends_leaves_nothing_behind() -> None:
     for number in range(1, 200):
         give(pipe, end, list(sealer.seal(number, Flag.RELIABLE, bytes(3_000), 1500)))
     assert end.budget.held_bytes == held
-    assert end.feed.drops == {DropReason.BAD_TAG: 3 * 199}
+    assert end.writer_proxy.drops == {DropReason.BAD_TAG: 3 * 199}
     for at in range(50):
         pipe.tell(*Notes(reader_of(bytes([at])), pipe.source, TOPIC, strange).hello())
     assert pipe.publisher.readers == 1

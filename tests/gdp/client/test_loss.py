@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gdp.client.feed import FeedState
+from gdp.client.writer_proxy import WriterProxyState
 from gdp.errors import DropReason
 from gdp.frame.codec import decode
 from gdp.limits import READER_GRACE_S, READER_LEASE_S, WINDOW_BYTES
@@ -16,7 +16,7 @@ from tests.gdp.client.pipe import End, Pipe, publisher_of
 
 def live(pipe: Pipe, *names: bytes) -> list[End]:
     ends = [pipe.join(name) for name in names]
-    assert pipe.run(2.0, lambda: all(end.feed.state is FeedState.LIVE for end in ends))
+    assert pipe.run(2.0, lambda: all(end.writer_proxy.state is WriterProxyState.LIVE for end in ends))
     return ends
 
 
@@ -44,10 +44,10 @@ def assert_complete(pipe: Pipe, end: End) -> None:
     """Nothing doubled, in order, and each message delivered or in a range of lost ones."""
     pipe.run(5.0)
     numbers = sequences(end)
-    lost = [each for span in end.feed.losses.ranges for each in range(span.first, span.last + 1)]
+    lost = [each for span in end.writer_proxy.losses.ranges for each in range(span.first, span.last + 1)]
     assert numbers == sorted(set(numbers))
     assert sorted(numbers + lost) == list(range(numbers[0], pipe.publisher.messages + 1))
-    assert end.feed.lost == len(lost)
+    assert end.writer_proxy.lost == len(lost)
 
 
 @pytest.mark.parametrize("away_s", [3.0, 10.0, 30.0])
@@ -61,7 +61,7 @@ def test_a_reader_that_was_away_within_the_grace_time_loses_nothing(away_s: floa
     stream(pipe, 2.0)
     assert pipe.run(5.0, pipe.publisher.is_acknowledged)
     assert_complete(pipe, end)
-    assert (end.feed.lost, pipe.publisher.losses.total) == (0, 0)
+    assert (end.writer_proxy.lost, pipe.publisher.losses.total) == (0, 0)
     assert got(end) == list(range(pipe.publisher.messages))
     assert pipe.publisher.acknowledged == pipe.publisher.messages
 
@@ -77,11 +77,11 @@ def test_a_reader_that_was_away_for_longer_is_told_exactly_what_it_lost_and_why(
     pipe.run(5.0)
     stream(pipe, 2.0)
     assert_complete(pipe, end)
-    first, last = end.feed.losses.ranges[0].first, end.feed.losses.ranges[-1].last
+    first, last = end.writer_proxy.losses.ranges[0].first, end.writer_proxy.losses.ranges[-1].last
     assert (first, last) == (21, published)
-    assert {each.reason for each in end.feed.losses.ranges} == {LossReason.GIVEN_UP, LossReason.NO_READER}
+    assert {each.reason for each in end.writer_proxy.losses.ranges} == {LossReason.GIVEN_UP, LossReason.NO_READER}
     assert pipe.publisher.losses.counts.keys() == {LossReason.GIVEN_UP, LossReason.NO_READER}
-    assert pipe.publisher.messages - pipe.publisher.acknowledged == end.feed.lost
+    assert pipe.publisher.messages - pipe.publisher.acknowledged == end.writer_proxy.lost
 
 
 def test_a_suspended_reader_holds_up_nobody_and_gets_what_it_lacks_when_it_returns() -> None:
@@ -96,7 +96,7 @@ def test_a_suspended_reader_holds_up_nobody_and_gets_what_it_lacks_when_it_retur
     silence(moves, is_silent=False)
     assert pipe.run(10.0, lambda: len(moves.delivered) == 60)
     assert_complete(pipe, moves)
-    assert moves.feed.lost == 0
+    assert moves.writer_proxy.lost == 0
 
 
 def test_others_do_not_wait_for_a_reader_that_catches_up() -> None:
@@ -113,7 +113,7 @@ def test_others_do_not_wait_for_a_reader_that_catches_up() -> None:
     moves.loss = 0.0
     assert pipe.run(30.0, pipe.publisher.is_acknowledged)
     assert_complete(pipe, moves)
-    assert moves.feed.lost == 0
+    assert moves.writer_proxy.lost == 0
 
 
 def test_what_a_full_window_pushes_out_of_a_suspended_reader_is_lost_and_named() -> None:
@@ -130,7 +130,7 @@ def test_what_a_full_window_pushes_out_of_a_suspended_reader_is_lost_and_named()
     silence(end, is_silent=False)
     assert pipe.run(20.0, pipe.publisher.is_acknowledged)
     assert_complete(pipe, end)
-    assert list(end.feed.losses.ranges) == [LostRange(11, 10 + gone, LossReason.WINDOW_OVERFLOW)]
+    assert list(end.writer_proxy.losses.ranges) == [LostRange(11, 10 + gone, LossReason.WINDOW_OVERFLOW)]
     assert pipe.publisher.messages - pipe.publisher.acknowledged == gone
 
 
@@ -157,7 +157,7 @@ def test_a_reader_that_starts_again_counts_what_came_between_its_lives() -> None
     second = pipe.join(b"a", incarnation=8)
     pipe.run(2.0)
     stream(pipe, 1.0)
-    assert list(second.feed.losses.ranges) == [LostRange(11, 40, LossReason.READER_RESTARTED)]
+    assert list(second.writer_proxy.losses.ranges) == [LostRange(11, 40, LossReason.READER_RESTARTED)]
     assert sequences(second) == list(range(41, 51))
 
 
@@ -165,14 +165,14 @@ def test_a_reader_that_said_goodbye_has_lost_nothing_when_it_comes_again() -> No
     pipe = Pipe(publisher_of())
     (first,) = live(pipe, b"a")
     stream(pipe, 1.0)
-    note = first.feed.close()
-    pipe.publisher.receive_report(decode(note), note, pipe.now_s)
+    note = first.writer_proxy.close()
+    pipe.publisher.receive_acknack(decode(note), note, pipe.now_s)
     del pipe.ends[first.reader.name]
     stream(pipe, 1.0)
     second = pipe.join(b"a", incarnation=8)
     pipe.run(1.0)
     stream(pipe, 1.0)
-    assert second.feed.lost == 0
+    assert second.writer_proxy.lost == 0
     assert len(second.delivered) == 10
 
 
@@ -182,7 +182,7 @@ def test_the_first_contact_with_a_publisher_that_has_published_for_long_is_no_lo
     (end,) = live(pipe, b"a")
     stream(pipe, 1.0)
     pipe.run(2.0)
-    assert end.feed.lost == 0
+    assert end.writer_proxy.lost == 0
     assert sequences(end) == list(range(51, 61))
     assert pipe.publisher.losses.counts == {LossReason.NO_READER: 50}
 
@@ -199,9 +199,9 @@ def test_best_effort_and_reliable_gaps_are_counted_in_messages(burst: int, *, re
         pipe.run(0.01)
     end.loss = 0.0
     assert_complete(pipe, end)
-    assert len(end.delivered) + end.feed.lost == 100 * burst
-    assert (end.feed.lost == 0) == reliable
-    assert end.feed.losses.counts.keys() <= {LossReason.GAP}
+    assert len(end.delivered) + end.writer_proxy.lost == 100 * burst
+    assert (end.writer_proxy.lost == 0) == reliable
+    assert end.writer_proxy.losses.counts.keys() <= {LossReason.GAP}
 
 
 def test_the_last_messages_of_a_best_effort_topic_are_counted_though_none_follows() -> None:
@@ -212,7 +212,7 @@ def test_the_last_messages_of_a_best_effort_topic_are_counted_though_none_follow
     pipe.publish([b"gone"] * 5)
     end.deaf = False
     pipe.run(3.0)
-    assert list(end.feed.losses.ranges) == [LostRange(11, 15, LossReason.GAP)]
+    assert list(end.writer_proxy.losses.ranges) == [LostRange(11, 15, LossReason.GAP)]
 
 
 def test_what_a_publisher_passes_over_is_lost_for_its_reason() -> None:
@@ -224,7 +224,7 @@ def test_what_a_publisher_passes_over_is_lost_for_its_reason() -> None:
     pipe.publisher.skip(LossReason.WINDOW_OVERFLOW)
     pipe.run(3.0)
     wanted = [LostRange(11, 11, LossReason.TOO_LARGE), LostRange(22, 22, LossReason.WINDOW_OVERFLOW)]
-    assert list(end.feed.losses.ranges) == wanted
+    assert list(end.writer_proxy.losses.ranges) == wanted
     assert pipe.publisher.messages - pipe.publisher.acknowledged == 2
 
 
@@ -239,7 +239,7 @@ def test_a_suspended_reader_is_counted_once_however_often_it_falls_silent() -> N
         pipe.run(3.0)
         stream(pipe, 5.0, every_s=1.0)
     assert_complete(pipe, end)
-    assert pipe.publisher.messages - pipe.publisher.acknowledged == end.feed.lost > 100
+    assert pipe.publisher.messages - pipe.publisher.acknowledged == end.writer_proxy.lost > 100
 
 
 OUTAGES = st.lists(
@@ -275,4 +275,4 @@ def test_through_any_outages_published_is_delivered_or_lost(
     pipe.run(20.0)
     for end in (one, other):
         assert_complete(pipe, end)
-    assert other.feed.lost == 0
+    assert other.writer_proxy.lost == 0

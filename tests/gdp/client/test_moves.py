@@ -46,7 +46,7 @@ def test_what_is_under_way_when_the_path_narrows_arrives_once_and_in_order() -> 
     narrow(pipe, one)
     assert pipe.run(5, pipe.publisher.is_acknowledged)
     assert one.messages == other.messages == sent
-    assert one.feed.lost == other.feed.lost == 0
+    assert one.writer_proxy.lost == other.writer_proxy.lost == 0
 
 
 def test_numbers_still_rise() -> None:
@@ -96,7 +96,7 @@ def test_confirmed_messages_are_counted_and_not_their_numbers() -> None:
     assert pipe.publisher.acknowledged == pipe.publisher.messages == len(one.messages) == 30
 
 
-def test_a_late_joiner_gets_latched_messages_in_the_new_size_and_nobody_gets_them_again() -> None:
+def test_a_late_reassembler_gets_latched_messages_in_the_new_size_and_nobody_gets_them_again() -> None:
     pipe = wide(depth=3)
     (one,) = joined(pipe, b"a")
     sent = messages(10)

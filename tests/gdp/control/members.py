@@ -2,35 +2,37 @@
 
 from __future__ import annotations
 
-from gdp.control.frames import ControlSplitter
-from gdp.control.greeter import Greeter
+from gdp.control.fragments import ControlFragmenter
+from gdp.control.neighbor_discovery import HelloProtocol
+from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
-from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.validity import Validity
-from gdp.effects import Arrival, Instant
 from gdp.frame.codec import HEADER_BYTES, decode
 from gdp.frame.kinds import Kind
+from gdp.sansio import ReceivedFrame, Timestamps
 from gdp.trust.domain import Policy
 
 UNIX_S = 1_800_000_000
 YEAR = Validity(UNIX_S - 31_536_000, UNIX_S + 31_536_000)
 
-SCHOOL = DomainAuthority.found("school", SigningKey.generate(), YEAR)
-CLOUD = DomainAuthority.found("cloud", SigningKey.generate(), YEAR)
-ELSEWHERE = DomainAuthority.found("elsewhere", SigningKey.generate(), YEAR)
+SCHOOL = CertificateAuthority.create("school", SigningKey.generate(), YEAR)
+CLOUD = CertificateAuthority.create("cloud", SigningKey.generate(), YEAR)
+ELSEWHERE = CertificateAuthority.create("elsewhere", SigningKey.generate(), YEAR)
 POLICY = Policy(SCHOOL.root, [CLOUD.root])
 
 
-def node(label: str, role: Role = Role.SWITCH, domain: DomainAuthority = SCHOOL, validity: Validity = YEAR) -> Identity:
+def node(
+    label: str, role: Role = Role.SWITCH, domain: CertificateAuthority = SCHOOL, validity: Validity = YEAR
+) -> Identity:
     """Return a new node of a domain."""
     return NodeKeys.generate(role, label).join(domain, validity)
 
 
-def at(mono_s: float, unix_s: float = UNIX_S) -> Instant:
+def at(mono_s: float, unix_s: float = UNIX_S) -> Timestamps:
     """Return a moment."""
-    return Instant(mono_s, unix_s)
+    return Timestamps(mono_s, unix_s)
 
 
 class Nonces:
@@ -44,9 +46,9 @@ class Nonces:
         return self._next.to_bytes(size, "big")
 
 
-def greeter(identity: Identity, salt: int, policy: Policy = POLICY) -> Greeter:
+def hello_protocol(identity: Identity, salt: int, policy: Policy = POLICY) -> HelloProtocol:
     """Return a greeter with one port, numbered 0."""
-    made = Greeter(identity, policy, ControlSplitter(identity.name, salt), Nonces(salt))
+    made = HelloProtocol(identity, policy, ControlFragmenter(identity.name, salt), Nonces(salt))
     made.add_port(0, bytes([2, salt, 0, 0, 0, 0]), 1_500, 10, 0.0)
     return made
 
@@ -56,7 +58,7 @@ def statement_of(frame: bytes) -> bytes:
     return frame[HEADER_BYTES : HEADER_BYTES + decode(frame).length]
 
 
-def hello_in(statement: bytes, port: int = 0, mac: bytes = b"\x02far\x00\x00", padded_bytes: int = 0) -> Arrival:
+def hello_in(statement: bytes, port: int = 0, mac: bytes = b"\x02far\x00\x00", padded_bytes: int = 0) -> ReceivedFrame:
     """Return the arrival of a hello in one frame, with zeros behind up to ``padded_bytes``."""
-    (frame,) = ControlSplitter(bytes(32), 1).split(Kind.HELLO, statement, 60_000)
-    return Arrival(port, mac, frame.ljust(padded_bytes, b"\0"))
+    (frame,) = ControlFragmenter(bytes(32), 1).split(Kind.HELLO, statement, 60_000)
+    return ReceivedFrame(port, mac, frame.ljust(padded_bytes, b"\0"))

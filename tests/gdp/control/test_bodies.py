@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.hello import Hello
 from gdp.control.join import Join
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
-from gdp.control.query import Answer, Query
+from gdp.control.query import Query, Response
 from gdp.control.relay import Relay
 from gdp.control.revoked import Lacking, Revoked
-from gdp.control.verdict import Verdict
 from gdp.crypto.statements import Fields, Statement, StatementType, parse, sign
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
@@ -26,7 +26,7 @@ HELLO = Hello(b"n" * 8, 7, (b"h" * 16,), 1_500, b"d" * 8, b"cert")
 JOIN = Join(A, B, C, A, frozenset({A, B}), 1_400, 7.0, b"evidence", b"s" * 16, 99)
 LINKS, INSIDE, RIBS = (Adjacency(B, A, 10, 1_500),), (Adjacency(C, A, 3, 1),), (AttachedRib(C, A, bytes(8)),)
 STATE = LinkState(NODE.name, A, Scope.BORDER, 5, LINKS, INSIDE, RIBS, (A, B))
-ANSWER = Answer(A, B, b"claim", C, (A, B), 30.0)
+ANSWER = Response(A, B, b"claim", C, (A, B), 30.0)
 REVOKED = Revoked(b"s" * 16, 7, ((A, 3, b"d" * 8), (B, 0, bytes(8))))
 BUCKETS = Revoked(b"s" * 16, 8, (), A, tuple(bytes([at]) * 8 for at in range(256)))
 LACKING = Lacking(b"s" * 16, 9, A, (1, 200), (b"i" * 8, b"j" * 8))
@@ -45,16 +45,16 @@ BODIES: dict[str, tuple[bytes, object, Read]] = {
     "revoked": (REVOKED.to_wire(NODE.name, NODE.key), REVOKED, Revoked.from_fields),
     "revoked in buckets": (BUCKETS.to_wire(NODE.name, NODE.key), BUCKETS, Revoked.from_fields),
     "lacking": (LACKING.to_wire(NODE.name, NODE.key), LACKING, Lacking.from_fields),
-    "answer": (ANSWER.to_wire(NODE.name, NODE.key, b"cert"), ANSWER, Answer.from_fields),
+    "answer": (ANSWER.to_wire(NODE.name, NODE.key, b"cert"), ANSWER, Response.from_fields),
     "relay": (
         Relay(b"claim", (A,), b"cert").to_wire(NODE.name, NODE.key),
         Relay(b"claim", (A,), b"cert"),
         Relay.from_fields,
     ),
-    "verdict": (
-        Verdict(A, B, DropReason.STALE, 3).to_wire(NODE.name, NODE.key, b"cert"),
-        Verdict(A, B, DropReason.STALE, 3),
-        Verdict.from_fields,
+    "advertise-ack": (
+        AdvertiseAck(A, B, DropReason.STALE, 3).to_wire(NODE.name, NODE.key, b"cert"),
+        AdvertiseAck(A, B, DropReason.STALE, 3),
+        AdvertiseAck.from_fields,
     ),
 }
 
@@ -91,16 +91,16 @@ def test_an_empty_body_is_malformed(which: str) -> None:
 
 
 def test_a_reason_of_a_later_version_is_a_refusal_all_the_same() -> None:
-    fields = {**body_of("verdict").fields, "r": 200}
-    verdict = Verdict.from_fields(parse(sign(StatementType.VERDICT, fields, NODE.name, NODE.key)).fields)
-    assert verdict.refused is DropReason.MALFORMED
+    fields = {**body_of("advertise-ack").fields, "r": 200}
+    ack = AdvertiseAck.from_fields(parse(sign(StatementType.ADVERTISE_ACK, fields, NODE.name, NODE.key)).fields)
+    assert ack.refused is DropReason.MALFORMED
 
 
 def test_what_is_taken_has_no_reason() -> None:
-    taken = Verdict(A, B, None, 3)
-    assert Verdict.from_fields(parse(taken.to_wire(NODE.name, NODE.key, b"")).fields) == taken
+    taken = AdvertiseAck(A, B, None, 3)
+    assert AdvertiseAck.from_fields(parse(taken.to_wire(NODE.name, NODE.key, b"")).fields) == taken
 
 
-def test_an_answer_that_names_the_name_itself_without_a_claim_is_nobody() -> None:
-    assert Answer(A, A, b"", C, (), 2.0).is_nobody
-    assert not Answer(A, B, b"", C, (), 0.0).is_nobody
+def test_an_answer_that_names_the_name_itself_without_a_advertisement_is_nobody() -> None:
+    assert Response(A, A, b"", C, (), 2.0).is_nobody
+    assert not Response(A, B, b"", C, (), 0.0).is_nobody

@@ -6,20 +6,20 @@ from collections.abc import Callable
 
 import pytest
 
-from gdp.control.frames import ControlSplitter
-from gdp.control.greeter import Greeter
+from gdp.control.fragments import ControlFragmenter
 from gdp.control.hello import Hello, Timing
 from gdp.control.keepalive import KeepaliveFlag, Slowness, open_keepalive
+from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import NeighbourState
 from gdp.crypto.exchange import ExchangeKey
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import parse
 from gdp.crypto.validity import Validity
-from gdp.effects import Arrival
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
 from gdp.frame.codec import HEADER_BYTES, decode
 from gdp.frame.kinds import Kind
 from gdp.limits import CLOCK_SKEW_S, DEAD_S, HELLO_IDLE, HELLO_S
+from gdp.sansio import ReceivedFrame
 from tests.gdp.control.members import POLICY, UNIX_S, YEAR, Nonces, at, node
 
 A, B = node("a"), node("b")
@@ -36,7 +36,7 @@ class Pair:
     def __init__(self, one: Timing = FAST, two: Timing = FAST, identities: tuple[Identity, Identity] = (A, B)) -> None:
         self.now_s = 0.0
         self.ends = {
-            name: self.greeter(identity, salt, timing)
+            name: self.hello_protocol(identity, salt, timing)
             for name, identity, salt, timing in zip("ab", identities, (1, 2), (one, two), strict=True)
         }
         self.frames: list[tuple[str, bytes]] = []  # sender, frame
@@ -46,15 +46,15 @@ class Pair:
         self.gone_s: dict[str, float] = {}
 
     @staticmethod
-    def greeter(identity: Identity, salt: int, timing: Timing) -> Greeter:
-        splitter = ControlSplitter(identity.name, salt)
-        made = Greeter(identity, POLICY, splitter, Nonces(salt), timing=timing, incarnation=salt)
+    def hello_protocol(identity: Identity, salt: int, timing: Timing) -> HelloProtocol:
+        fragmenter = ControlFragmenter(identity.name, salt)
+        made = HelloProtocol(identity, POLICY, fragmenter, Nonces(salt), timing=timing, incarnation=salt)
         made.add_port(0, bytes([2, salt, 0, 0, 0, 0]), 1_500, 10, 0.0)
         return made
 
     def hear(self, name: str, frame: bytes) -> None:
         header = decode(frame)
-        arrival = Arrival(0, b"\x02far\x00\x00", frame)
+        arrival = ReceivedFrame(0, b"\x02far\x00\x00", frame)
         try:
             if header.kind == Kind.KEEPALIVE:
                 self.ends[name].receive_keepalive(arrival, header, at(self.now_s, UNIX_S + self.now_s))
@@ -72,12 +72,12 @@ class Pair:
                 if name in self.frozen:
                     continue
                 end = self.ends[name]
-                due_s = end.next_timeout()
+                due_s = end.get_timer()
                 if due_s is None or due_s > self.now_s:
                     continue
-                if end.expire(self.now_s):
+                if end.drop_silent(self.now_s):
                     self.gone_s.setdefault(name, self.now_s)
-                for transmit in end.take(self.now_s):
+                for transmit in end.hellos_to_send(self.now_s):
                     for frame in transmit.frames:
                         self.frames.append((name, frame))
                         if other not in self.frozen and self.passes(name, frame):
@@ -237,9 +237,9 @@ def test_a_strangers_keepalive_is_refused_and_not_answered() -> None:
     pair = up(Pair())
     pair.run(0.1)
     frame = keepalives_of(pair, "a")[-1]  # a's own, come back
-    pair.ends["a"].take(pair.now_s)  # what is due anyhow
+    pair.ends["a"].hellos_to_send(pair.now_s)  # what is due anyhow
     assert refusal(pair, frame) == [DropReason.UNKNOWN_SENDER]
-    assert pair.ends["a"].take(pair.now_s) == []
+    assert pair.ends["a"].hellos_to_send(pair.now_s) == []
 
 
 def test_a_short_keepalive_is_refused() -> None:

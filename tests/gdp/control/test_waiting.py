@@ -10,11 +10,11 @@ from gdp.control.strangers import STRANGERS_MAX, Strangers
 from gdp.control.waiting import Wait, WaitLog, WaitReason
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import parse
-from gdp.effects import Arrival
 from gdp.errors import DropReason, StatementError
 from gdp.limits import HELLO_S, WAIT_REPORT_S
+from gdp.sansio import ReceivedFrame
 from gdp.trust.right import Right
-from tests.gdp.control.members import CLOUD, ELSEWHERE, POLICY, Nonces, at, greeter, node, statement_of
+from tests.gdp.control.members import CLOUD, ELSEWHERE, POLICY, Nonces, at, hello_protocol, node, statement_of
 from tests.journeys.flows import ROBOT, ring
 
 DOWN, ALONE = Wait(WaitReason.LINK_DOWN, 0), Wait(WaitReason.NO_NEIGHBOUR, 0)
@@ -59,27 +59,31 @@ def test_a_port_and_a_missing_rib_are_reported_apart() -> None:
 
 def test_a_node_whose_link_is_down_and_then_up_says_so() -> None:
     alone = attachment()
-    alone.greeter.add_port(0, bytes(6), 1_500, 10, 0.0)
+    alone.hello_protocol.add_port(0, bytes(6), 1_500, 10, 0.0)
     assert reasons(alone) == [WaitReason.NO_NEIGHBOUR]
-    alone.greeter.port_changed(0, False, 0.0)
+    alone.hello_protocol.port_changed(0, False, 0.0)
     assert reasons(alone) == [WaitReason.LINK_DOWN]
 
 
 @pytest.mark.parametrize(("role", "reason"), [(Role.SWITCH, WaitReason.ONE_WAY), (Role.PROXY, WaitReason.NO_SWITCH)])
 def test_a_neighbour_that_does_not_answer_is_told_from_one_that_is_no_switch(role: Role, reason: WaitReason) -> None:
-    alone, other = attachment(), greeter(node("other", role), 2)
-    alone.greeter.add_port(0, bytes(6), 1_500, 10, 0.0)
-    for hello in other.take(0.0):
-        alone.greeter.receive(Arrival(0, b"\2far\0\0", hello.frames[0]), parse(statement_of(hello.frames[0])), at(0.0))
+    alone, other = attachment(), hello_protocol(node("other", role), 2)
+    alone.hello_protocol.add_port(0, bytes(6), 1_500, 10, 0.0)
+    for hello in other.hellos_to_send(0.0):
+        alone.hello_protocol.receive(
+            ReceivedFrame(0, b"\2far\0\0", hello.frames[0]), parse(statement_of(hello.frames[0])), at(0.0)
+        )
     assert reasons(alone) == [reason]
 
 
 def test_a_neighbour_of_a_domain_that_is_not_trusted_is_named_while_it_is_heard() -> None:
-    alone, stranger = attachment(), greeter(node("stranger", domain=ELSEWHERE), 2)
-    alone.greeter.add_port(0, bytes(6), 1_500, 10, 0.0)
-    (hello,) = stranger.take(0.0)
+    alone, stranger = attachment(), hello_protocol(node("stranger", domain=ELSEWHERE), 2)
+    alone.hello_protocol.add_port(0, bytes(6), 1_500, 10, 0.0)
+    (hello,) = stranger.hellos_to_send(0.0)
     with pytest.raises(StatementError):
-        alone.greeter.receive(Arrival(0, b"\2far\0\0", hello.frames[0]), parse(statement_of(hello.frames[0])), at(0.0))
+        alone.hello_protocol.receive(
+            ReceivedFrame(0, b"\2far\0\0", hello.frames[0]), parse(statement_of(hello.frames[0])), at(0.0)
+        )
     (wait,) = attachment_waits(alone, HELLO_S)
     assert wait == Wait(WaitReason.STRANGER, 0, ELSEWHERE.root.label, refused=DropReason.WRONG_DOMAIN)
     assert reasons(alone, 10.0) == [WaitReason.NO_NEIGHBOUR]
@@ -111,14 +115,16 @@ def test_a_refused_advertisement_is_named_with_the_reason() -> None:
     world = ring()
     robot = world.members[ROBOT].attachment
     own = world.identities[ROBOT].subject
-    robot.claim(own, Right.PUBLISH, (), is_global=True)
-    next(each for each in robot.claims if each.right is Right.PUBLISH).refused = DropReason.NOT_DELEGATED
+    robot.advertisement(own, Right.PUBLISH, (), is_global=True)
+    next(each for each in robot.advertisements if each.right is Right.PUBLISH).refused = DropReason.NOT_DELEGATED
     assert attachment_waits(robot, 0.0) == [Wait(WaitReason.REFUSED, name=own.name, refused=DropReason.NOT_DELEGATED)]
 
 
 def test_the_domain_of_a_trusted_member_is_not_a_stranger() -> None:
-    alone, other = attachment(), greeter(node("other", domain=CLOUD), 2)
-    alone.greeter.add_port(0, bytes(6), 1_500, 10, 0.0)
-    (hello,) = other.take(0.0)
-    alone.greeter.receive(Arrival(0, b"\2far\0\0", hello.frames[0]), parse(statement_of(hello.frames[0])), at(0.0))
+    alone, other = attachment(), hello_protocol(node("other", domain=CLOUD), 2)
+    alone.hello_protocol.add_port(0, bytes(6), 1_500, 10, 0.0)
+    (hello,) = other.hellos_to_send(0.0)
+    alone.hello_protocol.receive(
+        ReceivedFrame(0, b"\2far\0\0", hello.frames[0]), parse(statement_of(hello.frames[0])), at(0.0)
+    )
     assert reasons(alone) == [WaitReason.ONE_WAY]

@@ -18,24 +18,24 @@ from cryptography.x509.oid import NameOID
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gdp.crypto.ca import CertificateAuthority, request_membership
 from gdp.crypto.certificates import Membership, Role, Root, Unverified
 from gdp.crypto.identity import node_metadata
-from gdp.crypto.issuing import DomainAuthority, request_membership
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
-from gdp.crypto.x509_form import alternative_names, read_request, to_pem
+from gdp.crypto.x509_profile import alternative_names, read_request, to_pem
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.metadata import Metadata
 
 NOW = 1_800_000_000
 YEAR = Validity(NOW, NOW + 365 * 86_400)
 MONTH = Validity(NOW, NOW + 30 * 86_400)
-SCHOOL = DomainAuthority.found("school", SigningKey.generate(), YEAR)
+SCHOOL = CertificateAuthority.create("school", SigningKey.generate(), YEAR)
 DIGEST = node_metadata(Role.PROXY, "robot").digest()
 KEY = SigningKey.generate()
 REQUEST = request_membership(KEY, Role.PROXY, "robot", DIGEST)
-MEMBER = SCHOOL.admit(REQUEST, MONTH)
+MEMBER = SCHOOL.issue(REQUEST, MONTH)
 FOREIGN = (DropReason.BAD_CERTIFICATE, DropReason.WRONG_NAME, DropReason.WRONG_DOMAIN, DropReason.EXPIRED)
 
 
@@ -52,7 +52,7 @@ def test_a_membership_says_who_the_node_is() -> None:
 
 def test_a_leaf_is_a_switch_by_another_role_and_name() -> None:
     request = {role: request_membership(KEY, role, "robot", node_metadata(role, "robot").digest()) for role in Role}
-    leaf, switch = (SCHOOL.admit(request[role], MONTH) for role in (Role.LEAF, Role.SWITCH))
+    leaf, switch = (SCHOOL.issue(request[role], MONTH) for role in (Role.LEAF, Role.SWITCH))
     assert (leaf.role, switch.role) == (Role.LEAF, Role.SWITCH)
     assert [role for role in Role if role.is_switch] == [Role.SWITCH, Role.LEAF]
     assert leaf.name != switch.name
@@ -73,12 +73,12 @@ def test_der_and_pem_are_read_alike() -> None:
 
 
 def test_a_domain_of_the_same_label_does_not_vouch_for_it() -> None:
-    other = DomainAuthority.found("school", SigningKey.generate(), YEAR)
+    other = CertificateAuthority.create("school", SigningKey.generate(), YEAR)
     assert reason(MEMBER.wire, other.root) is DropReason.WRONG_DOMAIN
 
 
 def test_a_domain_of_another_label_does_not_vouch_for_it() -> None:
-    other = DomainAuthority.found("cloud", SigningKey.generate(), YEAR)
+    other = CertificateAuthority.create("cloud", SigningKey.generate(), YEAR)
     assert reason(MEMBER.wire, other.root) is DropReason.WRONG_DOMAIN
 
 
@@ -101,9 +101,9 @@ def test_a_second_signature_leaves_the_fingerprint_as_it_is() -> None:
     body = certificate.tbs_certificate_bytes + bytes.fromhex("300a06082a8648ce3d040302")
     body += b"\x03" + bytes((len(flipped) + 1,)) + b"\x00" + flipped
     wire = b"\x30\x82" + len(body).to_bytes(2, "big") + body
-    twin = Membership.from_wire(wire, SCHOOL.root, NOW)
-    assert twin.wire != MEMBER.wire
-    assert twin.fingerprint == MEMBER.fingerprint
+    converter = Membership.from_wire(wire, SCHOOL.root, NOW)
+    assert converter.wire != MEMBER.wire
+    assert converter.fingerprint == MEMBER.fingerprint
 
 
 @given(st.integers(0, len(MEMBER.wire) - 1), st.integers(1, 255))
@@ -230,7 +230,7 @@ def test_other_forms_are_bad_certificates(wire: bytes) -> None:
 
 def test_a_membership_cannot_outlive_its_root() -> None:
     with pytest.raises(LocalError):
-        SCHOOL.admit(REQUEST, Validity(NOW, YEAR.not_after_unix_s + 1))
+        SCHOOL.issue(REQUEST, Validity(NOW, YEAR.not_after_unix_s + 1))
 
 
 def test_a_request_for_a_domain_is_refused() -> None:
@@ -246,7 +246,7 @@ def test_a_request_for_a_domain_is_refused() -> None:
         .sign(SCHOOL.key.private, hashes.SHA256())
     )
     with pytest.raises(StatementError) as caught:
-        SCHOOL.admit(request.public_bytes(Encoding.PEM), MONTH)
+        SCHOOL.issue(request.public_bytes(Encoding.PEM), MONTH)
     assert caught.value.reason is DropReason.BAD_CERTIFICATE
 
 
@@ -255,21 +255,21 @@ def test_a_request_signed_by_another_key_is_refused() -> None:
     forged = bytearray(der)
     forged[-1] ^= 1
     with pytest.raises(StatementError) as caught:
-        SCHOOL.admit(bytes(forged), MONTH)
+        SCHOOL.issue(bytes(forged), MONTH)
     assert caught.value.reason is DropReason.BAD_CERTIFICATE
 
 
 @pytest.mark.parametrize("label", ["", "x" * 65, "a\nb"])
 def test_a_label_that_cannot_be_is_our_own_mistake(label: str) -> None:
     with pytest.raises(LocalError):
-        DomainAuthority.found(label, SigningKey.generate(), YEAR)
+        CertificateAuthority.create(label, SigningKey.generate(), YEAR)
     with pytest.raises(LocalError):
         request_membership(KEY, Role.RIB, label, DIGEST)
 
 
 def test_a_root_with_another_key_is_no_authority() -> None:
     with pytest.raises(LocalError):
-        DomainAuthority(KEY, SCHOOL.root)
+        CertificateAuthority(KEY, SCHOOL.root)
 
 
 def test_an_unverified_membership_has_its_name_proved() -> None:
@@ -308,7 +308,7 @@ def test_openssl_reads_name_role_and_label(files: Path) -> None:
 @needs_openssl
 def test_a_membership_issued_by_openssl_holds_here(tmp_path: Path) -> None:
     now = time.time()  # openssl goes by the real clock
-    authority = DomainAuthority.found("school", SigningKey.generate(), Validity.lasting(now - 60, 86_400))
+    authority = CertificateAuthority.create("school", SigningKey.generate(), Validity.lasting(now - 60, 86_400))
     root, key, request, out = (tmp_path / name for name in ("root.crt", "root.key", "node.csr", "node.crt"))
     root.write_bytes(to_pem(authority.root.wire))
     key.write_bytes(authority.key.to_pem())

@@ -153,7 +153,7 @@ def test_another_source_incarnation_kind_destination_or_secret_is_another_key() 
     base = (SECRET, Kind.DATA, SOURCE, INCARNATION, TOPIC)
     others = [
         (b"S" * 32, *base[1:]),
-        (SECRET, Kind.STATUS, *base[2:]),
+        (SECRET, Kind.HEARTBEAT, *base[2:]),
         (*base[:2], b"q" * 32, *base[3:]),
         (*base[:3], INCARNATION + 1, TOPIC),
         (*base[:4], b"u" * 32),

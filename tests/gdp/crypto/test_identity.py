@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys, node_metadata
-from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import StatementType, parse
 from gdp.crypto.validity import Validity
@@ -14,7 +14,7 @@ from gdp.errors import LocalError
 from gdp.metadata import Metadata
 
 SPAN = Validity(1_000, 2_000)
-SCHOOL = DomainAuthority.found("school", SigningKey.generate(), SPAN)
+SCHOOL = CertificateAuthority.create("school", SigningKey.generate(), SPAN)
 ROBOT = NodeKeys.generate(Role.PROXY, "robot", {"site": "roof"})
 MEMBER = ROBOT.join(SCHOOL, SPAN)
 
@@ -37,7 +37,7 @@ def test_the_membership_of_another_node_is_refused() -> None:
 
 
 def test_the_root_of_another_domain_is_refused() -> None:
-    cloud = DomainAuthority.found("cloud", SigningKey.generate(), SPAN)
+    cloud = CertificateAuthority.create("cloud", SigningKey.generate(), SPAN)
     with pytest.raises(LocalError, match="another domain"):
         ROBOT.admitted(MEMBER.member, cloud.root)
 

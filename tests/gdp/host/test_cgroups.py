@@ -13,7 +13,7 @@ import pytest
 
 from gdp.errors import LocalError
 from gdp.host.cgroups import Cgroup
-from gdp.host.run_registry import Runs
+from gdp.host.run_registry import RunRegistry
 
 _PATIENCE_S = 10.0
 
@@ -89,7 +89,7 @@ def test_a_run_takes_its_group_down(
     group: Cgroup, sleeper: subprocess.Popen[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    runs = Runs(tmp_path / "runs")
+    runs = RunRegistry(tmp_path / "runs")
     run = runs.start()
     run.plan_cgroup(group.name)
     group.add(sleeper.pid)

@@ -14,13 +14,13 @@ import pytest
 from gdp.errors import LocalError
 from gdp.host.mounts import mount_tmpfs
 from gdp.host.processes import Process
-from gdp.host.run_registry import Record, Run, Runs
+from gdp.host.run_registry import Record, Run, RunRegistry
 
 
 @pytest.fixture
-def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Runs:
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunRegistry:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    return Runs(tmp_path / "runs")
+    return RunRegistry(tmp_path / "runs")
 
 
 def rewrite(run: Run, folder: Path, change: Callable[[Record], None]) -> None:
@@ -34,7 +34,7 @@ def orphan(record: Record) -> None:
     record.owner = Process(record.owner.pid, record.owner.started - 1)
 
 
-def test_a_run_under_way_is_left_alone(runs: Runs) -> None:
+def test_a_run_under_way_is_left_alone(runs: RunRegistry) -> None:
     run = runs.start()
     assert runs.sweep() == []
     assert runs.take_down() == []
@@ -42,7 +42,7 @@ def test_a_run_under_way_is_left_alone(runs: Runs) -> None:
     run.end()
 
 
-def test_the_end_of_a_run_leaves_nothing(runs: Runs, tmp_path: Path) -> None:
+def test_the_end_of_a_run_leaves_nothing(runs: RunRegistry, tmp_path: Path) -> None:
     run = runs.start()
     (run.directory / "keys").mkdir()
     (run.directory / "keys" / "a").write_text("secret")
@@ -50,14 +50,14 @@ def test_the_end_of_a_run_leaves_nothing(runs: Runs, tmp_path: Path) -> None:
     assert list(tmp_path.rglob("*")) == [tmp_path / "runs"]
 
 
-def test_only_this_user_sees_a_run(runs: Runs, tmp_path: Path) -> None:
+def test_only_this_user_sees_a_run(runs: RunRegistry, tmp_path: Path) -> None:
     run = runs.start()
     assert run.directory.stat().st_mode & 0o777 == 0o700
     assert (tmp_path / "runs" / f"{run.id}.json").stat().st_mode & 0o777 == 0o600
     run.end()
 
 
-def test_the_run_of_a_killed_process_is_swept_with_its_processes(runs: Runs, tmp_path: Path) -> None:
+def test_the_run_of_a_killed_process_is_swept_with_its_processes(runs: RunRegistry, tmp_path: Path) -> None:
     run = runs.start()
     with subprocess.Popen([sys.executable, "-c", "import signal; signal.pause()"], start_new_session=True) as left:
         run.note_process(left.pid)
@@ -68,7 +68,7 @@ def test_the_run_of_a_killed_process_is_swept_with_its_processes(runs: Runs, tmp
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount")
-def test_what_a_run_mounted_is_unmounted_with_it(runs: Runs, tmp_path: Path) -> None:
+def test_what_a_run_mounted_is_unmounted_with_it(runs: RunRegistry, tmp_path: Path) -> None:
     run = runs.start()
     disk = run.directory / "disk"
     run.plan_mount(disk)
@@ -80,7 +80,7 @@ def test_what_a_run_mounted_is_unmounted_with_it(runs: Runs, tmp_path: Path) -> 
     assert str(disk) not in Path("/proc/self/mounts").read_text()
 
 
-def test_a_kept_run_outlives_its_process_until_it_is_taken_down(runs: Runs, tmp_path: Path) -> None:
+def test_a_kept_run_outlives_its_process_until_it_is_taken_down(runs: RunRegistry, tmp_path: Path) -> None:
     run = runs.start()
     with subprocess.Popen([sys.executable, "-c", "import signal; signal.pause()"], start_new_session=True) as left:
         run.note_process(left.pid)
@@ -92,13 +92,13 @@ def test_a_kept_run_outlives_its_process_until_it_is_taken_down(runs: Runs, tmp_
         assert left.wait(5) != 0
 
 
-def test_a_kept_run_whose_processes_all_died_is_swept(runs: Runs) -> None:
+def test_a_kept_run_whose_processes_all_died_is_swept(runs: RunRegistry) -> None:
     run = runs.start()
     run.keep()
     assert runs.sweep() == [run.id]
 
 
-def test_after_a_boot_no_process_is_touched_on_the_word_of_an_old_record(runs: Runs, tmp_path: Path) -> None:
+def test_after_a_boot_no_process_is_touched_on_the_word_of_an_old_record(runs: RunRegistry, tmp_path: Path) -> None:
     run = runs.start()
     with subprocess.Popen([sys.executable, "-c", "import signal; signal.pause()"], start_new_session=True) as stranger:
         run.note_process(stranger.pid)
@@ -108,7 +108,7 @@ def test_after_a_boot_no_process_is_touched_on_the_word_of_an_old_record(runs: R
         stranger.kill()
 
 
-def test_a_record_that_cannot_be_read_is_left_alone(runs: Runs, tmp_path: Path) -> None:
+def test_a_record_that_cannot_be_read_is_left_alone(runs: RunRegistry, tmp_path: Path) -> None:
     strange = tmp_path / "runs" / "abc.json"
     for text in ("", "[]", "{}", json.dumps({"run": "abc", "owner": 1, "processes": []})):
         strange.write_text(text)
@@ -116,7 +116,7 @@ def test_a_record_that_cannot_be_read_is_left_alone(runs: Runs, tmp_path: Path) 
     assert strange.exists()
 
 
-def test_a_record_whose_writer_was_killed_is_swept(runs: Runs, tmp_path: Path) -> None:
+def test_a_record_whose_writer_was_killed_is_swept(runs: RunRegistry, tmp_path: Path) -> None:
     run = runs.start()
     of_a_run, of_none, young = (tmp_path / "runs" / f"{name}.new" for name in (run.id, "abc", "def"))
     for each in (of_a_run, of_none, young):
@@ -134,4 +134,4 @@ def test_records_that_others_could_have_written_are_refused(tmp_path: Path) -> N
     (tmp_path / "open").mkdir()
     os.chmod(tmp_path / "open", 0o777)
     with pytest.raises(LocalError, match="must belong to this user alone"):
-        Runs(tmp_path / "open")
+        RunRegistry(tmp_path / "open")

@@ -10,8 +10,8 @@ from gdp.errors import DropReason, EnvelopeError
 from gdp.frame.codec import decode
 from gdp.frame.kinds import Kind
 from gdp.limits import JOIN_PATIENCE_S
-from gdp.message.join import Joined, Joiner
-from gdp.message.memory import Budget
+from gdp.message.reassembly import ReassembledMessage, Reassembler
+from gdp.message.reassembly_quota import ReassemblyQuota
 
 SECRET = b"s" * 32
 SOURCE = b"p" * 32
@@ -34,13 +34,13 @@ def opener_of(epoch: int) -> Opener:
     return Opener(SECRET, Kind.DATA, SOURCE, INCARNATION, TOPIC)
 
 
-def joiner(budget: Budget | None = None, patience_s: float = JOIN_PATIENCE_S) -> Joiner:
-    return Joiner(SOURCE, opener_of, WRITER.public, budget or Budget(), patience_s=patience_s)
+def reassembler(budget: ReassemblyQuota | None = None, patience_s: float = JOIN_PATIENCE_S) -> Reassembler:
+    return Reassembler(SOURCE, opener_of, WRITER.public, budget or ReassemblyQuota(), patience_s=patience_s)
 
 
-def add(to: Joiner, frame: bytes, now_s: float = 0.0) -> Joined | None:
+def add(to: Reassembler, frame: bytes, now_s: float = 0.0) -> ReassembledMessage | None:
     return to.add(decode(frame), frame, now_s)
 
 
-def add_all(to: Joiner, frames: list[bytes], now_s: float = 0.0) -> list[Joined]:
+def add_all(to: Reassembler, frames: list[bytes], now_s: float = 0.0) -> list[ReassembledMessage]:
     return [joined for frame in frames if (joined := add(to, frame, now_s)) is not None]

@@ -47,7 +47,7 @@ def test_what_waits_goes_together_in_order_as_far_as_there_is_room() -> None:
     messages = [bytes([at]) * 100 for at in range(10)]
     for message in messages:
         gathered.add(1, message)
-    first, second = gathered.take(4 * 104), gathered.take(4 * 104 + 50)
+    first, second = gathered.poll_batch(4 * 104), gathered.poll_batch(4 * 104 + 50)
     assert [*first, *second] == messages[:8]
     assert len(gathered) == 2
 
@@ -56,7 +56,7 @@ def test_a_message_for_which_there_is_no_room_any_more_goes_alone() -> None:
     gathered = Gathered()
     gathered.add(1, bytes(100))
     gathered.add(1, bytes(100))
-    assert gathered.take(50) == [bytes(100)]
+    assert gathered.poll_batch(50) == [bytes(100)]
 
 
 def test_all_that_was_held_is_given_back() -> None:
@@ -65,6 +65,6 @@ def test_all_that_was_held_is_given_back() -> None:
         gathered.add(1, bytes(size))
     held_bytes = gathered.held_bytes
     while gathered:
-        gathered.take(0)
+        gathered.poll_batch(0)
     assert held_bytes > 1_001
     assert gathered.held_bytes == 0

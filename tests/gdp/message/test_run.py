@@ -7,25 +7,25 @@ from random import Random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gdp.effects import Arrival
 from gdp.errors import DropReason, FrameError
 from gdp.frame.codec import HEADER_BYTES, HOPS_AT, decode
-from gdp.message.join import Joined, Joiner
-from gdp.message.memory import Budget
-from tests.gdp.message.sealed import add_all, joiner, seal
+from gdp.message.reassembly import ReassembledMessage, Reassembler
+from gdp.message.reassembly_quota import ReassemblyQuota
+from gdp.sansio import ReceivedFrame
+from tests.gdp.message.sealed import add_all, reassembler, seal
 
 LONG = bytes(range(256)) * 64
 
 
-def take(to: Joiner, frames: list[bytes], at_once: int = 64) -> tuple[list[Joined], int]:
+def take(to: Reassembler, frames: list[bytes], at_once: int = 64) -> tuple[list[ReassembledMessage], int]:
     """Give frames in batches, the short way where it is open; return what was joined, and how many went that way."""
-    joined: list[Joined] = []
+    joined: list[ReassembledMessage] = []
     short = 0
     for begin in range(0, len(frames), at_once):
-        arrivals = [Arrival(0, bytes(6), frame) for frame in frames[begin : begin + at_once]]
+        arrivals = [ReceivedFrame(0, bytes(6), frame) for frame in frames[begin : begin + at_once]]
         at = 0
         while at < len(arrivals):
-            taken = to.add_run(arrivals, at, 0.0)
+            taken = to.add_batch(arrivals, at, 0.0)
             short += taken
             at += taken
             if not taken:
@@ -38,7 +38,7 @@ def take(to: Joiner, frames: list[bytes], at_once: int = 64) -> tuple[list[Joine
 
 def test_all_inner_parts_but_the_first_go_the_short_way() -> None:
     frames = seal(1, LONG)
-    joined, short = take(joiner(), frames)
+    joined, short = take(reassembler(), frames)
     assert [each.message for each in joined] == [LONG]
     assert short >= len(frames) - 3
 
@@ -52,9 +52,9 @@ def test_both_ways_join_the_same(seed: int, at_once: int, doubled: float, swappe
     for at in range(1, len(frames)):
         if random.random() < swapped:
             frames[at - 1], frames[at] = frames[at], frames[at - 1]
-    budget = Budget()
-    by_both, _ = take(joiner(budget), frames, at_once)
-    by_one = add_all(joiner(), frames)
+    budget = ReassemblyQuota()
+    by_both, _ = take(reassembler(budget), frames, at_once)
+    by_one = add_all(reassembler(), frames)
     assert by_both == by_one
     assert [len(each.message) for each in sorted(by_both, key=lambda each: each.number)] == sizes
     assert budget.held_bytes == 0
@@ -65,7 +65,7 @@ def test_an_altered_part_dies_alone(part: int, at: int, bit: int) -> None:
     frames = seal(1, LONG)
     bad = bytearray(frames[part])
     bad[at] ^= 1 << bit
-    to = joiner()
+    to = reassembler()
     try:
         decode(bytes(bad))
     except FrameError:  # never reaches the joiner
@@ -77,8 +77,8 @@ def test_an_altered_part_dies_alone(part: int, at: int, bit: int) -> None:
 
 
 def test_memory_is_charged_before_a_run_is_opened() -> None:
-    budget = Budget(total_bytes=12_000, source_bytes=12_000)
-    to = joiner(budget)
+    budget = ReassemblyQuota(total_bytes=12_000, source_bytes=12_000)
+    to = reassembler(budget)
     joined, _ = take(to, seal(1, LONG))
     assert joined == []
     assert to.drops[DropReason.MEMORY_FULL] > 0

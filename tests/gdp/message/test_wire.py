@@ -8,21 +8,23 @@ from hypothesis import strategies as st
 
 from gdp.errors import FrameError
 from gdp.limits import NACKS_PER_REPORT
+from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
+from gdp.message.heartbeat import STARTS_MAX, Heartbeat, StreamStart
 from gdp.message.loss import GONE_MAX, LossReason, LostRange
-from gdp.message.move import MOVES_MAX, Move
-from gdp.message.report import Missing, Report, ReportFlag
-from gdp.message.status import STARTS_MAX, Start, Status
+from gdp.message.renumbering import MOVES_MAX, Renumbering
 
 U64 = st.integers(0, (1 << 64) - 1)
 U32 = st.integers(0, (1 << 32) - 1)
-MISSING = st.lists(st.builds(Missing, U64, U32, U32), max_size=NACKS_PER_REPORT).map(tuple)
-FLAGS = st.sampled_from([ReportFlag.NONE, ReportFlag.NEW, ReportFlag.BYE])
-REPORTS = st.builds(Report, FLAGS, U64, U32, MISSING, U64, U64)
+MISSING = st.lists(st.builds(MissingRange, U64, U32, U32), max_size=NACKS_PER_REPORT).map(tuple)
+FLAGS = st.sampled_from([AckNackFlag.NONE, AckNackFlag.NEW, AckNackFlag.BYE])
+REPORTS = st.builds(AckNack, FLAGS, U64, U32, MISSING, U64, U64)
 MOVES = st.lists(
-    st.builds(lambda first, span, gap: Move(first, span, first + span + gap), *[st.integers(1, 1 << 60)] * 3),
+    st.builds(lambda first, span, gap: Renumbering(first, span, first + span + gap), *[st.integers(1, 1 << 60)] * 3),
     max_size=MOVES_MAX,
 ).map(tuple)
-STARTS = st.dictionaries(st.binary(min_size=32, max_size=32), st.builds(Start, U64, U64, U64, U64), max_size=STARTS_MAX)
+STARTS = st.dictionaries(
+    st.binary(min_size=32, max_size=32), st.builds(StreamStart, U64, U64, U64, U64), max_size=STARTS_MAX
+)
 RANGES = st.tuples(U64, U64).map(sorted)
 GONE = st.lists(
     st.builds(lambda ends, reason: LostRange(*ends, reason), RANGES, st.sampled_from(LossReason)), max_size=GONE_MAX
@@ -30,26 +32,26 @@ GONE = st.lists(
 
 
 @given(REPORTS)
-def test_a_report_comes_back_as_it_was(report: Report) -> None:
-    assert Report.from_wire(report.to_wire()) == report
+def test_a_report_comes_back_as_it_was(report: AckNack) -> None:
+    assert AckNack.from_wire(report.to_wire()) == report
 
 
 @given(U64, U64, STARTS, st.binary(max_size=100), MOVES, GONE)
 def test_a_status_comes_back_as_it_was(
     one: int,
     other: int,
-    starts: dict[bytes, Start],
+    starts: dict[bytes, StreamStart],
     description: bytes,
-    moves: tuple[Move, ...],
+    moves: tuple[Renumbering, ...],
     gone: tuple[LostRange, ...],
 ) -> None:
-    status = Status(min(one, other), max(one, other), one % (1 << 32), starts, description, moves, one, other, gone)
-    assert Status.from_wire(status.to_wire()) == status
+    status = Heartbeat(min(one, other), max(one, other), one % (1 << 32), starts, description, moves, one, other, gone)
+    assert Heartbeat.from_wire(status.to_wire()) == status
 
 
 def test_a_move_that_leads_back_is_malformed() -> None:
     with pytest.raises(FrameError):
-        Status.from_wire(Status(5, 5, 0, {}, b"", (Move(3, 2, 5),)).to_wire())
+        Heartbeat.from_wire(Heartbeat(5, 5, 0, {}, b"", (Renumbering(3, 2, 5),)).to_wire())
 
 
 @given(st.binary(max_size=200))
@@ -57,7 +59,7 @@ def test_a_move_that_leads_back_is_malformed() -> None:
 @example(bytes(29) + b"\xff\xff")
 def test_arbitrary_bytes_are_a_report_or_a_frame_error(wire: bytes) -> None:
     try:
-        report = Report.from_wire(wire)
+        report = AckNack.from_wire(wire)
     except FrameError:
         return
     assert report.to_wire() == wire
@@ -67,7 +69,7 @@ def test_arbitrary_bytes_are_a_report_or_a_frame_error(wire: bytes) -> None:
 @example(bytes(36) + b"\xff\xff")
 def test_arbitrary_bytes_are_a_status_or_a_frame_error(wire: bytes) -> None:
     try:
-        status = Status.from_wire(wire)
+        status = Heartbeat.from_wire(wire)
     except FrameError:
         return
     assert status.oldest <= status.sent_number
@@ -75,5 +77,5 @@ def test_arbitrary_bytes_are_a_status_or_a_frame_error(wire: bytes) -> None:
 
 
 def test_ranges_beyond_the_limit_wait_for_the_next_report() -> None:
-    ranges = tuple(Missing(number, 0, 1) for number in range(NACKS_PER_REPORT + 10))
-    assert Report.from_wire(Report(ReportFlag.NONE, 0, 0, ranges).to_wire()).missing == ranges[:NACKS_PER_REPORT]
+    ranges = tuple(MissingRange(number, 0, 1) for number in range(NACKS_PER_REPORT + 10))
+    assert AckNack.from_wire(AckNack(AckNackFlag.NONE, 0, 0, ranges).to_wire()).missing == ranges[:NACKS_PER_REPORT]

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from gdp.crypto.certificates import Role
-from gdp.effects import Instant
 from gdp.nodes.credentials import Credentials, watched_folders
 from gdp.nodes.membership import load_policy
 from gdp.nodes.schema import Domain
+from gdp.sansio import Timestamps
 from gdp.stores.files import public, write_all
 from gdp.stores.issue import make_domain, make_node, renew_node
 from gdp.stores.keyring import load_identity, load_root
@@ -32,7 +32,7 @@ class Site:
         self.credentials = Credentials(self.node, self.config, self.identity, self.policy)
 
     def look(self, unix_s: float = NOW) -> None:
-        self.credentials.look(Instant(0.0, unix_s))
+        self.credentials.look(Timestamps(0.0, unix_s))
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import pytest
 
 from gdp.errors import LocalError
 from gdp.ports import netlink
-from gdp.ports.netlink import CLSACT_EGRESS, LinkAttribute, Questions
+from gdp.ports.netlink import CLSACT_EGRESS, LinkAttribute, NetlinkSocket
 
 ERROR, DONE, NEW_LINK = 2, 3, 16
 QUEUE = LinkAttribute.QDISC
@@ -40,12 +40,12 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
 
 def test_no_such_device_has_no_attributes(kernel: socket.socket) -> None:
     kernel.send(refusal(ERROR, 1, errno.ENODEV))
-    assert Questions().link(7) == {}
+    assert NetlinkSocket().link(7) == {}
 
 
 @pytest.mark.parametrize("number", [errno.EPERM, errno.ENOBUFS, errno.EBUSY])
 def test_a_refusal_does_not_read_as_nothing_there(kernel: socket.socket, number: int) -> None:
-    asking = Questions()
+    asking = NetlinkSocket()
     kernel.send(refusal(ERROR, 1, number))
     with pytest.raises(LocalError):
         asking.link(7)
@@ -58,7 +58,7 @@ def test_a_refusal_does_not_read_as_nothing_there(kernel: socket.socket, number:
 
 
 def test_a_late_answer_is_not_taken_for_the_next_ones(kernel: socket.socket) -> None:
-    asking = Questions()
+    asking = NetlinkSocket()
     with pytest.raises(LocalError, match="timed out"):
         asking.link(7)
     kernel.send(device(1, b"late"))
@@ -76,4 +76,4 @@ def test_without_a_descriptor_there_is_a_local_error(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(socket, "socket", none_left)
     with pytest.raises(LocalError, match="too many"):
-        Questions()
+        NetlinkSocket()

@@ -15,7 +15,7 @@ import pytest
 
 from gdp.frame.kinds import CONTROL_FROM, Flag, Kind
 from gdp.ports import sockets
-from gdp.ports.sockets import Lane, only_ours, steps_of
+from gdp.ports.sockets import TrafficClass, attach_ethertype_filter, steps_of
 from tests.fixtures_forwarding import ONE, frame
 
 LOAD_BYTE, LOAD_LENGTH, JUMP_EQUAL, JUMP_AT_LEAST, JUMP_SET, RETURN = 0x30, 0x80, 0x15, 0x35, 0x45, 0x06
@@ -28,11 +28,11 @@ TO_US, TO_ALL, TO_MANY, TO_ANOTHER, FROM_US = (
     socket.PACKET_OTHERHOST,
     socket.PACKET_OUTGOING,
 )
-KINDS = (0x00, Kind.DATA, Kind.REPORT, CONTROL_FROM - 1, CONTROL_FROM, Kind.HELLO, Kind.REVOKE, 0xFF)
+KINDS = (0x00, Kind.DATA, Kind.ACKNACK, CONTROL_FROM - 1, CONTROL_FROM, Kind.HELLO, Kind.REVOKE, 0xFF)
 FLAGS = (Flag.NONE, Flag.LAST, Flag.URGENT, Flag.URGENT | Flag.RELIABLE, 0xFF, 0xFF & ~Flag.URGENT)
 
 
-def takes(lane: Lane, packet: bytes, kind: int = TO_US, neighbours: tuple[bytes, ...] = ()) -> bool:
+def takes(lane: TrafficClass, packet: bytes, kind: int = TO_US, neighbours: tuple[bytes, ...] = ()) -> bool:
     """Run a lane's filter on a packet, from the Ethernet header on."""
     at, value = 0, 0
     steps = steps_of(lane, neighbours)
@@ -63,7 +63,7 @@ def takes(lane: Lane, packet: bytes, kind: int = TO_US, neighbours: tuple[bytes,
 
 def lanes_of(packet: bytes, kind: int = TO_US, neighbours: tuple[bytes, ...] = ()) -> list[str]:
     """Return the names of the lanes that take a packet."""
-    return [lane.name for lane in Lane if takes(lane, packet, kind, neighbours)]
+    return [lane.name for lane in TrafficClass if takes(lane, packet, kind, neighbours)]
 
 
 def lane_of_control(kind: int) -> str:
@@ -115,7 +115,7 @@ def test_a_frame_cut_short_still_comes_by_one_lane_so_that_it_is_counted(length:
 
 
 def test_every_jump_of_a_filter_ends_inside_it() -> None:
-    for lane in Lane:
+    for lane in TrafficClass:
         steps = steps_of(lane, [bytes([each]) * 6 for each in range(64)])
         for at, (code, if_true, if_false, _) in enumerate(steps):
             assert code in (LOAD_BYTE, LOAD_LENGTH, JUMP_EQUAL, JUMP_AT_LEAST, JUMP_SET, RETURN, LOAD_HALF, LOAD_WORD)
@@ -137,19 +137,19 @@ class Recorder:
         self.options[level, option] = value
 
 
-@pytest.mark.parametrize("lane", Lane)
-def test_the_kernel_is_given_the_whole_filter(lane: Lane) -> None:
+@pytest.mark.parametrize("lane", TrafficClass)
+def test_the_kernel_is_given_the_whole_filter(lane: TrafficClass) -> None:
     asked = Recorder()
-    only_ours(asked, lane)  # type: ignore[arg-type]
+    attach_ethertype_filter(asked, lane)  # type: ignore[arg-type]
     given = asked.options[socket.SOL_SOCKET, 26]
     assert isinstance(given, bytes)
     assert struct.unpack("@HP", given)[0] == len(steps_of(lane))
 
 
 def test_an_older_kernel_without_the_option_to_ignore_what_leaves_will_do() -> None:
-    only_ours(Recorder(refuses=23))  # type: ignore[arg-type]
+    attach_ethertype_filter(Recorder(refuses=23))  # type: ignore[arg-type]
     with pytest.raises(OSError, match="refused"):
-        only_ours(Recorder(refuses=23, number=errno.EPERM))  # type: ignore[arg-type]
+        attach_ethertype_filter(Recorder(refuses=23, number=errno.EPERM))  # type: ignore[arg-type]
 
 
 def test_buffers_are_asked_for_past_the_limit_and_else_up_to_it() -> None:

@@ -7,10 +7,10 @@ import pytest
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.service.dispatch import GATHER_S, HEDGE_FIRST_S, Ask, Dispatch
-from gdp.service.keeper import Keeper
 from gdp.service.latency import LATELY_S
-from gdp.service.ordered import Log, Position, State, call_of
 from gdp.service.replication import ALL, Mode, Replication
+from gdp.service.replication_messages import LogId, ReplicaStatus, Snapshot, call_of
+from gdp.service.sequencer import Sequencer
 from gdp.service.serving import ENDED_MAX, Asked, Serving
 
 FAST, SLOW, BAD = (Name(bytes([number]) * 32) for number in (1, 2, 3))
@@ -32,7 +32,7 @@ def begin(dispatch: Dispatch[str], now_s: float, timeout_s: float | None = 5.0) 
 
 
 def asked_first(dispatch: Dispatch[str]) -> tuple[Name, ...] | None:
-    first, *_ = [each for each in dispatch.take() if isinstance(each, Ask)]
+    first, *_ = [each for each in dispatch.poll_effects() if isinstance(each, Ask)]
     return first.servers
 
 
@@ -41,7 +41,7 @@ def test_one_that_refuses_at_once_does_not_draw_the_requests() -> None:
     call = begin(dispatch, 0.0)
     dispatch.refused(call, BAD, "no", 0.001)
     dispatch.answered(call, SLOW, "yes", 0.2)
-    dispatch.take()
+    dispatch.poll_effects()
     begin(dispatch, 1.0)
     assert asked_first(dispatch) == (SLOW,)
     begin(dispatch, 1.0 + 2 * LATELY_S)
@@ -53,7 +53,7 @@ def test_one_that_rejects_goals_at_once_does_not_draw_them() -> None:
     call = begin(dispatch, 0.0)
     dispatch.declined(call, BAD, "no", 0.001)
     dispatch.answered(call, SLOW, "yes", 0.2)
-    dispatch.take()
+    dispatch.poll_effects()
     begin(dispatch, 1.0)
     assert asked_first(dispatch) == (SLOW,)
 
@@ -70,8 +70,8 @@ def test_one_that_says_nothing_does_not_take_the_second_copies_from_one_that_wou
         else:
             server, took_s = FAST, 0.3
         dispatch.answered(call, server, "yes", at_s + took_s)
-        dispatch.timeout(at_s + took_s + GATHER_S)
-        dispatch.take()
+        dispatch.handle_timer(at_s + took_s + GATHER_S)
+        dispatch.poll_effects()
     assert saved >= 8  # of ten
 
 
@@ -79,43 +79,43 @@ def test_late_calls_without_a_budget_wake_nobody_again_and_again() -> None:
     dispatch = dispatch_to(POOR, FAST, SLOW)
     for _ in range(100):
         begin(dispatch, 0.0, None)
-    dispatch.timeout(2 * HEDGE_FIRST_S)
-    assert dispatch.next_timeout() is None
+    dispatch.handle_timer(2 * HEDGE_FIRST_S)
+    assert dispatch.get_timer() is None
 
 
 def test_the_call_that_is_late_for_longest_gets_the_first_second_copy_that_requests_earn() -> None:
     dispatch = dispatch_to(Replication(Mode.HEDGED, budget=0.5), FAST, SLOW)
     oldest = begin(dispatch, 0.0)
-    dispatch.timeout(2 * HEDGE_FIRST_S)
+    dispatch.handle_timer(2 * HEDGE_FIRST_S)
     asked_first(dispatch)
     newest = begin(dispatch, 1.0)
-    copies = [each.call for each in dispatch.take() if isinstance(each, Ask)]
+    copies = [each.call for each in dispatch.poll_effects() if isinstance(each, Ask)]
     assert copies == [newest, oldest]
 
 
 def test_one_that_goes_and_comes_back_is_asked_each_call_once() -> None:
     dispatch = dispatch_to(ALL, FAST, BAD)
     call = begin(dispatch, 0.0)
-    dispatch.take()
+    dispatch.poll_effects()
     for now_s in (1.0, 2.0):
         dispatch.gone(BAD, now_s, "it describes itself anew")
         dispatch.came(BAD, now_s)
     dispatch.came(SLOW, 3.0)
-    assert dispatch.take() == [Ask(call, b"request", (SLOW,))]
+    assert dispatch.poll_effects() == [Ask(call, b"request", (SLOW,))]
     for server in (FAST, SLOW):
         dispatch.gone(server, 4.0, "gone")
-    assert dispatch.take() == [Ask(call, b"request", (BAD,))]  # when no other is left
+    assert dispatch.poll_effects() == [Ask(call, b"request", (BAD,))]  # when no other is left
 
 
 def test_a_client_with_many_requests_waits_its_turn() -> None:
     serving: Serving[bytes] = Serving(0, at_once=1)
     numbers = [serving.begin(0.0, None, Asked(GREEDY, 0, call), b"") for call in range(100)]
     serving.begin(0.0, None, Asked(MODEST, 0, 0), b"")
-    assert [turn.asked.client for turn in serving.take()] == [GREEDY]
+    assert [turn.asked.client for turn in serving.poll_turns()] == [GREEDY]
     serving.end(numbers[0])
     clients = []
     for _ in range(2):
-        (turn,) = serving.take()
+        (turn,) = serving.poll_turns()
         clients.append(turn.asked.client)
         serving.end(turn.number)
     assert set(clients) == {GREEDY, MODEST}
@@ -136,7 +136,7 @@ def test_room_is_there_again_when_all_has_ended_however_it_ended() -> None:
         for call in range(4):
             after = Asked(GREEDY, 0, 4 * at_s) if call == 3 else None
             serving.begin(at_s, 0.5, Asked(GREEDY, 0, 4 * at_s + call), bytes(10), after)
-        (turn,) = serving.take()
+        (turn,) = serving.poll_turns()
         serving.stop(Asked(GREEDY, 0, 4 * at_s + 1))
         serving.end(turn.number)
         serving.expired(at_s + 0.5)
@@ -152,30 +152,30 @@ def test_words_of_one_client_do_not_push_out_what_another_was_answered() -> None
     assert serving.answer_of(Asked(GREEDY, 0, 0)) is None
 
 
-def test_a_replica_that_claims_more_than_the_log_has_does_not_break_it() -> None:
-    keeper = Keeper[str](life=lambda: 7)
-    keeper.came(BAD, 0.0)
-    keeper.positioned(BAD, Position(tells=True), 0.1)
-    keeper.timeout(2.0)
-    keeper.positioned(BAD, Position(keeper.log, 0, 0, tells=True), 2.1)
+def test_a_replica_that_advertisements_more_than_the_log_has_does_not_break_it() -> None:
+    sequencer = Sequencer[str](life=lambda: 7)
+    sequencer.came(BAD, 0.0)
+    sequencer.positioned(BAD, ReplicaStatus(tells=True), 0.1)
+    sequencer.handle_timer(2.0)
+    sequencer.positioned(BAD, ReplicaStatus(sequencer.log, 0, 0, tells=True), 2.1)
     ends: list[str] = []
-    call = keeper.begin(2.2, lambda _: b"request", 5.0, ends.append, lambda why, _: ends.append(why.value))
-    keeper.answered(call_of(keeper.log, 1_000), BAD, "far ahead", 2.3)
-    keeper.positioned(BAD, State(keeper.log, 1_000, b"state"), 2.4)
-    keeper.positioned(BAD, Position(keeper.log, 1_000, 1_000, tells=True), 2.5)
-    assert (keeper.strange, ends) == (1, [])
-    keeper.positioned(BAD, Position(keeper.log, 0, 0, tells=True), 2.6)
-    keeper.answered(call, BAD, "the answer", 2.7)
+    call = sequencer.begin(2.2, lambda _: b"request", 5.0, ends.append, lambda why, _: ends.append(why.value))
+    sequencer.answered(call_of(sequencer.log, 1_000), BAD, "far ahead", 2.3)
+    sequencer.positioned(BAD, Snapshot(sequencer.log, 1_000, b"state"), 2.4)
+    sequencer.positioned(BAD, ReplicaStatus(sequencer.log, 1_000, 1_000, tells=True), 2.5)
+    assert (sequencer.strange, ends) == (1, [])
+    sequencer.positioned(BAD, ReplicaStatus(sequencer.log, 0, 0, tells=True), 2.6)
+    sequencer.answered(call, BAD, "the answer", 2.7)
     assert ends == ["the answer"]
 
 
 def test_a_request_whose_call_has_ended_is_not_sent() -> None:
     dispatch = dispatch_to(ONE, FAST, SLOW)
     begin(dispatch, 0.0)
-    dispatch.take()
+    dispatch.poll_effects()
     for server in (FAST, SLOW):
         dispatch.gone(server, 0.1, "both in one moment")
-    assert dispatch.take() == []
+    assert dispatch.poll_effects() == []
 
 
 def test_a_request_for_which_there_is_no_room_is_not_even_written() -> None:
@@ -197,9 +197,9 @@ def test_a_request_for_which_there_is_no_room_is_not_even_written() -> None:
     assert written == []
 
 
-def test_a_replica_cannot_claim_a_log_after_which_there_is_none() -> None:
-    keeper = Keeper[str](life=lambda: 7)
-    keeper.came(BAD, 0.0)
-    keeper.positioned(BAD, Position(Log((1 << 64) - 1, 5), 3, 3), 0.1)
-    keeper.timeout(2.0)
-    assert (keeper.strange, keeper.log.generation) == (1, 0)
+def test_a_replica_cannot_advertisement_a_log_after_which_there_is_none() -> None:
+    sequencer = Sequencer[str](life=lambda: 7)
+    sequencer.came(BAD, 0.0)
+    sequencer.positioned(BAD, ReplicaStatus(LogId((1 << 64) - 1, 5), 3, 3), 0.1)
+    sequencer.handle_timer(2.0)
+    assert (sequencer.strange, sequencer.log.generation) == (1, 0)

@@ -12,54 +12,54 @@ from gdp.service.calls import Calls
 
 def test_the_first_answer_wins_and_a_later_one_finds_nobody() -> None:
     calls: Calls[str] = Calls(4, 7)
-    number = calls.begin(0.0, 5.0, "first")
+    number = calls.add_call(0.0, 5.0, "first")
     assert [calls.get(number), calls.end(number), calls.end(number)] == ["first", "first", None]
 
 
 def test_an_answer_after_the_timeout_never_answers_the_next_call() -> None:
     calls: Calls[str] = Calls(4, 7)
-    late = calls.begin(0.0, 1.0, "late")
+    late = calls.add_call(0.0, 1.0, "late")
     assert calls.expired(1.0) == [(late, "late")]
-    calls.begin(1.0, 1.0, "next")
+    calls.add_call(1.0, 1.0, "next")
     assert (calls.end(late), len(calls)) == (None, 1)
 
 
 def test_numbers_begin_at_the_random_start_and_wrap_in_64_bits() -> None:
     calls: Calls[str] = Calls(4, (1 << 64) - 1)
-    assert [calls.begin(0.0, None, "a"), calls.begin(0.0, None, "b")] == [(1 << 64) - 1, 0]
+    assert [calls.add_call(0.0, None, "a"), calls.add_call(0.0, None, "b")] == [(1 << 64) - 1, 0]
 
 
 def test_a_call_without_a_timeout_waits_for_ever() -> None:
     calls: Calls[str] = Calls(4, 7)
-    number = calls.begin(0.0, None, "goal")
-    assert (calls.next_timeout(), calls.expired(1e9), number in calls) == (None, [], True)
+    number = calls.add_call(0.0, None, "goal")
+    assert (calls.get_timer(), calls.expired(1e9), number in calls) == (None, [], True)
 
 
 def test_calls_above_the_limit_are_refused_until_one_ends() -> None:
     calls: Calls[int] = Calls(2, 0)
-    first = calls.begin(0.0, 1.0, 1)
-    calls.begin(0.0, 1.0, 2)
+    first = calls.add_call(0.0, 1.0, 1)
+    calls.add_call(0.0, 1.0, 2)
     with pytest.raises(LocalError, match="2 calls"):
-        calls.begin(0.0, 1.0, 3)
+        calls.add_call(0.0, 1.0, 3)
     calls.end(first)
-    calls.begin(0.0, 1.0, 3)
+    calls.add_call(0.0, 1.0, 3)
 
 
 def test_all_fail_at_once_the_oldest_first() -> None:
     calls: Calls[str] = Calls(4, 7)
-    calls.begin(0.0, 5.0, "a")
-    calls.begin(0.0, 1.0, "b")
+    calls.add_call(0.0, 5.0, "a")
+    calls.add_call(0.0, 1.0, "b")
     assert calls.fail_all() == [(7, "a"), (8, "b")]
-    assert (len(calls), calls.next_timeout(), calls.fail_all()) == (0, None, [])
+    assert (len(calls), calls.get_timer(), calls.fail_all()) == (0, None, [])
 
 
 def test_a_hundred_thousand_answered_calls_leave_no_timers_behind() -> None:
     calls: Calls[int] = Calls(8, 0)
-    standing = calls.begin(0.0, 3_600.0, -1)
+    standing = calls.add_call(0.0, 3_600.0, -1)
     for each in range(100_000):
-        calls.end(calls.begin(0.0, 3_600.0, each))
+        calls.end(calls.add_call(0.0, 3_600.0, each))
     assert len(calls._timers) < 200
-    assert (calls.next_timeout(), standing in calls) == (3_600.0, True)
+    assert (calls.get_timer(), standing in calls) == (3_600.0, True)
 
 
 Step = st.one_of(
@@ -77,7 +77,7 @@ def test_each_call_ends_exactly_once_and_never_before_its_time(steps: list[tuple
     open_until: dict[int, float] = {}
     for step, value in steps:
         if step == "begin" and len(open_until) < 8:
-            number = calls.begin(now_s, value, begun)
+            number = calls.add_call(now_s, value, begun)
             assert number == begun
             open_until[number] = float("inf") if value is None else now_s + value
             begun += 1
@@ -92,5 +92,5 @@ def test_each_call_ends_exactly_once_and_never_before_its_time(steps: list[tuple
             assert [number for number, _ in calls.fail_all()] == list(open_until)
             open_until.clear()
         ends = [until_s for until_s in open_until.values() if until_s != float("inf")]
-        assert calls.next_timeout() == min(ends, default=None)
+        assert calls.get_timer() == min(ends, default=None)
         assert len(calls) == len(open_until)

@@ -41,17 +41,17 @@ class Bench:
         return number
 
     def asked(self) -> list[tuple[Name, ...] | None]:
-        return [each.servers for each in self.dispatch.take() if isinstance(each, Ask)]
+        return [each.servers for each in self.dispatch.poll_effects() if isinstance(each, Ask)]
 
     def stops(self, now_s: float) -> list[Stop]:
-        self.dispatch.timeout(now_s)
-        return [each for each in self.dispatch.take() if isinstance(each, Stop)]
+        self.dispatch.handle_timer(now_s)
+        return [each for each in self.dispatch.poll_effects() if isinstance(each, Stop)]
 
 
 def test_all_are_asked_by_the_tree_and_the_first_answer_wins() -> None:
     bench = Bench()
     call = bench.begin()
-    assert bench.dispatch.take() == [Ask(call, b"0", None)]
+    assert bench.dispatch.poll_effects() == [Ask(call, b"0", None)]
     bench.dispatch.answered(call, B, "b", 0.1)
     bench.dispatch.answered(call, A, "a", 0.2)
     assert (bench.ends, bench.dispatch.late) == ({call: ["b"]}, 1)
@@ -75,7 +75,7 @@ def test_those_that_owe_an_answer_are_told_in_one_word_a_little_later() -> None:
         bench.dispatch.answered(third, server, "soon enough", 0.1 + GATHER_S / 2)
     bench.asked()
     assert bench.stops(0.1 + GATHER_S / 2) == []
-    assert bench.dispatch.next_timeout() == 0.1 + GATHER_S
+    assert bench.dispatch.get_timer() == 0.1 + GATHER_S
     assert bench.stops(0.1 + GATHER_S) == [Stop((first, second), None)]
     assert bench.stops(9.0) == []
 
@@ -143,7 +143,7 @@ def test_an_answer_that_says_no_counts_if_nobody_says_yes() -> None:
         bench.dispatch.declined(call, A, "no", 0.1)
     bench.dispatch.declined(rejected, B, "no, too", 0.2)
     bench.dispatch.answered(accepted, B, "yes", 0.2)
-    bench.dispatch.timeout(5.0)
+    bench.dispatch.handle_timer(5.0)
     assert bench.ends == {rejected: ["no"], accepted: ["yes"], late: ["no"]}
 
 
@@ -174,8 +174,8 @@ def test_the_second_copy_goes_when_the_first_is_late() -> None:
     bench = Bench(HEDGED)
     call = bench.begin()
     assert bench.asked() == [(A,)]
-    assert bench.dispatch.next_timeout() == HEDGE_FIRST_S
-    bench.dispatch.timeout(HEDGE_FIRST_S)
+    assert bench.dispatch.get_timer() == HEDGE_FIRST_S
+    bench.dispatch.handle_timer(HEDGE_FIRST_S)
     assert bench.asked() == [(B,)]
     bench.dispatch.answered(call, B, "b", 0.1)
     assert bench.stops(0.2) == [Stop((call,), A)]
@@ -186,7 +186,7 @@ def test_a_first_copy_has_as_long_as_nearly_all_answers_took() -> None:
     for number in range(100):
         bench.dispatch.answered(bench.begin(float(number)), *_one(bench), number + 0.002)
     bench.begin(200.0)
-    assert bench.dispatch.next_timeout() == pytest.approx(200.002)
+    assert bench.dispatch.get_timer() == pytest.approx(200.002)
 
 
 def test_second_copies_stay_within_the_budget_but_replacements_are_free() -> None:
@@ -196,7 +196,7 @@ def test_second_copies_stay_within_the_budget_but_replacements_are_free() -> Non
         call = bench.begin(float(number))
         (chosen,) = (servers or () for servers in bench.asked())
         took_s = 0.6 if number % 33 == 32 else 0.01
-        bench.dispatch.timeout(number + took_s - 0.001)
+        bench.dispatch.handle_timer(number + took_s - 0.001)
         bench.dispatch.answered(call, chosen[0], "an answer", number + took_s)
         bench.stops(number + 0.7)
         hedged = bench.dispatch.hedged
@@ -210,7 +210,7 @@ def test_second_copies_stay_within_the_budget_but_replacements_are_free() -> Non
 def test_named_servers_are_asked_first_and_not_hedged() -> None:
     bench = Bench(HEDGED)
     call = bench.begin(first=(C,))
-    assert (bench.asked(), bench.dispatch.next_timeout()) == ([(C,)], 5.0)
+    assert (bench.asked(), bench.dispatch.get_timer()) == ([(C,)], 5.0)
     bench.dispatch.gone(C, 0.1, "gone")
     assert bench.asked() == [(A,)]
     bench.dispatch.answered(call, A, "a", 0.2)
@@ -240,7 +240,7 @@ def test_a_callback_may_begin_the_next_call() -> None:
         bench.begin(1.0)
 
     bench.dispatch.begin(0.0, lambda _: b"", 1.0, ends.append, failed)
-    bench.dispatch.timeout(1.0)
+    bench.dispatch.handle_timer(1.0)
     assert (ends, len(bench.dispatch)) == (["timed out"], 1)
 
 
@@ -284,10 +284,10 @@ def test_each_call_ends_exactly_once(replication: Replication, steps: list[tuple
             dispatch.leaves(value)
         elif isinstance(value, float):
             now_s += value
-            dispatch.timeout(now_s)
-            due_s = dispatch.next_timeout()
+            dispatch.handle_timer(now_s)
+            due_s = dispatch.get_timer()
             assert due_s is None or due_s > now_s
-        for effect in dispatch.take():
+        for effect in dispatch.poll_effects():
             if isinstance(effect, Ask):
                 whom = live if effect.servers is None else set(effect.servers)
                 assert whom <= live
@@ -299,7 +299,7 @@ def test_each_call_ends_exactly_once(replication: Replication, steps: list[tuple
         assert all(owed[call] & live for call, ends in bench.ends.items() if not ends)
     dispatch.fail_all("closed")
     assert all(len(ends) == 1 for ends in bench.ends.values())
-    assert (len(dispatch), dispatch.held_bytes, dispatch.next_timeout()) == (0, 0, None)
+    assert (len(dispatch), dispatch.held_bytes, dispatch.get_timer()) == (0, 0, None)
 
 
 def _one(bench: Bench) -> tuple[Name, str]:

@@ -10,8 +10,8 @@ from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.session.core import SessionCore
 from gdp.session.session import Session
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Topology
-from gdp.simulation.world import World
 from gdp.trust.right import Right
 
 __all__ = ["FOREVER_S", "Simulated", "world_of"]
@@ -73,7 +73,7 @@ class Simulated:
 
     def __init__(self, rights: Rights) -> None:
         attachments = (Attachment("s", "rib", "rib0"), *(Attachment("s", "proxy", label) for label in rights))
-        self.world = World(Topology((), (DomainPlan("lab", ("s",)),), attachments))
+        self.world = Simulation(Topology((), (DomainPlan("lab", ("s",)),), attachments))
         self.cores: dict[str, SessionCore] = {}
         self.sessions: dict[str, Session] = {}
         starts = iter(range(1, 1 << 30, 1 << 20))

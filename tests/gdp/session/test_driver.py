@@ -72,7 +72,7 @@ class Stub:
     # core, member and publisher
     def handle(self, now_s: float) -> None: ...
 
-    def next_timeout(self) -> float | None:
+    def get_timer(self) -> float | None:
         return None
 
     def flush(self, now_s: float) -> None: ...

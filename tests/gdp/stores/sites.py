@@ -12,30 +12,30 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gdp.control.query import Answer, Query
+from gdp.control.advertise_ack import AdvertiseAck
+from gdp.control.query import Query, Response
 from gdp.control.relay import Relay
-from gdp.control.verdict import Verdict
+from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
-from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
-from gdp.effects import Instant
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.nodes.config import ClusterConfig
-from gdp.rib.machine import Letter, Rib, RibSettings
+from gdp.rib.core import OutgoingStatement, RibCore, RibSettings
 from gdp.rib.store import MemoryStore, Store
+from gdp.sansio import Timestamps
 from gdp.stores.cluster import ClusterStore, load_functions
 from gdp.stores.cluster_link import ClusterLink
 from gdp.stores.snapshot import Snapshot
-from gdp.trust.claim import make_claim
+from gdp.trust.advertisement import sign_advertisement
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
-from gdp.trust.verifier import ClaimVerifier
+from gdp.trust.verifier import AdvertisementVerifier
 
 EVIDENCE_S = 3_600  # for which claims can be proven: the RtCert ends before the memberships
 START_CLUSTER = Path(__file__).parents[3] / "scripts" / "start_cluster.sh"
@@ -49,7 +49,7 @@ class Site:
 
     def __post_init__(self) -> None:
         self.validity = Validity.lasting(self.unix_s, 86_400)
-        self.authority = DomainAuthority.found("site", SigningKey.generate(), self.validity)
+        self.authority = CertificateAuthority.create("site", SigningKey.generate(), self.validity)
         self.switch, self.robot = self.node(Role.SWITCH, "switch"), self.node(Role.PROXY, "robot")
         self.ribs = self.node(Role.RIB, "one"), self.node(Role.RIB, "two")
         self.rtcert = RtCert.make(self.robot, self.switch.name, Validity.lasting(self.unix_s, EVIDENCE_S))
@@ -60,14 +60,14 @@ class Site:
     def policy(self) -> Policy:
         return Policy(self.authority.root)
 
-    def now(self, later_s: float = 0.0) -> Instant:
-        return Instant(1_000.0 + later_s, self.unix_s + later_s)
+    def now(self, later_s: float = 0.0) -> Timestamps:
+        return Timestamps(1_000.0 + later_s, self.unix_s + later_s)
 
     def subject(self, name: str) -> Subject:
         return Subject.of(Metadata({"kind": "topic", "name": name}), self.robot.key.public.compressed)
 
     def relay(self, name: str, sequence: int, lease_s: float = 60.0) -> bytes:
-        wire = make_claim(
+        wire = sign_advertisement(
             self.robot,
             Right.PUBLISH,
             self.subject(name),
@@ -97,22 +97,22 @@ class Pair:
     def __init__(self, site: Site, stores: tuple[Store, Store], peers: tuple[Name, ...] = ()) -> None:
         self.site = site
         self.one, self.two = (
-            Rib(identity, site.policy(), store, RibSettings(peers=peers))
+            RibCore(identity, site.policy(), store, RibSettings(peers=peers))
             for identity, store in zip(site.ribs, stores, strict=True)
         )
-        self.sent: list[Letter] = []
+        self.sent: list[OutgoingStatement] = []
 
-    def give(self, rib: Rib, wire: bytes, later_s: float = 0.0) -> list[Letter]:
+    def give(self, rib: RibCore, wire: bytes, later_s: float = 0.0) -> list[OutgoingStatement]:
         """Hand a statement of the switch to a RIB; return what goes back to the switch."""
         rib.receive_all([(wire, self.site.switch.name)], self.site.now(later_s))
         return self.take(rib)
 
-    def take(self, rib: Rib) -> list[Letter]:
-        letters = rib.take()
-        self.sent += [letter for letter in letters if letter.to != self.site.switch.name]
-        return [letter for letter in letters if letter.to == self.site.switch.name]
+    def take(self, rib: RibCore) -> list[OutgoingStatement]:
+        letters = rib.statements_to_send()
+        self.sent += [outgoing for outgoing in letters if outgoing.to != self.site.switch.name]
+        return [outgoing for outgoing in letters if outgoing.to == self.site.switch.name]
 
-    def sync(self, later_s: float = 0.0) -> list[Letter]:
+    def sync(self, later_s: float = 0.0) -> list[OutgoingStatement]:
         """Return what the second RIB tells the switch of it."""
         raise NotImplementedError
 
@@ -126,19 +126,19 @@ class MemoryPair(Pair):
     def __init__(self, site: Site) -> None:
         super().__init__(site, (MemoryStore(), MemoryStore()), tuple(identity.name for identity in site.ribs))
 
-    def sync(self, later_s: float = 0.0) -> list[Letter]:
+    def sync(self, later_s: float = 0.0) -> list[OutgoingStatement]:
         told = self.take(self.two)
         now = self.site.now(later_s)
         by_name = {identity.name: rib for identity, rib in zip(self.site.ribs, (self.one, self.two), strict=True)}
         for rib in by_name.values():
             rib.connected(now)
-            rib.timeout(now)
+            rib.handle_timer(now)
             told += self.take(rib)
         while self.sent:
-            letter = self.sent.pop(0)
-            sender = parse(letter.statement).signer
-            by_name[letter.to].receive(letter.statement, sender, now)
-            told += self.take(by_name[letter.to])
+            outgoing = self.sent.pop(0)
+            sender = parse(outgoing.statement).signer
+            by_name[outgoing.to].receive(outgoing.statement, sender, now)
+            told += self.take(by_name[outgoing.to])
         return told
 
 
@@ -151,7 +151,7 @@ class SnapshotPair(Pair):
         self.memory.changes = set()
         super().__init__(site, (self.memory, MemoryStore()))
 
-    def sync(self, later_s: float = 0.0) -> list[Letter]:
+    def sync(self, later_s: float = 0.0) -> list[OutgoingStatement]:
         now = self.site.now(later_s)
         writer = Snapshot(self._path)
         writer.start()
@@ -170,12 +170,12 @@ class ClusterPair(Pair):
     def __init__(self, site: Site, config: ClusterConfig) -> None:
         self.links = [ClusterLink(config.address()) for _ in range(2)]
         load_functions(self.links[0])
-        self.stores = [ClusterStore(link, ClaimVerifier(site.policy())) for link in self.links]
+        self.stores = [ClusterStore(link, AdvertisementVerifier(site.policy())) for link in self.links]
         super().__init__(site, (self.stores[0], self.stores[1]))
         for store in self.stores:
             store.changed()  # begin to listen
 
-    def sync(self, later_s: float = 0.0) -> list[Letter]:
+    def sync(self, later_s: float = 0.0) -> list[OutgoingStatement]:
         select.select([self.links[1]], [], [], 5.0)
         self.two.changed(self.stores[1].changed(), self.site.now(later_s))
         return self.take(self.two)
@@ -219,11 +219,11 @@ def _pid_of_server(folder: Path, port: int) -> int:
     raise AssertionError(f"no server on port {port}")
 
 
-def verdicts(letters: list[Letter]) -> list[Verdict]:
-    found = [parse(letter.statement) for letter in letters]
-    return [Verdict.from_fields(each.fields) for each in found if each.type is StatementType.VERDICT]
+def verdicts(letters: list[OutgoingStatement]) -> list[AdvertiseAck]:
+    found = [parse(outgoing.statement) for outgoing in letters]
+    return [AdvertiseAck.from_fields(each.fields) for each in found if each.type is StatementType.ADVERTISE_ACK]
 
 
-def answers(letters: list[Letter]) -> list[Answer]:
-    found = [parse(letter.statement) for letter in letters]
-    return [Answer.from_fields(each.fields) for each in found if each.type is StatementType.ANSWER]
+def answers(letters: list[OutgoingStatement]) -> list[Response]:
+    found = [parse(outgoing.statement) for outgoing in letters]
+    return [Response.from_fields(each.fields) for each in found if each.type is StatementType.ANSWER]

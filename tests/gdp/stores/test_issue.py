@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from gdp.crypto.certificates import Role
-from gdp.crypto.x509_form import to_pem
+from gdp.crypto.x509_profile import to_pem
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.metadata import Metadata
 from gdp.names import Name
@@ -37,10 +37,10 @@ from gdp.stores.keyring import (
     load_root,
     save_delegation,
 )
-from gdp.trust.claim import make_claim
+from gdp.trust.advertisement import sign_advertisement
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
-from gdp.trust.verifier import ClaimVerifier
+from gdp.trust.verifier import AdvertisementVerifier
 
 NOW = 1_800_000_000.0
 CAMERA = Metadata({"kind": "topic", "name": "/camera/image"})
@@ -82,12 +82,12 @@ def test_a_second_call_replaces_nothing(keys: Path) -> None:
     assert {path: path.read_bytes() for path in keys.rglob("*") if path.is_file()} == before
 
 
-def test_a_delegation_leads_to_a_claim_that_is_believed(keys: Path) -> None:
+def test_a_delegation_leads_to_a_advertisement_that_is_believed(keys: Path) -> None:
     given = delegate(keys / "lab", keys / "robot/node.card", CAMERA, [Right.PUBLISH], [0, 1], unix_s=NOW)
     install_delegation(keys / "robot", given, unix_s=NOW)
     (found,) = load_delegations(keys / "robot" / "delegations")
     identity = load_identity(keys / "robot", NOW)
-    claim = make_claim(
+    advertisement = sign_advertisement(
         identity,
         Right.PUBLISH,
         found.subject,
@@ -99,7 +99,9 @@ def test_a_delegation_leads_to_a_claim_that_is_believed(keys: Path) -> None:
         chain=found.chain,
     )
     policy = Policy(load_root(keys / "school" / "root.crt"))
-    assert ClaimVerifier(policy).verify(claim, NOW).name == CAMERA.name(load_owner(keys / "lab").key.public.compressed)
+    assert AdvertisementVerifier(policy).verify(advertisement, NOW).name == CAMERA.name(
+        load_owner(keys / "lab").key.public.compressed
+    )
     assert set(found.open(identity)) == {0, 1}
 
 

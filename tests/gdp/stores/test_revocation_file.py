@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 
 from gdp.crypto.statements import Statement, parse
-from gdp.effects import Instant
 from gdp.errors import LocalError
 from gdp.nodes.revocation_upkeep import RevocationUpkeep
+from gdp.sansio import Timestamps
 from gdp.trust.revocation import Revocation
 from gdp.trust.revocations import OPERATOR, Revocations
 from tests.gdp.trust.world import CAMERA, CLOUD, LAB, NOW, SCHOOL
 
-AT = Instant(0.0, NOW)
+AT = Timestamps(0.0, NOW)
 ROOTS = {each.root.key.compressed: each.root.domain for each in (SCHOOL, CLOUD)}
 
 
@@ -28,7 +28,7 @@ def of_lab(number: int) -> Statement:
     return parse(LAB.revoke(CAMERA, number.to_bytes(32, "big"), NOW + 1_000))
 
 
-def begun(folder: Path, revoked: Revocations, at: Instant = AT) -> RevocationUpkeep:
+def begun(folder: Path, revoked: Revocations, at: Timestamps = AT) -> RevocationUpkeep:
     upkeep = RevocationUpkeep(folder, revoked)
     upkeep.load(at)
     upkeep.start()
@@ -39,13 +39,13 @@ def written(folder: Path, *statements: Statement) -> Revocations:
     revoked = Revocations(ROOTS)
     upkeep = begun(folder, revoked)
     for at, statement in enumerate(statements):
-        revoked.take(statement, str(at).encode(), AT, lambda _: True)
+        revoked.receive_revocation(statement, str(at).encode(), AT, lambda _: True)
     upkeep.work(AT)
     upkeep.close()
     return revoked
 
 
-def read(folder: Path, at: Instant = AT, roots: object = ROOTS) -> Revocations:
+def read(folder: Path, at: Timestamps = AT, roots: object = ROOTS) -> Revocations:
     revoked = Revocations(roots)  # type: ignore[arg-type]
     upkeep = RevocationUpkeep(folder, revoked)
     upkeep.load(at)
@@ -53,13 +53,13 @@ def read(folder: Path, at: Instant = AT, roots: object = ROOTS) -> Revocations:
     return revoked
 
 
-def test_what_was_kept_comes_back_with_its_giver(tmp_path: Path) -> None:
+def test_what_was_kept_comes_back_with_its_origin(tmp_path: Path) -> None:
     before = written(tmp_path, of_school(1), of_lab(2))
     after = read(tmp_path)
     keys = set(before.keys())
     assert set(after.keys()) == keys
     assert {after.kept(key) for key in keys} == {before.kept(key) for key in keys}
-    assert {kept.giver for key in keys if (kept := after.kept(key)) is not None} == {OPERATOR, b"1"}
+    assert {kept.origin for key in keys if (kept := after.kept(key)) is not None} == {OPERATOR, b"1"}
 
 
 def test_only_this_user_may_read_the_file(tmp_path: Path) -> None:
@@ -70,7 +70,7 @@ def test_only_this_user_may_read_the_file(tmp_path: Path) -> None:
 def test_what_a_killed_node_had_synced_comes_back(tmp_path: Path) -> None:
     revoked = Revocations(ROOTS)
     upkeep = begun(tmp_path, revoked)
-    revoked.take(of_school(1), b"a", AT, lambda _: True)
+    revoked.receive_revocation(of_school(1), b"a", AT, lambda _: True)
     upkeep.work(AT)
     upkeep.close()
     for path in tmp_path.iterdir():  # a copy of what a kill would leave behind
@@ -81,7 +81,7 @@ def test_what_a_killed_node_had_synced_comes_back(tmp_path: Path) -> None:
 
 def test_what_has_run_out_is_forgotten_by_the_file_too(tmp_path: Path) -> None:
     written(tmp_path, of_school(1, NOW + 10), of_school(2, NOW + 9_000))
-    assert len(read(tmp_path, Instant(0.0, NOW + 5_000))) == 1
+    assert len(read(tmp_path, Timestamps(0.0, NOW + 5_000))) == 1
     with sqlite3.connect(tmp_path / "revocations") as database:
         assert database.execute("SELECT count(*) FROM revocations").fetchone() == (1,)
     database.close()
@@ -120,7 +120,7 @@ def test_without_a_folder_nothing_is_written(tmp_path: Path) -> None:
     upkeep = RevocationUpkeep(None, revoked)
     upkeep.load(AT)
     upkeep.start()
-    revoked.take(of_school(1), b"a", AT, lambda _: True)
+    revoked.receive_revocation(of_school(1), b"a", AT, lambda _: True)
     upkeep.work(AT)
     upkeep.close()
     assert revoked.changes is None

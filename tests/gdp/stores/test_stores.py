@@ -23,15 +23,15 @@ from redis._parsers.base import BaseParser
 
 from gdp.control.replica import Entry, Key
 from gdp.crypto.validity import Validity
-from gdp.effects import Instant
 from gdp.errors import DropReason, StoreError
 from gdp.limits import CLOCK_SKEW_S
 from gdp.names import Name
 from gdp.nodes.config import ClusterConfig
 from gdp.nodes.rib_cluster import ClusterUpkeep
 from gdp.nodes.rib_upkeep import MemoryUpkeep
-from gdp.rib.machine import Rib, RibSettings
+from gdp.rib.core import RibCore, RibSettings
 from gdp.rib.store import MemoryStore
+from gdp.sansio import Timestamps
 from gdp.stores.cluster_link import ClusterLink, _translated
 from gdp.stores.snapshot import SLICE, Snapshot
 from gdp.trust.rtcert import RtCert
@@ -92,13 +92,13 @@ class TestEveryStore:
             pair.sync()  # a RIB that has not met its peer denies nothing
         pair.give(pair.two, pair.site.query("/a", watch_s=20.0))
         pair.give(pair.one, pair.site.relay("/a", 1))
-        assert [each.claim != b"" for each in answers(pair.sync())] == [True]
+        assert [each.advertisement != b"" for each in answers(pair.sync())] == [True]
 
-    def test_an_older_claim_is_stale_whichever_rib_it_comes_to(self, pair: Pair) -> None:
+    def test_an_older_advertisement_is_stale_whichever_rib_it_comes_to(self, pair: Pair) -> None:
         pair.give(pair.one, pair.site.relay("/a", 5))
         pair.sync()
-        (verdict,) = verdicts(pair.give(pair.two, pair.site.relay("/a", 4)))
-        assert (verdict.refused, verdict.sequence) == (DropReason.STALE, 5)
+        (ack,) = verdicts(pair.give(pair.two, pair.site.relay("/a", 4)))
+        assert (ack.refused, ack.sequence) == (DropReason.STALE, 5)
 
     def test_a_withdrawal_holds_at_both(self, pair: Pair) -> None:
         pair.give(pair.one, pair.site.relay("/a", 1))
@@ -113,12 +113,12 @@ class TestEveryStore:
         pair.sync()
         assert len(answers(pair.give(pair.two, pair.site.query("/a"), 4.0))) == 1
         for rib in (pair.one, pair.two):
-            rib.timeout(pair.site.now(5.1))
+            rib.handle_timer(pair.site.now(5.1))
             pair.take(rib)
         assert [each.is_nobody for each in answers(pair.give(pair.two, pair.site.query("/a"), 5.1))] == [True]
 
 
-def test_peers_forget_a_withdrawal_when_the_claim_can_be_proven_no_more() -> None:
+def test_peers_forget_a_withdrawal_when_the_advertisement_can_be_proven_no_more() -> None:
     pair = MemoryPair(Site())
     pair.sync()
     pair.give(pair.one, pair.site.relay("/a", 1))
@@ -131,7 +131,7 @@ def test_peers_forget_a_withdrawal_when_the_claim_can_be_proven_no_more() -> Non
     assert (held, left) == ([1, 1], [0, 0])
 
 
-def test_a_peer_forgets_no_withdrawal_sooner_than_what_it_knows_of_the_claim_says() -> None:
+def test_a_peer_forgets_no_withdrawal_sooner_than_what_it_knows_of_the_advertisement_says() -> None:
     pair = MemoryPair(Site())
     pair.sync()
     pair.give(pair.one, pair.site.relay("/a", 1))
@@ -141,7 +141,7 @@ def test_a_peer_forgets_no_withdrawal_sooner_than_what_it_knows_of_the_claim_say
     entry = pair.one.entry_of(key, pair.site.now().mono_s)
     assert entry is not None
     pair.two.load([replace(entry, until_unix_s=int(pair.site.unix_s) + 10)], pair.site.now())
-    pair.two.timeout(pair.site.now(11.0))
+    pair.two.handle_timer(pair.site.now(11.0))
     assert [each.refused for each in verdicts(pair.give(pair.two, pair.site.relay("/a", 1), 11.0))] == [
         DropReason.STALE
     ]
@@ -156,7 +156,7 @@ def test_a_snapshot_keeps_no_withdrawal_for_longer_than_the_rib(tmp_path: Path) 
     pair.sync()
     rows = []
     for later_s in (0.0, float(FORGOTTEN_S)):
-        pair.one.timeout(pair.site.now(later_s))
+        pair.one.handle_timer(pair.site.now(later_s))
         pair.sync(later_s)
         with contextlib.closing(sqlite3.connect(path)) as database:
             rows.append(database.execute("SELECT count(*) FROM entries").fetchone()[0])
@@ -169,8 +169,8 @@ def test_of_two_writes_at_once_the_newer_wins_and_the_other_is_not_confirmed(ser
         pair.give(rib, pair.site.query("/a"))  # both believe that there is nobody
     assert verdicts(pair.give(pair.one, pair.site.relay("/a", 9)))[0].refused is None
     assert verdicts(pair.give(pair.two, pair.site.relay("/a", 8))) == []
-    (verdict,) = verdicts(pair.give(pair.two, pair.site.relay("/a", 8)))
-    assert (verdict.refused, verdict.sequence) == (DropReason.STALE, 9)
+    (ack,) = verdicts(pair.give(pair.two, pair.site.relay("/a", 8)))
+    assert (ack.refused, ack.sequence) == (DropReason.STALE, 9)
     pair.close()
 
 
@@ -184,10 +184,10 @@ def test_a_rib_starts_while_a_primary_is_frozen_and_brings_it_the_functions_late
         upkeep = ClusterUpkeep(config.address(), site.policy(), allow_unowned=False)
         was_complete = upkeep.is_complete
     at = site.now()
-    upkeep.begin(Rib(site.ribs[0], site.policy(), upkeep.store, RibSettings()), at)
+    upkeep.begin(RibCore(site.ribs[0], site.policy(), upkeep.store, RibSettings()), at)
     deadline_s = time.monotonic() + 60
     while not upkeep.is_complete and time.monotonic() < deadline_s:
-        at = Instant(at.mono_s + 1.0, at.unix_s + 1.0)
+        at = Timestamps(at.mono_s + 1.0, at.unix_s + 1.0)
         upkeep.work(at)
         select.select([], [], [], 0.05)  # the servers agree in their own time who is a primary
     assert (was_complete, upkeep.is_complete) == (False, True)
@@ -243,7 +243,7 @@ def test_a_snapshot_that_cannot_be_written_is_reported_once(tmp_path: Path, capl
     assert caplog.text.count("snapshot not written") == 1
 
 
-def changes_of(pair: Pair, names: Sequence[str], rib: Rib) -> list[tuple[Key, Entry | None]]:
+def changes_of(pair: Pair, names: Sequence[str], rib: RibCore) -> list[tuple[Key, Entry | None]]:
     keys = [(pair.site.subject(name).name, pair.site.robot.name) for name in names]
     return [(key, rib.entry_of(key, pair.site.now().mono_s)) for key in keys]
 
@@ -274,7 +274,7 @@ def test_what_waits_for_a_full_disk_is_bounded_by_what_is_kept(tmp_path: Path, m
     monkeypatch.setattr("gdp.nodes.rib_upkeep.CHANGES_MAX", 4)
     site, folder = Site(), tmp_path / "disk"
     upkeep = MemoryUpkeep(folder / "rib.sqlite")
-    rib = Rib(site.ribs[0], site.policy(), upkeep.store, RibSettings())
+    rib = RibCore(site.ribs[0], site.policy(), upkeep.store, RibSettings())
     upkeep.begin(rib, site.now())
     waiting = upkeep._memory.changes
     assert waiting is not None
@@ -283,7 +283,7 @@ def test_what_waits_for_a_full_disk_is_bounded_by_what_is_kept(tmp_path: Path, m
         site.rtcert = RtCert.make(site.robot, site.switch.name, Validity.lasting(begin.unix_s, 50))
         rib.receive(site.relay(f"/{number}", 1, lease_s=5.0), site.switch.name, begin)
         for later_s in (10.0, 60.0):  # the lease ends, then what is remembered of it
-            rib.timeout(site.now(100.0 * number + later_s))
+            rib.handle_timer(site.now(100.0 * number + later_s))
         upkeep.work(site.now(100.0 * number + 60.0))
         waiting = upkeep._memory.changes
         assert waiting is not None
@@ -355,7 +355,7 @@ def test_an_altered_entry_of_a_snapshot_is_not_believed(tmp_path: Path) -> None:
     pair.give(pair.one, pair.site.relay("/a", 1))
     pair.sync()
     other = Site()
-    rib = Rib(other.ribs[0], other.policy(), MemoryStore(), pair.one._settings)
+    rib = RibCore(other.ribs[0], other.policy(), MemoryStore(), pair.one._settings)
     for entries in Snapshot(tmp_path / "rib.sqlite").load(other.unix_s):
         rib.load(entries, other.now())
     assert (rib.names, rib.refusals) == (0, {DropReason.WRONG_DOMAIN: 1})

@@ -11,7 +11,7 @@ import pytest
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.keys import SIGNATURE_BYTES
-from gdp.crypto.x509_form import read_request
+from gdp.crypto.x509_profile import read_request
 from gdp.errors import LocalError
 from gdp.stores.files import private, write_all
 from gdp.stores.issue import admit_node, make_domain, make_node_keys, make_owner

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
 from gdp.names import Name
-from gdp.switch.link_states import LinkStates
+from gdp.switch.lsdb import LinkStateDatabase
 from gdp.switch.paths import Paths
 
 
@@ -38,9 +38,9 @@ def state(
     return LinkState(name(origin), domain, scope, sequence, links, inside, attached, listed, is_leaf=is_leaf)
 
 
-def known(*states: LinkState) -> LinkStates:
+def known(*states: LinkState) -> LinkStateDatabase:
     """Return what a switch of HOME knows."""
-    link_states = LinkStates(HOME)
+    link_states = LinkStateDatabase(HOME)
     for each in states:
         link_states.put(each, b"wire of " + each.origin, 0.0)
     return link_states

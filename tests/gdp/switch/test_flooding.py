@@ -11,11 +11,11 @@ from gdp.frame.codec import HEADER_BYTES, Header, encode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import HOPS_MAX, LINK_STATE_LEASE_S, LINK_STATE_REFRESH_S
 from gdp.names import ZERO
-from gdp.simulation.world import World
+from gdp.simulation.simulation import Simulation
 from tests.journeys.flows import ring
 
 
-def say(world: World, state: LinkState, by: str, to: str, port: int = 0) -> None:
+def say(world: Simulation, state: LinkState, by: str, to: str, port: int = 0) -> None:
     """Let a neighbour of ``to`` pass on a link state that ``by`` signed."""
     identity = world.identities[by]
     state = replace(state, said_unix_s=int(world.network.now.unix_s))
@@ -27,7 +27,7 @@ def say(world: World, state: LinkState, by: str, to: str, port: int = 0) -> None
     world.network.run(0.2)
 
 
-def origins(world: World, label: str, scope: Scope) -> set[bytes]:
+def origins(world: Simulation, label: str, scope: Scope) -> set[bytes]:
     return {bytes(each.origin) for each in world.switches[label]._flooding.link_states.states(scope)}
 
 
@@ -83,12 +83,12 @@ def test_a_switch_that_is_gone_is_forgotten_and_the_others_are_not() -> None:
 
 def test_neighbours_that_missed_a_flood_catch_up_by_their_digests() -> None:
     world = ring()
-    cable = world.cables[frozenset(("nuc1", "nuc2"))]
+    sim_link = world.cables[frozenset(("nuc1", "nuc2"))]
     world.network.run(1)
-    cable.loss = 1.0
+    sim_link.loss = 1.0
     world.network.set_link(world.cables[frozenset(("nuc3", "nuc4"))], up=False)
     world.network.run(0.4)
-    cable.loss = 0.0
+    sim_link.loss = 0.0
     world.network.run(3)
     one, two = (world.switches[each]._flooding.link_states for each in ("nuc1", "nuc2"))
     assert one.digest(one._domain) == two.digest(two._domain)
@@ -100,7 +100,7 @@ def test_a_port_with_several_switches_shows_what_all_of_them_should_have() -> No
     flooding = world.switches["nuc1"]._flooding
     (port,) = (
         port
-        for port in flooding._greeter.ports.values()
+        for port in flooding._hello_protocol.ports.values()
         if any(each.name == world.identities["nuc2"].name for each in port.neighbours.values())
     )
     (inside,) = port.neighbours.values()

@@ -5,20 +5,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gdp.errors import DropReason
-from gdp.switch.forwarder import Drop, Forward, HandUp, decide, rewrite
+from gdp.switch.forwarder import Drop, Forward, Punt, decide, rewrite
 from tests.fixtures_forwarding import CASES, ENTRIES, MTUS, ONE, TO_WIDE, Case, frame
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_each_fixture_gets_its_verdict(case: Case) -> None:
-    verdict = decide(case.frame, ENTRIES, MTUS)
-    assert isinstance(verdict, HandUp) == case.handed_up
-    if isinstance(verdict, Drop):
-        assert (verdict.reason,) == case.drops
+def test_each_fixture_gets_its_ack(case: Case) -> None:
+    ack = decide(case.frame, ENTRIES, MTUS)
+    assert isinstance(ack, Punt) == case.punted
+    if isinstance(ack, Drop):
+        assert (ack.reason,) == case.drops
         assert not case.out
-    if isinstance(verdict, Forward):
-        assert verdict.lost == case.drops
-        assert {port: rewrite(case.frame, macs) for port, macs in verdict.hops} == case.out
+    if isinstance(ack, Forward):
+        assert ack.lost == case.drops
+        assert {port: rewrite(case.frame, macs) for port, macs in ack.hops} == case.out
 
 
 def test_another_ethertype_is_dropped() -> None:
@@ -27,15 +27,15 @@ def test_another_ethertype_is_dropped() -> None:
 
 
 @given(st.binary(max_size=300))
-def test_arbitrary_bytes_get_a_verdict(data: bytes) -> None:
-    assert isinstance(decide(data, ENTRIES, MTUS), Drop | HandUp | Forward)
+def test_arbitrary_bytes_get_a_ack(data: bytes) -> None:
+    assert isinstance(decide(data, ENTRIES, MTUS), Drop | Punt | Forward)
 
 
 @given(st.binary(min_size=6, max_size=6), st.integers(0, 255), st.integers(0, 255), st.binary(max_size=40))
 def test_only_a_frame_with_hops_to_spare_is_forwarded(mac: bytes, kind: int, hops_left: int, payload: bytes) -> None:
     before = mac + frame(ONE, payload, kind=kind, hops_left=hops_left)[6:]
-    verdict = decide(before, ENTRIES, MTUS)
-    assert isinstance(verdict, Forward) == (kind < 0x80 and hops_left > 1)
+    ack = decide(before, ENTRIES, MTUS)
+    assert isinstance(ack, Forward) == (kind < 0x80 and hops_left > 1)
 
 
 @pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from gdp.limits import CLAIM_LEASE_S, PARKED_S
+from gdp.limits import ADVERTISEMENT_LEASE_S, PENDING_S
 from gdp.names import Name
 from gdp.switch.name_queries import BATCH_MAX, QUERIES_MAX, RETRY_S, TRIES_MAX, NameQueries
 from gdp.switch.query_window import WINDOW
@@ -49,7 +49,7 @@ def test_a_watch_goes_on_after_its_answer() -> None:
     queries.watch(TOPIC, 0.0)
     queries.receive_answer(TOPIC, 0.0)
     assert polled(queries, 1.0) == []
-    assert polled(queries, CLAIM_LEASE_S / 4) == [(TOPIC, queries.watch_s)]
+    assert polled(queries, ADVERTISEMENT_LEASE_S / 4) == [(TOPIC, queries.watch_s)]
 
 
 def test_a_watch_is_sent_at_once_though_the_name_was_queried_before() -> None:
@@ -129,8 +129,8 @@ def test_a_name_that_waits_too_long_for_the_window_fails_without_a_query() -> No
     first = [each for _ in range(10) for each, _ in polled(queries, 0.0)]
     late = name(str(WINDOW))
     assert late not in first
-    queries.receive_answer(first[0], PARKED_S)
-    failed = [each for _ in range(10) for each in queries.poll_due(PARKED_S)[1]]
+    queries.receive_answer(first[0], PENDING_S)
+    failed = [each for _ in range(10) for each in queries.poll_due(PENDING_S)[1]]
     assert failed == [late]
     assert late not in queries
 
@@ -143,5 +143,5 @@ def test_a_watch_is_renewed_in_time_however_often_the_rib_sends_updates() -> Non
         sent_s += [now_s] if polled(queries, now_s) else []
         queries.receive_answer(TOPIC, now_s)
     assert sent_s[0] == 0
-    assert all(b - a <= CLAIM_LEASE_S / 4 for a, b in pairwise(sent_s))
-    assert len(sent_s) >= 60 / (CLAIM_LEASE_S / 4)
+    assert all(b - a <= ADVERTISEMENT_LEASE_S / 4 for a, b in pairwise(sent_s))
+    assert len(sent_s) >= 60 / (ADVERTISEMENT_LEASE_S / 4)

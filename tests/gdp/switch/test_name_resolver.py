@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 from gdp.errors import DropReason
-from gdp.limits import CLAIM_LEASE_S, NEGATIVE_LEASE_S, PARKED_S, QUESTIONS_BURST
+from gdp.limits import ADVERTISEMENT_LEASE_S, NEGATIVE_LEASE_S, PENDING_S, QUESTIONS_BURST
 from gdp.names import Name
+from gdp.switch.name_cache import Location
 from gdp.switch.name_queries import QUERIES_MAX, RETRY_S, TRIES_MAX
 from gdp.switch.name_resolver import NameResolver
-from gdp.switch.places import Place
 from gdp.trust.right import Right
 from tests.gdp.switch.net import HOME, name
 
@@ -17,15 +17,15 @@ ME, FAR, SERVER, TOPIC = name("me"), name("far"), name("server"), name("topic")
 NEIGHBOUR = b"n" + name("neighbour")
 
 
-def location(of: Name = SERVER, right: Right = Right.ATTACH, switch: Name = FAR, expires_s: float = 30.0) -> Place:
-    return Place(
+def location(of: Name = SERVER, right: Right = Right.ATTACH, switch: Name = FAR, expires_s: float = 30.0) -> Location:
+    return Location(
         name=of,
         advertiser=name("robot"),
         right=right,
         switch=switch,
         domain=HOME,
         transit=frozenset(),
-        claim=b"claim",
+        advertisement=b"claim",
         expires_s=expires_s,
     )
 
@@ -43,7 +43,7 @@ def test_a_location_answers_the_query_and_releases_the_frame() -> None:
     resolver = missed()
     resolver.receive_location(location(), 0.1)
     assert resolver.resolve(SERVER, 0.1, NEIGHBOUR) == ([location()], None)
-    assert resolver.release_frames(SERVER) == [(b"frame", PARKED_S, NEIGHBOUR)]
+    assert resolver.release_frames(SERVER) == [(b"frame", PENDING_S, NEIGHBOUR)]
     assert (resolver.pending_frames, resolver.drops.total()) == (0, 0)
 
 
@@ -78,9 +78,9 @@ def test_a_query_without_an_answer_drops_the_frame_when_it_fails() -> None:
 
 def test_a_frame_expires_while_its_query_is_open() -> None:
     resolver = missed()
-    assert resolver.next_expiry() == PARKED_S
-    resolver.expire(PARKED_S)
-    assert resolver.drops == {DropReason.PARKED_EXPIRED: 1}
+    assert resolver.next_expiry() == PENDING_S
+    resolver.expire(PENDING_S)
+    assert resolver.drops == {DropReason.PENDING_EXPIRED: 1}
     assert resolver.open_queries == 1
 
 
@@ -90,7 +90,7 @@ def test_a_frame_that_has_no_query_is_counted() -> None:
         resolver.resolve(name(str(number)), 0.0)
     resolver.resolve(SERVER, 0.0)
     resolver.buffer_frame(SERVER, b"frame", 0.0, NEIGHBOUR)
-    assert (resolver.pending_frames, resolver.drops) == (0, {DropReason.PARKED_FULL: 1})
+    assert (resolver.pending_frames, resolver.drops) == (0, {DropReason.PENDING_FULL: 1})
 
 
 def test_a_neighbour_above_its_rate_opens_no_query() -> None:
@@ -132,7 +132,7 @@ def test_a_location_that_is_used_is_watched() -> None:
     resolver = NameResolver(ME)
     resolver.receive_location(location(), 0.0)
     resolver.resolve(SERVER, 0.0)
-    assert resolver.queries_to_send(0.0) == [(SERVER, 2 * CLAIM_LEASE_S)]
+    assert resolver.queries_to_send(0.0) == [(SERVER, 2 * ADVERTISEMENT_LEASE_S)]
 
 
 def test_a_location_outlives_its_lease_only_while_no_rib_answers() -> None:
@@ -147,20 +147,20 @@ def test_a_location_outlives_its_lease_only_while_no_rib_answers() -> None:
 def test_a_new_rib_gets_every_watch_at_once() -> None:
     resolver = NameResolver(ME)
     resolver.watch(TOPIC, 0.0)
-    assert resolver.queries_to_send(0.0) == [(TOPIC, CLAIM_LEASE_S)]
+    assert resolver.queries_to_send(0.0) == [(TOPIC, ADVERTISEMENT_LEASE_S)]
     resolver.receive_location(location(TOPIC, Right.PUBLISH), 0.0)
     assert resolver.queries_to_send(1.0) == []
     resolver.rib_changed(1.0, has_rib=True)
-    assert resolver.queries_to_send(1.0) == [(TOPIC, CLAIM_LEASE_S)]
+    assert resolver.queries_to_send(1.0) == [(TOPIC, ADVERTISEMENT_LEASE_S)]
 
 
-def test_the_echo_of_a_relayed_claim_answers_no_query_until_it_is_repeated() -> None:
+def test_the_echo_of_a_relayed_advertisement_answers_no_query_until_it_is_repeated() -> None:
     resolver = NameResolver(ME)
-    watch = [(TOPIC, CLAIM_LEASE_S)]
+    watch = [(TOPIC, ADVERTISEMENT_LEASE_S)]
     resolver.watch(TOPIC, 0.0)
     assert resolver.queries_to_send(0.0) == watch
     resolver.receive_location(location(TOPIC), 0.01, is_ours=True)
     assert resolver.queries_to_send(RETRY_S) == watch
     resolver.receive_location(location(TOPIC), RETRY_S + 0.01, is_ours=True)
     assert resolver.queries_to_send(2 * RETRY_S + 0.1) == []
-    assert resolver.queries_to_send(CLAIM_LEASE_S / 4 + 1) == watch
+    assert resolver.queries_to_send(ADVERTISEMENT_LEASE_S / 4 + 1) == watch

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from gdp.control.link_state import Scope
-from gdp.switch.paths import Paths, Way
+from gdp.switch.paths import Path, Paths
 from tests.gdp.switch.net import AWAY, HOME, THIRD, known, link, name, paths, state
 
 ALL = frozenset({HOME, AWAY, THIRD})
 
 
-def first(way: Way | None) -> str | None:
+def first(way: Path | None) -> str | None:
     return None if way is None else way.first.rstrip(b"-").decode()
 
 
@@ -20,7 +20,7 @@ def test_the_cheaper_way_is_taken_though_it_is_longer() -> None:
         state("b", link("a", 5), link("c", 5)),
         state("c", link("b", 5), link("a", 30)),
     )
-    assert found.to_switch(name("c"), HOME, ALL) == Way(name("b"), 10)
+    assert found.to_switch(name("c"), HOME, ALL) == Path(name("b"), 10)
 
 
 def test_a_link_that_one_end_names_does_not_count() -> None:
@@ -30,7 +30,7 @@ def test_a_link_that_one_end_names_does_not_count() -> None:
 
 def test_each_direction_has_its_own_cost() -> None:
     found = paths("a", state("a", link("b", 7)), state("b", link("a", 900)))
-    assert found.to_switch(name("b"), HOME, ALL) == Way(name("b"), 7)
+    assert found.to_switch(name("b"), HOME, ALL) == Path(name("b"), 7)
 
 
 def three_domains() -> Paths:
@@ -47,8 +47,8 @@ def three_domains() -> Paths:
 
 def test_a_domain_that_is_not_allowed_is_gone_around() -> None:
     found = three_domains()
-    assert found.to_switch(name("x"), AWAY, ALL) == Way(name("t"), 10)
-    assert found.to_switch(name("x"), AWAY, frozenset({HOME, AWAY})) == Way(name("x"), 50)
+    assert found.to_switch(name("x"), AWAY, ALL) == Path(name("t"), 10)
+    assert found.to_switch(name("x"), AWAY, frozenset({HOME, AWAY})) == Path(name("x"), 50)
 
 
 def test_there_is_no_way_into_a_domain_that_is_not_allowed() -> None:
@@ -84,7 +84,7 @@ def test_at_home_borders_are_reached_by_links_and_not_by_what_they_tell_others()
         state("c", link("b", 5), link("t", 9, THIRD)),
         state("c", link("t", 9, THIRD), scope=Scope.BORDER, inside=(link("a", 10),)),
     )
-    assert found.to_switch(name("c"), HOME, ALL) == Way(name("b"), 10)
+    assert found.to_switch(name("c"), HOME, ALL) == Path(name("b"), 10)
 
 
 def test_another_domain_is_crossed_from_border_to_border() -> None:
@@ -97,7 +97,7 @@ def test_another_domain_is_crossed_from_border_to_border() -> None:
         state("y", link("t", 5, THIRD), domain=AWAY, scope=border, inside=(link("x", 20, AWAY),)),
         state("t", link("y", 5, AWAY), domain=THIRD, scope=border),
     )
-    assert found.to_switch(name("t"), THIRD, ALL) == Way(name("x"), 30)
+    assert found.to_switch(name("t"), THIRD, ALL) == Path(name("x"), 30)
 
 
 def test_borders_are_those_of_our_domain_with_links_that_leave_it() -> None:
@@ -133,8 +133,8 @@ def parted_home() -> Paths:
 
 
 def test_a_part_of_our_domain_that_is_cut_off_is_reached_through_another_domain() -> None:
-    assert parted_home().to_switch(name("e"), HOME, ALL) == Way(name("x"), 10)
-    assert parted_home().to_rib(name("rib"), ALL) == (Way(name("x"), 10), name("d"))
+    assert parted_home().to_switch(name("e"), HOME, ALL) == Path(name("x"), 10)
+    assert parted_home().to_rib(name("rib"), ALL) == (Path(name("x"), 10), name("d"))
 
 
 def test_a_part_that_is_cut_off_is_not_reached_through_a_domain_that_is_not_allowed() -> None:
@@ -154,7 +154,7 @@ def test_of_two_parts_of_another_domain_the_one_that_lists_a_switch_leads_to_it(
         state("x", link("a", 5), domain=AWAY, scope=border, members=("x",)),
         state("y", link("a", 50), domain=AWAY, scope=border, members=("y", "inner")),
     )
-    assert found.to_switch(name("inner"), AWAY, ALL) == Way(name("y"), 50)
+    assert found.to_switch(name("inner"), AWAY, ALL) == Path(name("y"), 50)
 
 
 def square(ab: int = 10, ac: int = 10, bd: int = 10, cd: int = 10) -> Paths:
@@ -171,24 +171,24 @@ def square(ab: int = 10, ac: int = 10, bd: int = 10, cd: int = 10) -> Paths:
 
 
 def test_a_neighbour_whose_own_way_does_not_lead_back_is_an_alternate() -> None:
-    assert square().to_switch(name("d"), HOME, ALL) == Way(name("b"), 20, name("c"))
+    assert square().to_switch(name("d"), HOME, ALL) == Path(name("b"), 20, name("c"))
 
 
 def test_a_neighbour_whose_own_way_leads_back_is_no_alternate() -> None:
-    assert square(cd=30).to_switch(name("d"), HOME, ALL) == Way(name("b"), 20, None)
-    assert square(cd=29).to_switch(name("d"), HOME, ALL) == Way(name("b"), 20, name("c"))
+    assert square(cd=30).to_switch(name("d"), HOME, ALL) == Path(name("b"), 20, None)
+    assert square(cd=29).to_switch(name("d"), HOME, ALL) == Path(name("b"), 20, name("c"))
 
 
 def test_alternates_are_left_out_until_they_are_wanted() -> None:
     found = square()
     found.has_alternates = False
-    assert found.to_switch(name("d"), HOME, ALL) == Way(name("b"), 20)
+    assert found.to_switch(name("d"), HOME, ALL) == Path(name("b"), 20)
 
 
 def test_a_neighbour_of_another_domain_is_no_alternate() -> None:
     found = three_domains()
     found.has_alternates = True
-    assert found.to_switch(name("x"), AWAY, ALL) == Way(name("t"), 10, None)
+    assert found.to_switch(name("x"), AWAY, ALL) == Path(name("t"), 10, None)
 
 
 def beside_a_leaf(me: str, bd: int = 100, dear: int = 1) -> Paths:
@@ -206,22 +206,22 @@ def beside_a_leaf(me: str, bd: int = 100, dear: int = 1) -> Paths:
 
 def test_a_way_leads_to_a_leaf_and_never_through_one() -> None:
     found = beside_a_leaf("a")
-    assert found.to_switch(name("d"), HOME, ALL) == Way(name("b"), 110)
-    assert found.to_switch(name("leaf"), HOME, ALL) == Way(name("leaf"), 1)
-    assert found.to_rib(name("rib"), ALL) == (Way(name("b"), 110), name("d"))
+    assert found.to_switch(name("d"), HOME, ALL) == Path(name("b"), 110)
+    assert found.to_switch(name("leaf"), HOME, ALL) == Path(name("leaf"), 1)
+    assert found.to_rib(name("rib"), ALL) == (Path(name("b"), 110), name("d"))
     assert not found.carries_transit(name("leaf"))
 
 
 def test_a_leaf_is_an_alternate_to_itself_only() -> None:
     found = beside_a_leaf("a", 10, dear=500)
-    assert found.to_switch(name("leaf"), HOME, ALL) == Way(name("b"), 21, name("leaf"))
-    assert found.to_switch(name("d"), HOME, ALL) == Way(name("b"), 20, None)
+    assert found.to_switch(name("leaf"), HOME, ALL) == Path(name("b"), 21, name("leaf"))
+    assert found.to_switch(name("d"), HOME, ALL) == Path(name("b"), 20, None)
 
 
 def test_a_leaf_itself_takes_either_neighbour_for_nothing_comes_back_through_it() -> None:
     found = beside_a_leaf("leaf")
-    assert found.to_switch(name("b"), HOME, ALL) == Way(name("a"), 11, name("d"))
-    assert found.to_switch(name("d"), HOME, ALL) == Way(name("d"), 1, name("a"))
+    assert found.to_switch(name("b"), HOME, ALL) == Path(name("a"), 11, name("d"))
+    assert found.to_switch(name("d"), HOME, ALL) == Path(name("d"), 1, name("a"))
     assert found.distance_from(name("leaf"), name("d"), HOME, ALL) is None
 
 

@@ -30,7 +30,7 @@ def test_a_tree_carries_what_fits_its_narrowest_branch() -> None:
     assert tree().mtu == 1_400
 
 
-def test_a_tree_shows_the_claim_that_stands_longest() -> None:
+def test_a_tree_shows_the_advertisement_that_stands_longest() -> None:
     assert (tree().evidence, tree().expires_s()) == (b"far claim", 9.0)
 
 

@@ -7,7 +7,7 @@ from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import HOPS_MAX
 from gdp.names import Name
-from gdp.simulation.world import World
+from gdp.simulation.simulation import Simulation
 from gdp.switch.table import NOWHERE
 from gdp.switch.unicast import NEGATIVE_S, _Installed
 from tests.journeys.flows import ROBOT, SERVER, flowing, ring
@@ -15,7 +15,7 @@ from tests.journeys.flows import ROBOT, SERVER, flowing, ring
 ABSENT = Name(b"?" * 32)
 
 
-def send(world: World, destination: Name, source: str = ROBOT, kind: int = Kind.REPORT) -> None:
+def send(world: Simulation, destination: Name, source: str = ROBOT, kind: int = Kind.ACKNACK) -> None:
     """Let a member send a frame to a name."""
     member = world.members[source]
     frame = encode(Header(kind, Flag.LAST, HOPS_MAX, 1, 0, 1, 0, 1, 9, destination, member.name))

@@ -43,7 +43,7 @@ def test_every_number_of_a_node_has_its_name() -> None:
     text = Metrics(
         Sources(
             table_entries=lambda: 7,
-            parked_frames=lambda: 8,
+            pending_frames=lambda: 8,
             rib_answers=lambda: {"found": 1},
             rib_refusals=lambda: {"expired": 2},
             messages=lambda: {"in": 3},

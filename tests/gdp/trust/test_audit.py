@@ -18,7 +18,7 @@ def trail() -> AuditTrail:
 
 def taken(from_: AuditTrail, mono_s: float, after: list[AuditLine] | None = None) -> list[AuditLine]:
     seq, previous = (after[-1].seq, after[-1].hash) if after else (0, BEGIN)
-    return from_.take(mono_s, 1_800_000_000.0 + mono_s, seq, previous)
+    return from_.poll_lines(mono_s, 1_800_000_000.0 + mono_s, seq, previous)
 
 
 def test_lines_are_numbered_and_each_holds_the_hash_of_the_one_before() -> None:

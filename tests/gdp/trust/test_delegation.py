@@ -26,8 +26,8 @@ from tests.gdp.trust.world import (
     NOW,
     ROBOT,
     adcert,
+    advertisement,
     card,
-    claim,
 )
 from tests.gdp.trust.world import verifier as new_verifier
 
@@ -47,9 +47,9 @@ def test_a_delegation_comes_back_from_its_file() -> None:
     assert dict(again.metadata or {}) == dict(CAMERA_METADATA)
 
 
-def test_it_holds_and_its_claim_is_believed() -> None:
+def test_it_holds_and_its_advertisement_is_believed() -> None:
     GIVEN.verify(ROBOT, NOW)
-    assert new_verifier().verify(claim(subject=GIVEN.subject, chain=GIVEN.chain), NOW).name == CAMERA.name
+    assert new_verifier().verify(advertisement(subject=GIVEN.subject, chain=GIVEN.chain), NOW).name == CAMERA.name
 
 
 def test_it_opens_to_the_secrets_of_its_epochs() -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import NodeKeys
-from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import parse
-from gdp.effects import Instant
 from gdp.errors import DropReason, LocalError, StatementError
+from gdp.sansio import Timestamps
 from gdp.trust.domain import Policy
 from gdp.trust.revocation import Revocation
 from tests.gdp.trust.world import CLOUD, DAY, NOW, ROBOT, SCHOOL, STRANGER
@@ -24,7 +24,10 @@ def refusal(policy: Policy, wire: bytes, unix_s: float = NOW) -> DropReason:
 
 def take_back(policy: Policy, fingerprint: bytes) -> None:
     wire = Revocation.make(SCHOOL.key, SCHOOL.root.subject, fingerprint, DAY.not_after_unix_s)
-    assert policy.revoked.take(parse(wire), b"a neighbour", Instant(0.0, NOW), lambda _: False) is not None
+    assert (
+        policy.revoked.receive_revocation(parse(wire), b"a neighbour", Timestamps(0.0, NOW), lambda _: False)
+        is not None
+    )
 
 
 def test_a_domain_trusts_itself_and_those_it_names() -> None:
@@ -79,10 +82,10 @@ def test_a_foreign_member_is_refused() -> None:
 
 
 def test_domains_of_the_same_label_are_told_apart() -> None:
-    twin = DomainAuthority.found("school", SigningKey.generate(), DAY)
-    node = NodeKeys.generate(Role.RIB, "rib").join(twin, DAY)
-    policy = Policy(SCHOOL.root, [twin.root])
-    assert policy.verify_membership(node.membership, NOW).domain == twin.root.domain
+    converter = CertificateAuthority.create("school", SigningKey.generate(), DAY)
+    node = NodeKeys.generate(Role.RIB, "rib").join(converter, DAY)
+    policy = Policy(SCHOOL.root, [converter.root])
+    assert policy.verify_membership(node.membership, NOW).domain == converter.root.domain
     assert policy.verify_membership(ROBOT.membership, NOW).domain == SCHOOL.root.domain
     assert refusal(Policy(SCHOOL.root), node.membership) is DropReason.WRONG_DOMAIN
 

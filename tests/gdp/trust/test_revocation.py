@@ -7,16 +7,16 @@ import pytest
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import Statement, StatementType, parse, sign
 from gdp.crypto.subject import Subject
-from gdp.effects import Instant
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.limits import CERTIFICATE_LIFE_MAX_S
 from gdp.metadata import Metadata
+from gdp.sansio import Timestamps
 from gdp.trust.revocation import Revocation
 from gdp.trust.revocations import OPERATOR, Revocations
 from tests.gdp.trust.world import CAMERA, CLOUD, LAB, NOW, ROBOT, SCHOOL
 
 ROOTS = {SCHOOL.root.key.compressed: SCHOOL.root.domain}
-AT = Instant(100.0, NOW)
+AT = Timestamps(100.0, NOW)
 OTHER = SigningKey.generate()
 OTHERS = Subject.of(Metadata({"kind": "topic", "name": "/other"}), OTHER.public.compressed)
 
@@ -37,13 +37,13 @@ def fingerprint(number: int) -> bytes:
     return number.to_bytes(32, "big")
 
 
-def take(revoked: Revocations, statement: Statement, giver: bytes = b"a", at: Instant = AT) -> Revocation | None:
-    return revoked.take(statement, giver, at, lambda _: True)
+def take(revoked: Revocations, statement: Statement, origin: bytes = b"a", at: Timestamps = AT) -> Revocation | None:
+    return revoked.receive_revocation(statement, origin, at, lambda _: True)
 
 
-def refusal(revoked: Revocations, statement: Statement, giver: bytes = b"a", at: Instant = AT) -> DropReason:
+def refusal(revoked: Revocations, statement: Statement, origin: bytes = b"a", at: Timestamps = AT) -> DropReason:
     with pytest.raises(StatementError) as caught:
-        take(revoked, statement, giver, at)
+        take(revoked, statement, origin, at)
     return caught.value.reason
 
 
@@ -102,7 +102,7 @@ def test_a_statement_of_a_later_form_comes_out_whole() -> None:
 def test_it_is_kept_until_the_certificate_would_have_run_out(make: object) -> None:
     revoked = Revocations(ROOTS)
     take(revoked, make(1))  # type: ignore[operator]
-    take(revoked, make(2, NOW + 9_000), at=Instant(5_000.0, NOW + 5_000))  # type: ignore[operator]
+    take(revoked, make(2, NOW + 9_000), at=Timestamps(5_000.0, NOW + 5_000))  # type: ignore[operator]
     assert len(revoked) == 1
     assert [number for _, number in revoked.keys()] == [fingerprint(2)]  # noqa: SIM118
 
@@ -112,12 +112,12 @@ def test_a_later_end_replaces_an_earlier_one(make: object) -> None:
     revoked = Revocations(ROOTS)
     take(revoked, make(1))  # type: ignore[operator]
     assert take(revoked, make(1, NOW + 9_000)) is not None  # type: ignore[operator]
-    take(revoked, make(2, NOW + 9_000), at=Instant(5_000.0, NOW + 5_000))  # type: ignore[operator]
+    take(revoked, make(2, NOW + 9_000), at=Timestamps(5_000.0, NOW + 5_000))  # type: ignore[operator]
     assert len(revoked) == 2
 
 
 def test_what_has_run_out_needs_no_revocation() -> None:
-    assert refusal(Revocations(ROOTS), by_lab(1), at=Instant(0.0, NOW + 5_000)) is DropReason.EXPIRED
+    assert refusal(Revocations(ROOTS), by_lab(1), at=Timestamps(0.0, NOW + 5_000)) is DropReason.EXPIRED
 
 
 def test_a_revocation_for_longer_than_a_certificate_can_hold_is_refused() -> None:
@@ -131,15 +131,15 @@ def test_whose_certificates_are_not_held_is_refused_before_its_signature_is_look
     forged = parse(Revocation.make(SigningKey.generate(), CAMERA, bytes(32), NOW))
     for statement in (by_lab(1), forged, parse(Revocation.make(CLOUD.key, CLOUD.root.subject, bytes(32), NOW))):
         with pytest.raises(StatementError) as caught:
-            revoked.take(statement, b"a", AT, lambda _: False)
+            revoked.receive_revocation(statement, b"a", AT, lambda _: False)
         assert caught.value.reason is DropReason.UNCONCERNED
     assert len(revoked) == 0
 
 
 def test_what_the_operator_hands_in_is_kept_whoever_issued_it() -> None:
-    revoked = Revocations(ROOTS, per_issuer=2, per_giver=2, of_owners=2)
+    revoked = Revocations(ROOTS, per_issuer=2, per_origin=2, of_owners=2)
     for number in range(5):
-        assert revoked.take(by_lab(number), OPERATOR, AT, lambda _: False) is not None
+        assert revoked.receive_revocation(by_lab(number), OPERATOR, AT, lambda _: False) is not None
     refusal(revoked, by_other(1))
     assert all(has(revoked, number) for number in range(5))
 
@@ -174,7 +174,7 @@ def test_who_gives_too_many_gives_up_its_own_only() -> None:
 
 
 def test_within_a_givers_share_the_owner_that_has_most_gives_way() -> None:
-    revoked = Revocations(ROOTS, per_giver=3)
+    revoked = Revocations(ROOTS, per_origin=3)
     for number in range(3):
         take(revoked, by_lab(number))
     assert take(revoked, by_other(0)) is not None
@@ -190,12 +190,12 @@ def test_roots_have_room_that_nobody_else_can_fill() -> None:
     assert refusal(revoked, by_other(3), b"c") is DropReason.QUOTA
 
 
-def test_a_giver_has_a_rate_and_another_one_is_not_held_up() -> None:
+def test_a_origin_has_a_rate_and_another_one_is_not_held_up() -> None:
     revoked = Revocations(ROOTS, per_issuer=10_000)
     reasons = set()
     for number in range(600):
         try:
-            revoked.take(by_other(number), b"a", AT, lambda _: False)
+            revoked.receive_revocation(by_other(number), b"a", AT, lambda _: False)
         except StatementError as error:
             reasons.add(error.reason)
     assert reasons == {DropReason.UNCONCERNED, DropReason.QUOTA}

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import pytest
 
+from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Membership, Role, Root
 from gdp.crypto.identity import NodeKeys
-from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import parse
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
-from gdp.effects import Instant
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.limits import CLOCK_SKEW_S
+from gdp.sansio import Timestamps
 from gdp.trust.adcert import AdCertCache, Chain
 from gdp.trust.domain import Policy
 from gdp.trust.owner import Owner, successor_subject
@@ -29,8 +29,8 @@ from tests.gdp.trust.world import (
     NOW,
     ROBOT,
     SCHOOL,
+    advertisement,
     card,
-    claim,
     verifier,
 )
 
@@ -70,8 +70,8 @@ def test_who_has_the_first_root_only_does_not_believe_the_second() -> None:
 
 def test_a_policy_takes_on_a_successor_and_nothing_else() -> None:
     policy = Policy(SCHOOL.root, [CLOUD.root])
-    twin = DomainAuthority.found("school", SigningKey.generate(), DAY)
-    for stranger in (twin.root, CLOUD.succeed(SigningKey.generate(), DAY, RETIRES).root):
+    converter = CertificateAuthority.create("school", SigningKey.generate(), DAY)
+    for stranger in (converter.root, CLOUD.succeed(SigningKey.generate(), DAY, RETIRES).root):
         if stranger.domain == CLOUD.root.domain:
             policy.renew_roots([stranger])
         else:
@@ -96,7 +96,9 @@ def test_another_roots_successor_is_no_successor() -> None:
 
 def take_back(policy: Policy, key: SigningKey, signer: Subject, fingerprint: bytes) -> None:
     wire = Revocation.make(key, signer, fingerprint, DAY.not_after_unix_s)
-    assert policy.revoked.take(parse(wire), b"a neighbour", Instant(0.0, NOW), lambda _: True) is not None
+    assert (
+        policy.revoked.receive_revocation(parse(wire), b"a neighbour", Timestamps(0.0, NOW), lambda _: True) is not None
+    )
 
 
 def test_a_member_names_no_founder() -> None:
@@ -143,7 +145,7 @@ def test_a_successor_of_an_owner_delegates_its_names() -> None:
     assert given.open(ROBOT)[0].secret == LAB.delegate(
         card(), CAMERA_METADATA, [Right.PUBLISH], [0], DAY
     ).open(ROBOT)[0].secret  # fmt: skip
-    verifier().verify(claim(chain=given.chain), NOW)
+    verifier().verify(advertisement(chain=given.chain), NOW)
 
 
 def test_two_successions_leave_room_for_two_links() -> None:

@@ -4,29 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
-from gdp.crypto.issuing import DomainAuthority
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.metadata import Metadata
 from gdp.trust.adcert import AdCert
-from gdp.trust.card import Card
-from gdp.trust.claim import make_claim
+from gdp.trust.advertisement import sign_advertisement
 from gdp.trust.domain import Policy
+from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.owner import Owner
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
-from gdp.trust.verifier import ClaimVerifier
+from gdp.trust.verifier import AdvertisementVerifier
 
 NOW = 1_800_000_000
 DAY = Validity(NOW, NOW + 86_400)
 HOUR = Validity(NOW, NOW + 3_600)
 LATER = NOW + 10_000  # after the hour, within the day
 
-SCHOOL = DomainAuthority.found("school", SigningKey.generate(), DAY)
-CLOUD = DomainAuthority.found("cloud", SigningKey.generate(), DAY)
+SCHOOL = CertificateAuthority.create("school", SigningKey.generate(), DAY)
+CLOUD = CertificateAuthority.create("cloud", SigningKey.generate(), DAY)
 SWITCH = NodeKeys.generate(Role.SWITCH, "nuc1").join(SCHOOL, DAY)
 ROBOT = NodeKeys.generate(Role.PROXY, "robot").join(SCHOOL, DAY)
 GATEWAY = NodeKeys.generate(Role.PROXY, "gateway").join(SCHOOL, DAY)
@@ -37,9 +37,9 @@ CAMERA_METADATA = Metadata({"kind": "topic", "name": "/camera/image", "type": "s
 CAMERA = LAB.subject(CAMERA_METADATA)
 
 
-def card(node: Identity = ROBOT) -> Card:
+def card(node: Identity = ROBOT) -> NodeDescriptor:
     """Return a node's card, verified."""
-    return Card.from_wire(Card.make(node))
+    return NodeDescriptor.from_wire(NodeDescriptor.make(node))
 
 
 def adcert(
@@ -57,7 +57,7 @@ def adcert(
     return AdCert.make(signing, by, subject, node.subject, rights, validity, may_delegate=may_delegate)
 
 
-def claim(
+def advertisement(
     node: Identity = ROBOT,
     right: Right = Right.PUBLISH,
     subject: Subject = CAMERA,
@@ -68,7 +68,7 @@ def claim(
     lease_s: float = 60.0,
 ) -> bytes:
     """Return a claim; by default the robot's, to publish the camera, and it holds."""
-    return make_claim(
+    return sign_advertisement(
         node,
         right,
         subject,
@@ -81,6 +81,6 @@ def claim(
     )
 
 
-def verifier(*, allow_unowned: bool = False) -> ClaimVerifier:
+def verifier(*, allow_unowned: bool = False) -> AdvertisementVerifier:
     """Return a verifier of the school that trusts nobody else and remembers nothing yet."""
-    return ClaimVerifier(Policy(SCHOOL.root), allow_unowned=allow_unowned)
+    return AdvertisementVerifier(Policy(SCHOOL.root), allow_unowned=allow_unowned)

@@ -10,8 +10,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from proxy.serial.channel import Channel, RosVersion
 from proxy.serial.service import Service
-from proxy.serial.service_twin import twin_service
-from proxy.serial.standard import type_hash
+from proxy.serial.service_converter import translated_service
+from proxy.serial.standard_types import type_hash
 
 __all__ = [
     "FIBONACCI",
@@ -83,7 +83,7 @@ def service(type_name: str, request: str, response: str, ros: RosVersion = 2) ->
     )
     known = Service("", type_name, "", *halves)
     other: RosVersion = 2 if ros == 1 else 1
-    return twin_service(twin_service(known, other), ros)
+    return translated_service(translated_service(known, other), ros)
 
 
 @cache

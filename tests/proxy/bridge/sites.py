@@ -12,25 +12,25 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from gdp.client.member import Member, Topic
+from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.crypto.certificates import Role
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
+from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import ring5
-from gdp.simulation.world import World
 from gdp.trust.owner import Owner
 from gdp.trust.right import Right
 from proxy.bridge.bridge import Bridge
-from proxy.bridge.site import Site
-from proxy.config import ProxyConfig, Rule
+from proxy.bridge.context import BridgeContext
+from proxy.bridge.counters import Traffic
+from proxy.bridge.faults import Faults
+from proxy.config.config import ProxyConfig, Rule
+from proxy.config.rule import Kind
 from proxy.endpoints.endpoint import proxy_node_name
 from proxy.endpoints.fake import FakeEndpoint, FakeGraph
-from proxy.faults import Faults
-from proxy.rules.rule import Kind
 from proxy.serial.channel import Qos, RosVersion
-from proxy.traffic import Traffic
 from tests.proxy.bridge import known
 from tests.proxy.rule_files import OWNER, furnish, proxy, rules
 
@@ -62,16 +62,16 @@ class Machine:
     """One machine: its graph, and the proxy in it."""
 
     label: str
-    member: Member
+    member: Participant
     graph: FakeGraph
     endpoints: list[FakeEndpoint]
-    site: Site
+    site: BridgeContext
     bridge: Bridge
     tick_at_s: float = 0.0
 
     def is_due(self, now_s: float) -> bool:
         """Return whether the proxy's loop would wake up now."""
-        due_s = self.bridge.next_timeout()
+        due_s = self.bridge.get_timer()
         has_news = bool(self.member._messages) or any(endpoint._events for endpoint in self.endpoints)
         return has_news or now_s >= self.tick_at_s or (due_s is not None and due_s <= now_s)
 
@@ -88,7 +88,7 @@ class Machine:
     @property
     def carried(self) -> set[tuple[str, bool]]:
         """Return the local names that are carried, and whether out of here."""
-        return {(wish.local, wish.is_exposed) for wish, _ in self.bridge.flows}
+        return {(flow_spec.local, flow_spec.is_exposed) for flow_spec, _ in self.bridge.flows}
 
     @property
     def stream(self) -> Publisher:
@@ -131,7 +131,7 @@ class Sites:
     """
 
     def __init__(self, folder: Path, seed: int = 1) -> None:
-        self.world = World(ring5(), seed, keepalive_ms=500)
+        self.world = Simulation(ring5(), seed, keepalive_ms=500)
         self.world.owner = Owner(OWNER, bytes(range(32)))
         self.machines: list[Machine] = []
         self._folder = folder
@@ -190,13 +190,13 @@ class Sites:
         machine.member.leave()
         self.world.network.touch(machine.label)
         for endpoint in machine.endpoints:
-            endpoint.shut()
+            endpoint.remove_entity()
         self.machines.remove(machine)
 
     def kill(self, machine: Machine) -> None:
         """End a proxy without a goodbye to the overlay."""
         for endpoint in machine.endpoints:
-            endpoint.shut()
+            endpoint.remove_entity()
         self.machines.remove(machine)
         self.world.network.stop(machine.label)
 
@@ -212,7 +212,7 @@ class Sites:
         text += f"import:\n{rules(*imports)}" if imports else ""
         return proxy(self._folder, text)
 
-    def held(self, member: Member, config: ProxyConfig, holds: Sequence[Metadata] | None = None) -> Granted:
+    def held(self, member: Participant, config: ProxyConfig, holds: Sequence[Metadata] | None = None) -> Granted:
         """Return delegations for what the rules name in full, or for ``holds``."""
         given: dict[Name, tuple[Metadata, set[Right]]] = {}
         for is_exposed, listed in ((True, config.expose), (False, config.imports)):
@@ -249,11 +249,11 @@ class Sites:
     ) -> Machine:
         member = self.world.members[label]
         endpoints = [FakeEndpoint(graph, f"/{proxy_node_name(member.name.to_text())}") for graph in graphs]
-        site = Site(member, Traffic(), Faults())
+        site = BridgeContext(member, Traffic(), Faults())
         bridge = Bridge(site, config, endpoints, self.held(member, config, holds))
         return Machine(label, member, graphs[0], endpoints, site, bridge)
 
-    def _topic(self, member: Member, metadata: Metadata, rights: set[Right]) -> Topic:
+    def _topic(self, member: Participant, metadata: Metadata, rights: set[Right]) -> Topic:
         told = {key: str(value) for key, value in metadata.items() if key != "name"}
         return self.world.topic(str(metadata["name"]), member, rights, **told)
 

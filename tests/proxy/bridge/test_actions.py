@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from proxy.endpoints.fake import FakeGraph, Publication
-from proxy.qos import default
+from proxy.endpoints.qos import default
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import FIBONACCI
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites

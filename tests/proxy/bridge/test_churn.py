@@ -114,7 +114,7 @@ def test_servers_that_come_and_go(sites: Sites) -> None:
 
 
 def test_topics_of_ever_new_names_under_a_pattern(sites: Sites, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.ERROR, "proxy.faults")  # it would keep them all
+    caplog.set_level(logging.ERROR, "proxy.bridge.faults")  # it would keep them all
     robot = sites.add(ROBOT, expose=["name: /many/*"], holds=[])
     count = iter(range(1_000_000))
 

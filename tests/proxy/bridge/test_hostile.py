@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import LocalError
-from proxy.exchange import Answer, Exchange, News, Outcome, Request
-from proxy.parcel import Description, Parcel
-from proxy.qos import default
+from proxy.endpoints.qos import default
 from proxy.serial.channel import Channel
+from proxy.wire.message import RosMessage, TopicDescription
+from proxy.wire.service import Answer, Exchange, News, Outcome, Request
 from tests.proxy.bridge import known
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, STRING, string, switch, switched
@@ -39,11 +39,11 @@ def listening(sites: Sites) -> tuple[Machine, Machine, Ear]:
 
 
 def say(sites: Sites, robot: Machine, channel: Channel, body: bytes) -> None:
-    robot.stream.describe(Description("cdr", (channel,)).to_wire())
+    robot.stream.describe(TopicDescription("cdr", (channel,)).to_wire())
     robot.member.flush(sites.now_s)
     sites.world.network.touch(robot.label)
     sites.run(0.5)
-    robot.stream.publish(Parcel(0, 1, body).to_wire())
+    robot.stream.publish(RosMessage(0, 1, body).to_wire())
     robot.member.flush(sites.now_s)
     sites.world.network.touch(robot.label)
     sites.run(0.5)
@@ -107,7 +107,7 @@ def test_answers_and_news_that_are_none_do_not_stop_a_client(sites: Sites, wire:
     caller = Client(client.graph)
     assert sites.run(3, caller.sees_server)
     server.stream.publish(wire)
-    server.member.answer(server.stream.topic, client.member.name, wire)
+    server.member.respond(server.stream.topic, client.member.name, wire)
     sites.run(1)
     caller.call(switch(on=True))
     assert sites.run(1, lambda: caller.outcomes == [switched("yes")])

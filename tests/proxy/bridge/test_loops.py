@@ -13,7 +13,7 @@ from tests.proxy.bridge.known import STRING, string, switch, switched
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
 
 CHATTER = f"name: /chatter, type: {STRING}"
-TWIN, FAR_TWIN = "nuc1/twin", "nuc5/twin"
+CONVERTER, FAR_CONVERTER = "nuc1/twin", "nuc5/twin"
 BOTH = (CHATTER,)
 
 
@@ -64,7 +64,7 @@ def test_talkers_on_both_sides_of_one_topic_are_heard_once_everywhere(sites: Sit
 
 def test_two_proxies_on_one_graph_send_a_message_once(sites: Sites) -> None:
     shared = graph()
-    twins = sites.add(ROBOT, expose=[CHATTER], graph=shared), sites.add(TWIN, expose=[CHATTER], graph=shared)
+    twins = sites.add(ROBOT, expose=[CHATTER], graph=shared), sites.add(CONVERTER, expose=[CHATTER], graph=shared)
     server = sites.add(SERVER, imports=[CHATTER])
     ear, talker = Ear(server.graph, "/chatter"), shared.publish("/talker", "/chatter", STRING)
     sites.run(5)
@@ -76,21 +76,24 @@ def test_two_proxies_on_one_graph_send_a_message_once(sites: Sites) -> None:
 
 def test_two_proxies_on_one_graph_bring_a_message_in_once(sites: Sites) -> None:
     shared = graph()
-    twins = sites.add(SERVER, imports=[CHATTER], graph=shared), sites.add(FAR_TWIN, imports=[CHATTER], graph=shared)
+    twins = (
+        sites.add(SERVER, imports=[CHATTER], graph=shared),
+        sites.add(FAR_CONVERTER, imports=[CHATTER], graph=shared),
+    )
     robot = sites.add(ROBOT, expose=[CHATTER])
     ear, talker = Ear(shared, "/chatter"), robot.graph.publish("/talker", "/chatter", STRING)
     sites.run(5)
     talker.publish(string("once"))
     sites.run(5)
     assert ear.texts == ["once"]
-    assert sorted(len(twin.bridge.flows) for twin in twins) == [0, 1]
+    assert sorted(len(converter.bridge.flows) for converter in twins) == [0, 1]
 
 
 def test_two_proxies_on_each_graph_that_expose_and_import_the_same_topic(sites: Sites) -> None:
     left, right = graph(), graph()
     machines = [
         sites.add(label, graph=shared, expose=BOTH, imports=BOTH)
-        for label, shared in ((ROBOT, left), (TWIN, left), (SERVER, right), (FAR_TWIN, right))
+        for label, shared in ((ROBOT, left), (CONVERTER, left), (SERVER, right), (FAR_CONVERTER, right))
     ]
     ears = Ear(left, "/chatter"), Ear(right, "/chatter")
     talkers = [each.publish("/talker", "/chatter", STRING) for each in (left, right)]
@@ -110,7 +113,7 @@ def test_a_proxy_that_exposes_beside_one_that_imports_does_not_send_back_what_ca
 ) -> None:
     shared = graph()
     sites.add(ROBOT, expose=[CHATTER], graph=shared)
-    sites.add(TWIN, imports=[CHATTER], graph=shared)
+    sites.add(CONVERTER, imports=[CHATTER], graph=shared)
     far = sites.add(SERVER, expose=BOTH, imports=BOTH)
     ears = Ear(shared, "/chatter"), Ear(far.graph, "/chatter")
     talkers = [each.publish("/talker", "/chatter", STRING) for each in (shared, far.graph)]
@@ -125,14 +128,14 @@ def test_a_proxy_that_exposes_beside_one_that_imports_does_not_send_back_what_ca
 
 
 @pytest.mark.parametrize("is_killed", [False, True], ids=["goes", "dies"])
-def test_the_twin_takes_over_within_a_second_when_the_leading_proxy(sites: Sites, *, is_killed: bool) -> None:
+def test_the_converter_takes_over_within_a_second_when_the_leading_proxy(sites: Sites, *, is_killed: bool) -> None:
     shared = graph()
-    twins = sites.add(ROBOT, expose=[CHATTER], graph=shared), sites.add(TWIN, expose=[CHATTER], graph=shared)
+    twins = sites.add(ROBOT, expose=[CHATTER], graph=shared), sites.add(CONVERTER, expose=[CHATTER], graph=shared)
     server = sites.add(SERVER, imports=[CHATTER])
     ear, talker = Ear(server.graph, "/chatter"), shared.publish("/talker", "/chatter", STRING)
     sites.run(5)
     (leading,) = streams(*twins)
-    (other,) = (twin for twin in twins if twin is not leading)
+    (other,) = (converter for converter in twins if converter is not leading)
     talker.publish(string("1"))
     sites.run(1)
     if is_killed:
@@ -147,7 +150,7 @@ def test_the_twin_takes_over_within_a_second_when_the_leading_proxy(sites: Sites
 
 def test_a_proxy_of_higher_rank_that_comes_later_takes_over_without_a_message_twice(sites: Sites) -> None:
     shared = graph()
-    names = {label: sites.name(label) for label in (ROBOT, TWIN)}
+    names = {label: sites.name(label) for label in (ROBOT, CONVERTER)}
     late, early = sorted(names, key=lambda label: names[label])
     first = sites.add(early, expose=[CHATTER], graph=shared)
     server = sites.add(SERVER, imports=[CHATTER])
@@ -165,7 +168,7 @@ def test_a_proxy_of_higher_rank_that_comes_later_takes_over_without_a_message_tw
 def test_twins_of_a_service_serve_it_once(sites: Sites) -> None:
     shared, rule = graph(), f"kind: service, name: /switch, type: {known.SET_BOOL}"
     local = LocalServer(shared, answer=lambda _: switched("yes"))
-    twins = sites.add(SERVER, expose=[rule], graph=shared), sites.add(FAR_TWIN, expose=[rule], graph=shared)
+    twins = sites.add(SERVER, expose=[rule], graph=shared), sites.add(FAR_CONVERTER, expose=[rule], graph=shared)
     client = sites.add(ROBOT, imports=[rule])
     sites.run(5)
     assert len(streams(*twins)) == 1
@@ -179,13 +182,13 @@ def test_twins_that_import_a_service_call_it_once_and_the_other_takes_over(sites
     shared, rule = graph(), f"kind: service, name: /switch, type: {known.SET_BOOL}"
     far = sites.add(SERVER, expose=[rule])
     local = LocalServer(far.graph, answer=lambda _: switched("yes"))
-    twins = sites.add(ROBOT, imports=[rule], graph=shared), sites.add(TWIN, imports=[rule], graph=shared)
+    twins = sites.add(ROBOT, imports=[rule], graph=shared), sites.add(CONVERTER, imports=[rule], graph=shared)
     caller = Client(shared)
     sites.run(5)
     assert len(shared.servers) == 1
     caller.call(switch(on=True))
     assert sites.run(1, lambda: caller.outcomes == [switched("yes")])
-    sites.leave(next(twin for twin in twins if twin.bridge.flows))
+    sites.leave(next(converter for converter in twins if converter.bridge.flows))
     assert sites.run(1.5, caller.sees_server)
     caller.call(switch(on=True))
     assert sites.run(1, lambda: len(caller.outcomes) == 2)
@@ -197,7 +200,7 @@ def test_the_virtual_server_of_one_proxy_is_not_exposed_by_another(sites: Sites)
     far = sites.add(SERVER, expose=[rule])
     LocalServer(far.graph)
     importing = sites.add(ROBOT, imports=[rule], graph=shared)
-    exposing = sites.add(TWIN, expose=[rule], graph=shared)
+    exposing = sites.add(CONVERTER, expose=[rule], graph=shared)
     sites.run(5)
     assert len(importing.bridge.flows) == 1
     assert shared.servers

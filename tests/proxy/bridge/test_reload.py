@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gdp.client.member import Topic
+from gdp.client.participant import Topic
 from proxy.endpoints.fake import Publication
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, STRING, string, switch, switched
@@ -83,7 +83,7 @@ def test_a_rule_of_another_encoding_goes_on_above_the_numbers(sites: Sites) -> N
     talker.publish(string("3"))
     sites.run(1)
     assert ear.texts == ["0", "1", "2", "3"]
-    assert [tally.duplicated for tally in server.bridge.tallies] == [0]
+    assert [stats.duplicated for stats in server.bridge.stats] == [0]
 
 
 def test_a_new_epoch_takes_effect_without_a_message_lost(sites: Sites) -> None:
@@ -136,7 +136,7 @@ def test_a_pattern_takes_what_a_removed_rule_named_without_a_number_again(sites:
     talker.publish(string("2"))
     sites.run(1)
     assert ear.texts == ["1", "2"]
-    assert [tally.duplicated for tally in server.bridge.tallies] == [0]
+    assert [stats.duplicated for stats in server.bridge.stats] == [0]
 
 
 def test_calls_under_way_go_on_through_a_reload_of_other_rules(sites: Sites) -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from gdp.client.delivery import Delivered
-from gdp.client.member import Message
+from gdp.client.participant import Message
 from gdp.errors import LocalError
 from proxy.bridge.exposed_service import ExposedService
-from proxy.exchange import Exchange
-from proxy.rules.rule import CALL_MAX_S
+from proxy.config.rule import CALL_MAX_S
+from proxy.wire.service import Exchange
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import switch, switched
 from tests.proxy.bridge.sites import ROBOT, SERVER, Machine, Sites
@@ -72,7 +72,7 @@ def test_a_call_without_a_limit_ends_at_the_servers_side_all_the_same(sites: Sit
     machine, local, _, caller = called(sites, timeout_s="null")
     caller.call(switch(on=True))
     assert sites.run(1, lambda: local.asked == 1)
-    due_s = serving_of(machine).next_timeout()
+    due_s = serving_of(machine).get_timer()
     assert due_s is not None
     assert due_s <= sites.now_s + CALL_MAX_S
 
@@ -84,7 +84,7 @@ def test_a_goal_may_take_as_long_as_it_likes(sites: Sites) -> None:
     caller.results.call(goal_id(1))
     sites.run(1)
     assert [len(serving_of(machine)._serving) for machine in machines] == [1] * len(servers)
-    assert [serving_of(machine).next_timeout() for machine in machines] == [None] * len(servers)
+    assert [serving_of(machine).get_timer() for machine in machines] == [None] * len(servers)
 
 
 def test_a_client_that_has_too_much_under_way_is_told_so(sites: Sites) -> None:
@@ -124,8 +124,8 @@ def test_requests_of_a_client_without_a_description_do_not_keep_a_server_from_le
     machine, _, client, _ = called(sites)
     flow, publisher = serving_of(machine), bytes(client.member.name)
     with pytest.MonkeyPatch.context() as patch:
-        (feed,) = machine.member.feeds_of(machine.stream.topic)
-        patch.setattr(feed, "description", b"")
+        (writer_proxy,) = machine.member.writer_proxies_of(machine.stream.topic)
+        patch.setattr(writer_proxy, "description", b"")
         for number in range(300):
             flow.receive(Message(machine.stream.topic, Delivered(publisher, 1, number, b"?", 1, 0), b""), sites.now_s)
         flow.drain(sites.now_s)

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 from gdp.client.delivery import Delivered
-from gdp.client.member import Message
+from gdp.client.participant import Message
 from proxy.bridge.imported_service import ImportedService
-from proxy.exchange import Answer, Outcome
-from proxy.qos import default
+from proxy.endpoints.qos import default
 from proxy.serial.channel import RosVersion
+from proxy.wire.service import Answer, Outcome
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, TRIGGER, switch, switched
 from tests.proxy.bridge.sites import ROBOT, Ear, Machine, Sites

@@ -81,13 +81,13 @@ def test_clients_on_several_machines_each_get_their_own_answers(sites: Sites) ->
     server, client = pair(sites)
     third = sites.add("nuc4/third", imports=[SWITCH])
     LocalServer(server.graph, answer=lambda raw: switched(f"got {raw[-1]}"))
-    callers = [Client(client.graph), Client(third.graph)]
-    assert sites.run(3, lambda: all(caller.sees_server() for caller in callers))
-    for on, caller in enumerate(callers):
+    remote_clients = [Client(client.graph), Client(third.graph)]
+    assert sites.run(3, lambda: all(caller.sees_server() for caller in remote_clients))
+    for on, caller in enumerate(remote_clients):
         for _ in range(20):
             caller.call(switch(on=bool(on)))
-    assert sites.run(3, lambda: all(len(caller.outcomes) == 20 for caller in callers))
-    assert [set(caller.outcomes) for caller in callers] == [{switched("got 0")}, {switched("got 1")}]
+    assert sites.run(3, lambda: all(len(caller.outcomes) == 20 for caller in remote_clients))
+    assert [set(caller.outcomes) for caller in remote_clients] == [{switched("got 0")}, {switched("got 1")}]
 
 
 def test_two_far_servers_are_both_asked_and_the_first_answer_wins(sites: Sites) -> None:

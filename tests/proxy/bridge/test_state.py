@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import get_types_from_msg
 
-from proxy.bridge import parameter
+from proxy.bridge import state_parameter
 from proxy.bridge.imported_service import ImportedService
 from proxy.endpoints.fake import FakeGraph, Server
 from tests.proxy.bridge import known
@@ -41,7 +41,7 @@ class Counter:
     def __post_init__(self) -> None:
         self.servers = [self.graph.serve("/counter", "/switch", SET_BOOL, self._count)]
         if self.tells:
-            for (part, type_name), ask in ((parameter.GET, self._get), (parameter.SET, self._set)):
+            for (part, type_name), ask in ((state_parameter.GET, self._get), (state_parameter.SET, self._set)):
                 self.graph.services[type_name] = known.service(type_name, "", "")
                 self.servers.append(self.graph.serve("/counter", f"/counter/{part}", type_name, ask))
 
@@ -57,18 +57,18 @@ class Counter:
             done(switched(str(self.count)))
 
     def _get(self, raw: bytes, done: Callable[[bytes | str], None]) -> None:
-        assert raw == parameter.read_request()
+        assert raw == state_parameter.read_request()
         done(_said(b"%d" % self.count))
 
     def _set(self, raw: bytes, done: Callable[[bytes | str], None]) -> None:
-        store = parameter._store()
+        store = state_parameter._store()
         (asked,) = store.deserialize_cdr(raw, "rcl_interfaces/msg/SetParameters_Request").parameters  # type: ignore[attr-defined]
         self.count = int(bytes(asked.value.byte_array_value))
         done(b"\0\1\0\0" + b"\1\0\0\0" + b"\1\0\0\0" + b"\1\0\0\0\0")
 
 
 def _said(state: bytes) -> bytes:
-    store, name = parameter._store(), "rcl_interfaces/msg/Said"
+    store, name = state_parameter._store(), "rcl_interfaces/msg/Said"
     if name not in store.types:
         store.register(get_types_from_msg("rcl_interfaces/ParameterValue[] values", name))
     empty = np.zeros(0, np.uint8)
@@ -93,9 +93,9 @@ def follow(client: Machine, count: int) -> Callable[[], bool]:
     """Return what tells whether so many servers follow a client's log."""
 
     def do() -> bool:
-        keepers = [flow._keeper for _, flow in client.bridge.flows if isinstance(flow, ImportedService)]
+        keepers = [flow._sequencer for _, flow in client.bridge.flows if isinstance(flow, ImportedService)]
         return [
-            sum(each.follows for each in keeper._replicas.values()) for keeper in keepers if keeper is not None
+            sum(each.follows for each in sequencer._replicas.values()) for sequencer in keepers if sequencer is not None
         ] == [count]
 
     return do

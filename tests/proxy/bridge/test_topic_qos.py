@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from proxy.endpoints.fake import FakeGraph
-from proxy.qos import default
+from proxy.endpoints.qos import default
 from proxy.serial.channel import Qos, RosVersion
 from tests.proxy.bridge import known
 from tests.proxy.bridge.known import STRING, string
@@ -114,7 +114,7 @@ def test_a_latched_topic_reaches_the_same_reader_again_after_it_left(sites: Site
     assert again.texts == ["map"]
 
 
-def test_what_two_publishers_latched_reaches_a_late_joiner_from_both(sites: Sites) -> None:
+def test_what_two_publishers_latched_reaches_a_late_reassembler_from_both(sites: Sites) -> None:
     robot, server = pair(sites)
     talkers = [robot.graph.publish(f"/talker{n}", "/chatter", STRING, LATCHED) for n in range(2)]
     sites.run(1)
@@ -143,7 +143,7 @@ def test_what_a_later_publisher_latches_pushes_nothing_of_the_first_out(sites: S
     assert second.texts == ["first", "first", "later"]  # the first one's is kept, and was said again to be kept
 
 
-def test_what_publishers_on_two_machines_latched_reaches_a_late_joiner_from_both(sites: Sites) -> None:
+def test_what_publishers_on_two_machines_latched_reaches_a_late_reassembler_from_both(sites: Sites) -> None:
     robot, server = pair(sites)
     third = sites.add("nuc2/third", expose=[CHATTER])
     for machine, text in ((robot, "robot"), (third, "third")):

@@ -110,7 +110,7 @@ def test_definitions_that_differ_are_told_once_with_the_first_difference_and_the
     (told,) = caplog.messages
     assert told.startswith("/pose: other-type: ")
     assert "y: int32 there, float64 here" in told
-    assert [tally.refused for tally in server.bridge.tallies if tally.topic == "/pose"] == [3]
+    assert [stats.refused for stats in server.bridge.stats if stats.topic == "/pose"] == [3]
 
 
 def test_definitions_that_differ_between_ros_1_and_ros_2_are_told(

@@ -66,13 +66,13 @@ def test_a_talker_that_leaves_is_withdrawn_and_one_that_returns_goes_on_above_it
     talker.publish(string("before"))
     assert sites.run(1, lambda: len(ear.heard) == 1)
     talker.close()
-    assert sites.run(1, lambda: not robot.member.publishers() and not list(server.member.feeds()))
+    assert sites.run(1, lambda: not robot.member.publishers() and not list(server.member.writer_proxies()))
     talker = talk(robot)
     assert sites.run(1, robot.is_read)
     talker.publish(string("after"))
     assert sites.run(1, lambda: len(ear.heard) == 2)
     assert ear.texts == ["before", "after"]
-    assert [tally.duplicated for tally in server.bridge.tallies] == [0]
+    assert [stats.duplicated for stats in server.bridge.stats] == [0]
 
 
 def test_the_last_words_of_a_talker_that_leaves_at_once_arrive(sites: Sites) -> None:

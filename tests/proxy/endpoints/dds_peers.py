@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from proxy.endpoints.endpoint import End, Event, Role
+from proxy.endpoints.endpoint import Event, GraphEntity, Role
 
 if TYPE_CHECKING:
     from proxy.endpoints.dds import DdsEndpoint
@@ -111,12 +111,12 @@ class Ears:
         while not holds(events):
             assert time.monotonic() < until_s, (events, self.endpoint.graph())
             select.select([self.endpoint.fileno()], [], [], 0.1)
-            events += self.endpoint.take()
+            events += self.endpoint.poll_events()
         return events
 
-    def wait_end(self, role: Role, name: str) -> End:
+    def wait_end(self, role: Role, name: str) -> GraphEntity:
         """Return an end, as soon as it is in the graph."""
-        found: list[End] = []
+        found: list[GraphEntity] = []
 
         def is_there(_: list[Event]) -> bool:
             found[:] = [end for end in self.endpoint.graph() if (end.role, end.name) == (role, name)]
@@ -243,7 +243,7 @@ def _rclpy_peer() -> None:
 
 def _dds_peer(domain: int) -> None:
     from proxy.endpoints.dds import DdsEndpoint
-    from proxy.endpoints.endpoint import Answered, Asked, Failed
+    from proxy.endpoints.endpoint import CallFailed, RequestReceived, ResponseReceived
     from proxy.serial.channel import Channel
     from proxy.serial.service import Service
 
@@ -254,12 +254,12 @@ def _dds_peer(domain: int) -> None:
     for command in _lines():
         if command is None:
             select.select([endpoint.fileno(), 0], [], [], 0.1)
-        for event in endpoint.take():
-            if isinstance(event, Asked) and event.handle not in mute:
+        for event in endpoint.poll_events():
+            if isinstance(event, RequestReceived) and event.handle not in mute:
                 endpoint.answer(event.handle, event.ticket, event.raw)
-            elif isinstance(event, Answered):
+            elif isinstance(event, ResponseReceived):
                 _say(answered=event.call, raw=event.raw.hex())
-            elif isinstance(event, Failed):
+            elif isinstance(event, CallFailed):
                 _say(failed=event.call, reason=event.reason)
         if command is None:
             continue
@@ -270,14 +270,14 @@ def _dds_peer(domain: int) -> None:
             if command.get("mute"):
                 mute.add(handles[name])
         elif do == "dial":
-            handles[name] = endpoint.dial(name, str(command["type"]))
+            handles[name] = endpoint.create_client(name, str(command["type"]))
         elif do == "call":
             endpoint.call(handles[name], int(str(command["call"])), bytes.fromhex(str(command["hex"])))
         elif do == "close":
             endpoint.close(handles.pop(name))
         elif do == "graph":
             _say(answer="graph", ends=[[end.name, end.role.value, end.node] for end in endpoint.graph()])
-    endpoint.shut()
+    endpoint.remove_entity()
 
 
 if __name__ == "__main__":

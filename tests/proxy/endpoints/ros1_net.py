@@ -107,7 +107,7 @@ class Ear:
                 raise AssertionError(f"it did not come; events: {str(self.events)[-2000:]}, {self.endpoint.graph()}")
             # What is counted, not told (subscribers), wakes too, but a look now and then costs nothing.
             select.select([self.endpoint], [], [], min(left_s, 0.5))
-            self.events += self.endpoint.take()
+            self.events += self.endpoint.poll_events()
 
     def of(self, kind: type[_Event], handle: int | None = None) -> list[_Event]:
         return [
@@ -189,7 +189,7 @@ class Net:
     def leave(self) -> None:
         """End the peers and endpoints."""
         for endpoint in self.endpoints:
-            endpoint.shut()
+            endpoint.remove_entity()
         self.endpoints.clear()
         self.end_peers()
 

@@ -16,7 +16,14 @@ from typing import TypeVar
 
 import pytest
 
-from proxy.endpoints.endpoint import Answered, Asked, Event, Failed, Heard, proxy_node_name
+from proxy.endpoints.endpoint import (
+    CallFailed,
+    Event,
+    MessageReceived,
+    RequestReceived,
+    ResponseReceived,
+    proxy_node_name,
+)
 from proxy.endpoints.ros2 import Ros2Endpoint
 
 DOMAIN = 100 + os.getpid() % 100
@@ -89,29 +96,33 @@ class Ears:
         while not is_met():
             assert time.monotonic() < end, f"{what} did not happen; {self.events[-5:]}"
             select.select([self.endpoint], [], [], 0.02)
-            self.events += self.endpoint.take()
+            self.events += self.endpoint.poll_events()
 
     def for_s(self, seconds: float) -> None:
         """Take events for a time: for what must not happen."""
         end = time.monotonic() + seconds
         while (rest := end - time.monotonic()) > 0:
             select.select([self.endpoint], [], [], rest)
-            self.events += self.endpoint.take()
+            self.events += self.endpoint.poll_events()
 
     def of(self, kind: type[_Found], handle: int) -> list[_Found]:
         """Return the events of a kind of a handle so far."""
         return [event for event in self.events if isinstance(event, kind) and event[0] == handle]
 
     def heard(self, handle: int) -> list[bytes]:
-        return [event.raw for event in self.of(Heard, handle)]
+        return [event.raw for event in self.of(MessageReceived, handle)]
 
-    def next_asked(self, handle: int, count: int = 1) -> list[Asked]:
-        self.until(lambda: len(self.of(Asked, handle)) >= count, "a request")
-        return self.of(Asked, handle)
+    def next_asked(self, handle: int, count: int = 1) -> list[RequestReceived]:
+        self.until(lambda: len(self.of(RequestReceived, handle)) >= count, "a request")
+        return self.of(RequestReceived, handle)
 
-    def outcome(self, handle: int, call: int) -> Answered | Failed:
-        def found() -> list[Answered | Failed]:
-            return [event for event in (*self.of(Answered, handle), *self.of(Failed, handle)) if event.call == call]
+    def outcome(self, handle: int, call: int) -> ResponseReceived | CallFailed:
+        def found() -> list[ResponseReceived | CallFailed]:
+            return [
+                event
+                for event in (*self.of(ResponseReceived, handle), *self.of(CallFailed, handle))
+                if event.call == call
+            ]
 
         self.until(found, f"the outcome of call {call}")
         return found()[0]
@@ -136,7 +147,7 @@ def endpoint_of_ours(node: str = NODE) -> Iterator[Ears]:
         try:
             yield Ears(endpoint)
         finally:
-            endpoint.shut()
+            endpoint.remove_entity()
 
 
 @contextmanager

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 pytest.importorskip("cyclonedds", reason="Cyclone DDS's Python binding is not installed")
 
+from proxy.endpoints.dds.graph_cache import GraphCache, Peer
 from proxy.endpoints.dds.naming import Named, dds_type, hash_in, identity, identity_in, named, user_data
 from proxy.endpoints.dds.node_info import NodeInfo, read_info, write_info
-from proxy.endpoints.dds.survey import Peer, Survey
 from proxy.endpoints.endpoint import Role
-from proxy.qos import default
+from proxy.endpoints.qos import default
 
 ME = bytes(range(16))
 READER, WRITER = bytes([1] * 16), bytes([2] * 16)
@@ -66,7 +66,7 @@ def test_what_is_no_node_information_is_read_as_none_or_as_some(raw: bytes) -> N
 
 
 def test_the_ends_of_a_ros_participant_show_once_it_told_their_node() -> None:
-    survey = Survey()
+    survey = GraphCache()
     peer = Peer(WRITER, Named(Role.PUBLISHES, "/a", "std_msgs/msg/String"), "", default(), b"")
     survey.joined(1, WRITER)
     survey.found(2, peer)
@@ -78,7 +78,7 @@ def test_the_ends_of_a_ros_participant_show_once_it_told_their_node() -> None:
 
 
 def test_what_is_not_ros_shows_without_a_node() -> None:
-    survey = Survey()
+    survey = GraphCache()
     survey.found(2, Peer(WRITER, Named(Role.PUBLISHES, "/a", "std_msgs/msg/String"), "", default(), b""))
     assert [end.node for end in survey.graph()] == [""]
 

@@ -14,7 +14,7 @@ pytest.importorskip("cyclonedds", reason="Cyclone DDS's Python binding is not in
 
 from gdp.errors import LocalError
 from proxy.endpoints.dds import DdsEndpoint
-from proxy.endpoints.endpoint import Answered, Asked, Event, Failed, Role
+from proxy.endpoints.endpoint import CallFailed, Event, RequestReceived, ResponseReceived, Role
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 from tests.proxy.endpoints.dds_peers import CYCLONE, Ears, Peer, peer
@@ -33,7 +33,7 @@ def ears(domain: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ears]:
     monkeypatch.setenv("CYCLONEDDS_URI", CYCLONE)
     endpoint = DdsEndpoint(domain, "gdp_proxy_0123456789ab")
     yield Ears(endpoint)
-    endpoint.shut()
+    endpoint.remove_entity()
 
 
 @pytest.fixture
@@ -46,23 +46,23 @@ def request(number: int) -> bytes:
     return b"\x00\x01\x00\x00" + number.to_bytes(8, "little")
 
 
-def answers(events: list[Event]) -> list[Answered]:
-    return [each for each in events if isinstance(each, Answered)]
+def answers(events: list[Event]) -> list[ResponseReceived]:
+    return [each for each in events if isinstance(each, ResponseReceived)]
 
 
 def test_the_first_call_is_answered_at_once(ears: Ears, robot: Peer) -> None:
     robot.tell("serve", topic="/set", type=SET)
     assert ears.wait_end(Role.SERVES, "/set").node == "/robot"
-    handle = ears.endpoint.dial("/set", SET)
+    handle = ears.endpoint.create_client("/set", SET)
     ears.endpoint.call(handle, 41, request(7))
     events = ears.wait(lambda got: bool(answers(got)))
-    assert answers(events) == [Answered(handle, 41, request(7))]
+    assert answers(events) == [ResponseReceived(handle, 41, request(7))]
 
 
 def test_a_thousand_calls_at_once_are_each_answered_with_their_own(ears: Ears, robot: Peer) -> None:
     robot.tell("serve", topic="/set", type=SET)
     ears.wait_end(Role.SERVES, "/set")
-    handle = ears.endpoint.dial("/set", SET)
+    handle = ears.endpoint.create_client("/set", SET)
     for number in range(1_000):
         ears.endpoint.call(handle, number, request(number))
     events = ears.wait(lambda got: len(answers(got)) == 1_000)
@@ -75,8 +75,8 @@ def test_a_local_client_is_answered_by_us(ears: Ears, robot: Peer) -> None:
     ears.wait_end(Role.CALLS, "/set")
     for number in range(50):
         robot.tell("call", topic="/set", call=number, hex=request(number).hex())
-    events = ears.wait(lambda got: sum(isinstance(each, Asked) for each in got) == 50)
-    for asked in reversed([each for each in events if isinstance(each, Asked)]):
+    events = ears.wait(lambda got: sum(isinstance(each, RequestReceived) for each in got) == 50)
+    for asked in reversed([each for each in events if isinstance(each, RequestReceived)]):
         ears.endpoint.answer(handle, asked.ticket, asked.raw)
     assert {each["answered"]: each["raw"] for each in robot.wait_news("answered", None, 50)} == {
         number: request(number).hex() for number in range(50)
@@ -86,19 +86,19 @@ def test_a_local_client_is_answered_by_us(ears: Ears, robot: Peer) -> None:
 def test_a_call_fails_when_its_server_leaves(ears: Ears, robot: Peer) -> None:
     robot.tell("serve", topic="/set", type=SET, mute=True)
     ears.wait_end(Role.SERVES, "/set")
-    handle = ears.endpoint.dial("/set", SET)
+    handle = ears.endpoint.create_client("/set", SET)
     ears.endpoint.call(handle, 41, request(7))
     robot.tell("close", topic="/set")
-    events = ears.wait(lambda got: any(isinstance(each, Failed) for each in got))
-    assert Failed(handle, 41, "the server is gone") in events
+    events = ears.wait(lambda got: any(isinstance(each, CallFailed) for each in got))
+    assert CallFailed(handle, 41, "the server is gone") in events
     ears.endpoint.call(handle, 42, request(7))
-    assert Failed(handle, 42, "no server") in ears.endpoint.take()
+    assert CallFailed(handle, 42, "no server") in ears.endpoint.poll_events()
 
 
 def test_the_response_of_a_dropped_call_is_nobodys(ears: Ears, robot: Peer) -> None:
     robot.tell("serve", topic="/set", type=SET)
     ears.wait_end(Role.SERVES, "/set")
-    handle = ears.endpoint.dial("/set", SET)
+    handle = ears.endpoint.create_client("/set", SET)
     ears.endpoint.call(handle, 1, request(1))
     ears.endpoint.drop(handle, 1)
     ears.endpoint.call(handle, 2, request(2))
@@ -118,11 +118,11 @@ def test_an_endpoint_never_hears_itself(ears: Ears) -> None:
     kind = "std_msgs/msg/String"
     ears.endpoint.subscribe("/chat", kind, None)
     handle = ears.endpoint.advertise(ears.endpoint.channel("/chat", kind))
-    server, client = ears.endpoint.serve(SERVICE), ears.endpoint.dial("/set", SET)
+    server, client = ears.endpoint.serve(SERVICE), ears.endpoint.create_client("/set", SET)
     ears.endpoint.publish(handle, b"\x00\x01\x00\x00\x01\x00\x00\x00\x00\x00\x00\x00")
     ears.endpoint.call(client, 1, request(1))
     assert ears.endpoint.subscribers(handle) == 0
-    assert Failed(client, 1, "no server") in ears.endpoint.take()
+    assert CallFailed(client, 1, "no server") in ears.endpoint.poll_events()
     assert ears.endpoint.graph() == frozenset()
     assert server != client
 
@@ -135,9 +135,9 @@ def test_what_is_opened_and_closed_leaves_nothing_behind(ears: Ears) -> None:
                 ears.endpoint.subscribe(topic, "std_msgs/msg/String", None),
                 ears.endpoint.advertise(ears.endpoint.channel(topic, "std_msgs/msg/String")),
                 ears.endpoint.serve(SERVICE),
-                ears.endpoint.dial("/set", SET),
+                ears.endpoint.create_client("/set", SET),
             ]
-            ears.endpoint.take()
+            ears.endpoint.poll_events()
             for handle in opened:
                 ears.endpoint.close(handle)
 

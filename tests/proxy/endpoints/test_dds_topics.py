@@ -13,8 +13,16 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from gdp.errors import LocalError
 from proxy.endpoints.dds import DdsEndpoint
-from proxy.endpoints.endpoint import Asked, Described, Event, Faulted, GraphChanged, Heard, Role
-from proxy.qos import default, unmatched
+from proxy.endpoints.endpoint import (
+    EndpointError,
+    Event,
+    GraphChanged,
+    MessageReceived,
+    RequestReceived,
+    Role,
+    TypeResolved,
+)
+from proxy.endpoints.qos import default, unmatched
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 from tests.proxy.endpoints.dds_peers import CYCLONE, Ears, Peer, digest, peer
@@ -35,7 +43,7 @@ def ears(domain: int) -> Iterator[Ears]:
         patch.setenv("CYCLONEDDS_URI", CYCLONE)
         endpoint = DdsEndpoint(domain, "gdp_proxy_0123456789ab")
     yield Ears(endpoint)
-    endpoint.shut()
+    endpoint.remove_entity()
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +53,7 @@ def robot(domain: int) -> Iterator[Peer]:
 
 
 def heard(events: Sequence[Event]) -> list[bytes]:
-    return [event.raw for event in events if isinstance(event, Heard)]
+    return [event.raw for event in events if isinstance(event, MessageReceived)]
 
 
 def test_a_node_of_rclpy_is_seen_with_its_type_hash_and_qos(ears: Ears, robot: Peer) -> None:
@@ -71,7 +79,7 @@ def test_what_rclpy_publishes_is_heard_after_it_was_described(ears: Ears, robot:
     handle = ears.endpoint.subscribe("/theirs", STRING, default(latched=True))
     robot.tell("publish", topic="/theirs", hex=HELLO.hex())
     events = [each for each in ears.wait(lambda got: bool(heard(got))) if not isinstance(each, GraphChanged)]
-    assert events[0] == Described(handle, ears.endpoint.channel("/theirs", STRING))
+    assert events[0] == TypeResolved(handle, ears.endpoint.channel("/theirs", STRING))
     assert heard(events) == [HELLO]
 
 
@@ -98,7 +106,7 @@ def test_an_image_goes_both_ways_unchanged(ears: Ears, robot: Peer) -> None:
     assert robot.wait_heard("/back", 1) == [sent["digest"]]
 
 
-def test_a_late_joiner_gets_what_was_latched(ears: Ears, robot: Peer) -> None:
+def test_a_late_reassembler_gets_what_was_latched(ears: Ears, robot: Peer) -> None:
     channel = Channel("/map", STRING, 2, STRING_HASH, qos=(default(latched=True, depth=2),))
     handle = ears.endpoint.advertise(channel)
     for text in (b"first", b"hello", b"world"):
@@ -136,7 +144,7 @@ def test_a_reader_that_stands_still_holds_up_nobody(ears: Ears, domain: int) -> 
         for _ in range(30):
             ears.endpoint.publish(handle, HELLO + bytes(921_600))
         second.process.send_signal(signal.SIGCONT)
-        assert not [each for each in ears.endpoint.take() if isinstance(each, Faulted)]
+        assert not [each for each in ears.endpoint.poll_events() if isinstance(each, EndpointError)]
 
 
 def test_an_end_that_leaves_is_gone_from_the_graph(ears: Ears, domain: int) -> None:
@@ -155,7 +163,7 @@ def test_a_type_that_nobody_knows_here_is_heard_as_bytes(ears: Ears, robot: Peer
     robot.tell("publish", topic="/odd", hex="0001000000")
     events = ears.wait(lambda got: bool(heard(got)))
     assert end.hash.startswith("RIHS01_")
-    assert Described(handle, Channel("/odd", "test_msgs/msg/Empty", 2, end.hash)) in events
+    assert TypeResolved(handle, Channel("/odd", "test_msgs/msg/Empty", 2, end.hash)) in events
 
 
 def test_another_definition_of_a_local_type_is_refused(ears: Ears, robot: Peer) -> None:
@@ -169,10 +177,10 @@ def test_a_service_with_a_peer_of_another_vendor_is_refused_with_a_reason(ears: 
     robot.ask("serve", topic="/set", type="std_srvs/srv/SetBool")
     end = ears.wait_end(Role.SERVES, "/set")
     assert (end.type_name, end.node, end.hash[:7]) == ("std_srvs/srv/SetBool", "/robot", "RIHS01_")
-    handle = ears.endpoint.dial("/set", "std_srvs/srv/SetBool")
+    handle = ears.endpoint.create_client("/set", "std_srvs/srv/SetBool")
     ears.endpoint.call(handle, 7, b"\x00\x01\x00\x00\x01\x00\x00\x00")
     events = ears.wait(lambda got: any(getattr(each, "call", 0) == 7 for each in got))
-    (fault,) = [each.reason for each in events if isinstance(each, Faulted)]
+    (fault,) = [each.reason for each in events if isinstance(each, EndpointError)]
     assert "Fast DDS" in fault
     assert "endpoint ros2" in fault
 
@@ -183,10 +191,10 @@ def test_a_request_of_another_vendor_is_never_taken_for_one_of_ours(ears: Ears, 
     halves = [Channel("/basic", f"{kind}_{half}", 2) for half in ("Request", "Response")]
     handle = ears.endpoint.serve(Service("/basic", kind, "", halves[0], halves[1]))
     robot.ask("call", topic="/basic", type=kind)
-    events = ears.wait(lambda got: any(isinstance(each, Faulted) for each in got))
+    events = ears.wait(lambda got: any(isinstance(each, EndpointError) for each in got))
     ears.endpoint.advertise(ears.endpoint.channel("/after", STRING))
     robot.ask("subscribe", topic="/after", type=STRING)
     ears.wait_end(Role.SUBSCRIBES, "/after")
-    events += ears.endpoint.take()
-    assert [each.handle for each in events if isinstance(each, Faulted)] == [handle]
-    assert not [each for each in events if isinstance(each, Asked)]
+    events += ears.endpoint.poll_events()
+    assert [each.handle for each in events if isinstance(each, EndpointError)] == [handle]
+    assert not [each for each in events if isinstance(each, RequestReceived)]

@@ -12,7 +12,7 @@ from gdp.errors import LocalError
 from proxy.endpoints.definition import definition_of, interface_of, type_hash_of
 from proxy.endpoints.ros2.types import channel_of, class_of, service_of
 from proxy.serial.schema import parse
-from proxy.serial.standard import type_hash
+from proxy.serial.standard_types import type_hash
 from tests.proxy.endpoints.ros2_net import needs
 
 needs("std_msgs", "sensor_msgs", "nav_msgs", "std_srvs", "test_msgs")

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import LocalError
-from proxy.endpoints.endpoint import Described, Faulted, GraphChanged, Heard, Role
+from proxy.endpoints.endpoint import EndpointError, GraphChanged, MessageReceived, Role, TypeResolved
 from proxy.endpoints.ros1 import Ros1Endpoint, install
 from proxy.serial.channel import Channel, Qos
 from tests.proxy.endpoints.ros1_net import NODE, Ear, Net, ros1_net
@@ -75,16 +75,16 @@ def channel(topic: str, *, latched: bool = False, depth: int = 1, type_name: str
 def test_a_talker_is_heard_byte_for_byte_after_its_description(net: Net, ear: Ear) -> None:
     handle = ear.endpoint.subscribe("/chatter", STRING, None)
     talker = net.peer(TALKER.format(node="talker", topic="/chatter", latch=True))
-    ear.wait(Heard)
+    ear.wait(MessageReceived)
     talker.tell("second")
-    ear.wait(Heard, 2)
-    described = next(index for index, event in enumerate(ear.events) if isinstance(event, Described))
-    heard = next(index for index, event in enumerate(ear.events) if isinstance(event, Heard))
+    ear.wait(MessageReceived, 2)
+    described = next(index for index, event in enumerate(ear.events) if isinstance(event, TypeResolved))
+    heard = next(index for index, event in enumerate(ear.events) if isinstance(event, MessageReceived))
     assert described < heard
-    assert ear.of(Described)[0].channel == Channel(
+    assert ear.of(TypeResolved)[0].channel == Channel(
         "/chatter", STRING, 1, STRING_MD5, "string data\n", "msg", (), True, "/talker"
     )
-    assert [event.raw for event in ear.of(Heard, handle)] == [string("first of talker"), string("second")]
+    assert [event.raw for event in ear.of(MessageReceived, handle)] == [string("first of talker"), string("second")]
 
 
 def test_what_is_published_is_heard_byte_for_byte_from_our_node(net: Net, ear: Ear) -> None:
@@ -101,7 +101,7 @@ def test_what_is_published_is_heard_byte_for_byte_from_our_node(net: Net, ear: E
     ear.until(lambda: ear.endpoint.subscribers(handle) == 0)
 
 
-def test_a_late_joiner_gets_the_kept_messages_of_a_latched_publisher_each_once(net: Net, ear: Ear) -> None:
+def test_a_late_reassembler_gets_the_kept_messages_of_a_latched_publisher_each_once(net: Net, ear: Ear) -> None:
     handle = ear.endpoint.advertise(channel("/map", latched=True, depth=3))
     for number in range(5):
         ear.endpoint.publish(handle, string(str(number)))
@@ -119,12 +119,12 @@ def test_a_late_subscription_hears_the_latched_message_of_each_of_two_publishers
     net.peer(TALKER.format(node="one", topic="/static", latch=True))
     net.peer(TALKER.format(node="two", topic="/static", latch=True))
     ear.endpoint.subscribe("/static", STRING, None)
-    heard = ear.wait(Heard, 2)
+    heard = ear.wait(MessageReceived, 2)
     assert {event.raw for event in heard} == {string("first of one"), string("first of two")}
-    assert ear.of(Described)[-1].channel.callerid is None
+    assert ear.of(TypeResolved)[-1].channel.callerid is None
 
 
-def test_two_latched_publishers_of_ours_on_one_topic_both_reach_a_late_joiner(net: Net, ear: Ear) -> None:
+def test_two_latched_publishers_of_ours_on_one_topic_both_reach_a_late_reassembler(net: Net, ear: Ear) -> None:
     first = ear.endpoint.advertise(channel("/tf_static", latched=True))
     second = ear.endpoint.advertise(channel("/tf_static", latched=True))
     ear.endpoint.publish(first, string("a"))
@@ -145,8 +145,8 @@ def test_own_messages_and_those_of_another_proxy_are_not_heard(net: Net, ear: Ea
     handle = ear.endpoint.subscribe("/loop", STRING, None)
     other.until(lambda: other.endpoint.subscribers(theirs) == 1)
     net.peer(TALKER.format(node="talker", topic="/loop", latch=True))
-    ear.wait(Heard, 1, handle)
-    assert [event.raw for event in ear.of(Heard)] == [string("first of talker")]
+    ear.wait(MessageReceived, 1, handle)
+    assert [event.raw for event in ear.of(MessageReceived)] == [string("first of talker")]
     assert ear.endpoint.subscribers(mine) == 0
 
 
@@ -174,7 +174,7 @@ def test_a_node_that_dies_without_a_farewell_leaves_the_graph(net: Net, ear: Ear
 def test_a_publisher_with_another_md5_is_a_fault_and_the_first_is_still_heard(net: Net, ear: Ear) -> None:
     handle = ear.endpoint.subscribe("/mixed", STRING, None)
     talker = net.peer(TALKER.format(node="talker", topic="/mixed", latch=True))
-    ear.wait(Heard)
+    ear.wait(MessageReceived)
     net.peer(
         """
 from std_msgs.msg import Int32
@@ -185,18 +185,18 @@ print("ready")
 rospy.spin()
 """
     )
-    fault = ear.wait(Faulted, 1, handle)[0]
+    fault = ear.wait(EndpointError, 1, handle)[0]
     assert STRING_MD5 in fault.reason
     assert "da5909fbe378aeaf85e547e830cc1bb7" in fault.reason
     talker.tell("on")
-    ear.wait(Heard, 2)
-    assert ear.of(Heard)[-1].raw == string("on")
+    ear.wait(MessageReceived, 2)
+    assert ear.of(MessageReceived)[-1].raw == string("on")
 
 
 def test_a_definition_that_differs_from_the_installed_one_is_a_fault(ear: Ear) -> None:
     wrong = Channel("/wrong", STRING, 1, "0" * 32, "string text\n", "msg")
     handle = ear.endpoint.advertise(wrong)
-    reason = ear.wait(Faulted, 1, handle)[0].reason
+    reason = ear.wait(EndpointError, 1, handle)[0].reason
     assert STRING_MD5 in reason
     assert "0" * 32 in reason
 
@@ -205,7 +205,7 @@ def test_a_topic_of_another_local_type_is_a_fault_until_that_is_gone(net: Net, e
     talker = net.peer(TALKER.format(node="talker", topic="/taken", latch=False))
     ear.wait_end("/taken")
     handle = ear.endpoint.advertise(Channel("/taken", "std_msgs/msg/Empty", 1, "d41d8cd98f00b204e9800998ecf8427e"))
-    assert "std_msgs/String" in ear.wait(Faulted, 1, handle)[0].reason
+    assert "std_msgs/String" in ear.wait(EndpointError, 1, handle)[0].reason
     talker.end()
     listener = net.peer(LISTENER.format(node="listener", topic="/taken", type="AnyMsg"))
     ear.until(lambda: ear.endpoint.subscribers(handle) == 1)
@@ -272,7 +272,7 @@ def test_rounds_of_subscribing_and_advertising_leave_no_descriptor_and_no_thread
         for _ in range(count):
             hear = [ear.endpoint.subscribe(f"/in{lane}", STRING, None) for lane in range(10)]
             tell = [ear.endpoint.advertise(channel(f"/out{lane}", latched=True)) for lane in range(10)]
-            ear.wait(Heard, 10)
+            ear.wait(MessageReceived, 10)
             ear.until(lambda tell=tell: all(ear.endpoint.subscribers(handle) for handle in tell))  # type: ignore[misc]
             for handle in (*hear, *tell):
                 ear.endpoint.close(handle)

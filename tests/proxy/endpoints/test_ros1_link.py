@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from proxy.endpoints.ros1.link import Frame, Kind, Link, LinkEndedError
+from proxy.endpoints.ros1.ipc import Frame, IpcLink, Kind, LinkEndedError
 
-Pair = tuple[Link, Link, list[int]]
+Pair = tuple[IpcLink, IpcLink, list[int]]
 
 
 def paired(budget_bytes: int = 1 << 20) -> Pair:
     behind: list[int] = []
     left, right = socket.socketpair()
-    return Link(left, lambda: behind.append(1), budget_bytes=budget_bytes), Link(right, lambda: None), behind
+    return IpcLink(left, lambda: behind.append(1), budget_bytes=budget_bytes), IpcLink(right, lambda: None), behind
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def pair() -> Iterator[Pair]:
     pair[1].close()
 
 
-def everything(sender: Link, receiver: Link) -> list[Frame]:
+def everything(sender: IpcLink, receiver: IpcLink) -> list[Frame]:
     frames: list[Frame] = []
     while True:
         was_behind = sender.is_behind

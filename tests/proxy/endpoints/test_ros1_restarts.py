@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from proxy.endpoints.endpoint import Answered, Asked, Failed, Faulted, Heard
+from proxy.endpoints.endpoint import CallFailed, EndpointError, MessageReceived, RequestReceived, ResponseReceived
 from tests.proxy.endpoints.ros1_net import Ear, Net, ros1_net
 from tests.proxy.endpoints.test_ros1 import LISTENER, STRING, TALKER, channel, string
 from tests.proxy.endpoints.test_ros1_services import CLIENTS, SERVER, SET_BOOL, fine, set_bool
@@ -26,23 +26,23 @@ def is_all_there(net: Net, ear: Ear, hears: int, tells: int, serves: int, dial: 
     """Everything that four handles promise, with new peers."""
     ear.events.clear()
     net.peer(TALKER.format(node="talker", topic="/in", latch=True))
-    assert ear.wait(Heard, 1, hears)[0].raw == string("first of talker")
+    assert ear.wait(MessageReceived, 1, hears)[0].raw == string("first of talker")
     listener = net.peer(LISTENER.format(node="listener", topic="/out", type="AnyMsg"))
     assert listener.line().startswith(string("kept").hex())
     ear.until(lambda: ear.endpoint.subscribers(tells) == 1)
     client = net.peer(CLIENTS.format(count=1))
-    ear.endpoint.answer(serves, ear.wait(Asked, 1, serves)[0].ticket, fine("yes"))
+    ear.endpoint.answer(serves, ear.wait(RequestReceived, 1, serves)[0].ticket, fine("yes"))
     assert client.line() == "0 True yes"
     net.peer(SERVER)
     ear.endpoint.call(dial, 99, b"\1")
-    ear.until(lambda: Answered(dial, 99, fine("fine")) in ear.events)
+    ear.until(lambda: ResponseReceived(dial, 99, fine("fine")) in ear.events)
 
 
 def four(ear: Ear) -> tuple[int, int, int, int]:
     tells = ear.endpoint.advertise(channel("/out", latched=True))
     ear.endpoint.publish(tells, string("kept"))
     hears = ear.endpoint.subscribe("/in", STRING, None)
-    return hears, tells, ear.endpoint.serve(set_bool()), ear.endpoint.dial("/flag", SET_BOOL)
+    return hears, tells, ear.endpoint.serve(set_bool()), ear.endpoint.create_client("/flag", SET_BOOL)
 
 
 def test_a_master_that_comes_later_is_joined(net: Net) -> None:
@@ -50,7 +50,7 @@ def test_a_master_that_comes_later_is_joined(net: Net) -> None:
     ear = net.endpoint()
     handles = four(ear)
     for handle in handles:
-        assert "does not answer" in ear.wait(Faulted, 1, handle)[0].reason
+        assert "does not answer" in ear.wait(EndpointError, 1, handle)[0].reason
     net.start_master()
     is_all_there(net, ear, *handles)
 
@@ -62,7 +62,7 @@ def test_a_master_that_was_restarted_gets_everything_again(net: Net) -> None:
     ear.events.clear()
     net.stop_master()
     for handle in handles:
-        assert "does not answer" in ear.wait(Faulted, 1, handle)[0].reason
+        assert "does not answer" in ear.wait(EndpointError, 1, handle)[0].reason
     net.end_peers()
     net.start_master()
     is_all_there(net, ear, *handles)
@@ -75,13 +75,13 @@ def test_a_killed_rospy_process_comes_back_with_everything(net: Net) -> None:
     ear.events.clear()
     net.end_peers()
     server = net.peer(SERVER)
-    dial = ear.endpoint.dial("/slow", SET_BOOL)
+    dial = ear.endpoint.create_client("/slow", SET_BOOL)
     ear.endpoint.call(dial, 7, b"\1")
     server.until("asked")
     os.kill(ear.endpoint._process.pid, signal.SIGKILL)
-    assert ear.wait(Failed, 1, dial)[0].call == 7
+    assert ear.wait(CallFailed, 1, dial)[0].call == 7
     for handle in (*handles, dial):
-        assert "has ended" in ear.wait(Faulted, 1, handle)[0].reason
+        assert "has ended" in ear.wait(EndpointError, 1, handle)[0].reason
     server.end()
     is_all_there(net, ear, *handles)
 
@@ -108,7 +108,7 @@ input()
 def test_an_endpoint_shuts_without_a_master_too(net: Net) -> None:
     net.stop_master()
     ear = net.endpoint()
-    ear.wait(Faulted, 1, ear.endpoint.subscribe("/in", STRING, None))
+    ear.wait(EndpointError, 1, ear.endpoint.subscribe("/in", STRING, None))
     process = ear.endpoint._process
     net.leave()
     assert process.returncode == 0
@@ -121,6 +121,6 @@ def test_the_rospy_process_ends_with_the_proxy(net: Net) -> None:
     other.wait_end("/out")
     net.endpoints.remove(ear.endpoint)
     process = ear.endpoint._process
-    ear.endpoint.shut()
+    ear.endpoint.remove_entity()
     assert process.returncode == 0
     other.wait_end("/out", gone=True)

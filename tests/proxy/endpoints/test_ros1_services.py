@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from gdp.errors import LocalError
-from proxy.endpoints.endpoint import Answered, Asked, Failed, Faulted, Role
+from proxy.endpoints.endpoint import CallFailed, EndpointError, RequestReceived, ResponseReceived, Role
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 from tests.proxy.endpoints.ros1_net import Ear, Net, ros1_net
@@ -84,11 +84,11 @@ def test_a_local_server_answers_byte_for_byte_and_its_refusal_is_the_reason(net:
     ear.wait_end("/flag")
     (end,) = (end for end in ear.endpoint.graph() if end.name == "/flag")
     assert (end.role, end.type_name, end.node, end.hash) == (Role.SERVES, SET_BOOL, "/server", SET_BOOL_MD5)
-    dial = ear.endpoint.dial("/flag", SET_BOOL)
+    dial = ear.endpoint.create_client("/flag", SET_BOOL)
     for call in range(4):
         ear.endpoint.call(dial, call, bytes([call % 2]))
-    answers = ear.wait(Answered, 2, dial)
-    failures = ear.wait(Failed, 2, dial)
+    answers = ear.wait(ResponseReceived, 2, dial)
+    failures = ear.wait(CallFailed, 2, dial)
     assert {(event.call, event.raw) for event in answers} == {(1, fine("fine")), (3, fine("fine"))}
     assert {(event.call, event.reason) for event in failures} == {(0, "no falsehoods"), (2, "no falsehoods")}
 
@@ -96,60 +96,60 @@ def test_a_local_server_answers_byte_for_byte_and_its_refusal_is_the_reason(net:
 def test_fifty_calls_under_way_at_once_are_all_answered(net: Net, ear: Ear) -> None:
     server = net.peer(SERVER)
     ear.wait_end("/slow")
-    dial = ear.endpoint.dial("/slow", SET_BOOL)
+    dial = ear.endpoint.create_client("/slow", SET_BOOL)
     for call in range(50):
         ear.endpoint.call(dial, call, b"\1")
     for _ in range(50):
         assert server.line() == "asked"
     server.tell("go")
-    assert sorted(event.call for event in ear.wait(Answered, 50, dial)) == list(range(50))
+    assert sorted(event.call for event in ear.wait(ResponseReceived, 50, dial)) == list(range(50))
 
 
 def test_a_server_that_dies_in_mid_call_fails_the_call_and_its_successor_is_called(net: Net, ear: Ear) -> None:
     server = net.peer(SERVER)
     ear.wait_end("/slow")
-    dial = ear.endpoint.dial("/slow", SET_BOOL)
+    dial = ear.endpoint.create_client("/slow", SET_BOOL)
     ear.endpoint.call(dial, 1, b"\1")
     assert server.line() == "asked"
     server.end(kindly=False)
-    assert ear.wait(Failed, 1, dial)[0].call == 1
+    assert ear.wait(CallFailed, 1, dial)[0].call == 1
     successor = net.peer(SERVER)
     ear.endpoint.call(dial, 2, b"\1")
     assert successor.line() == "asked"
     successor.tell("go")
-    assert ear.wait(Answered, 1, dial)[0] == Answered(dial, 2, fine("at last"))
+    assert ear.wait(ResponseReceived, 1, dial)[0] == ResponseReceived(dial, 2, fine("at last"))
 
 
 def test_a_dropped_call_is_never_answered_and_does_not_hold_up_the_next(net: Net, ear: Ear) -> None:
     server = net.peer(SERVER)
     ear.wait_end("/slow")
-    dial = ear.endpoint.dial("/slow", SET_BOOL)
+    dial = ear.endpoint.create_client("/slow", SET_BOOL)
     ear.endpoint.call(dial, 1, b"\1")
     assert server.line() == "asked"
     ear.endpoint.drop(dial, 1)
     server.tell("go")
     ear.endpoint.call(dial, 2, b"\1")
-    assert ear.wait(Answered, 1, dial) == [Answered(dial, 2, fine("at last"))]
-    assert not ear.of(Failed)
+    assert ear.wait(ResponseReceived, 1, dial) == [ResponseReceived(dial, 2, fine("at last"))]
+    assert not ear.of(CallFailed)
 
 
 def test_a_service_that_is_not_there_fails_at_once(ear: Ear) -> None:
-    dial = ear.endpoint.dial("/nowhere", SET_BOOL)
+    dial = ear.endpoint.create_client("/nowhere", SET_BOOL)
     ear.endpoint.call(dial, 1, b"\1")
-    assert "unavailable" in ear.wait(Failed, 1, dial)[0].reason
+    assert "unavailable" in ear.wait(CallFailed, 1, dial)[0].reason
 
 
 def test_a_server_of_another_type_does_not_answer_for_the_one_dialled(net: Net, ear: Ear) -> None:
     net.peer(SERVER)
-    dial = ear.endpoint.dial("/flag", "std_srvs/srv/Trigger")
+    dial = ear.endpoint.create_client("/flag", "std_srvs/srv/Trigger")
     ear.endpoint.call(dial, 1, b"")
-    assert "std_srvs/SetBool" in ear.wait(Failed, 1, dial)[0].reason
+    assert "std_srvs/SetBool" in ear.wait(CallFailed, 1, dial)[0].reason
 
 
 def test_fifty_local_clients_at_once_are_answered_or_refused_with_the_reason(net: Net, ear: Ear) -> None:
     handle = ear.endpoint.serve(set_bool())
     clients = net.peer(CLIENTS.format(count=50))
-    asked = ear.wait(Asked, 50, handle)
+    asked = ear.wait(RequestReceived, 50, handle)
     assert len({event.ticket for event in asked}) == 50
     for event in asked:
         if event.raw == b"\1":
@@ -170,7 +170,7 @@ def test_fifty_local_clients_at_once_are_answered_or_refused_with_the_reason(net
 def test_closing_a_server_fails_who_waits(net: Net, ear: Ear) -> None:
     handle = ear.endpoint.serve(set_bool(md5=""))
     client = net.peer(CLIENTS.format(count=1))
-    ear.wait(Asked)
+    ear.wait(RequestReceived)
     ear.endpoint.close(handle)
     assert "no longer offered" in client.line()
 
@@ -179,16 +179,16 @@ def test_a_service_that_is_served_here_is_a_fault_until_its_server_leaves(net: N
     server = net.peer(SERVER)
     ear.wait_end("/flag")
     handle = ear.endpoint.serve(set_bool("/flag"))
-    assert "/server" in ear.wait(Faulted, 1, handle)[0].reason
+    assert "/server" in ear.wait(EndpointError, 1, handle)[0].reason
     server.end(kindly=False)
     net.peer(CLIENTS.format(count=1).replace("/virtual", "/flag"))
-    asked = ear.wait(Asked, 1, handle)[0]
+    asked = ear.wait(RequestReceived, 1, handle)[0]
     ear.endpoint.answer(handle, asked.ticket, fine(""))
 
 
 def test_a_service_whose_definition_differs_from_the_installed_one_is_a_fault(ear: Ear) -> None:
     handle = ear.endpoint.serve(set_bool(md5="0" * 32))
-    assert SET_BOOL_MD5 in ear.wait(Faulted, 1, handle)[0].reason
+    assert SET_BOOL_MD5 in ear.wait(EndpointError, 1, handle)[0].reason
 
 
 def test_a_service_type_that_is_not_installed_is_served_by_its_definitions(net: Net, ear: Ear) -> None:
@@ -202,17 +202,17 @@ def test_a_service_type_that_is_not_installed_is_served_by_its_definitions(net: 
     assert (opaque.hash, opaque.request.definition) == (SET_BOOL_MD5, "")
 
 
-def test_rounds_of_serving_and_dialling_leave_no_descriptor_and_no_thread(net: Net, ear: Ear) -> None:
+def test_rounds_of_serving_and_client_entity_leave_no_descriptor_and_no_thread(net: Net, ear: Ear) -> None:
     net.peer(SERVER)
     pid = ear.endpoint._process.pid
 
     def rounds(count: int) -> None:
         for _ in range(count):
             serves = ear.endpoint.serve(set_bool())
-            dials = [ear.endpoint.dial("/flag", SET_BOOL) for _ in range(10)]
+            dials = [ear.endpoint.create_client("/flag", SET_BOOL) for _ in range(10)]
             for dial in dials:
                 ear.endpoint.call(dial, 1, b"\1")
-            ear.wait(Answered, 10)
+            ear.wait(ResponseReceived, 10)
             for handle in (serves, *dials):
                 ear.endpoint.close(handle)
             ear.events.clear()

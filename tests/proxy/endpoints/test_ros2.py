@@ -11,7 +11,7 @@ from dataclasses import replace
 import pytest
 
 from gdp.errors import LocalError
-from proxy.endpoints.endpoint import Described, Faulted, Heard, Role
+from proxy.endpoints.endpoint import EndpointError, MessageReceived, Role, TypeResolved
 from proxy.endpoints.ros2.qos import filled
 from proxy.serial.channel import Channel
 from tests.proxy.endpoints.ros2_net import CONFINED, DOMAIN, NODE, Ears, Peer, endpoint_of_ours, needs, peer_of
@@ -52,8 +52,8 @@ def test_a_message_is_heard_after_its_channel_was_described(ears: Ears, peer: Pe
     peer.tell("pa.publish(String(data='hello'))")
     ears.until(lambda: ears.heard(handle), "a message")
     assert ears.heard(handle) == [text("hello")]
-    (described,) = ears.of(Described, handle)
-    assert ears.events.index(described) < ears.events.index(ears.of(Heard, handle)[0])
+    (described,) = ears.of(TypeResolved, handle)
+    assert ears.events.index(described) < ears.events.index(ears.of(MessageReceived, handle)[0])
     channel = described.channel
     assert (channel.topic, channel.type_name, channel.ros, channel.definition) == ("/a", STRING, 2, "string data\n")
     assert [(qos.reliability, qos.durability) for qos in channel.qos] == [("reliable", "volatile")]
@@ -106,7 +106,7 @@ def test_the_graph_shows_ends_that_come_and_go_and_never_our_own(ears: Ears, pee
     assert not {end.name for end in ears.endpoint.graph()} & {"/rosout", "/parameter_events"}
 
 
-def test_a_late_joiner_gets_what_a_latched_channel_kept(ears: Ears, peer: Peer) -> None:
+def test_a_late_reassembler_gets_what_a_latched_channel_kept(ears: Ears, peer: Peer) -> None:
     channel = ears.endpoint.channel("/map", STRING)
     handle = ears.endpoint.advertise(replace(channel, qos=(replace(LATCHED, depth=2),)))
     for word in ("one", "two", "three"):
@@ -120,7 +120,7 @@ def test_a_late_subscription_of_ours_gets_what_a_talker_kept(ears: Ears, peer: P
     peer.tell("!pl = talk(String, '/tf_static', 'transient_local', 1); pl.publish(String(data='kept'))")
     handle = ears.endpoint.subscribe("/tf_static", STRING, LATCHED)
     ears.until(lambda: ears.heard(handle), "the kept message")
-    ears.until(lambda: any(event.channel.latched for event in ears.of(Described, handle)), "its description")
+    ears.until(lambda: any(event.channel.latched for event in ears.of(TypeResolved, handle)), "its description")
 
 
 def test_own_messages_are_never_heard_and_those_of_others_are(ears: Ears, peer: Peer) -> None:
@@ -149,16 +149,16 @@ def test_own_kept_messages_are_not_heard_by_a_late_subscription(ears: Ears) -> N
 def test_a_qos_that_cannot_match_is_a_fault_that_says_why(ears: Ears, peer: Peer) -> None:
     peer.tell("!pq = talk(String, '/q', 'best_effort')")
     handle = ears.endpoint.subscribe("/q", STRING, None)
-    ears.until(lambda: ears.of(Faulted, handle), "the fault")
-    assert "reliability: best effort offered, reliable requested" in ears.of(Faulted, handle)[0].reason
-    assert "/peer" in ears.of(Faulted, handle)[0].reason
+    ears.until(lambda: ears.of(EndpointError, handle), "the fault")
+    assert "reliability: best effort offered, reliable requested" in ears.of(EndpointError, handle)[0].reason
+    assert "/peer" in ears.of(EndpointError, handle)[0].reason
 
 
 def test_a_topic_of_another_type_is_a_fault(ears: Ears, peer: Peer) -> None:
     peer.tell("!pt = talk(String, '/typed')")
     handle = ears.endpoint.subscribe("/typed", "sensor_msgs/msg/Image", None)
-    ears.until(lambda: ears.of(Faulted, handle), "the fault")
-    assert f"another type, {STRING}" in ears.of(Faulted, handle)[0].reason
+    ears.until(lambda: ears.of(EndpointError, handle), "the fault")
+    assert f"another type, {STRING}" in ears.of(EndpointError, handle)[0].reason
 
 
 def test_after_close_no_event_names_the_handle(ears: Ears, peer: Peer) -> None:
@@ -197,7 +197,7 @@ def test_many_rounds_leave_no_descriptor_and_no_thread(ears: Ears) -> None:
             handles.append(ears.endpoint.advertise(ears.endpoint.channel("/r", STRING)))
             for handle in handles:
                 ears.endpoint.close(handle)
-            ears.endpoint.take()
+            ears.endpoint.poll_events()
 
     rounds(20)
     before = len(os.listdir("/proc/self/fd")), len(os.listdir("/proc/self/task"))

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from proxy.endpoints.endpoint import End, Role
-from proxy.endpoints.ros2.own import OwnMessages
+from proxy.endpoints.endpoint import GraphEntity, Role
+from proxy.endpoints.ros2.loopback_filter import LoopbackFilter
 from proxy.endpoints.ros2.qos import conflict, filled
-from proxy.endpoints.ros2.verdict import verdict
+from proxy.endpoints.ros2.qos_compat import incompatibility
 from proxy.serial.channel import Channel, Qos
 
 RELIABLE = filled(None)
@@ -51,41 +51,43 @@ def test_every_way_to_say_infinite_is_left_unsaid(infinite: tuple[int, int]) -> 
     assert filled(replace(RELIABLE, deadline=infinite, lifespan=infinite, lease=infinite)) == RELIABLE
 
 
-def test_a_verdict_names_the_node_and_what_differs() -> None:
-    end = End(Role.PUBLISHES, "/a", "std_msgs/msg/String", "/talker", "01", STRING.hash, RELIABLE)
-    assert verdict(Role.SUBSCRIBES, STRING, RELIABLE, frozenset({end})) == ""
+def test_a_ack_names_the_node_and_what_differs() -> None:
+    end = GraphEntity(Role.PUBLISHES, "/a", "std_msgs/msg/String", "/talker", "01", STRING.hash, RELIABLE)
+    assert incompatibility(Role.SUBSCRIBES, STRING, RELIABLE, frozenset({end})) == ""
     other = replace(end, hash="RIHS01_" + "b" * 64)
-    assert "another definition of std_msgs/msg/String" in verdict(
+    assert "another definition of std_msgs/msg/String" in incompatibility(
         Role.SUBSCRIBES, STRING, RELIABLE, frozenset({end, other})
     )
     typed = replace(end, type_name="std_msgs/msg/Bool")
-    assert "/talker publishes it with another type" in verdict(Role.SUBSCRIBES, STRING, RELIABLE, frozenset({typed}))
-    assert verdict(Role.PUBLISHES, STRING, RELIABLE, frozenset({typed})) == ""  # it publishes too
+    assert "/talker publishes it with another type" in incompatibility(
+        Role.SUBSCRIBES, STRING, RELIABLE, frozenset({typed})
+    )
+    assert incompatibility(Role.PUBLISHES, STRING, RELIABLE, frozenset({typed})) == ""  # it publishes too
 
 
 def test_as_many_copies_are_taken_out_as_were_published() -> None:
-    own = OwnMessages()
+    own = LoopbackFilter()
     own.add(b"\0\1\0\0same", 0.0)
     own.add(b"\0\1\0\0same", 0.1)
-    assert own.take(b"\0\1\0\3same", 0.2)  # the encapsulation may say how much padding there is
-    assert not own.take(b"\0\1\0\0other", 0.2)
-    assert own.take(b"\0\1\0\0same", 0.3)
-    assert not own.take(b"\0\1\0\0same", 0.3)
+    assert own.is_loopback(b"\0\1\0\3same", 0.2)  # the encapsulation may say how much padding there is
+    assert not own.is_loopback(b"\0\1\0\0other", 0.2)
+    assert own.is_loopback(b"\0\1\0\0same", 0.3)
+    assert not own.is_loopback(b"\0\1\0\0same", 0.3)
 
 
 def test_what_was_not_heard_soon_is_forgotten() -> None:
-    own = OwnMessages()
+    own = LoopbackFilter()
     own.add(b"\0\1\0\0a", 0.0)
-    own.take(b"\0\1\0\0a", 0.1)
+    own.is_loopback(b"\0\1\0\0a", 0.1)
     own.add(b"\0\1\0\0a", 1.0)
-    assert own.take(b"\0\1\0\0a", 2.5)  # the first copy's time is over, not the second's
+    assert own.is_loopback(b"\0\1\0\0a", 2.5)  # the first copy's time is over, not the second's
     own.add(b"\0\1\0\0a", 3.0)
-    assert not own.take(b"\0\1\0\0a", 5.1)
+    assert not own.is_loopback(b"\0\1\0\0a", 5.1)
 
 
 def test_memory_is_bounded() -> None:
-    own = OwnMessages()
+    own = LoopbackFilter()
     for number in range(10_000):
         own.add(b"\0\1\0\0%d" % number, 0.0)
-    assert not own.take(b"\0\1\0\0" + b"1", 0.1)
-    assert own.take(b"\0\1\0\0" + b"9999", 0.1)
+    assert not own.is_loopback(b"\0\1\0\0" + b"1", 0.1)
+    assert own.is_loopback(b"\0\1\0\0" + b"9999", 0.1)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from gdp.errors import LocalError
-from proxy.endpoints.endpoint import Answered, Failed, Role
+from proxy.endpoints.endpoint import CallFailed, ResponseReceived, Role
 from tests.proxy.endpoints.ros2_net import Ears, Peer, endpoint_of_ours, needs, peer_of
 
 needs("std_srvs", "test_msgs", "action_msgs")
@@ -61,21 +61,21 @@ def served(ears: Ears, name: str) -> bool:
 def test_the_first_call_of_a_new_client_is_answered(ears: Ears, peer: Peer) -> None:
     peer.tell("!s1 = node.create_service(SetBool, '/s1', answer)")
     ears.until(lambda: served(ears, "/s1"), "the server in the graph")
-    handle = ears.endpoint.dial("/s1", SET_BOOL)
+    handle = ears.endpoint.create_client("/s1", SET_BOOL)
     ears.endpoint.call(handle, 7, TRUE)
     outcome = ears.outcome(handle, 7)
-    assert isinstance(outcome, Answered)
+    assert isinstance(outcome, ResponseReceived)
     assert read(outcome.raw) == (True, "it is")
 
 
 def test_a_call_without_a_server_fails_at_once(ears: Ears) -> None:
-    handle = ears.endpoint.dial("/nobody", SET_BOOL)
+    handle = ears.endpoint.create_client("/nobody", SET_BOOL)
     ears.endpoint.call(handle, 1, TRUE)
-    assert list(ears.endpoint.take())[-1] == Failed(handle, 1, "no server of /nobody")
+    assert list(ears.endpoint.poll_events())[-1] == CallFailed(handle, 1, "no server of /nobody")
 
 
 def test_bytes_that_are_no_request_fail(ears: Ears, peer: Peer) -> None:
-    handle = ears.endpoint.dial("/nobody", "rcl_interfaces/srv/GetParameters")
+    handle = ears.endpoint.create_client("/nobody", "rcl_interfaces/srv/GetParameters")
     ears.endpoint.call(handle, 1, b"\0\1\0\0\xff\xff\xff\xff")
     assert "cannot be read" in str(ears.outcome(handle, 1))
 
@@ -87,24 +87,24 @@ def test_fifty_calls_at_once_each_get_their_own_answer(ears: Ears, peer: Peer) -
     from test_msgs.srv import BasicTypes
 
     ears.until(lambda: served(ears, "/s2"), "the server in the graph")
-    handle = ears.endpoint.dial("/s2", "test_msgs/srv/BasicTypes")
+    handle = ears.endpoint.create_client("/s2", "test_msgs/srv/BasicTypes")
     for call in range(50):
         ears.endpoint.call(handle, call, bytes(serialize_message(BasicTypes.Request(int32_value=call))))
     for call in range(50):
         outcome = ears.outcome(handle, call)
-        assert isinstance(outcome, Answered)
+        assert isinstance(outcome, ResponseReceived)
         assert deserialize_message(outcome.raw, BasicTypes.Response).int32_value == call
 
 
 def test_a_dropped_call_is_nobodys(ears: Ears, peer: Peer) -> None:
     peer.tell("!s3 = node.create_service(SetBool, '/s3', answer)")
     ears.until(lambda: served(ears, "/s3"), "the server in the graph")
-    handle = ears.endpoint.dial("/s3", SET_BOOL)
+    handle = ears.endpoint.create_client("/s3", SET_BOOL)
     ears.endpoint.call(handle, 1, TRUE)
     ears.endpoint.drop(handle, 1)
     ears.endpoint.call(handle, 2, TRUE)
     ears.outcome(handle, 2)
-    assert [event.call for event in ears.of(Answered, handle)] == [2]
+    assert [event.call for event in ears.of(ResponseReceived, handle)] == [2]
 
 
 def test_calls_under_way_fail_when_the_server_dies(ears: Ears) -> None:
@@ -113,12 +113,12 @@ def test_calls_under_way_fail_when_the_server_dies(ears: Ears) -> None:
         mortal.tell("!hold = lambda q, r: time.sleep(1)")
         mortal.tell("!sm = node.create_service(SetBool, '/mortal', hold)")
         ears.until(lambda: served(ears, "/mortal"), "the server in the graph")
-        handle = ears.endpoint.dial("/mortal", SET_BOOL)
+        handle = ears.endpoint.create_client("/mortal", SET_BOOL)
         ears.endpoint.call(handle, 1, TRUE)
         ears.for_s(0.3)
         mortal.tell("node.destroy_service(sm)")
         outcome = ears.outcome(handle, 1)
-    assert outcome == Failed(handle, 1, "the server of /mortal is gone")
+    assert outcome == CallFailed(handle, 1, "the server of /mortal is gone")
 
 
 def test_a_local_client_is_answered_under_its_ticket(ears: Ears, peer: Peer) -> None:
@@ -173,16 +173,16 @@ def test_the_hidden_parts_of_an_action_show_and_can_be_called(ears: Ears, peer: 
 
     goal = Fibonacci.Impl.SendGoalService.Request()
     goal.goal_id.uuid[0] = 9
-    send = ears.endpoint.dial("/fib/_action/send_goal", "test_msgs/action/Fibonacci_SendGoal")
+    send = ears.endpoint.create_client("/fib/_action/send_goal", "test_msgs/action/Fibonacci_SendGoal")
     ears.endpoint.call(send, 1, bytes(serialize_message(goal)))
     outcome = ears.outcome(send, 1)
-    assert isinstance(outcome, Answered)
+    assert isinstance(outcome, ResponseReceived)
     assert deserialize_message(outcome.raw, Fibonacci.Impl.SendGoalService.Response).accepted
     ask = Fibonacci.Impl.GetResultService.Request(goal_id=goal.goal_id)
-    result = ears.endpoint.dial("/fib/_action/get_result", "test_msgs/action/Fibonacci_GetResult")
+    result = ears.endpoint.create_client("/fib/_action/get_result", "test_msgs/action/Fibonacci_GetResult")
     ears.endpoint.call(result, 1, bytes(serialize_message(ask)))
     outcome = ears.outcome(result, 1)
-    assert isinstance(outcome, Answered)
+    assert isinstance(outcome, ResponseReceived)
     got = deserialize_message(outcome.raw, Fibonacci.Impl.GetResultService.Response)
     assert list(got.result.sequence) == [1, 1]
 
@@ -203,6 +203,6 @@ def test_servers_and_clients_show_and_go(ears: Ears, peer: Peer) -> None:
 
 def test_a_service_of_an_unknown_type_says_what_to_install(ears: Ears) -> None:
     with pytest.raises(LocalError, match="install the package no_such_msgs"):
-        ears.endpoint.dial("/x", "no_such_msgs/srv/Do")
+        ears.endpoint.create_client("/x", "no_such_msgs/srv/Do")
     with pytest.raises(LocalError, match="is not a service"):
         ears.endpoint.service("/x", "std_msgs/msg/String")

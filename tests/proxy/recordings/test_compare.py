@@ -29,8 +29,8 @@ def record(path: Path, messages: Sequence[bytes]) -> Path:
 
 
 def judged(folder: Path, sent: Sequence[bytes], received: Sequence[bytes], *, exact: bool = True) -> TopicComparison:
-    (verdict,) = compare(record(folder / "a.mcap", sent), record(folder / "b.mcap", received), exact=exact)
-    return verdict
+    (ack,) = compare(record(folder / "a.mcap", sent), record(folder / "b.mcap", received), exact=exact)
+    return ack
 
 
 SENT = [message(value) for value in range(5)]
@@ -42,28 +42,28 @@ def test_what_arrived_whole_is_identical_and_in_order(tmp_path: Path) -> None:
 
 
 def test_a_lost_message_is_counted(tmp_path: Path) -> None:
-    verdict = judged(tmp_path, SENT, SENT[:2] + SENT[3:])
-    assert (verdict.delivered, verdict.lost, verdict.identical, verdict.in_order) == (4, 1, False, True)
+    ack = judged(tmp_path, SENT, SENT[:2] + SENT[3:])
+    assert (ack.delivered, ack.lost, ack.identical, ack.in_order) == (4, 1, False, True)
 
 
 def test_a_duplicate_is_counted_and_is_no_disorder(tmp_path: Path) -> None:
-    verdict = judged(tmp_path, SENT, [*SENT[:3], SENT[0], *SENT[3:], SENT[4]])
-    assert (verdict.delivered, verdict.duplicated, verdict.identical, verdict.in_order) == (5, 2, True, True)
+    ack = judged(tmp_path, SENT, [*SENT[:3], SENT[0], *SENT[3:], SENT[4]])
+    assert (ack.delivered, ack.duplicated, ack.identical, ack.in_order) == (5, 2, True, True)
 
 
 def test_equal_messages_sent_twice_are_no_duplicates(tmp_path: Path) -> None:
-    verdict = judged(tmp_path, [SENT[0], SENT[0]], [SENT[0], SENT[0]])
-    assert (verdict.delivered, verdict.duplicated, verdict.identical) == (2, 0, True)
+    ack = judged(tmp_path, [SENT[0], SENT[0]], [SENT[0], SENT[0]])
+    assert (ack.delivered, ack.duplicated, ack.identical) == (2, 0, True)
 
 
 def test_another_order_is_seen(tmp_path: Path) -> None:
-    verdict = judged(tmp_path, SENT, [SENT[1], SENT[0], *SENT[2:]])
-    assert (verdict.identical, verdict.in_order) == (True, False)
+    ack = judged(tmp_path, SENT, [SENT[1], SENT[0], *SENT[2:]])
+    assert (ack.identical, ack.in_order) == (True, False)
 
 
 def test_an_altered_message_is_neither_delivered_nor_identical(tmp_path: Path) -> None:
-    verdict = judged(tmp_path, SENT, [*SENT[:4], message(9)])
-    assert (verdict.delivered, verdict.lost, verdict.altered, verdict.identical) == (4, 1, 1, False)
+    ack = judged(tmp_path, SENT, [*SENT[:4], message(9)])
+    assert (ack.delivered, ack.lost, ack.altered, ack.identical) == (4, 1, 1, False)
 
 
 def test_rubbish_in_padding_counts_only_where_bytes_are_compared(tmp_path: Path) -> None:
@@ -94,12 +94,12 @@ def test_publishers_of_one_topic_are_in_order_each_by_itself(tmp_path: Path) -> 
                 counts[who] += 1
         return tmp_path / name
 
-    (verdict,) = compare(bag("a.bag", "xyxyxy"), bag("b.bag", "xxyyxy"), exact=True)
-    assert verdict.identical
-    assert verdict.in_order
+    (ack,) = compare(bag("a.bag", "xyxyxy"), bag("b.bag", "xxyyxy"), exact=True)
+    assert ack.identical
+    assert ack.in_order
 
 
 @pytest.mark.parametrize("name", READABLE)
 def test_a_shared_recording_equals_itself(name: str) -> None:
     verdicts = compare(recording(name), recording(name), exact=True)
-    assert all(verdict.identical and verdict.in_order and not verdict.duplicated for verdict in verdicts)
+    assert all(ack.identical and ack.in_order and not ack.duplicated for ack in verdicts)

@@ -11,16 +11,16 @@ import pytest
 
 from gdp.errors import LocalError
 from proxy.bridge.bridge import Bridge
-from proxy.bridge.site import Site
-from proxy.endpoints.endpoint import Described, GraphChanged, Heard
+from proxy.bridge.context import BridgeContext
+from proxy.bridge.counters import Traffic
+from proxy.bridge.faults import Faults
+from proxy.config.recorded import RecordedRules
+from proxy.endpoints.endpoint import GraphChanged, MessageReceived, TypeResolved
 from proxy.endpoints.fake import FakeEndpoint, FakeGraph
-from proxy.faults import Faults
 from proxy.recordings.endpoint import RecordingEndpoint, ReplayEndpoint
 from proxy.recordings.reader import BagReader
 from proxy.recordings.writer import BagWriter
-from proxy.rules.recorded import RecordedRules
 from proxy.serial.channel import Channel, RosVersion
-from proxy.traffic import Traffic
 from tests.proxy.bridge import known
 from tests.proxy.bridge.known import IMAGE, STRING
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
@@ -81,7 +81,7 @@ def join(
     sites.world.add_member(label, label.partition("/")[0])
     assert sites.world.settle()
     member, config = sites.world.members[label], sites.config(expose, imports)
-    site = Site(member, Traffic(), Faults())
+    site = BridgeContext(member, Traffic(), Faults())
     rules = RecordedRules.of(expose=config.expose, imports=config.imports)
     bridge = Bridge(site, rules, [endpoint], sites.held(member, config))
     ends = [cast(FakeEndpoint, endpoint)]
@@ -167,7 +167,7 @@ def test_two_types_of_one_recorded_topic_cross_as_two(sites: Sites, tmp_path: Pa
     for endpoint in opened(path):
         robot = join(sites, ROBOT, endpoint, expose=[CHATTER, "name: /chatter, type: std_msgs/msg/Other"])
         sites.run(1)
-        assert {wish.type_name for wish, _ in robot.bridge.flows} == {STRING, "std_msgs/msg/Other"}
+        assert {flow_spec.type_name for flow_spec, _ in robot.bridge.flows} == {STRING, "std_msgs/msg/Other"}
         assert robot.faults == {}
 
 
@@ -189,8 +189,8 @@ def test_messages_of_the_other_ros_are_refused_and_counted(
         server = join(sites, SERVER, RecordingEndpoint(writer, [("/chatter", STRING)]), imports=[CHATTER])
         assert sites.run(3, robot.is_read)
         play(sites, replayed)
-        (tally,) = server.bridge.tallies
-        assert (tally.received, tally.refused, server.faults) == (0, 6, {"refused": 1})
+        (stats,) = server.bridge.stats
+        assert (stats.received, stats.refused, server.faults) == (0, 6, {"refused": 1})
 
 
 def test_a_message_that_cannot_be_written_is_counted_as_refused(sites: Sites, tmp_path: Path) -> None:
@@ -202,8 +202,8 @@ def test_a_message_that_cannot_be_written_is_counted_as_refused(sites: Sites, tm
         assert sites.run(3, robot.is_read)
         play(sites, endpoint)
         sites.run(0.1)
-        (tally,) = server.bridge.tallies
-        assert (tally.received, tally.lost, server.faults) == (0, 3, {"refused": 3})
+        (stats,) = server.bridge.stats
+        assert (stats.received, stats.lost, server.faults) == (0, 3, {"refused": 3})
 
 
 def test_without_a_file_messages_are_counted(sites: Sites, replayed: ReplayEndpoint) -> None:
@@ -212,8 +212,8 @@ def test_without_a_file_messages_are_counted(sites: Sites, replayed: ReplayEndpo
     assert sites.run(3, robot.is_read)
     play(sites, replayed)
     sites.run(0.1)
-    (tally,) = server.bridge.tallies
-    assert (tally.received, tally.lost) == (6, 0)
+    (stats,) = server.bridge.stats
+    assert (stats.received, stats.lost) == (6, 0)
 
 
 def test_a_replayed_topic_is_reliable_unless_its_rule_says_otherwise(sites: Sites, tmp_path: Path) -> None:
@@ -236,8 +236,8 @@ def test_a_late_recorder_gets_the_last_message_of_a_latched_recording(sites: Sit
         server = join(sites, SERVER, RecordingEndpoint(None, [("/chatter", STRING)]), imports=[CHATTER])
         assert sites.run(3, robot.is_read)
         sites.run(1)
-        (tally,) = server.bridge.tallies
-        assert tally.received == 1
+        (stats,) = server.bridge.stats
+        assert stats.received == 1
 
 
 def test_a_message_above_the_rules_limit_is_not_published_but_counted(sites: Sites, replayed: ReplayEndpoint) -> None:
@@ -255,11 +255,11 @@ def test_a_subscription_is_described_with_every_channel_before_its_first_message
     for message in replayed.messages():
         replayed.deliver(message)
         break
-    changed, described, heard = replayed.take()
+    changed, described, heard = replayed.poll_events()
     assert changed == GraphChanged()
-    assert isinstance(described, Described)
+    assert isinstance(described, TypeResolved)
     assert [each.callerid for each in (described.channel, *described.others)] == ["/a", "/b"]
-    assert isinstance(heard, Heard)
+    assert isinstance(heard, MessageReceived)
     assert (heard.handle, heard.channel, heard.raw) == (handle, 0, raw(1, b"0 of 0"))
 
 
@@ -275,7 +275,7 @@ def test_a_topic_of_another_type_cannot_be_subscribed_to(replayed: ReplayEndpoin
 
 def test_the_descriptor_is_readable_while_there_are_events(replayed: ReplayEndpoint) -> None:
     assert select.select([replayed], [], [], 0)[0]
-    replayed.take()
+    replayed.poll_events()
     assert not select.select([replayed], [], [], 0)[0]
 
 
@@ -289,6 +289,6 @@ def test_an_equal_channel_has_one_handle(tmp_path: Path) -> None:
 def test_a_recording_serves_and_calls_nothing() -> None:
     endpoint = RecordingEndpoint(None, [])
     service = known.services(2)[known.SET_BOOL]
-    for act in (lambda: endpoint.serve(service), lambda: endpoint.dial("/switch", known.SET_BOOL)):
+    for act in (lambda: endpoint.serve(service), lambda: endpoint.create_client("/switch", known.SET_BOOL)):
         with pytest.raises(LocalError, match="a recording holds topics only"):
             act()

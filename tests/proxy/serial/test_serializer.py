@@ -213,7 +213,7 @@ def mixed_message(seed: int) -> tuple[Channel, bytes]:
     message = make["a/msg/B"](
         flag=bool(random.integers(2)),
         octet=int(random.integers(128)),
-        letter=int(random.integers(256)),
+        outgoing=int(random.integers(256)),
         i8=int(random.integers(-128, 128)),
         u16=int(random.integers(1 << 16)),
         i32=int(random.integers(-(1 << 31), 1 << 31)),
@@ -401,7 +401,7 @@ def test_a_typed_array_of_another_kind_or_length_is_refused() -> None:
         assert refusal(about, cbor2.dumps({"a": cbor2.CBORTag(tag, raw)}), "cbor") is DropReason.MALFORMED
 
 
-def test_a_few_bytes_that_claim_many_records_without_fields_are_not_read() -> None:
+def test_a_few_bytes_that_advertisement_many_records_without_fields_are_not_read() -> None:
     channel = known.custom("a/msg/Nothings", f"a/Nothing[] nothings\n{RULE}MSG: a/Nothing\n", 1)
     serializer = Serializer(channel, "json")
     assert json.loads(serializer.encode(struct.pack("<I", 200))) == {"nothings": [{}] * 200}

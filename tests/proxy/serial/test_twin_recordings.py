@@ -7,16 +7,16 @@ from rosbags.typesys import Stores, get_typestore
 
 from proxy.recordings.reader import BagReader
 from proxy.serial.channel import Channel
+from proxy.serial.converter import MessageConverter, translated_channel
 from proxy.serial.serializer import Serializer, canonical
-from proxy.serial.twin import Twin, twin_channel
 from tests.proxy.recordings.samples import READABLE, recording
 
 
 @pytest.mark.parametrize("name", READABLE)
 def test_every_message_of_a_recording_crosses_and_comes_back_identical_but_for_seq(name: str) -> None:
     with BagReader(recording(name)) as bag:
-        sides = [(channel, twin_channel(channel, 1 if channel.ros == 2 else 2)) for channel in bag.channels]
-        ways = [(Twin(here, there), Twin(there, here)) for here, there in sides]
+        sides = [(channel, translated_channel(channel, 1 if channel.ros == 2 else 2)) for channel in bag.channels]
+        ways = [(MessageConverter(here, there), MessageConverter(there, here)) for here, there in sides]
         for message in bag.messages():
             onward, backward = ways[message.channel]
             here, there = sides[message.channel]
@@ -29,7 +29,7 @@ def test_every_message_of_a_recording_crosses_and_comes_back_identical_but_for_s
 def test_rosbags_converts_the_types_it_knows_to_the_same_bytes(name: str) -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
     with BagReader(recording(name)) as bag:
-        ways = [Twin(channel, twin_channel(channel, 2)) for channel in bag.channels]
+        ways = [MessageConverter(channel, translated_channel(channel, 2)) for channel in bag.channels]
         compared = 0
         for message in bag.messages():
             channel = bag.channels[message.channel]
@@ -46,7 +46,7 @@ def test_rosbags_writes_ros_1_for_the_ros_2_recording_with_the_same_bytes() -> N
     store = get_typestore(Stores.ROS2_JAZZY)
     compared = 0
     with BagReader(recording("ninety_four_types.mcap")) as bag:
-        ways = [Twin(channel, twin_channel(channel, 1)) for channel in bag.channels]
+        ways = [MessageConverter(channel, translated_channel(channel, 1)) for channel in bag.channels]
         for message in bag.messages():
             channel = bag.channels[message.channel]
             if channel.type_name not in store.fielddefs or "std_msgs/Header" in channel.definition:

@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2's rclpy")
 
-from fog.launch.probe import free_domain
+from fog.launch.interface_discovery import free_domain
 from fog_demo.caller import Tally
 
 
@@ -43,18 +43,18 @@ def test_the_robot_is_answered_by_the_machine_and_both_end_cleanly() -> None:
 
 
 def test_a_wrong_answer_is_counted() -> None:
-    tally = Tally(calls=2)
-    tally.answered(True, Tallied(success=False, message="a"), 0.001, 5.0)
-    line = json.loads(tally.line(unix_s=1.0, done=False))
+    stats = Tally(calls=2)
+    stats.answered(True, Tallied(success=False, message="a"), 0.001, 5.0)
+    line = json.loads(stats.line(unix_s=1.0, done=False))
     assert (line["wrong"], line["under_way"], line["median_ms"]) == (1, 1, 1.0)
 
 
 def test_the_longest_silence_since_the_line_before_is_told() -> None:
-    tally = Tally()
+    stats = Tally()
     for now_s in (5.0, 5.5, 5.6):
-        tally.answered(True, Tallied(success=True, message="a"), 0.001, now_s)
-    assert json.loads(tally.line(unix_s=1.0, done=False))["silence_ms"] == 500.0
-    assert json.loads(tally.line(unix_s=2.0, done=True))["silence_ms"] == 0.0
+        stats.answered(True, Tallied(success=True, message="a"), 0.001, now_s)
+    assert json.loads(stats.line(unix_s=1.0, done=False))["silence_ms"] == 500.0
+    assert json.loads(stats.line(unix_s=2.0, done=True))["silence_ms"] == 0.0
 
 
 class Tallied:

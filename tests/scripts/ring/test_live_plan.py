@@ -9,10 +9,10 @@ import pytest
 from gdp.simulation.topology import ring5
 from gdp.stores.keyring import load_delegations
 from gdp.trust.right import Right
-from proxy.config import ProxyConfig
-from proxy.rules.rule import DOMAIN_MAX
+from proxy.config.config import ProxyConfig
+from proxy.config.rule import DOMAIN_MAX
 from ring.live_plan import CARRIED, Graph, graphs_of, messages_in
-from ring.materials import Materials
+from ring.materials import OverlayCredentials
 from ring.nodes.content import TALKS
 from ring.options import Live
 
@@ -41,7 +41,7 @@ def test_every_talker_says_at_least_something() -> None:
 @pytest.mark.parametrize("ros", [1, 2])
 def test_both_proxies_know_all_by_one_name_and_each_may_do_its_part(ros: int, tmp_path: Path) -> None:
     graph = Graph(1 if ros == 1 else 2, 7)
-    materials = Materials(RING, tmp_path, metrics=False)
+    materials = OverlayCredentials(RING, tmp_path, metrics=False)
     robot = ProxyConfig.load(materials.live(ROBOT, "expose", CARRIED, "json", graph.to_yaml()))
     server = ProxyConfig.load(materials.live(SERVER, "import", CARRIED, "json", graph.to_yaml()))
     assert [end.ros for end in robot.ros] == [ros]

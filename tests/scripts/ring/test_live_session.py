@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from gdp.host.run_registry import Run, Runs
+from gdp.host.run_registry import Run, RunRegistry
 from ring import live_session
 from ring.child import ChildError
 from ring.children import Children
 from ring.live_result import Heard
-from ring.live_session import Cast, LiveSession
-from ring.progress import Teller
+from ring.live_session import LiveNodes, LiveSession
+from ring.progress import ProgressReporter
 
 HEAD = """
 import json, signal, sys
@@ -38,7 +38,7 @@ CALLER = HEAD + "say('hears'); wait(signal.SIGUSR1); say('done', answered=1); si
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    started = Runs(tmp_path / "runs").start()
+    started = RunRegistry(tmp_path / "runs").start()
     yield started
     started.end()
 
@@ -52,8 +52,8 @@ def play(run: Run, talker: str = TALKER, lamp: str = LAMP, listener: str = LISTE
                 for name, code in (("talker", talker), ("lamp", lamp), ("listener", listener), ("caller", caller))
             ]
             await children.ready(nodes)
-            cast = Cast({nodes[0]: 2}, nodes[1], nodes[2], nodes[3], 1)
-            session = LiveSession(children, cast, Teller(Console(file=io.StringIO())))
+            live_nodes = LiveNodes({nodes[0]: 2}, nodes[1], nodes[2], nodes[3], 1)
+            session = LiveSession(children, live_nodes, ProgressReporter(Console(file=io.StringIO())))
             await session.meet()
             return await asyncio.wait_for(session.talk(0.1), 20)
         finally:

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from gdp.host.run_registry import Run, Runs
+from gdp.host.run_registry import Run, RunRegistry
 from ring import replay as replay_module
 from ring.child import Child, ChildError
 from ring.children import Children
 from ring.injection import Injection
-from ring.progress import Teller
+from ring.progress import ProgressReporter
 from ring.replay import Replay, Report
 
 HEAD = """
@@ -45,20 +45,20 @@ class Nothing:
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    started = Runs(tmp_path / "runs").start()
+    started = RunRegistry(tmp_path / "runs").start()
     yield started
     started.end()
 
 
 def play(run: Run, sender: str, receiver: str, told: io.StringIO | None = None) -> Report:
-    teller = Teller(Console(file=told or io.StringIO(), width=120))
+    reporter = ProgressReporter(Console(file=told or io.StringIO(), width=120))
 
     async def both(children: Children) -> Report:
         far = children.start("receiver", [sys.executable, "-c", receiver])
         await children.ready([far])
         near = children.start("sender", [sys.executable, "-c", sender])
         await children.guarded(near.wait_for("ready", 10))
-        return await Replay(children, near, far, 2, teller).report(lambda: Injection(Nothing(), (), teller))
+        return await Replay(children, near, far, 2, reporter).report(lambda: Injection(Nothing(), (), reporter))
 
     return within(run, both)
 

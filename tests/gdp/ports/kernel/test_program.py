@@ -19,11 +19,11 @@ from gdp.frame.codec import DESTINATION_AT, ETHER_BYTES, HEADER_BYTES, SOURCE_AT
 from gdp.frame.kinds import Flag, Kind
 from gdp.ports.kernel import syscall
 from gdp.ports.kernel.assembler import Assembler, Reg
-from gdp.ports.kernel.loaded import Loaded
-from gdp.ports.kernel.mirror import Mirror
+from gdp.ports.kernel.loaded_program import LoadedProgram
+from gdp.ports.kernel.map_sync import MapSync
 from gdp.ports.kernel.program import DROP, REDIRECT, UP
 from gdp.ports.kernel.syscall import LoadRefusedError
-from gdp.switch.forwarder import Drop, Forward, HandUp, decide, rewrite
+from gdp.switch.forwarder import Drop, Forward, Punt, decide, rewrite
 from gdp.switch.table import NOWHERE, Hops, Table, sides_of
 from tests.fixtures_forwarding import (
     ANYBODY,
@@ -54,21 +54,21 @@ TO_UNTOLD = (UNTOLD, bytes(12))
 class Step:
     """What the program did with one frame, and what it counted."""
 
-    verdict: int
+    ack: int
     frame: bytes
     drops: dict[DropReason, int]
     taken: int
     copies: int
 
 
-def forwards(loaded: Loaded, entries: Mapping[bytes, Hops], mtus: Mapping[int, int] = MTUS) -> Table:
+def forwards(loaded: LoadedProgram, entries: Mapping[bytes, Hops], mtus: Mapping[int, int] = MTUS) -> Table:
     """Let the program forward by these entries; ports have no device, for nothing is sent here."""
     table = Table()
     for port in range(UNTOLD):
         loaded.set_port(port, 1 if port in mtus else 0, mtus.get(port, 0), 0)
     for key in list(entries):
         table.install(key, entries[key], 1.0)
-    table.observe(Mirror(table, *loaded.of_entries))
+    table.observe(MapSync(table, *loaded.of_entries))
     return table
 
 
@@ -77,13 +77,13 @@ def clear(table: Table) -> None:
     table.observe(None)
 
 
-def step(loaded: Loaded, given: bytes) -> Step:
+def step(loaded: LoadedProgram, given: bytes) -> Step:
     before = loaded.counters()
     run = syscall.run(loaded.program_of(0), given)
     after = loaded.counters()
     drops = {reason: after.drops[reason] - before.drops[reason] for reason in DropReason}
     return Step(
-        run.verdict,
+        run.ack,
         run.frame,
         {reason: count for reason, count in drops.items() if count},
         after.frames_in - before.frames_in,
@@ -94,17 +94,17 @@ def step(loaded: Loaded, given: bytes) -> Step:
 def check(done: Step, given: bytes, entries: Mapping[bytes, Hops]) -> None:
     """Whether the program did what ``decide`` and ``rewrite`` say, or left it to them for a reason that it may."""
     said = decide(given, entries, MTUS)
-    if done.verdict == UP:
+    if done.ack == UP:
         reasons = {said.reason} if isinstance(said, Drop) else set(said.lost) if isinstance(said, Forward) else set()
-        assert isinstance(said, HandUp) or reasons & LEFT_TO_PYTHON or given[DESTINATION] + bytes(32) in entries
+        assert isinstance(said, Punt) or reasons & LEFT_TO_PYTHON or given[DESTINATION] + bytes(32) in entries
         assert (done.frame, done.drops, done.taken, done.copies) == (given, {}, 0, 0)
-    elif done.verdict == DROP:
+    elif done.ack == DROP:
         lost = (said.reason,) if isinstance(said, Drop) else said.lost if isinstance(said, Forward) else ()
         assert not isinstance(said, Forward) or not said.hops
         assert done.drops == {lost[0]: 1}
         assert (done.taken, done.copies) == (1, 0)
     else:
-        assert done.verdict == REDIRECT
+        assert done.ack == REDIRECT
         assert isinstance(said, Forward)
         ((_, macs),) = said.hops
         assert done.frame == rewrite(given, macs)
@@ -115,7 +115,7 @@ SINGLE = {key: hops for key, hops in ENTRIES.items() if len(hops) < 2}
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_each_fixture_of_one_hop_becomes_what_the_reference_says(case: Case, loaded: Loaded) -> None:
+def test_each_fixture_of_one_hop_becomes_what_the_reference_says(case: Case, loaded: LoadedProgram) -> None:
     given = TO_US + case.frame[6:]
     table = forwards(loaded, SINGLE)
     try:
@@ -124,11 +124,11 @@ def test_each_fixture_of_one_hop_becomes_what_the_reference_says(case: Case, loa
         clear(table)
 
 
-def test_the_ordinary_is_not_left_to_python(loaded: Loaded) -> None:
+def test_the_ordinary_is_not_left_to_python(loaded: LoadedProgram) -> None:
     table = forwards(loaded, SINGLE)
     try:
         verdicts = [
-            step(loaded, TO_US + each[6:]).verdict
+            step(loaded, TO_US + each[6:]).ack
             for each in (frame(ONE), frame(SPLIT, source=OTHER_SOURCE), frame(GONE, source=OTHER_SOURCE))
         ]
     finally:
@@ -167,8 +167,8 @@ def frames(draw: st.DrawFn) -> bytes:
 
 @settings(deadline=None)
 @given(given=st.lists(frames(), min_size=1, max_size=8), entries=TABLES)
-def test_generated_frames_and_tables_get_the_verdict_of_the_reference(
-    loaded: Loaded, given: list[bytes], entries: dict[bytes, Hops]
+def test_generated_frames_and_tables_get_the_ack_of_the_reference(
+    loaded: LoadedProgram, given: list[bytes], entries: dict[bytes, Hops]
 ) -> None:
     table = forwards(loaded, entries)
     try:
@@ -179,7 +179,7 @@ def test_generated_frames_and_tables_get_the_verdict_of_the_reference(
 
 
 @pytest.mark.parametrize("hops", [(TO_WIDE,), NOWHERE])
-def test_what_comes_from_a_side_where_its_publisher_is_not_is_dropped_there(loaded: Loaded, hops: Hops) -> None:
+def test_what_comes_from_a_side_where_its_publisher_is_not_is_dropped_there(loaded: LoadedProgram, hops: Hops) -> None:
     given = TO_US + frame(ONE)[6:]
     key = given[ETHER_BYTES + DESTINATION_AT : ETHER_BYTES + HEADER_BYTES]
     table = forwards(loaded, {})
@@ -195,7 +195,7 @@ def test_what_comes_from_a_side_where_its_publisher_is_not_is_dropped_there(load
                 is_ours = port in ports or (port > 63 and 63 in ports) or (port == 63 and max(ports) > 63)
                 assert (lost == 0) == is_ours
                 assert (said == Drop(DropReason.WRONG_SIDE)) != is_ours
-                assert is_ours or run.verdict == DROP
+                assert is_ours or run.ack == DROP
         table.install(key, hops, 1.0)
         assert loaded.counters().drops[DropReason.WRONG_SIDE] == after.drops[DropReason.WRONG_SIDE]
         syscall.run(loaded.program_of(1), given)
@@ -204,39 +204,39 @@ def test_what_comes_from_a_side_where_its_publisher_is_not_is_dropped_there(load
         clear(table)
 
 
-def test_only_what_is_urgent_gets_a_priority(loaded: Loaded) -> None:
+def test_only_what_is_urgent_gets_a_priority(loaded: LoadedProgram) -> None:
     table = forwards(loaded, SINGLE)
     try:
         plain = syscall.run(loaded.program_of(0), TO_US + frame(ONE)[6:])
         urgent = syscall.run(loaded.program_of(0), TO_US + frame(ONE, flags=Flag.URGENT)[6:])
     finally:
         clear(table)
-    assert (plain.verdict, plain.priority) == (REDIRECT, 0)
-    assert (urgent.verdict, urgent.priority) == (REDIRECT, 6)
+    assert (plain.ack, plain.priority) == (REDIRECT, 0)
+    assert (urgent.ack, urgent.priority) == (REDIRECT, 6)
 
 
-def test_what_another_station_should_get_is_left_alone(loaded: Loaded) -> None:
+def test_what_another_station_should_get_is_left_alone(loaded: LoadedProgram) -> None:
     table = forwards(loaded, SINGLE)
     try:
-        assert step(loaded, bytes([2, 0, 0, 0, 0, 9]) + frame(ONE)[6:]).verdict == UP
-        assert step(loaded, b"\xff" * 6 + frame(ONE)[6:]).verdict == UP
+        assert step(loaded, bytes([2, 0, 0, 0, 0, 9]) + frame(ONE)[6:]).ack == UP
+        assert step(loaded, b"\xff" * 6 + frame(ONE)[6:]).ack == UP
     finally:
         clear(table)
 
 
-def test_a_lease_that_ended_leaves_everything_to_python(loaded: Loaded) -> None:
+def test_a_lease_that_ended_leaves_everything_to_python(loaded: LoadedProgram) -> None:
     table = forwards(loaded, SINGLE)
     given = TO_US + frame(ONE)[6:]
     try:
         loaded.renew(-1)
-        assert step(loaded, given).verdict == (UP if loaded.is_leased else REDIRECT)
+        assert step(loaded, given).ack == (UP if loaded.is_leased else REDIRECT)
         loaded.renew(3_600)
-        assert step(loaded, given).verdict == REDIRECT
+        assert step(loaded, given).ack == REDIRECT
     finally:
         clear(table)
 
 
-def test_a_refused_program_says_why_in_the_words_of_the_verifier(loaded: Loaded) -> None:
+def test_a_refused_program_says_why_in_the_words_of_the_verifier(loaded: LoadedProgram) -> None:
     bad = Assembler()
     bad.load(Reg.R0, Reg.R5, 0, 8)
     bad.leave()
@@ -249,4 +249,4 @@ def test_a_refused_program_says_why_in_the_words_of_the_verifier(loaded: Loaded)
 def test_an_unknown_machine_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("platform.machine", lambda: "pdp11")
     with pytest.raises(Exception, match="pdp11"):
-        Loaded(1)
+        LoadedProgram(1)

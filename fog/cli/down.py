@@ -1,0 +1,149 @@
+"""``fog down``: machines given back, and at last all that they stood on; whatever died before.
+
+Place: command.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from contextlib import closing, suppress
+from typing import Annotated, Final
+
+import typer
+
+from fog.cli.options import AsJson, ClusterName, SiteFile, State, opened
+from fog.cli.views import a_console, event_line, print_json
+from fog.machine import MachineState
+from fog.site import Site
+from fog.supervisor.background import ensure, is_running, pid_of
+from fog.supervisor.infrastructure import local_provider, open_provider, tear_down
+from fog.supervisor.journal import Journal
+from gdp.errors import LocalError, StoreError
+
+__all__ = ["clear", "down", "end_cluster"]
+
+_PATIENCE_S: Final = 20.0  # with a supervisor; then it is done here
+_LEAVE_S: Final = 5.0
+_STEP_S: Final = 0.05
+_TRIES: Final = 5
+
+IfUp = Annotated[bool, typer.Option("--if-up", hidden=True)]  # of a launch that need not have begun
+All = Annotated[bool, typer.Option("--all", help="every cluster, and all that they stand on")]
+
+
+def down(
+    cluster: ClusterName = None,
+    all_: All = False,
+    if_up: IfUp = False,
+    site: SiteFile = None,
+    state: State = None,
+    as_json: AsJson = False,
+) -> None:
+    """Give all machines of a cluster back; of the only one, if no name is given.
+
+    It works after any crash: machines are found at their provider, also those that no journal knows.
+
+    \b
+    Examples:
+      fog down
+      fog down planner
+      fog down --all
+    """
+    with opened(site, state, supervised=False) as (here, journal):
+        known = {each.plan.name: each for each in journal.clusters()}
+        if cluster is not None and cluster not in known and not if_up and not _has_machines(here, cluster):
+            up = ", ".join(name for name in sorted(known) if known[name].is_up) or "none"
+            raise LocalError(f"no cluster is called {cluster}; up: {up}")
+        names = [cluster] if cluster is not None else sorted({*known, *(_standing(here) if all_ else ())})
+        if cluster is None and not all_:
+            names = [name for name in names if known[name].is_up] or names[:1]
+            if len(names) > 1:
+                raise LocalError(f"which cluster? There are {', '.join(names)}; --all: every one")
+        ended = [end_cluster(here, journal, name, "fog down", as_json=as_json) for name in names]
+        clear(here, journal, whatever=all_)
+        if as_json:
+            print_json({"ended": names, "machines": sum(ended)})
+        elif not names:
+            typer.echo("nothing is up")
+
+
+def clear(site: Site, journal: Journal, *, whatever: bool = False) -> None:
+    """Remove what clusters stand on, if none is up; or ``whatever`` is."""
+    if whatever or not any(each.is_up for each in journal.clusters()):
+        _leave(site)
+        tear_down(site)
+
+
+def end_cluster(site: Site, journal: Journal, name: str, why: str, *, as_json: bool) -> int:
+    """Give all machines of a cluster back, and return when they are gone; say how many there were.
+
+    Raises:
+        StoreError: the provider cannot be asked.
+    """
+    console = a_console(stderr=as_json)
+    last = max((each.id for each in journal.events(last=1)), default=0)
+    journal.unwant(name, why, time.time())
+    is_known = any(each.plan.name == name for each in journal.clusters())
+    count = len(journal.machines(name, gone=False))
+    with console.status(f"{name}: machines are given back"):
+        if is_known and count:
+            ensure(site)
+        end_s = time.monotonic() + _PATIENCE_S
+        while is_known and journal.machines(name, gone=False) and time.monotonic() < end_s:
+            ensure(site)
+            time.sleep(_STEP_S)
+        rest = _release(site, name)
+        now_s = time.time()
+        for record in journal.machines(name, gone=False):
+            from fog.supervisor.record import Outcome
+
+            journal.put(record.ended(record.ending or Outcome.RELEASED, why, now_s), now_s, "released", why)
+    for entry in journal.events(name, after=last):
+        if not as_json:
+            console.print(event_line(entry))
+    return max(count, rest)
+
+
+def _release(site: Site, name: str) -> int:
+    """Terminate whatever the provider still has of a cluster; return how many machines that were."""
+    with closing(open_provider(site)) as provider:
+        found: set[str] = set()
+        for _ in range(_TRIES):
+            machines = provider.describe(name)
+            living = [each.id for each in machines if each.state is not MachineState.GONE]
+            provider.terminate([each.id for each in machines])
+            found.update(living)
+            if not living:
+                return len(found)
+            time.sleep(provider.poll_s)
+    raise StoreError(f"{name}: the provider still has machines; once more: fog down {name}")
+
+
+def _standing(site: Site) -> set[str]:
+    """Return the clusters of which machines stand, by their own records."""
+    if site.provider != "local":
+        return set()
+    from fog.providers.local.machine_handle import list_machines
+
+    return {each.file.spec.cluster for each in list_machines(local_provider(site).runs)}
+
+
+def _has_machines(site: Site, cluster: str) -> bool:
+    """Return whether the provider has machines of a cluster that no journal knows."""
+    with closing(open_provider(site)) as provider:
+        return any(each.state is not MachineState.GONE for each in provider.describe(cluster))
+
+
+def _leave(site: Site) -> None:
+    """Let the supervisor end; it has nothing to do."""
+    pid = pid_of(site)
+    if pid is None:
+        return
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        with suppress(ProcessLookupError):
+            os.kill(pid, number)
+        end_s = time.monotonic() + _LEAVE_S
+        while is_running(site) and time.monotonic() < end_s:
+            time.sleep(_STEP_S)

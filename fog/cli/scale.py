@@ -1,0 +1,207 @@
+"""``fog scale``, ``logs``, ``ssh`` and ``supervise``: clusters and machines that are there already.
+
+Place: command.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from contextlib import closing
+from dataclasses import replace
+from typing import Annotated, Final, Optional
+
+import typer
+
+from fog.cli.launch import follow
+from fog.cli.market import choices, market, refusal
+from fog.cli.options import AsJson, ClusterOption, SiteFile, State, opened, the_cluster
+from fog.cli.views import print_json, stage
+from fog.enrolment.bootstrap import PROXY
+from fog.supervisor.background import LOG, ensure
+from fog.supervisor.final_logs import MACHINE
+from fog.supervisor.infrastructure import open_provider, set_up
+from fog.supervisor.journal import Journal
+from fog.supervisor.record import Record
+from gdp.cli.node import Verbose, set_up_logging
+from gdp.errors import LocalError
+
+__all__ = ["logs", "scale", "ssh", "supervise"]
+
+_LINES: Final = 50
+_WAIT_S: Final = 600.0
+
+scale = typer.Typer(no_args_is_help=True, help="Add or take away replicas while all runs.")
+
+Count = Annotated[int, typer.Argument(metavar="[N]", min=1, help="how many")]
+Detach = Annotated[bool, typer.Option("--detach", help="do not wait")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="show what it would cost, change nothing")]
+Machine = Annotated[str, typer.Argument(metavar="MACHINE", help="such as m3; see fog status")]
+Program = Annotated[str, typer.Argument(metavar="[PROGRAM]", help="node, proxy or switch; empty: the machine itself")]
+Lines = Annotated[int, typer.Option("--lines", "-n", min=1, help="only the last so many")]
+Lock = Annotated[Optional[int], typer.Option("--lock", hidden=True)]  # noqa: UP045
+Stay = Annotated[bool, typer.Option("--stay", help="go on also while nothing is wanted; for systemd")]
+
+
+@scale.command("up")
+def up(
+    count: Count = 1,
+    cluster: ClusterOption = None,
+    site: SiteFile = None,
+    state: State = None,
+    dry_run: DryRun = False,
+    detach: Detach = False,
+    as_json: AsJson = False,
+) -> None:
+    """Add replicas like the last one of the plan, in regions of their own where that can be had.
+
+    \b
+    Examples:
+      fog scale up
+      fog scale up 2 --cluster planner --dry-run
+    """
+    with opened(site, state) as (here, journal):
+        plan = the_cluster(journal, cluster).plan
+        more = [replace(plan.machines[-1], region="")] * count
+        with closing(open_provider(here)) as provider:
+            offers = choices(market(provider, more, here.latencies), more)
+            if None in offers:
+                raise LocalError(refusal(provider, more, offers))
+        usd = sum(each.usd_per_hour for each in offers if each is not None)
+        if dry_run:
+            _say({"cluster": plan.name, "adds": count, "usd_per_hour": round(usd, 6)}, as_json=as_json)
+            return
+        last = max((each.id for each in journal.events(last=1)), default=0)
+        wider = replace(plan, machines=(*plan.machines, *more))
+        set_up(here)
+        journal.want(wider, time.time(), why=f"{len(plan.machines)} -> {len(wider.machines)} machines")
+        ensure(here)
+        if not detach:
+            follow(here, journal, wider, last, _WAIT_S, as_json=as_json)
+
+
+@scale.command("down")
+def down(
+    count: Count = 1,
+    cluster: ClusterOption = None,
+    site: SiteFile = None,
+    state: State = None,
+    as_json: AsJson = False,
+) -> None:
+    """Take replicas away: first those that do not serve, then the youngest.
+
+    What is under way on them is answered.
+
+    \b
+    Example:
+      fog scale down 1 --cluster planner
+    """
+    with opened(site, state) as (here, journal):
+        plan = the_cluster(journal, cluster).plan
+        left = len(plan.machines) - count
+        if left < 1:
+            raise LocalError(f"{plan.name} has {len(plan.machines)} machines; to end it: fog down {plan.name}")
+        smaller = replace(plan, machines=plan.machines[:left])
+        journal.want(smaller, time.time(), why=f"{len(plan.machines)} -> {left} machines")
+        ensure(here)
+        _say({"cluster": plan.name, "machines": left}, as_json=as_json)
+
+
+def logs(
+    machine: Machine,
+    program: Program = PROXY,
+    cluster: ClusterOption = None,
+    lines: Lines = _LINES,
+    site: SiteFile = None,
+    state: State = None,
+) -> None:
+    """Show the last lines that a program of a machine wrote; MACHINE may be supervisor.
+
+    Of a machine that was lost the last lines of each program are kept, and shown with a word on how it ended.
+
+    \b
+    Examples:
+      fog logs m1 node
+      fog logs supervisor
+    """
+    with opened(site, state) as (here, journal):
+        if machine == "supervisor":
+            path = here.state / LOG
+            text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
+            typer.echo("\n".join(text.splitlines()[-lines:]))
+            return
+        record = _machine(journal, cluster, machine)
+        if record.is_gone:
+            typer.echo(_last_words(journal, record, program or MACHINE, lines))
+            return
+        with closing(open_provider(here)) as provider:
+            typer.echo(provider.log(record.id, program, lines).rstrip("\n"))
+
+
+def ssh(machine: Machine, cluster: ClusterOption = None, site: SiteFile = None, state: State = None) -> None:
+    """Open a shell on a machine.
+
+    \b
+    Example:
+      fog ssh m1
+    """
+    with opened(site, state) as (here, journal):
+        record = _machine(journal, cluster, machine)
+        if record.is_gone:
+            raise LocalError(f"{record.name} is gone: {stage(record)}, {record.reason}")
+        with closing(open_provider(here)) as provider:
+            words = provider.shell(record.id)
+        os.execvp(words[0], words)
+
+
+def supervise(
+    site: SiteFile = None, state: State = None, stay: Stay = False, lock: Lock = None, verbose: Verbose = False
+) -> None:
+    """Keep clusters as they are wanted. Other verbs start it by themselves, in the background.
+
+    \b
+    Example:
+      fog supervise --stay
+    """
+    from fog.supervisor.process import supervise as be_supervisor
+
+    set_up_logging(verbose=verbose)
+    with opened(site, state, supervised=False) as (here, _):
+        be_supervisor(here, stays=stay, lock=lock)
+
+
+def _machine(journal: Journal, cluster: str | None, name: str) -> Record:
+    """Return a machine that has an id.
+
+    Raises:
+        LocalError: there is none of that name.
+    """
+    plan = the_cluster(journal, cluster).plan
+    records = journal.machines(plan.name)
+    found = next((each for each in records if each.name == name), None)
+    if found is None or not found.id:
+        living = ", ".join(each.name for each in records if not each.is_gone) or "none"
+        raise LocalError(f"{plan.name} has no machine {name}: there are {living}")
+    return found
+
+
+def _last_words(journal: Journal, record: Record, program: str, lines: int) -> str:
+    """Return what was kept of a machine that is gone.
+
+    Raises:
+        LocalError: nothing was.
+    """
+    kept = journal.last_words(record.spec.cluster, record.name)
+    gone = f"{record.name} is gone: {stage(record)}, {record.reason}"
+    if not kept:
+        raise LocalError(f"{gone}; its logs went with it")
+    if program not in kept:
+        raise LocalError(f"{gone}; kept are the last lines of {', '.join(kept)}")
+    return "\n".join([f"# {gone}; its last lines:", *kept[program].splitlines()[-lines:]])
+
+
+def _say(fields: dict[str, object], *, as_json: bool) -> None:
+    if as_json:
+        print_json(fields)
+    else:
+        typer.echo(", ".join(f"{key.replace('_', ' ')}: {value}" for key, value in fields.items()))

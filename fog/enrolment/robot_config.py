@@ -1,0 +1,170 @@
+"""Rules and delegations by which a robot's proxy uses a cluster.
+
+I/O; writes drop-in files and delegations, and asks running nodes to reload through their control sockets.
+``proxy.yaml`` never changes. The rules of a cluster are the file ``fog-CLUSTER.yaml`` of the drop-in directory
+(``proxy.config.drop_ins``), which ``forget_rules`` removes. A rule that the proxy already has is not written again.
+The file
+is private (0600) if ``proxy.yaml`` is, or if a rule contains a name's salt.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import logging
+import os
+import re
+import stat
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from fog.cluster import ExportedInterface
+from fog.enrolment.bootstrap import robot_rule
+from fog.enrolment.members import Authority, metadata_of
+from gdp.errors import GdpError, LocalError
+from gdp.nodes.control_client import NotRunningError, ask_node, find_control_socket
+from gdp.nodes.control_protocol import Command
+from gdp.stores.files import private, public, write_all
+from gdp.stores.keyring import load_public_key
+from proxy.config import matching
+from proxy.config.config import ProxyConfig
+from proxy.config.drop_ins import drop_in_directory
+
+__all__ = ["add_rules", "control_socket_of", "reload", "reload_proxy", "remove_rules"]
+
+log = logging.getLogger(__name__)
+
+_SALT: Final = re.compile(r"""\bsalt["']?[ \t]*:""")  # under `metadata`
+_HEAD: Final = "# Rules of cluster {cluster}; fog writes this file, and removes it with the cluster.\nimport:\n"
+_OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
+_RELOAD_S: Final = 10.0
+
+
+def add_rules(
+    path: Path, authority: Authority, cluster: str, carried: Sequence[ExportedInterface], *, days: float
+) -> None:
+    """Let a robot's proxy use what a cluster serves, by rule and delegation; the proxy may run or not.
+
+    Args:
+        path: ``proxy.yaml`` of the robot.
+        days: validity of the delegations.
+
+    Raises:
+        ConfigError: the configuration is not a proxy's, or a rule conflicts with one of its own.
+        LocalError: keys are missing, or the drop-in cannot be written.
+    """
+    key = load_public_key(authority.owner_key).compressed
+    with _locked(path):
+        config = ProxyConfig.load(path)
+        lacking = [
+            each
+            for each in carried
+            if matching.imported(config.imports, metadata_of(each).name(key), metadata_of(each)) is None
+        ]
+        if lacking:
+            _add_rules(path, authority, cluster, lacking)
+        authority.grant_access(config.identity, config.delegations, carried, days=days)
+
+
+def remove_rules(path: Path, cluster: str) -> bool:
+    """Remove the drop-in file of a cluster; return whether there was one."""
+    file = _drop_in(path, cluster)
+    with _locked(path):
+        try:
+            file.unlink()
+        except FileNotFoundError:
+            return False
+        except OSError as error:
+            raise LocalError(f"{file}: {error.strerror}") from error
+    return True
+
+
+def control_socket_of(identity: Path, configured: Path | None) -> Path:
+    """Return the control socket of a node of this host.
+
+    Args:
+        identity: directory of its keys.
+        configured: ``control_socket`` of its configuration.
+
+    Raises:
+        LocalError: the directory is of no node.
+    """
+    return configured or find_control_socket(identity)
+
+
+def reload(identity: Path, configured: Path | None = None) -> bool:
+    """Have a node of this host read its configuration again, if it runs; return whether it did.
+
+    A node that refuses keeps its old configuration; the reason is logged.
+
+    Args:
+        identity: directory of its keys.
+        configured: ``control_socket`` of its configuration.
+    """
+    try:
+        answer = ask_node(control_socket_of(identity, configured), Command.RELOAD, _RELOAD_S)
+    except NotRunningError:
+        return False
+    except GdpError as error:
+        log.warning("node not reloaded identity=%s reason=%s", identity, error)
+        return False
+    if not answer.is_ok:
+        log.warning("node not reloaded identity=%s reason=%s", identity, answer.error)
+    return answer.is_ok
+
+
+def reload_proxy(path: Path) -> bool:
+    """Have the proxy of this ``proxy.yaml`` read it again, if it runs; return whether it did.
+
+    Raises:
+        ConfigError: the file is not a proxy's.
+    """
+    config = ProxyConfig.load(path)
+    return reload(config.identity, config.control_socket)
+
+
+def _drop_in(path: Path, cluster: str) -> Path:
+    return drop_in_directory(path) / f"fog-{cluster}.yaml"
+
+
+def _add_rules(path: Path, authority: Authority, cluster: str, carried: Sequence[ExportedInterface]) -> None:
+    """Append rules to the drop-in file of a cluster; restore it if the proxy does not accept the result."""
+    file = _drop_in(path, cluster)
+    is_private = not path.stat().st_mode & _OTHERS
+    try:
+        file.parent.mkdir(mode=0o700 if is_private else 0o755, exist_ok=True)
+        before = file.read_text(encoding="utf-8") if file.exists() else None
+    except OSError as error:
+        raise LocalError(f"{file}: {error.strerror}") from error
+    owner = os.path.relpath(authority.owner_key, file.parent)
+    lines = [f"- {json.dumps({**robot_rule(each), 'owner': owner})}\n" for each in carried]
+    _write(file, (before or _HEAD.format(cluster=cluster)) + "".join(lines), is_private=is_private)
+    try:
+        ProxyConfig.load(path)
+    except Exception:
+        if before is None:
+            file.unlink()
+        else:
+            _write(file, before, is_private=is_private)
+        raise
+
+
+def _write(file: Path, text: str, *, is_private: bool) -> None:
+    new = private if is_private or _SALT.search(text) else public
+    write_all(file.parent, {file.name: new(text.encode())}, force=True)
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Exclude other launches that change this robot's rules, by a lock on the folder of ``proxy.yaml``."""
+    try:
+        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise LocalError(f"{path.parent}: {error.strerror}") from error
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(folder)

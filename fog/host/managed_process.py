@@ -1,0 +1,149 @@
+"""One life of a program: started, listened to, ended.
+
+Place: shell. Each leads a session of its own, so that what it starts ends with it; the kernel kills it when the
+machine's own process ends, however that comes about (``PR_SET_PDEATHSIG``, by setpriv(1)). It inherits no
+credentials of the environment (``fog/child_environment``).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import pwd
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from fog.child_environment import child_environment
+from fog.host.bounded_log import BoundedLog
+from fog.machine import Program
+
+__all__ = ["NODE_USER", "ManagedProcess"]
+
+NODE_USER: Final = "FOG_NODE_USER"  # the variable that names the user who runs nodes; without it: the machine's own
+
+_READ_BYTES: Final = 1 << 16
+
+
+class ManagedProcess:
+    """A process that runs.
+
+    Args:
+        home: the machine's folder; the process begins there, or in the home of ``FOG_NODE_USER``.
+        log: takes what it says.
+        on_ready: called when it is up.
+
+    Raises:
+        OSError: it cannot be started, or there is no such user as ``FOG_NODE_USER`` says.
+    """
+
+    def __init__(self, program: Program, home: Path, log: BoundedLog, on_ready: Callable[[], None]) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._log = log
+        self._on_ready: Callable[[], None] | None = on_ready
+        self._sign = program.ready.encode()
+        self._said = b""
+        self.ended: asyncio.Future[int] = self._loop.create_future()
+        words = [word.replace("{home}", str(home)).replace("{python}", sys.executable) for word in program.argv]
+        environment = {key: value.replace("{home}", str(home)) for key, value in program.environment.items()}
+        user = os.environ.get(NODE_USER, "") if program.is_users else ""
+        own = _home_of(user)
+        self._hears, says = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+        os.set_blocking(says, True)  # ours alone must not wait
+        try:
+            self._process: subprocess.Popen[bytes] = subprocess.Popen(
+                ["setpriv", "--pdeathsig", "KILL", *_as_user(user), "--", *words],
+                stdin=subprocess.DEVNULL,
+                stdout=says,
+                stderr=says,
+                cwd=own.get("HOME", home),
+                env={**child_environment(os.environ), "PYTHONUNBUFFERED": "1", **own, **environment},
+                start_new_session=True,
+            )
+        except OSError:
+            os.close(self._hears)
+            raise
+        finally:
+            os.close(says)
+        self._pidfd = os.pidfd_open(self.pid)
+        self._loop.add_reader(self._pidfd, self._reap)
+        self._loop.add_reader(self._hears, self._hear)
+        if not self._sign:
+            self._tell_ready()
+
+    @property
+    def pid(self) -> int:
+        """Return the process id, which is also its group's."""
+        return self._process.pid
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send a signal to the program alone; fine if it has ended."""
+        if not self.ended.done():
+            self._process.send_signal(number)
+
+    def kill(self) -> None:
+        """Kill its whole group at once."""
+        if not self.ended.done():
+            os.killpg(self.pid, signal.SIGKILL)
+
+    async def end(self, patience_s: float) -> None:
+        """Ask it to end; after ``patience_s`` kill it. Fine if it has ended."""
+        self.signal(signal.SIGTERM)
+        await asyncio.wait([self.ended], timeout=patience_s)
+        self.kill()
+        await asyncio.wait([self.ended])
+
+    def _hear(self) -> None:
+        try:
+            data = os.read(self._hears, _READ_BYTES)
+        except BlockingIOError:
+            return
+        if not data:
+            self._loop.remove_reader(self._hears)
+            return
+        self._log.write(data)
+        if self._on_ready is not None:
+            self._said += data
+            if self._sign in self._said:
+                self._tell_ready()
+            else:
+                self._said = self._said[-_READ_BYTES:]
+
+    def _tell_ready(self) -> None:
+        tell, self._on_ready, self._said = self._on_ready, None, b""
+        if tell is not None:
+            tell()
+
+    def _reap(self) -> None:
+        """Called by the loop when the process has ended, before its id can be anyone else's."""
+        self._loop.remove_reader(self._pidfd)
+        os.close(self._pidfd)
+        with suppress(ProcessLookupError):
+            os.killpg(self.pid, signal.SIGKILL)  # what it started and left
+        self._hear()
+        self._loop.remove_reader(self._hears)
+        os.close(self._hears)
+        self._on_ready = None
+        self.ended.set_result(self._process.wait())
+
+
+def _as_user(user: str) -> list[str]:
+    """Return the options of setpriv(1) by which a program runs as another user, without any capability to come."""
+    if not user:
+        return []
+    rights = ["--inh-caps=-all", "--ambient-caps=-all", "--bounding-set=-all", "--no-new-privs"]
+    return ["--reuid", user, "--regid", user, "--init-groups", *rights]
+
+
+def _home_of(user: str) -> dict[str, str]:
+    if not user:
+        return {}
+    try:
+        home = pwd.getpwnam(user).pw_dir
+    except KeyError as error:
+        raise FileNotFoundError(f"no user {user}, whom {NODE_USER} names") from error
+    return {"HOME": home, "USER": user, "LOGNAME": user, "ROS_HOME": f"{home}/.ros", "XDG_RUNTIME_DIR": home}

@@ -1,0 +1,101 @@
+"""Keeps one program of a machine up: starts it, and starts it again with growing pauses when it ends.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from fog.host.bounded_log import BoundedLog
+from fog.host.managed_process import ManagedProcess
+from fog.host.status import ProgramStatus
+from fog.machine import Program
+
+__all__ = ["ProgramSupervisor"]
+
+log = logging.getLogger(__name__)
+
+PAUSE_MIN_S: Final = 0.1
+PAUSE_MAX_S: Final = 10.0
+_STEADY_S: Final = 30.0  # who ran this long is started again at once
+_END_PATIENCE_S: Final = 2.0
+
+
+class ProgramSupervisor:
+    """One program over all its lives.
+
+    Args:
+        changed: called whenever ``status`` is another.
+    """
+
+    def __init__(self, program: Program, home: Path, changed: Callable[[], None]) -> None:
+        self.program = program
+        self.status = ProgramStatus()
+        self.ready = asyncio.Event()  # set once it was up for the first time
+        self._home = home
+        self._changed = changed
+        self._life: ManagedProcess | None = None
+        self._log = BoundedLog(home / "logs" / f"{program.name}.log")
+
+    async def keep(self) -> str:
+        """Run the program until it ends for good; return how, in a few words. To stop it, cancel this, then ``end``."""
+        pause_s, restarts = PAUSE_MIN_S, 0
+        while True:
+            begun_s = asyncio.get_running_loop().time()
+            how = await self._live(restarts)
+            self._become(ProgramStatus(restarts=restarts))
+            if not self.program.restarts:
+                return f"{self.program.name} {how}"
+            log.warning("program ended program=%s how=%s pause_s=%.1f", self.program.name, how, pause_s)
+            if asyncio.get_running_loop().time() - begun_s > _STEADY_S:
+                pause_s = PAUSE_MIN_S
+            await asyncio.sleep(pause_s)
+            pause_s = min(2 * pause_s, PAUSE_MAX_S)
+            restarts += 1
+
+    def ask(self, number: signal.Signals) -> asyncio.Future[int] | None:
+        """Send the program a signal; return its end, or None if it does not run."""
+        if self._life is None or self._life.ended.done():
+            return None
+        self._life.signal(number)
+        return self._life.ended
+
+    def kill(self) -> None:
+        """Kill the program at once."""
+        if self._life is not None:
+            self._life.kill()
+
+    async def end(self) -> None:
+        """End the program kindly, after ``keep`` was cancelled."""
+        if self._life is not None:
+            await self._life.end(_END_PATIENCE_S)
+        self._log.close()
+        self._become(ProgramStatus(restarts=self.status.restarts))
+
+    async def _live(self, restarts: int) -> str:
+        try:
+            life = self._life = ManagedProcess(self.program, self._home, self._log, lambda: self._up(restarts))
+        except OSError as error:
+            return f"could not be started: {error}"
+        if not self.status.up:
+            self._become(ProgramStatus(life.pid, restarts=restarts))
+        return f"ended with code {await asyncio.shield(life.ended)}"
+
+    def _up(self, restarts: int) -> None:
+        self.ready.set()
+        asyncio.get_running_loop().call_soon(self._tell_up, restarts)
+
+    def _tell_up(self, restarts: int) -> None:
+        if self._life is not None and not self._life.ended.done():
+            self._become(ProgramStatus(self._life.pid, up=True, restarts=restarts))
+
+    def _become(self, status: ProgramStatus) -> None:
+        if status != self.status:
+            self.status = status
+            self._changed()

@@ -1,0 +1,125 @@
+"""What can befall a local machine: notice, death, a stop, a slow processor, a late link.
+
+Place: shell; for tests, demonstrations and experiments. Each function takes the site's records and a machine's id, or
+its name where only one is called so, and raises ``LocalError`` where there is no such machine.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+
+from fog.host.preemption_notice import write_notice
+from fog.host.status import Status
+from fog.providers.local.machine_handle import LocalMachine, find
+from fog.providers.local.netlinks import delete, exists, join_within, plug
+from fog.providers.local.spawn import spawn_detached
+from gdp.errors import LocalError
+from gdp.host.processes import end_all
+from gdp.host.run_registry import RunRegistry
+
+__all__ = ["delay", "freeze", "hold", "kill", "notice", "slow", "thaw"]
+
+
+def notice(runs: RunRegistry, machine: str, seconds: float) -> None:
+    """Say that the machine will be taken; it is killed after so many seconds, whatever anybody does."""
+    found = _alive(runs, machine)
+    write_notice(found.home, time.time() + seconds)
+    _signal(found, signal.SIGUSR2)
+
+
+def kill(runs: RunRegistry, machine: str) -> None:
+    """Kill all processes of the machine at once, without a goodbye, and unplug it: what a power cut does."""
+    found = find(runs, machine)
+    groups = list(_groups(found))
+    if found.is_alive and found.file.gone_unix_s is None:
+        replace(found.file, gone_unix_s=time.time()).write(found.directory)  # whoever notices knows how late it is
+    found.cgroup.kill()
+    for group in groups:
+        with suppress(ProcessLookupError):
+            os.killpg(group, signal.SIGKILL)
+    for device in (found.plug, found.uplink_plug):
+        delete(found.gateway, device)
+
+
+def freeze(runs: RunRegistry, machine: str) -> None:
+    """Stop the machine where it is; its link stays up, and nothing answers."""
+    hold(_alive(runs, machine), held=True)
+
+
+def thaw(runs: RunRegistry, machine: str) -> None:
+    """Let a frozen machine go on."""
+    hold(_alive(runs, machine), held=False)
+
+
+def slow(runs: RunRegistry, machine: str, share: float | None) -> None:
+    """Let the machine take this share of one processor, such as 0.1; None: what its hardware has again.
+
+    Raises:
+        LocalError: there are no cgroups to do it with; a share of nothing.
+    """
+    found = _alive(runs, machine)
+    if share is not None and share <= 0:
+        raise LocalError(f"share {share:g}: expected more than 0")
+    found.cgroup.limit_cpu(share if share is not None else found.file.spec.offer.hardware.cpus or None)
+
+
+def delay(runs: RunRegistry, machine: str, ms: float) -> None:
+    """Let every frame take ``ms`` longer, each way, on the machine's link; 0: no longer.
+
+    Raises:
+        LocalError: a negative time, or the kernel refuses.
+    """
+    if ms < 0:
+        raise LocalError(f"delay {ms:g} ms: expected none or more")
+    found = _alive(runs, machine)
+    run = runs.resume(found.id)
+    before = found.record.processes[1:]
+    if ms:
+        if not exists(found.gateway, found.relay_out):
+            join_within(found.gateway, found.relay_out, found.relay_in)
+        argv = ["fog.providers.local.delay", found.plug, found.relay_out, f"{ms:g}"]
+        spawn_detached(run, found.gateway, argv, found.directory / "delay.log", is_heard=True)
+        plug(found.gateway, found.plug, into=False)
+        plug(found.gateway, found.relay_in)
+    else:
+        delete(found.gateway, found.relay_out)
+        plug(found.gateway, found.plug)
+    end_all(before)
+
+
+def hold(machine: LocalMachine, *, held: bool) -> None:
+    """Stop all processes of a machine where they are, or let them go on; fine if it has none."""
+    if machine.cgroup.hold(held=held):
+        return
+    for group in _groups(machine):  # without cgroups; what a program began as a session of its own goes on
+        with suppress(ProcessLookupError):
+            os.killpg(group, signal.SIGSTOP if held else signal.SIGCONT)
+
+
+def _alive(runs: RunRegistry, machine: str) -> LocalMachine:
+    found = find(runs, machine)
+    if found.host is None or not found.host.alive:
+        raise LocalError(f"machine {machine} does not run")
+    return found
+
+
+def _groups(machine: LocalMachine) -> Iterator[int]:
+    """Yield the process groups: the machine's own and each program's."""
+    if machine.host is None or not machine.host.alive:
+        return
+    status = Status.read(machine.home)
+    yield machine.host.pid
+    for program in status.programs.values() if status is not None else ():
+        if program.pid is not None:
+            yield program.pid
+
+
+def _signal(machine: LocalMachine, number: signal.Signals) -> None:
+    if machine.host is not None and machine.host.alive:
+        with suppress(ProcessLookupError):
+            os.kill(machine.host.pid, number)

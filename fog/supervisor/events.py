@@ -1,0 +1,50 @@
+"""What happened to a machine, from what was known of it before and is now: the lines of ``fog status --events``.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from fog.machine import Machine, MachineState
+from fog.supervisor.record import Record
+
+__all__ = ["Change", "changes"]
+
+
+class Change(NamedTuple):
+    """What happened; ``since_unix_s``: when, if the machine's or the provider's records say so."""
+
+    what: str
+    detail: str
+    since_unix_s: float | None = None
+
+
+def changes(before: Record, after: Record, seen: Machine | None, now_s: float) -> Iterator[Change]:
+    """Yield what happened.
+
+    Args:
+        seen: what the provider said of it now.
+    """
+    since = f"{now_s - after.asked_unix_s:.1f} s after it was asked for"
+    if before.up_unix_s is None and after.up_unix_s is not None:
+        yield Change("up", since)
+    if before.noticed_unix_s is None and after.noticed_unix_s is not None:
+        leaves_in_s = (after.leaves_at_unix_s or now_s) - now_s
+        yield Change("notice", f"{after.reason}; leaves in {leaves_in_s:.1f} s", _since(seen, MachineState.LEAVING))
+    if before.served_unix_s is None and after.served_unix_s is not None:
+        yield Change("serving", since)
+    elif before.unreachable_unix_s is not None and after.unreachable_unix_s is None and not after.is_gone:
+        yield Change("serving", f"again, after {now_s - before.unreachable_unix_s:.1f} s")
+    is_lost = before.unreachable_unix_s is None and after.unreachable_unix_s is not None
+    if after.served_unix_s is not None and is_lost and not after.is_released and after.drained_unix_s is None:
+        yield Change("unheard", "its replica is not heard in the overlay")
+    if not before.is_gone and after.is_gone:
+        what = after.ending.value if after.ending is not None else "gone"
+        yield Change(what, after.reason, _since(seen, MachineState.GONE))
+
+
+def _since(seen: Machine | None, state: MachineState) -> float | None:
+    return seen.since_unix_s if seen is not None and seen.state is state else None

@@ -1,0 +1,147 @@
+"""What a site's clusters stand on: the provider, and on this machine its network and the robot's own side.
+
+Place: shell. All of it outlives the command that made it, is found again by records in the state folder, and ends with
+``fall``.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from fog.cluster import CloudNode
+from fog.enrolment.bootstrap import gateway_boot
+from fog.host.status import STATUS_FILE, Status
+from fog.launch.resolve import command_line, deferred
+from fog.machine import MachineState
+from fog.providers.local.netlinks import delete
+from fog.providers.local.spawn import spawn_detached
+from fog.providers.provider import Provider
+from fog.site import SCRATCH, Site
+from gdp.errors import LocalError
+from gdp.host.run_registry import RunRegistry
+
+if TYPE_CHECKING:
+    from fog.providers.local.provider import LocalProvider
+
+__all__ = ["command_of", "is_up", "local_provider", "open_provider", "set_up", "tear_down"]
+
+log = logging.getLogger(__name__)
+
+_OWN_SPACE: Final = Path("/proc/self/ns/net")
+_GATEWAY_DAYS: Final = 3_650.0
+_BOOT_S: Final = 60.0
+_STEP_S: Final = 0.05
+
+
+def open_provider(site: Site, regions: Sequence[str] = ()) -> Provider:
+    """Return the site's provider; nothing is made yet.
+
+    Args:
+        regions: that plans name: ``local`` pretends to have them.
+
+    Raises:
+        LocalError: what it needs is not installed, or its settings are wrong.
+    """
+    match site.provider:
+        case "local":
+            return local_provider(site, regions)
+        case "aws":
+            from fog.catalog.prices import price_list
+            from fog.providers.aws.provider import AwsProvider
+
+            return AwsProvider(lambda hardware, spot: price_list("aws", hardware, spot=spot), site.aws)
+        case "skypilot":
+            from fog.providers.skypilot.provider import SkyPilotProvider
+
+            return SkyPilotProvider(site.skypilot)
+
+
+def local_provider(site: Site, regions: Sequence[str] = ()) -> LocalProvider:
+    """Return the provider ``local`` of a site.
+
+    Raises:
+        LocalError: its folder belongs to somebody else.
+    """
+    from fog.providers.local.provider import LocalProvider
+
+    boot = partial(gateway_boot, site.authority, days=_GATEWAY_DAYS)
+    return LocalProvider(site.state / "local", boot, site.topology, uplink=site.uplink, regions=regions)
+
+
+def command_of(site: Site, node: CloudNode) -> Sequence[str]:
+    """Return how a node is started on a machine of this site.
+
+    Raises:
+        LocalError: machines share this host, and there is no such node here.
+    """
+    return command_line(node, os.environ) if site.provider == "local" else deferred(node)
+
+
+def set_up(site: Site) -> None:
+    """Make what machines and the robot meet on; what stands is left as it is.
+
+    Raises:
+        LocalError: the kernel refuses, or the robot's side does not come up; the text says where its logs are.
+    """
+    with site.locked("ground"):
+        if site.provider == "local":
+            local_provider(site).open_network()
+        if site.robot is not None and not is_up(site):
+            _start_robot(site, site.robot)
+
+
+def is_up(site: Site) -> bool:
+    """Return whether the robot's own side runs."""
+    return any(record.kept and not record.dead for record in _robot_runs(site).all())
+
+
+def tear_down(site: Site) -> None:
+    """Remove what ``stand`` made, and what is left of machines. Fine if nothing stands."""
+    with site.locked("ground"):
+        _robot_runs(site).take_down()
+        if site.devices is not None:
+            for name in (site.devices.proxy, site.devices.rib, site.devices.watch):
+                delete(None, f"{name}-s")  # where its switch was killed
+        if site.provider == "local":
+            provider = local_provider(site)
+            provider.close_network()
+            provider.sweep()
+        for left in (site.state / SCRATCH).iterdir():  # keys of a machine whose making was killed
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def _robot_runs(site: Site) -> RunRegistry:
+    return RunRegistry(site.state / "robot-runs")
+
+
+def _start_robot(site: Site, home: Path) -> None:
+    runs = _robot_runs(site)
+    runs.sweep()
+    (home / STATUS_FILE).unlink(missing_ok=True)
+    (home / "logs").mkdir(mode=0o700, exist_ok=True)
+    run = runs.start()
+    argv = ["fog.host.cli", "--home", str(home), "--await-go"]
+    try:
+        spawn_detached(run, _OWN_SPACE, argv, home / "logs" / "machine.log", lambda _: None)
+        _await_up(home)
+    except BaseException:
+        run.end()
+        raise
+    log.info("robot's side up home=%s", home)
+
+
+def _await_up(home: Path) -> None:
+    """Return when all programs are up; status files tell nobody when they change."""
+    end_s = time.monotonic() + _BOOT_S
+    while (status := Status.read(home)) is None or status.state is not MachineState.RUNNING:
+        restarts = sum(each.restarts for each in status.programs.values()) if status is not None else 0
+        if time.monotonic() > end_s or restarts > 2 or (status is not None and status.state is MachineState.GONE):
+            raise LocalError(f"the robot's side does not come up; its programs' words are in {home / 'logs'}")
+        time.sleep(_STEP_S)

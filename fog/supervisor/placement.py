@@ -1,0 +1,85 @@
+"""Where the next machine is to be: the best of what is offered, away from the others and from where one was just lost.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Final
+
+from fog.cluster import MachineRequest
+from fog.offer import Offer
+from fog.plan.choice import Choice, choose
+from fog.supervisor.record import Outcome, Record
+
+__all__ = ["held_until", "place", "wary_until"]
+
+_WARY_S: Final = 60.0  # after a loss, doubled by each further one
+_WARY_MAX_S: Final = 3_600.0
+_HOLD_S: Final = 1.0  # after a failure to get one, doubled by each further one
+_HOLD_MAX_S: Final = 300.0
+_MEMORY_S: Final = 3_600.0  # how long a loss counts
+_PATIENCE: Final = 4  # so many failures in a row anywhere, and the cause is rather ours than a region's
+
+
+def place(
+    wanted: MachineRequest,
+    offers: Sequence[Offer],
+    records: Sequence[Record],
+    now_s: float,
+    latency_ms: Mapping[str, float] | None = None,
+) -> Choice | None:
+    """Return the offer to take, and why. Where a wished region has just taken a machine, another one does.
+
+    Args:
+        offers: of enough hardware.
+        records: of the cluster, those that are gone included.
+        latency_ms: of regions, as measured from the robot.
+
+    Returns None while whoever could offer it failed so lately that it is too early to ask again.
+
+    Raises:
+        LocalError: nothing fits, now or later.
+    """
+    if _is_resting(records, now_s):
+        return None
+    regions = {each.region for each in offers}
+    losses = {region: [each for each in records if each.spec.offer.region == region] for region in regions}
+    held = {region for region in regions if held_until(losses[region], now_s) > now_s}
+    going = {each.spec.offer.region for each in records if each.noticed_unix_s is not None and not each.is_gone}
+    avoid = [region for region in regions if region in going or wary_until(losses[region], now_s) > now_s]
+    used = [each.spec.offer.region for each in records if not each.is_gone and not each.is_outgoing]
+    free = replace(wanted, region="") if wanted.region in {*avoid, *held} else wanted
+    open_ = [each for each in offers if each.region not in held]
+    if held and not any(free.hardware.fits(each.hardware) and each.is_spot == free.is_spot for each in open_):
+        return None
+    return choose(open_, [free], latency_ms, used=used, avoid=avoid)[0]
+
+
+def wary_until(records: Iterable[Record], now_s: float) -> float:
+    """Return until when a place is better left alone, for machines were taken there."""
+    lost = _moments(records, Outcome.TAKEN, now_s)
+    return lost[-1] + min(_WARY_S * 2 ** (len(lost) - 1), _WARY_MAX_S) if lost else 0.0
+
+
+def held_until(records: Iterable[Record], now_s: float) -> float:
+    """Return until when a place is not asked again, for machines were not to be had there."""
+    failed = _moments(records, Outcome.FAILED, now_s)
+    return failed[-1] + min(_HOLD_S * 2 ** (len(failed) - 1), _HOLD_MAX_S) if failed else 0.0
+
+
+def _is_resting(records: Sequence[Record], now_s: float) -> bool:
+    """Return whether so many failed since one last served that each further try would only cost."""
+    served_s = max((each.served_unix_s or 0.0 for each in records), default=0.0)
+    failed = [moment for moment in _moments(records, Outcome.FAILED, now_s) if moment > served_s]
+    if len(failed) < _PATIENCE:
+        return False
+    pause_s: float = min(_HOLD_S * 2 ** len(failed), _HOLD_MAX_S)
+    return now_s < failed[-1] + pause_s
+
+
+def _moments(records: Iterable[Record], ending: Outcome, now_s: float) -> list[float]:
+    moments = (each.gone_unix_s for each in records if each.ending is ending and each.gone_unix_s is not None)
+    return sorted(moment for moment in moments if moment > now_s - _MEMORY_S)

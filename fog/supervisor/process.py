@@ -1,0 +1,166 @@
+"""The process that is a site's supervisor: what it is made of, its signals, its end.
+
+Place: shell. Apart from ``background``, for what it imports takes longer than most commands need in all.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, closing
+from dataclasses import replace
+from functools import partial
+from types import FrameType
+from typing import Final
+
+from fog.enrolment.listener import Listener, bind_tcp, bind_unix
+from fog.enrolment.responder import Responder
+from fog.enrolment.tickets import Tickets
+from fog.site import Site, topology_now
+from fog.supervisor.background import held
+from fog.supervisor.infrastructure import command_of, open_provider, set_up
+from fog.supervisor.journal import Journal
+from fog.supervisor.reconcile import Timeouts
+from fog.supervisor.supervisor import Supervisor
+from fog.supervisor.watch import Watch
+from fog.topology import Gateway
+from gdp.errors import StoreError
+from gdp.host.processes import Process
+from gdp.nodes.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
+
+__all__ = ["supervise"]
+
+log = logging.getLogger(__name__)
+
+_ELSEWHERE_S: Final = 900.0  # a machine of a cloud has an image to boot and packages to install
+_DONE_S: Final = 2.0  # nothing is wanted for so long: it ends
+
+
+def supervise(site: Site, *, stays: bool = False, lock: int | None = None) -> None:
+    """Be the supervisor, until SIGTERM or, unless ``stays``, until nothing is wanted any more.
+
+    Args:
+        lock: descriptor of the lock, where it was taken already.
+
+    Raises:
+        LocalError: another one lives, the provider cannot be had, or machines have nowhere to enrol: a port is taken.
+    """
+    with (
+        held(site, lock),
+        closing(Journal(site.journal)) as journal,
+        closing(Tickets(site.enrolment_folder)) as tickets,
+        closing(Listener(_bound(site), Responder(tickets, site.authority))),
+    ):
+        _run(site, journal, tickets, stays=stays)
+
+
+def _bound(site: Site) -> socket.socket:
+    """Return the socket at which the site's machines enrol."""
+    if site.enrolment_address:
+        return bind_tcp(*site.enrolment_listens)
+    return bind_unix(site.enrolment_socket)
+
+
+def _run(site: Site, journal: Journal, tickets: Tickets, *, stays: bool) -> None:
+    ended, drained = threading.Event(), threading.Event()
+    watch = Watch(*site.watch) if site.watch is not None else None
+    offered = _offered(site, journal)
+    provider = open_provider(replace(site, topology=offered[1]), offered[0])
+    supervisor = Supervisor(
+        site=site,
+        journal=journal,
+        tickets=tickets,
+        provider=provider,
+        command=partial(command_of, site),
+        heard=watch.heard if watch is not None else lambda: None,
+        on_names=watch.reload if watch is not None else lambda: None,
+        patience=Timeouts() if provider.name == "local" else Timeouts(boot_s=_ELSEWHERE_S),
+    )
+
+    def drain() -> None:
+        ended.set()
+        supervisor.wake()
+
+    handlers = ControlHandlers(
+        reload=supervisor.wake,
+        status=partial(_status, site, supervisor, time.monotonic()),
+        drain=drain,
+        is_drained=drained.is_set,
+    )
+    _call_on_signals(drain)
+    log.info("supervisor begins site=%s provider=%s pid=%d", site.state, provider.name, os.getpid())
+    done_at_s: float | None = None
+    is_reconciled = False
+    stack = ExitStack()
+    try:
+        stack.enter_context(serve_control_in_thread(site.state / CONTROL_SOCKET, handlers))
+        if any(each.is_up for each in journal.clusters()):
+            set_up(site)  # after a crash of this machine nothing stands
+        while not ended.is_set():
+            try:
+                if (now := _offered(site, journal)) != offered:
+                    offered = now
+                    supervisor.use(open_provider(replace(site, topology=offered[1]), offered[0]))
+                supervisor.reconcile()
+                if not is_reconciled:
+                    supervisor.reconciled(_begun_unix_s())
+                    is_reconciled = True
+                is_done = supervisor.is_done and not stays
+            except StoreError as error:
+                log.error("look failed reason=%s", error)
+                is_done = False
+            if not is_done:
+                done_at_s = None
+            elif done_at_s is None:
+                done_at_s = time.monotonic()
+            elif time.monotonic() - done_at_s >= _DONE_S:
+                break
+            supervisor.wait()
+    finally:
+        supervisor.close()
+        drained.set()  # no action runs any more, and all results are in the journal
+        stack.close()
+        if watch is not None:
+            watch.close()
+        provider.close()
+    log.info("supervisor ends")
+
+
+def _call_on_signals(drain: Callable[[], None]) -> None:
+    def handle(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        drain()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, handle)
+
+
+def _status(site: Site, supervisor: Supervisor, begun_s: float) -> dict[str, object]:
+    """Return what ``gdp status`` shows of the supervisor; called from the thread of the control socket."""
+    with closing(Journal(site.journal)) as journal:
+        clusters = [each.plan.name for each in journal.clusters() if each.is_up]
+        machines = sum(len(journal.machines(each, gone=False)) for each in clusters)
+    return {
+        "role": "supervisor",
+        "uptime_s": round(time.monotonic() - begun_s, 1),
+        "clusters": clusters,
+        "machines": machines,
+        "actions": supervisor.running_actions,
+    }
+
+
+def _offered(site: Site, journal: Journal) -> tuple[tuple[str, ...], Gateway]:
+    """Return what the provider is to have: the regions that plans name, and the gateways."""
+    wanted = (each for cluster in journal.clusters() for each in cluster.plan.machines)
+    return tuple(dict.fromkeys(each.region for each in wanted if each.region)), topology_now(site)
+
+
+def _begun_unix_s() -> float:
+    """Return when this process was started, its imports included."""
+    started_s = Process.of(os.getpid()).started / os.sysconf("SC_CLK_TCK")
+    return time.time() - (time.clock_gettime(time.CLOCK_BOOTTIME) - started_s)

@@ -1,0 +1,70 @@
+"""Message counters of proxies on this host, for the idle limit of clusters.
+
+I/O. The counters come from the control socket of a proxy. If the socket of a robot's proxy cannot be reached, as in a
+container, its metrics port is asked. What it sends includes topics: more than calls, never fewer.
+Source: Prometheus text exposition format, version 0.0.4.
+"""
+
+from __future__ import annotations
+
+import re
+from http.client import HTTPException
+from pathlib import Path
+from typing import Final
+from urllib.request import urlopen
+
+from fog.enrolment.robot_config import control_socket_of
+from gdp.errors import GdpError
+from gdp.names import Name
+from gdp.nodes.control_client import ask_node, find_control_socket_of
+from gdp.nodes.control_protocol import Command
+from proxy.config.config import ProxyConfig
+
+__all__ = ["received_by", "sent_by"]
+
+_SENT: Final = re.compile(rb'^gdp_messages_total\{direction="out"\} (\S+)$', re.MULTILINE)
+_TIMEOUT_S: Final = 0.5
+
+
+def received_by(proxy: str) -> int | None:
+    """Return how many messages a machine's proxy on this host has received since its start; None: it does not answer.
+
+    Args:
+        proxy: its name, 64 hex digits.
+    """
+    try:
+        return _count(find_control_socket_of(Name.from_text(proxy)), "in")
+    except GdpError:
+        return None
+
+
+def sent_by(proxy: Path) -> int | None:
+    """Return how many messages a robot's proxy has sent since its start; None: it does not answer.
+
+    Args:
+        proxy: its ``proxy.yaml``.
+
+    Raises:
+        ConfigError: the file is not a proxy's.
+    """
+    config = ProxyConfig.load(proxy)
+    try:
+        return _count(control_socket_of(config.identity, config.control_socket), "out")
+    except GdpError:
+        return None if config.metrics is None else _sent_by_metrics(config.metrics.port)
+
+
+def _count(socket: Path, direction: str) -> int | None:
+    match ask_node(socket, Command.STATUS, _TIMEOUT_S).result:
+        case {"counters": {"messages": dict(messages)}} if isinstance(messages.get(direction), int):
+            return int(messages[direction])
+    return None
+
+
+def _sent_by_metrics(port: int) -> int | None:
+    try:
+        with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=_TIMEOUT_S) as answer:
+            found = _SENT.search(answer.read())
+    except (OSError, HTTPException):
+        return None  # it does not run, or not here
+    return None if found is None else int(float(found[1]))

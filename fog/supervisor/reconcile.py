@@ -1,0 +1,189 @@
+"""What to do next, from what is wanted and what there is.
+
+Place: pure. The same question may be asked at any time, and after any crash: the answer follows from the records alone.
+A machine that serves is let go only when as many others as are wanted serve, or when its time is over anyway.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from fog.cluster import MachineRequest
+from fog.supervisor.record import Outcome, Record
+
+__all__ = ["Action", "Drain", "Launch", "Release", "Timeouts", "decide"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Timeouts:
+    """How long what may last, in seconds.
+
+    Args:
+        boot_s: from asking for a machine until its replica serves.
+        unreachable_timeout_s: a replica that served is not heard, while another is.
+        partition_timeout_s: the same while none is: then it is rather the way to all of them that is cut.
+        drain_s: from telling a machine to finish until it is given back.
+        release_s: until a machine that was given back and is still there is given back again.
+        credential_renewal_s: this long before its papers run out, another machine takes its place.
+        gateway_s: after a machine became the gateway of its group, until silence behind it means something.
+    """
+
+    boot_s: float = 90.0
+    unreachable_s: float = 1.0
+    partition_timeout_s: float = 10.0
+    drain_s: float = 12.0
+    release_s: float = 5.0
+    credential_renewal_s: float = 1_800.0
+    gateway_s: float = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Launch:
+    """Ask for a machine."""
+
+    wanted: MachineRequest
+
+
+@dataclass(frozen=True, slots=True)
+class Drain:
+    """Tell a machine to finish what is under way."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Release:
+    """Give a machine back."""
+
+    name: str
+    reason: str
+    ending: Outcome = Outcome.RELEASED
+
+
+Action: TypeAlias = "Launch | Drain | Release"
+
+
+def decide(
+    wanted: Sequence[MachineRequest],
+    records: Sequence[Record],
+    now_s: float,
+    patience: Timeouts,
+    *,
+    told: bool = True,
+    excused: Collection[str] = (),
+) -> list[Action]:
+    """Return what brings a cluster nearer to what is wanted.
+
+    Args:
+        wanted: one a machine; empty: all are given back at once.
+        records: of the cluster; those that are gone are of no account.
+        told: whether the overlay can be asked who serves; if not, a machine that is up counts as serving.
+        excused: names of machines that are not heard for another reason than their own, and are kept.
+    """
+    there = [record for record in records if not record.is_gone]
+    if not wanted:
+        return [
+            Release(each.name, "the cluster is down")
+            for each in there
+            if not each.is_released or now_s - (each.released_unix_s or now_s) >= patience.release_s
+        ]
+    view = _View(now_s, patience, told, any(_serves(each, told=told) for each in there), excused)
+    actions: list[Action] = []
+    fit: list[Record] = []  # to stay, if wanted
+    leaving: list[Record] = []  # serve on until others do, or their time is over
+    for each in there:
+        if (ended := view.ended(each)) is not None:
+            actions.append(ended)
+        elif each.is_released or each.drained_unix_s is not None:
+            continue
+        elif each.noticed_unix_s is not None or view.is_old(each):
+            leaving.append(each)
+        else:
+            fit.append(each)
+    fit.sort(key=lambda each: (not view.serves(each), each.up_unix_s is None, each.asked_unix_s))
+    kept, missing = _match(wanted, fit)
+    actions += [Launch(each) for each in missing]
+    spare = [each for each in fit if each not in kept]
+    owed = len(wanted) - sum(view.serves(each) for each in kept)  # how many more should serve
+    for each in [*spare, *sorted(leaving, key=lambda each: -(each.leaves_at_unix_s or now_s))]:
+        why = each.reason if each.noticed_unix_s is not None else "another took its place"
+        if not view.serves(each):
+            actions.append(Release(each.name, why if each in leaving else "not needed"))
+        elif owed > 0 and not view.is_due(each):
+            owed -= 1
+        else:
+            actions.append(Drain(each.name, why if each in leaving else "not needed"))
+    return actions
+
+
+def _serves(record: Record, *, told: bool) -> bool:
+    return record.is_serving if told else record.is_serving or record.up_unix_s is not None
+
+
+@dataclass(frozen=True, slots=True)
+class _View:
+    """A look at machines, one by one."""
+
+    now_s: float
+    patience: Timeouts
+    told: bool
+    is_any_serving: bool
+    excused: Collection[str]
+
+    def serves(self, record: Record) -> bool:
+        return _serves(record, told=self.told)
+
+    def is_old(self, record: Record) -> bool:
+        return record.papers.until_unix_s - self.patience.credential_renewal_s <= self.now_s
+
+    def is_due(self, record: Record) -> bool:
+        """Return whether half of the notice is over: what is under way needs the rest."""
+        if record.noticed_unix_s is None or record.leaves_at_unix_s is None:
+            return record.papers.until_unix_s <= self.now_s
+        return self.now_s >= (record.noticed_unix_s + record.leaves_at_unix_s) / 2
+
+    def ended(self, record: Record) -> Release | None:
+        """Return how to let go of what is to serve no more."""
+        limit, now_s = self.patience, self.now_s
+        if record.released_unix_s is not None:
+            is_late = now_s - record.released_unix_s >= limit.release_s
+            return Release(record.name, record.reason, record.ending or Outcome.RELEASED) if is_late else None
+        if record.drained_unix_s is not None:
+            is_done = now_s - record.drained_unix_s >= limit.drain_s
+            return Release(record.name, record.reason) if is_done else None
+        if not self.told:
+            return None
+        if record.served_unix_s is None:
+            is_late = now_s - record.asked_unix_s >= limit.boot_s
+            return Release(record.name, "did not serve in time", Outcome.FAILED) if is_late else None
+        since_s = record.unreachable_unix_s
+        patience_s = limit.unreachable_s if self.is_any_serving else limit.partition_timeout_s
+        if since_s is not None and now_s - since_s >= patience_s and record.name not in self.excused:
+            return Release(record.name, "its replica is not heard any more", Outcome.TAKEN)
+        return None
+
+
+def _match(wanted: Sequence[MachineRequest], fit: Sequence[Record]) -> tuple[list[Record], list[MachineRequest]]:
+    """Return the machines that do for what is wanted, the best first, and what is missing.
+
+    A region counts for nothing here: where a machine was taken, its successor is elsewhere.
+    """
+    open_, kept = list(wanted), list[Record]()
+    for is_same in (True, False):
+        for record in fit:
+            if record in kept:
+                continue
+            for each in open_:
+                if record.wanted == each if is_same else _does(record, each):
+                    open_.remove(each)
+                    kept.append(record)
+                    break
+    return kept, open_
+
+
+def _does(record: Record, wanted: MachineRequest) -> bool:
+    offer = record.spec.offer
+    return wanted.hardware.fits(offer.hardware) and offer.is_spot == wanted.is_spot

@@ -1,0 +1,470 @@
+"""A member of the overlay that publishes, reads, serves and calls: what a proxy, a replica or a capsule is to it.
+
+Place: pure; a shell or a simulated network feeds it frames and time, and takes out frames and messages.
+
+The walk of a message out: ``publish`` -> Publisher (number, seal, keep) -> the switch. And in: DATA or STATUS -> the
+feed of its topic and source -> ``take_messages``. Whoever serves or calls a name both publishes and reads it; what a
+server answers one client, and what a client asks one server, goes by private streams.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
+
+from gdp.client.attachment import Attachment
+from gdp.client.control_keys import ControlKeys
+from gdp.client.identities import ReaderIdentity, WriterIdentity
+from gdp.client.publications import Publications
+from gdp.client.publisher import Publisher
+from gdp.client.reader_proxies import CALLS, TOPICS
+from gdp.client.subscription import Message, Subscription, Subscriptions, Topic
+from gdp.client.timer_queue import TimerQueue
+from gdp.client.unicast_stream import Party, PeerIncarnation
+from gdp.client.writer_proxy import WriterProxy, WriterProxyState
+from gdp.control.boundary import ErrorBoundary
+from gdp.control.join import Join
+from gdp.control.query import Response
+from gdp.control.settings import NodeSettings
+from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
+from gdp.crypto.identity import Identity
+from gdp.crypto.introduction import Introduction
+from gdp.crypto.statements import Statement, StatementType
+from gdp.errors import DropReason, LocalError, RemoteError, StatementError
+from gdp.frame.codec import Header, decode
+from gdp.frame.kinds import CONTROL_FROM, Kind
+from gdp.limits import HELLO_S
+from gdp.message.loss import Losses, LossReason
+from gdp.names import Name
+from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
+from gdp.trust.domain import Policy
+from gdp.trust.right import Right
+from gdp.trust.verifier import AdvertisementVerifier
+
+_FOR_WRITER_PROXIES: Final = (int(Kind.DATA), int(Kind.HEARTBEAT))
+_NOTES: Final = (int(Kind.ACKNACK), int(Kind.INTRODUCTION))
+_STALL_S: Final = 2 * HELLO_S  # a member that is not called for longer, though hellos are due, had no time
+
+__all__ = ["Message", "Participant", "Topic"]
+
+
+class Participant:
+    """The machine of one member."""
+
+    def __init__(self, identity: Identity, policy: Policy, settings: NodeSettings) -> None:
+        self._identity = identity
+        self._verifier = AdvertisementVerifier(policy)
+        notes = ControlKeys(ExchangeKey.from_random(settings.random_bytes(EXCHANGE_KEY_BYTES)))
+        source = WriterIdentity(identity.name, settings.incarnation, identity.key, settings.random_bytes, notes)
+        self._publications = Publications(source, self._party_of)
+        self._turns = self._publications.turns
+        self._writer_proxies_due = TimerQueue[WriterProxy]()
+        self._reporting: dict[WriterProxy, None] = {}  # whose report may be due
+        self._introduced = (-1, b"")  # since when, and how
+        reader = ReaderIdentity(
+            identity.name, settings.incarnation, notes, self._introduction
+        )  # one, for all its feeds
+        self._subscriptions = Subscriptions(reader, self._verifier)
+        self._messages: list[Message] = []
+        self._under_way: tuple[WriterProxy, Subscription] | None = None  # whose next part is expected
+        self._now_s = 0.0
+        self._awake_s = 0.0  # since when this member has had time
+        self.boundary = ErrorBoundary()
+        self._drops: Counter[DropReason] = Counter()
+        self._source = source
+        self.attachment = Attachment(identity, policy, settings, notes.public)
+        self.attachment.advertisement(identity.subject, Right.ATTACH, (), is_global=True)
+
+    @property
+    def name(self) -> Name:
+        """Return the member's name."""
+        return self._identity.name
+
+    @property
+    def held_bytes(self) -> int:
+        """Return how much memory unfinished messages hold."""
+        return self._subscriptions.held_bytes
+
+    def drops(self) -> Mapping[DropReason, int]:
+        """Return what was dropped, by reason."""
+        attachment = self.attachment
+        total = self._drops + self._subscriptions.drops + attachment.drops + attachment.refusals
+        total += self._publications.drops
+        for writer_proxy in self.writer_proxies():
+            total += writer_proxy.drops
+        return total
+
+    def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Timestamps) -> None:
+        """Begin to look for a switch on a port."""
+        self.attachment.hello_protocol.add_port(index, mac, mtu, cost, now.mono_s)
+
+    def advertise(
+        self,
+        topic: Topic,
+        description: bytes,
+        *,
+        reliable: bool,
+        depth: int = 0,
+        is_global: bool = True,
+        urgent: bool = False,
+    ) -> Publisher:
+        """Publish a topic from now on.
+
+        Raises:
+            LocalError: not delegated to this member, or no secret for it.
+        """
+        self._check(topic, Right.PUBLISH, is_free=topic.name not in self._publications)
+        publisher = self._publications.add(
+            topic.name, topic.secrets, description, reliable=reliable, depth=depth, urgent=urgent
+        )
+        self._advertisement(topic, Right.PUBLISH, is_global=is_global)
+        return publisher
+
+    def serve(self, topic: Topic, description: bytes, *, is_global: bool = True, urgent: bool = False) -> Publisher:
+        """Serve a name from now on; return the stream that all its clients hear. ``answer`` reaches one of them.
+
+        Raises:
+            LocalError: not delegated to this member, no secret for it, or the name is in use here.
+        """
+        return self._take_part(topic, Right.SERVE, description, is_global=is_global, urgent=urgent)
+
+    def call(self, topic: Topic, description: bytes, *, is_global: bool = True, urgent: bool = False) -> Publisher:
+        """Call a name from now on; return the stream of requests, that all its servers hear. ``ask`` reaches one.
+
+        A request that is published while ``peers`` is empty reaches nobody.
+
+        Raises:
+            LocalError: not delegated to this member, no secret for it, or the name is in use here.
+        """
+        return self._take_part(topic, Right.CALL, description, is_global=is_global, urgent=urgent)
+
+    def respond(self, service: Name, client: Name, message: bytes) -> None:
+        """Send a message to one client of a name that is served here.
+
+        Raises:
+            LocalError: that client is not heard (any more), or there are too many; or the message is above the limits.
+        """
+        self._tell(Right.SERVE, service, client, message)
+
+    def ask(self, service: Name, server: Name, message: bytes) -> None:
+        """Send a request to one server of a name that is called here, beside the stream that all of them hear.
+
+        Raises:
+            LocalError: that server is not heard (any more), or there are too many; or the message is above the limits.
+        """
+        self._tell(Right.CALL, service, server, message)
+
+    def peers(self, service: Name) -> list[Name]:
+        """Return the servers of a name called here, or the clients of one served here, that are heard and follow.
+
+        A server that falls behind the others, or is silent for ``CALL_QUIET_S``, is none until it confirms again.
+        """
+        publisher = self._publications.get(service)
+        if publisher is None:
+            return []
+        return [party for party in self.heard(service) if publisher.is_followed_by(party, self._now_s, self._awake_s)]
+
+    def heard(self, service: Name) -> list[Name]:
+        """Return those of whom ``peers`` are some: whoever has joined us and is joined, keeping up or not."""
+        publisher = self._publications.get(service)
+        writer_proxies = [
+            writer_proxy
+            for writer_proxy in self.writer_proxies_of(service)
+            if writer_proxy.state is WriterProxyState.LIVE
+        ]
+        return [
+            writer_proxy.publisher
+            for writer_proxy in writer_proxies
+            if publisher is not None and publisher.is_read_by(writer_proxy.publisher)
+        ]
+
+    def withdraw(self, name: Name) -> None:
+        """Publish, serve or call a name no more; what is not, is not.
+
+        It may be taken up again at any time, and as something else.
+        """
+        if not self._publications.remove(name):
+            return
+        subscription = self._subscriptions.get(name)
+        right = Right.PUBLISH
+        if subscription is not None and subscription.right is not Right.READ:
+            right = subscription.right
+            self._close(self._subscriptions.remove(name))
+        self.attachment.withdraw(name, right)
+
+    def subscribe(self, topic: Topic) -> None:
+        """Read a topic from now on, from whoever may publish it.
+
+        Raises:
+            LocalError: not delegated to this member, or no secret for it.
+        """
+        self._check(topic, Right.READ, is_free=self._subscriptions.get(topic.name) is None)
+        self._subscriptions.add(topic, Right.READ)
+        self._advertisement(topic, Right.READ, is_global=False)
+
+    def unsubscribe(self, name: Name) -> None:
+        """Read a topic no more; what is not read, is not. Read again, it goes on with what is new then."""
+        subscription = self._subscriptions.get(name)
+        if subscription is not None and subscription.right is Right.READ:
+            self._close(self._subscriptions.remove(name))
+            self.attachment.withdraw(name, Right.READ)
+
+    def renew(self, topic: Topic) -> None:
+        """Take a topic's delegation and secrets anew, for what is published or read of it."""
+        self._publications.renew(topic.name, topic.secrets, self._now_s)
+        subscription = self._subscriptions.get(topic.name)
+        if subscription is not None:
+            subscription.topic = topic
+            for writer_proxy in subscription.all():
+                writer_proxy.renew(topic.secrets)
+        self.attachment.renew(topic.name, topic.delegation.chain)
+
+    def subscribed(self) -> list[Topic]:
+        """Return the topics that are read."""
+        return [subscription.topic for subscription in self._subscriptions if subscription.right is Right.READ]
+
+    def publishers(self) -> list[Publisher]:
+        """Return what is being published, one publisher for each topic."""
+        return list(self._publications)
+
+    def writer_proxies(self) -> Iterator[WriterProxy]:
+        """Yield what is being read: a feed for each publisher of each topic, and for what comes privately."""
+        for subscription in self._subscriptions:
+            yield from subscription.all()
+
+    def writer_proxies_of(self, topic: Name) -> list[WriterProxy]:
+        """Return the feeds of one topic, private ones apart."""
+        subscription = self._subscriptions.get(topic)
+        return [] if subscription is None else list(subscription.writer_proxies.values())
+
+    def losses_of(self, name: Name) -> Losses:
+        """Return what was lost of all that was heard on a name since it is heard."""
+        subscription = self._subscriptions.get(name)
+        return Losses() if subscription is None else subscription.losses()
+
+    def lost(self) -> Mapping[LossReason, int]:
+        """Return how many messages were lost on their way to this member, by reason."""
+        return self._subscriptions.lost()
+
+    def unconfirmed(self) -> Mapping[LossReason, int]:
+        """Return how many messages of this member some reader did not get, as far as it is known here, by reason."""
+        return self._publications.unconfirmed()
+
+    def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
+        """Take frames in."""
+        self._look_at_clock(now.mono_s)
+        fed: dict[WriterProxy, Subscription] = {}
+        at = 0
+        while at < len(arrivals):
+            if self._under_way is not None:
+                writer_proxy, subscription = self._under_way
+                taken = writer_proxy.receive_run(arrivals, at, now.mono_s)
+                if taken:
+                    fed[writer_proxy] = subscription
+                    at += taken
+                    continue
+            self._receive_one(arrivals[at], now, fed)
+            at += 1
+        self._hand_out(fed, now.mono_s)
+
+    def _hand_out(self, fed: dict[WriterProxy, Subscription], now_s: float) -> None:
+        for writer_proxy, subscription in fed.items():
+            self._messages += subscription.poll_messages(writer_proxy.publisher)
+            self._report(writer_proxy, now_s)
+        fed.clear()
+
+    def _receive_one(self, arrival: ReceivedFrame, now: Timestamps, fed: dict[WriterProxy, Subscription]) -> None:
+        try:
+            header = decode(arrival.frame)
+            if header.kind in _FOR_WRITER_PROXIES:
+                self._writer_proxy(header, arrival.frame, now.mono_s, fed)
+            elif header.kind in _NOTES:
+                self._take_note(header, arrival.frame, now.mono_s)
+            elif header.kind >= CONTROL_FROM:
+                statement = self.attachment.receive_control(arrival, header, now)
+                if statement is not None:
+                    self._hand_out(fed, now.mono_s)  # it may close feeds
+                    self._take_statement(statement, now)
+            else:
+                self._drops[DropReason.UNKNOWN_KIND] += 1
+        except RemoteError as error:
+            self._drops[error.reason] += 1
+        except Exception as error:  # one frame must not end the node
+            self.boundary.note(error)
+            self._drops[DropReason.INTERNAL] += 1
+
+    def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
+        """Learn that a port's link came or went."""
+        self.attachment.port_changed(port, up, now)
+
+    def handle_timer(self, now: Timestamps) -> None:
+        """Do what is due."""
+        self.attachment.handle_timer(now)
+        self._look_at_clock(now.mono_s)
+        self._publications.handle_timer(now.mono_s)
+        for writer_proxy in self._writer_proxies_due.poll_due(now.mono_s):
+            writer_proxy.handle_timer(now.mono_s)
+            self._reporting[writer_proxy] = None
+        self.flush(now.mono_s)
+
+    def flush(self, now_s: float) -> None:
+        """Hand what publishers and feeds have ready to the switch."""
+        if self.attachment.switch is None:
+            return
+        self._look_at_clock(now_s)
+        for frames in self._turns.poll_turn(now_s):
+            self.attachment.send(frames)
+        for writer_proxy in self._reporting:
+            self._report(writer_proxy, now_s)
+        self._reporting.clear()
+
+    def _report(self, writer_proxy: WriterProxy, now_s: float) -> None:
+        notes = writer_proxy.control_to_send(now_s)
+        if notes:
+            self.attachment.send(notes)
+        self._writer_proxies_due.reschedule(writer_proxy)
+
+    def get_timer(self) -> float | None:
+        """Return the monotonic second of the next timer, or None."""
+        times = [self.attachment.get_timer()]
+        if self.attachment.switch is not None:  # alone, nothing can be sent: hellos alone are due
+            times += [self._publications.next_due(), self._writer_proxies_due.next_due()]
+        return min((time for time in times if time is not None), default=None)
+
+    def poll_neighbours(self) -> Mapping[int, frozenset[bytes]]:
+        """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
+        return self.attachment.hello_protocol.poll_addresses()
+
+    def frames_to_send(self) -> list[OutgoingFrames]:
+        """Return, once, what is to be sent; more comes at the next call, until nothing does.
+
+        So the first frames of a large message are on their way while the next ones are being sealed, and the topics
+        take turns; urgent ones go first each time.
+        """
+        out = self.attachment.frames_to_send()
+        if not out and (self._turns or self._reporting):
+            self.flush(self._now_s)
+            out = self.attachment.frames_to_send()
+        return out
+
+    def poll_messages(self) -> list[Message]:
+        """Return, once, the messages that arrived, in order within each feed."""
+        messages, self._messages = self._messages, []
+        return messages
+
+    def leave(self) -> None:
+        """Say goodbye: close feeds, withdraw every name."""
+        self._close(self._subscriptions.leave())
+        self.attachment.withdraw_all()
+
+    def _check(self, topic: Topic, right: Right, *, is_free: bool) -> None:
+        if right not in topic.delegation.rights or not topic.secrets:
+            raise LocalError(f"no delegation to {right.value} {topic.name.short}")
+        if not is_free:
+            raise LocalError(f"{topic.name.short} is in use already: no {right.value} beside it")
+
+    def _advertisement(self, topic: Topic, right: Right, *, is_global: bool) -> None:
+        delegation = topic.delegation
+        self.attachment.advertisement(delegation.subject, right, delegation.chain, is_global=is_global)
+
+    def _take_part(self, topic: Topic, right: Right, description: bytes, *, is_global: bool, urgent: bool) -> Publisher:
+        is_free = topic.name not in self._publications and self._subscriptions.get(topic.name) is None
+        self._check(topic, right, is_free=is_free)
+        publisher = self._publications.add(
+            topic.name, topic.secrets, description,
+            reliable=True, urgent=urgent, patience=CALLS if right is Right.CALL else TOPICS,
+        )  # fmt: skip
+        self._publications.enable_unicast(topic.name, topic.secrets, urgent=urgent)
+        self._subscriptions.add(topic, right)
+        self._advertisement(topic, right, is_global=is_global)
+        return publisher
+
+    def _look_at_clock(self, now_s: float) -> None:
+        if now_s - self._now_s > _STALL_S:
+            self._awake_s = now_s  # what the others said meanwhile is still to be read
+        self._now_s = now_s
+
+    def _tell(self, right: Right, service: Name, party: Name, message: bytes) -> None:
+        subscription = self._subscriptions.get(service)
+        if subscription is None or subscription.right is not right:
+            raise LocalError(f"no {right.value} of {service.short} here")
+        self._publications.send_to(service, party, message, self._now_s)
+
+    def _writer_proxy(self, header: Header, frame: bytes, now_s: float, fed: dict[WriterProxy, Subscription]) -> None:
+        """Give a frame to the feed that it is for, and note that one."""
+        found = self._subscriptions.find(header, now_s)
+        if found is None:
+            self._drops[DropReason.NOT_FOR_US] += 1
+            return
+        subscription, writer_proxy = found
+        writer_proxy.receive(header, frame, now_s)
+        fed[writer_proxy] = subscription
+        if header.parts > 1:
+            self._under_way = writer_proxy, subscription
+
+    def _take_note(self, header: Header, frame: bytes, now_s: float) -> None:
+        if header.destination != self.name:
+            raise StatementError(DropReason.NOT_FOR_US)
+        if header.kind == Kind.INTRODUCTION:
+            self._publications.receive_introduction(header, frame)
+        else:
+            self._publications.receive_acknack(header, frame, now_s)
+
+    def _introduction(self) -> bytes:
+        """Return what proves whose notes ours are, in this life; made anew when an earlier life proves to be ahead."""
+        started, source = self.attachment.started, self._source
+        if self._introduced[0] != started:
+            wire = Introduction.make(
+                self._identity.subject, self._identity.key, source.incarnation, started, source.notes.public
+            )
+            self._introduced = started, wire
+        return self._introduced[1]
+
+    def _take_statement(self, statement: Statement, now: Timestamps) -> None:
+        if statement.type is StatementType.JOIN:
+            self._publications.receive_join(Join.from_fields(statement.fields), now.mono_s)
+        elif statement.type is StatementType.REVOKE:
+            self._revoke(statement, now)
+        elif statement.type is StatementType.ANSWER:
+            change = self._subscriptions.receive_response(Response.from_fields(statement.fields), now)
+            self._messages += change.rest
+            self._close(change.ended, goodbye=False)  # they may come back to what waits for them
+            self._reporting.update(dict.fromkeys(change.opened))
+
+    def _party_of(self, service: Name, party: bytes) -> Party | None:
+        """Return another party of a service that is heard now."""
+        subscription = self._subscriptions.get(service)
+        writer_proxy = None if subscription is None else subscription.writer_proxies.get(party)  # type: ignore[call-overload]
+        return (
+            None
+            if writer_proxy is None
+            else Party(PeerIncarnation(writer_proxy.publisher, writer_proxy.incarnation), writer_proxy.exchange)
+        )
+
+    def _revoke(self, statement: Statement, now: Timestamps) -> None:
+        """Open nothing more of a publisher whose claim rests on what was taken back."""
+        revocation = self.attachment.receive_revocation(statement, now, self._holds)
+        if revocation is not None:
+            self._close(self._subscriptions.recheck(revocation.fingerprint, now.unix_s))
+
+    def _holds(self, issuer_key: bytes) -> bool:
+        """Return whether a certificate of this key is held here: our own delegations', or of whom we hear."""
+        is_own = any(
+            issuer_key == pending_advertisement.subject.owner_key
+            for pending_advertisement in self.attachment.advertisements
+        )
+        return is_own or self._subscriptions.has_issuer(issuer_key)
+
+    def _close(self, writer_proxies: list[WriterProxy], *, goodbye: bool = True) -> None:
+        """Say goodbye to whom these feeds are of, unless told otherwise; a party that goes is told nothing more."""
+        self._under_way = None
+        for writer_proxy in writer_proxies:
+            note = writer_proxy.close()
+            if goodbye:
+                self.attachment.send([note])
+            self._reporting.pop(writer_proxy, None)
+            self._writer_proxies_due.reschedule(writer_proxy)
+            self._publications.forget(
+                writer_proxy.topic, PeerIncarnation(writer_proxy.publisher, writer_proxy.incarnation)
+            )

@@ -1,0 +1,271 @@
+"""Who reads a topic, as its publisher knows them by their notes: in which life, and since when they are silent.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds).
+
+A note opens under a key that its reader's introduction leads to, so nobody else moves what a reader has confirmed.
+
+A reader that is silent for ``READER_LEASE_S`` is suspended: it may have moved. It is no reader until it reports again,
+and is forgotten ``READER_GRACE_S`` later.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from gdp.client.identities import WriterIdentity
+from gdp.crypto.control_seal import ControlOpener, ControlReplayWindow, note_key
+from gdp.crypto.envelope import seal_key
+from gdp.errors import DropReason, EnvelopeError, FrameError, StatementError
+from gdp.frame.codec import Header
+from gdp.frame.kinds import Kind
+from gdp.limits import CALL_IDLE_S, CALL_LAG_S, CALL_QUIET_S, READER_GRACE_S, READER_LEASE_S, REPORT_IDLE_S
+from gdp.message.acknack import AckNack, AckNackFlag
+from gdp.message.heartbeat import StreamStart
+from gdp.names import Name
+
+__all__ = ["CALLS", "TOPICS", "ReaderProxies", "ReaderProxy", "ReaderTimeouts"]
+
+READERS_MAX: Final = 1_024
+_LIVES_MAX: Final = 4_096  # incarnations of readers whose introductions are remembered
+_EPOCHS_KEPT: Final = 2  # the one in use and the one before
+_SUSPENSION_MIN_LAGS: Final = 2
+_SUSPENSION_MAX_LAGS: Final = 16
+
+
+class ReaderTimeouts(NamedTuple):
+    """How long a publisher bears with a reader.
+
+    ``lag_s``: one that has not confirmed in this time what another has holds the window no longer; ``quiet_s``: one
+    from whom nothing is heard for this long does not follow; ``idle_s``: a live one reports at least so often.
+    """
+
+    lag_s: float
+    quiet_s: float
+    idle_s: float
+
+
+TOPICS: Final = ReaderTimeouts(READER_LEASE_S, READER_LEASE_S, REPORT_IDLE_S)
+CALLS: Final = ReaderTimeouts(CALL_LAG_S, CALL_QUIET_S, CALL_IDLE_S)  # other replicas must not wait for a dead one
+
+
+class _Life:
+    """What opens the notes of one life of a reader, and which of them were opened."""
+
+    def __init__(self, topic: Name, source: WriterIdentity, incarnation: int, started: int, exchange: bytes) -> None:
+        self.started = started
+        self._topic = topic
+        self._source = source
+        self._incarnation = incarnation
+        self._shared = source.notes.shared(exchange)
+        self._numbers = ControlReplayWindow()
+        self._openers: dict[bytes, ControlOpener] = {}  # by topic secret
+
+    def open(self, header: Header, frame: bytes, secret: bytes, now_s: float) -> bytes:
+        """Return a note's body.
+
+        Raises:
+            EnvelopeError: REPLAYED, MALFORMED or BAD_TAG.
+        """
+        self._numbers.check(header.number, now_s)
+        opener = self._openers.get(secret)
+        if opener is None:
+            ends = header.source, self._incarnation, self._source.name, self._source.incarnation
+            key = note_key(self._shared, secret, Kind.ACKNACK, *ends, self._topic)
+            opener = self._openers[secret] = ControlOpener(key, self._topic, self._source.incarnation)
+            if len(self._openers) > _EPOCHS_KEPT:
+                del self._openers[next(iter(self._openers))]
+        body = opener.open(header, frame)
+        self._numbers.accept(header.number, now_s)
+        return body
+
+
+@dataclass(slots=True)
+class ReaderProxy:
+    """One reader, in one life of its process.
+
+    Attributes:
+        life: what opens its notes.
+        sequence: it has confirmed every message before this one, but for ``lost`` of them that it counted as lost.
+        behind_s: since when its window has been suspended; None: it is not.
+        confirmed: what ``sequence`` was at the end of a former life; 0: not known.
+    """
+
+    incarnation: int
+    life: _Life
+    heard_s: float
+    sequence: int = 0
+    lost: int = 0
+    behind_s: float | None = None
+    confirmed: int = 0
+    start: StreamStart | None = None  # None once it has begun to confirm
+    out_until_s: float = 0.0  # it may not hold the window before
+    suspensions: int = 0
+
+
+class ReaderProxies:
+    """The readers of one publisher, by name."""
+
+    def __init__(self, topic: Name, source: WriterIdentity, patience: ReaderTimeouts = TOPICS) -> None:
+        self._topic = topic
+        self._source = source
+        self._patience = patience
+        self._readers: dict[bytes, ReaderProxy] = {}
+        self._suspended: dict[bytes, ReaderProxy] = {}
+        self._lives: OrderedDict[tuple[bytes, int], _Life] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._readers)
+
+    def __contains__(self, name: bytes) -> bool:
+        return name in self._readers
+
+    def __getitem__(self, name: bytes) -> ReaderProxy:
+        return self._readers[name]
+
+    def __iter__(self) -> Iterator[bytes]:
+        return iter(list(self._readers))
+
+    def readings(self) -> Iterator[ReaderProxy]:
+        """Return all of them."""
+        return iter(self._readers.values())
+
+    def names(self) -> list[bytes]:
+        """Return the names of all, suspended ones included."""
+        return [*self._readers, *self._suspended]
+
+    def all(self) -> list[ReaderProxy]:
+        """Return all, suspended ones included."""
+        return [*self._readers.values(), *self._suspended.values()]
+
+    def silent(self, now_s: float) -> list[bytes]:
+        """Return those that have not been heard for ``READER_LEASE_S``."""
+        return [name for name, reading in self._readers.items() if now_s - reading.heard_s > READER_LEASE_S]
+
+    def next_silent(self) -> float | None:
+        """Return the monotonic second at which ``silent`` or ``overdue`` has somebody to return, or None."""
+        due_s = [reading.heard_s + READER_LEASE_S + 0.001 for reading in self._readers.values()]
+        due_s += [each.behind_s + READER_GRACE_S + 0.001 for each in self.all() if each.behind_s is not None]
+        return min(due_s, default=None)
+
+    def suspend(self, name: bytes, now_s: float) -> None:
+        """Take a silent reader for none, until it reports again or is forgotten."""
+        reading = self._suspended[name] = self._readers.pop(name)
+        reading.behind_s = now_s if reading.behind_s is None else reading.behind_s
+
+    def is_suspended(self, name: bytes) -> bool:
+        """Return whether somebody is a suspended reader."""
+        return name in self._suspended
+
+    def resume(self, name: bytes, now_s: float) -> bool:
+        """Take a suspended reader for one again; return whether it was suspended."""
+        reading = self._suspended.pop(name, None)
+        if reading is None:
+            return False
+        reading.heard_s = now_s
+        self._readers[name] = reading
+        return True
+
+    def overdue(self, now_s: float) -> list[tuple[bytes, ReaderProxy]]:
+        """Return those whose window has been suspended for ``READER_GRACE_S``, and the first of too many."""
+        everyone = [*self._readers.items(), *self._suspended.items()]
+        late = [each for each in everyone if each[1].behind_s is not None and now_s - each[1].behind_s > READER_GRACE_S]
+        return late or list(self._suspended.items())[: max(len(self._suspended) - READERS_MAX, 0)]
+
+    def is_quiet(self, name: bytes, now_s: float) -> bool:
+        """Return whether a reader has missed two of its reports: it is not slow, it is not there."""
+        return now_s - self._readers[name].heard_s > 2 * self._patience.idle_s
+
+    def is_alive(self, name: bytes, now_s: float, awake_s: float) -> bool:
+        """Return whether somebody is a reader, and was not silent for too long since ``awake_s``."""
+        reading = self._readers.get(name)
+        return reading is not None and now_s - max(reading.heard_s, awake_s) <= self._patience.quiet_s
+
+    def suspend_again(self, name: bytes, now_s: float) -> None:
+        """Have a reader hold no window for a while, each time for longer."""
+        reading = self._readers[name]
+        lags = min(_SUSPENSION_MIN_LAGS << reading.suspensions, _SUSPENSION_MAX_LAGS)
+        reading.out_until_s = now_s + lags * self._patience.lag_s
+        reading.suspensions = min(reading.suspensions + 1, _SUSPENSION_MAX_LAGS)
+
+    def know(self, name: bytes, incarnation: int, started: int, exchange: bytes) -> None:
+        """Learn the key of one life of a reader, proven by its introduction or claim.
+
+        Raises:
+            StatementError: MALFORMED, it is no key.
+        """
+        life = (name, incarnation)
+        if life not in self._lives:
+            self._lives[life] = _Life(self._topic, self._source, incarnation, started, exchange)
+            if len(self._lives) > _LIVES_MAX:
+                self._lives.popitem(last=False)
+
+    def admit(self, name: bytes, incarnation: int, now_s: float) -> ReaderProxy:
+        """Take somebody who is known for a reader, in place of a former life of his."""
+        former = self._readers.get(name) or self._suspended.pop(name, None)
+        life, confirmed = self._lives[name, incarnation], former.sequence if former else 0
+        reading = self._readers[name] = ReaderProxy(incarnation, life, now_s, confirmed=confirmed)
+        return reading
+
+    def forget(self, name: bytes) -> bool:
+        """Let a reader go, suspended or not; return whether it was one."""
+        return (self._readers.pop(name, None) or self._suspended.pop(name, None)) is not None
+
+    def introduce(self, header: Header, frame: bytes, secret: bytes) -> None:
+        """Take the sealed introduction of a reader; of a life that is known nothing is opened.
+
+        Args:
+            secret: topic secret of the epoch in use.
+
+        Raises:
+            RemoteError: it does not open, does not hold, or is of an earlier life than the reader's present one.
+        """
+        life, source = (header.source, header.incarnation), self._source
+        reading = self._reading_of(header.source)
+        if life in self._lives or (reading is not None and reading.incarnation == header.incarnation):
+            return
+        key = seal_key(secret, Kind.INTRODUCTION, header.source, header.incarnation, source.name)
+        body = ControlOpener(key, self._topic, source.incarnation).open(header, frame)
+        introduction = source.notes.introduced(body, Name(header.source), header.incarnation)
+        if reading is not None and introduction.started <= reading.life.started:
+            raise StatementError(DropReason.STALE, "an introduction of an earlier life")
+        self.know(header.source, header.incarnation, introduction.started, introduction.exchange)
+
+    def open(
+        self, header: Header, frame: bytes, secret: bytes, now_s: float, *, may_begin: bool
+    ) -> tuple[AckNack, bool]:
+        """Return what a reader's sealed report says, and whether that reader, or this life of his, is new.
+
+        Args:
+            secret: topic secret of the note's epoch.
+            may_begin: whether who is no reader yet may become one.
+
+        Raises:
+            RemoteError: it does not open, is a replay, or of a life that did not introduce itself or is over.
+        """
+        name = header.source
+        reading = self._reading_of(name)
+        is_current = reading is not None and reading.incarnation == header.incarnation
+        life = reading.life if reading is not None and is_current else self._lives.get((name, header.incarnation))
+        if life is None:
+            raise FrameError(DropReason.UNKNOWN_SENDER, "a note of a life that did not introduce itself")
+        report = AckNack.from_wire(life.open(header, frame, secret, now_s))
+        is_new = AckNackFlag.NEW in report.flags
+        if not may_begin and (is_new or not is_current):
+            raise EnvelopeError(DropReason.UNKNOWN_EPOCH, "a new reader under an epoch that is over")
+        if name not in self._readers and len(self._readers) >= READERS_MAX:
+            raise EnvelopeError(DropReason.QUOTA, "readers")
+        if reading is not None and is_current:
+            reading.heard_s = now_s
+            self.resume(name, now_s)
+            return report, False
+        if reading is not None and (not is_new or life.started <= reading.life.started):
+            raise FrameError(DropReason.UNKNOWN_SENDER, "a report of a life that never began, or is over")
+        self._lives.move_to_end((name, header.incarnation))
+        self.admit(name, header.incarnation, now_s)
+        return report, True
+
+    def _reading_of(self, name: bytes) -> ReaderProxy | None:
+        return self._readers.get(name) or self._suspended.get(name)

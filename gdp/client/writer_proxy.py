@@ -1,0 +1,439 @@
+"""One publisher of one topic as a reader sees it (a writer proxy in RTPS).
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
+
+A feed begins ``NEW``: it introduces itself until a status says where to begin and what messages are. ``LIVE`` it
+delivers: a reliable topic in order and complete, a best-effort one in order and never waiting.
+
+It joins the reassembly of ``gdp/message/reassembly.py`` with ``reordering.py`` (what waits behind a gap),
+``delivery.py``
+(messages in order, and losses), ``ack_nack_schedule.py`` (when a report is due) and ``ack_nack_sealer.py`` (under which
+keys it is sealed).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from enum import Enum
+from typing import Final, NamedTuple
+
+from gdp.client.ack_nack_schedule import AckNackSchedule
+from gdp.client.ack_nack_sealer import AckNackSealer
+from gdp.client.delivery import Delivered, DeliveryQueue
+from gdp.client.identities import ReaderIdentity
+from gdp.client.key_epochs import Secrets
+from gdp.client.reordering import ReorderingBuffer
+from gdp.crypto.envelope import Opener
+from gdp.errors import DropReason, EnvelopeError, RemoteError
+from gdp.frame.codec import Header
+from gdp.frame.kinds import Flag, Kind
+from gdp.limits import NACKS_PER_REPORT, NUMBER_MAX, REPLAY_WINDOW_MESSAGES, REPORT_IDLE_S, SEQUENCE_BYTES
+from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
+from gdp.message.heartbeat import Heartbeat, StreamStart
+from gdp.message.loss import Losses, LossReason
+from gdp.message.reassembly import ReassembledMessage, Reassembler, VerifiesDigest
+from gdp.message.reassembly_quota import ReassemblyQuota
+from gdp.message.renumbering import Renumbering
+from gdp.names import Name
+from gdp.sansio import ReceivedFrame
+from gdp.trust.advertisement import Advertisement
+
+__all__ = ["Ended", "WriterProxy", "WriterProxyState"]
+
+ANNOUNCE_S: Final = 0.1
+_LATCHED: Final = int(Flag.LATCHED)
+_WAITING: Final = int(Flag.RELIABLE | Flag.LATCHED)  # topics whose readers wait for what is missing
+
+
+class WriterProxyState(Enum):
+    """How far a feed is."""
+
+    NEW = "new"
+    LIVE = "live"
+
+
+class Ended(NamedTuple):
+    """Where a feed ended, for another one of the same: what came before is not opened again.
+
+    Args:
+        number: of the next message.
+        status: the highest seen.
+        sequence: of the next message.
+        known: the first sequence number of which nothing is known: what lies between was published, and did not come.
+        resumes: the feed ended without its reader's will: what it misses meanwhile is lost, and asked for again.
+    """
+
+    number: int = 0
+    status: int = 0
+    sequence: int = 0
+    known: int = 0
+    resumes: bool = False
+
+
+_NOT_BEGUN: Final = Ended()
+
+
+class WriterProxy:
+    """Reads one incarnation of one publisher of a topic.
+
+    Args:
+        exchange: the publisher's X25519 key, as its claim names it.
+        budget: memory of all feeds.
+        ended: where an earlier feed of the same ended. A latched topic's last messages come again all the same, as its
+            publisher says in a new status, unless this feed resumes that one.
+        restarted: this reader read another incarnation of the publisher before: what was published in this one is lost.
+        introduces: the publisher learns the reader's key by an introduction, and says where to begin. Else it knows
+            the key already, and the feed is reliable and begins at the first message.
+
+    Attributes:
+        claim: newest claim of the publisher.
+        description: what the publisher says that its messages are.
+
+    Raises:
+        StatementError: MALFORMED, ``exchange`` is no key.
+    """
+
+    def __init__(
+        self,
+        *,
+        topic: Name,
+        reader: ReaderIdentity,
+        publisher: Name,
+        incarnation: int,
+        writer: VerifiesDigest,
+        exchange: bytes,
+        secrets: Secrets,
+        budget: ReassemblyQuota,
+        now_s: float,
+        ended: Ended = _NOT_BEGUN,
+        restarted: bool = False,
+        introduces: bool = True,
+    ) -> None:
+        self.publisher = publisher
+        self.incarnation = incarnation
+        self.topic = topic
+        self.exchange = exchange
+        self._reader = reader
+        self._secrets = secrets
+        self._before = ended
+        self._is_restarted = restarted
+        self._described = 0  # by which status
+        self._openers: dict[tuple[int, int], Opener] = {}
+        self._sealer = AckNackSealer(
+            topic=topic,
+            reader=reader,
+            publisher=publisher,
+            incarnation=incarnation,
+            exchange=exchange,
+            secrets=secrets,
+            introduces=introduces,
+            now_s=now_s,
+        )
+        self._data = Reassembler(
+            publisher, lambda epoch: self._opener(Kind.DATA, epoch), writer, budget, head_bytes=SEQUENCE_BYTES
+        )
+        self._status = Reassembler(publisher, lambda epoch: self._opener(Kind.HEARTBEAT, epoch), writer, budget)
+        self._schedule = AckNackSchedule(self._data, now_s)
+        self._order = ReorderingBuffer(publisher, budget)
+        self._delivery = DeliveryQueue(publisher, incarnation, self._data.drops)
+        self._is_reliable: bool | None = None
+        self._sent = (0, 0)  # the publisher has sent everything before this (number, part)
+        self.state = WriterProxyState.NEW
+        self.description = b""
+        self.advertisement: Advertisement | None = None
+        self.advertisement_sequence = 0
+        if not introduces:
+            self._begin_at(max(ended.number, 1), max(ended.sequence, 1), now_s)
+
+    @property
+    def idle_s(self) -> float:
+        """Return the longest time between two reports."""
+        return self._schedule.idle_s
+
+    @idle_s.setter
+    def idle_s(self, idle_s: float) -> None:
+        """Set the longest time between two reports."""
+        self._schedule.idle_s = idle_s
+
+    @property
+    def drops(self) -> Counter[DropReason]:
+        """Return what was dropped, by reason."""
+        return self._data.drops + self._status.drops
+
+    @property
+    def delivered(self) -> int:
+        """Return how many messages were delivered."""
+        return self._delivery.delivered
+
+    @property
+    def delivered_bytes(self) -> int:
+        """Return the size of what was delivered."""
+        return self._delivery.delivered_bytes
+
+    @property
+    def losses(self) -> Losses:
+        """Return which messages are known to be lost, and why."""
+        return self._delivery.losses
+
+    @property
+    def lost(self) -> int:
+        """Return how many messages are known to be lost."""
+        return self._delivery.losses.total
+
+    @property
+    def ended(self) -> Ended:
+        """Return where it is, for one that goes on after it."""
+        before, delivery = self._before, self._delivery
+        status = max(self._status.window.top, before.status)
+        if self.state is WriterProxyState.NEW:
+            return before._replace(status=status)
+        number, known = max(self._order.expected, before.number), max(delivery.known, delivery.sequence)
+        return Ended(number, status, delivery.sequence, known)
+
+    def finish(self) -> None:
+        """Deliver what is complete, and count what is known to lack: this incarnation publishes no more."""
+        if self.state is WriterProxyState.LIVE:
+            delivery = self._delivery
+            delivery.skipped = LossReason.PUBLISHER_RESTARTED
+            for joined in self._order.drain():
+                delivery.deliver(joined)
+            delivery.lose_until(delivery.known, LossReason.PUBLISHER_RESTARTED)
+
+    def refuse(self, reason: DropReason) -> None:
+        """Count a frame that is dropped unread."""
+        self._data.drops[reason] += 1
+
+    def receive(self, header: Header, frame: bytes, now_s: float) -> None:
+        """Process one DATA or STATUS frame of this publisher."""
+        if header.incarnation != self.incarnation:
+            self._data.drops[DropReason.WRONG_INCARNATION] += 1
+        elif header.kind == Kind.HEARTBEAT and header.number <= self._before.status:
+            self._status.drops[DropReason.REPLAYED] += 1
+        elif header.kind == Kind.HEARTBEAT:
+            joined = self._status.add(header, frame, now_s)
+            if joined is not None:
+                self._handle_status(joined, header.epoch, now_s)
+        else:
+            self._handle_data(header, frame, now_s)
+
+    def receive_run(self, arrivals: Sequence[ReceivedFrame], at: int, now_s: float) -> int:
+        """Process the frames of ``arrivals[at:]`` that continue the message under way; return how many."""
+        taken = self._data.add_batch(arrivals, at, now_s)
+        if taken:
+            self._schedule.count(taken * len(arrivals[at].frame))
+            if self.state is WriterProxyState.LIVE and self._is_reliable:
+                self._schedule.handle_run(now_s)
+        return taken
+
+    def handle_timer(self, now_s: float) -> None:
+        """Release what waited too long for its parts (best effort)."""
+        is_final = self.state is WriterProxyState.LIVE and not self._is_reliable
+        self._data.drop_expired(now_s, for_good=is_final)
+        self._status.drop_expired(now_s, for_good=False)
+
+    def get_timer(self) -> float:
+        """Return the monotonic second of the next timer."""
+        expiries = [self._status.next_expiry(), self._data.next_expiry()]
+        return min([self._schedule.due_s, *(expiry for expiry in expiries if expiry is not None)])
+
+    def control_to_send(self, now_s: float) -> list[bytes]:
+        """Return the frames of the report that is due, if one is, and of an introduction where it is wanted."""
+        schedule = self._schedule
+        if now_s < schedule.due_s:
+            return []
+        schedule.start_report()
+        if self.state is WriterProxyState.NEW:
+            schedule.due_s = now_s + ANNOUNCE_S
+            number, sequence = (self._before.number, self._before.sequence) if self._before.resumes else (0, 0)
+            return self._sealer.seal_first(AckNack(AckNackFlag.NEW, number, 0, (), sequence))
+        missing = self._missing() if self._is_reliable else ()
+        schedule.handle_reported(now_s, is_missing=bool(missing))
+        expected = self._order.expected
+        part, sequence = self._data.progress(expected), self._delivery.sequence
+        return self._sealer.seal_all(AckNack(AckNackFlag.NONE, expected, part, missing, sequence, self.lost), now_s)
+
+    def poll_delivered(self) -> list[Delivered]:
+        """Remove and return the messages that are ready, in order."""
+        return self._delivery.poll()
+
+    def close(self) -> bytes:
+        """Release all memory; return the frame that says goodbye."""
+        self._data.close()
+        self._status.close()
+        self._order.drain()
+        self._schedule.due_s = float("inf")
+        return self._sealer.seal(
+            AckNack(AckNackFlag.BYE, self._order.expected, 0, (), self._delivery.sequence, self.lost)
+        )
+
+    def renew(self, secrets: Secrets) -> None:
+        """Replace the topic's secrets; what is sealed under an epoch that is still among them opens as before."""
+        self._secrets = secrets
+        self._openers.clear()
+        self._sealer.renew(secrets)
+
+    def _opener(self, kind: Kind, epoch: int) -> Opener:
+        opener = self._openers.get((kind, epoch))
+        if opener is None:
+            secret = self._secrets.get(epoch)
+            if secret is None:
+                raise EnvelopeError(DropReason.UNKNOWN_EPOCH, str(epoch))
+            opener = Opener(secret, kind, self.publisher, self.incarnation, self.topic)
+            self._openers[kind, epoch] = opener
+        return opener
+
+    def _handle_data(self, header: Header, frame: bytes, now_s: float) -> None:
+        reassembler, expected = self._data, self._order.expected
+        if header.number > NUMBER_MAX:
+            reassembler.drops[DropReason.MALFORMED] += 1
+            return
+        if self.state is WriterProxyState.LIVE and not 0 <= header.number - expected < REPLAY_WINDOW_MESSAGES:
+            reassembler.drops[DropReason.LATE if header.number < expected else DropReason.MEMORY_FULL] += 1
+            return
+        seen, highest, refused = reassembler.new_parts, reassembler.highest, reassembler.drops[DropReason.MEMORY_FULL]
+        joined = reassembler.add(header, frame, now_s)
+        if reassembler.new_parts > seen:
+            if self._is_reliable is None:
+                self._set_reliable(header.flags)
+            self._schedule.count(header.length)
+            if self.state is WriterProxyState.LIVE and self._is_reliable:
+                self._schedule.handle_part(header, highest, expected, now_s)
+        if joined is not None:
+            self._sealer.handle_message(joined.number, header.epoch, now_s)
+            self._arrange(joined)
+        elif (
+            reassembler.drops[DropReason.MEMORY_FULL] > refused and self.state is WriterProxyState.LIVE and self._order
+        ):
+            self._delivery.skipped = LossReason.READER_MEMORY
+            self._skip_to(self._order.numbers[0])  # what waits behind the gap leaves no room to fill it: go on without
+            self._deliver()
+
+    def _arrange(self, joined: ReassembledMessage) -> None:
+        """Order a complete message, and deliver what is next."""
+        order, delivery = self._order, self._delivery
+        if self.state is WriterProxyState.LIVE and (not self._is_reliable or joined.number == order.expected):
+            if joined.number > order.expected:
+                self._skip_to(joined.number)
+            delivery.deliver(joined)
+            order.expected = joined.number + 1
+            self._deliver()
+        elif order.put(joined):
+            delivery.learn(min(int.from_bytes(joined.head, "big"), NUMBER_MAX) + 1)
+        elif self.state is WriterProxyState.NEW:
+            self._data.drops[DropReason.MEMORY_FULL] += 1
+        else:
+            delivery.skipped = LossReason.READER_MEMORY
+            self._skip_to(joined.number)
+            delivery.deliver(joined)
+            order.expected += 1
+            self._deliver()
+
+    def _missing(self) -> tuple[MissingRange, ...]:
+        """Return what is known to be lacking: gaps below the newest part, and all that a status announced."""
+        missing: list[MissingRange] = []
+        sent_number, sent_part = self._sent
+        end = max(self._data.highest + 1, sent_number + (sent_part > 0))
+        for number in self._data.window.unfinished(self._order.expected, end):
+            room = NACKS_PER_REPORT - len(missing)
+            if room <= 0:
+                break
+            ranges = self._data.missing(number, room, to_end=number < sent_number)
+            if not ranges and number == sent_number:
+                ranges = _below(self._data.missing(number, room, to_end=True), sent_part)
+            missing += [MissingRange(number, *each) for each in ranges]
+        return tuple(missing)
+
+    def _handle_status(self, joined: ReassembledMessage, epoch: int, now_s: float) -> None:
+        try:
+            status = Heartbeat.from_wire(joined.message)
+        except RemoteError as error:
+            self._status.drops[error.reason] += 1
+            return
+        self._set_reliable(joined.flags)
+        is_newest = joined.number == self._status.window.top
+        self._sealer.handle_status(epoch, now_s, is_newest=is_newest)
+        if self.state is WriterProxyState.NEW:
+            start = status.starts.get(self._reader.name)
+            if start is None or start.incarnation != self._reader.incarnation:
+                return
+            self._begin(status, start, is_latched=bool(joined.flags & _LATCHED))
+        if status.description and joined.number > self._described:
+            self.description, self._described = status.description, joined.number
+        order, delivery = self._order, self._delivery
+        if is_newest:
+            delivery.gone = status.gone
+        self._sent = max(self._sent, (status.sent_number, status.sent_part))
+        for move in status.moves:
+            if move.is_before(order.expected):
+                self._renumber(move)
+        otherwise = delivery.gap_reason
+        if status.oldest > order.expected:
+            self._skip_to(status.oldest)
+            delivery.lose_until(status.oldest_sequence, otherwise)
+        self._deliver()
+        if order.expected == status.sent_number:
+            delivery.lose_until(status.sent_sequence, otherwise)
+        delivery.learn(status.sent_sequence)
+        self._schedule.due_s = now_s
+
+    def _begin(self, status: Heartbeat, start: StreamStart, *, is_latched: bool) -> None:
+        """Begin where the publisher says, and count what came between this and what was read before."""
+        before, delivery = self._before, self._delivery
+        expected = start.number
+        if before.resumes or not is_latched:
+            expected = max(start.number, before.number)
+        begun, why = start.confirmed, LossReason.READER_RESTARTED
+        if before.resumes and before.sequence:
+            begun, why = before.sequence, LossReason.DETACHED
+        elif self._is_restarted:
+            begun, why = 1, LossReason.PUBLISHER_RESTARTED
+        delivery.gone = status.gone if why is LossReason.DETACHED else ()
+        delivery.sequence = begun or start.sequence
+        delivery.lose_until(start.sequence, why)
+        delivery.gone = status.gone
+        delivery.sequence = max(start.sequence, before.sequence) if expected > start.number else start.sequence
+        self.state = WriterProxyState.LIVE
+        self._order.start_at(expected)
+        self._data.start_at(expected, self._order.numbers)
+
+    def _begin_at(self, number: int, sequence: int, now_s: float) -> None:
+        """Begin a reliable feed at a message, without a status."""
+        self.state = WriterProxyState.LIVE
+        self._is_reliable = self._delivery.is_reliable = True
+        self._order.expected, self._delivery.sequence = number, sequence
+        self._data.start_at(number, ())
+        self._schedule.due_s = now_s + REPORT_IDLE_S
+
+    def _set_reliable(self, flags: int) -> None:
+        self._is_reliable = self._delivery.is_reliable = bool(flags & _WAITING)
+
+    def _renumber(self, move: Renumbering) -> None:
+        """Go on under new numbers: what waits under old ones waits under theirs."""
+        if self._order.expected < move.first:
+            self._skip_to(move.first)
+        moved = self._order.renumber(move)
+        self._data.forget(self._order.expected)
+        for joined in moved:
+            if joined.number not in self._order and self._order.put(joined):
+                self._data.skip(joined.number)
+
+    def _skip_to(self, number: int) -> None:
+        """Accept that what lies before ``number`` and is not here will not come."""
+        for joined in self._order.skip_to(number):
+            self._delivery.deliver(joined)
+        self._data.forget(number)
+
+    def _deliver(self) -> None:
+        order = self._order
+        if self.state is WriterProxyState.NEW or not order:
+            return
+        for joined in order.consecutive():
+            self._delivery.deliver(joined)
+        if order and not self._is_reliable:
+            self._skip_to(order.numbers[-1] + 1)
+
+
+def _below(ranges: list[tuple[int, int]], end: int) -> list[tuple[int, int]]:
+    """Return inclusive ranges as far as they lie below ``end``."""
+    return [(first, min(last, end - 1)) for first, last in ranges if first < end]

@@ -1,0 +1,164 @@
+"""A statement in frames: split where it is longer than a link carries, joined under tight bounds.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds). Statements are signed, not sealed; until one is whole
+nobody knows who wrote it, so memory is bounded per claimed source and in all, and patience is short. Where a bound is
+met the oldest unfinished statement makes room: a flood of beginnings ends its own, hardly one whose parts come at once.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+from gdp.errors import DropReason, FrameError, LocalError
+from gdp.frame.codec import HEADER_BYTES, Header, encode
+from gdp.frame.kinds import Flag
+from gdp.limits import (
+    CONTROL_JOIN_BYTES,
+    CONTROL_JOIN_SOURCE_BYTES,
+    CONTROL_MAX_BYTES,
+    CONTROL_PARTS_MAX,
+    CONTROL_PATIENCE_S,
+    HOPS_MAX,
+    MTU_MIN_BYTES,
+    RECORD_OVERHEAD_BYTES,
+)
+from gdp.message.reassembly_quota import ReassemblyQuota
+from gdp.names import ZERO
+
+__all__ = ["ControlFragmenter", "ControlReassembler"]
+
+_COST_BYTES: Final = 200  # what an unfinished statement costs beside its bytes
+_FAR_MTU: Final = MTU_MIN_BYTES  # behind the first link there may be a tunnel, or any link there may be
+
+_Key = tuple[bytes, int, int, int]  # origin, kind, incarnation, number
+
+
+class ControlFragmenter:
+    """Numbers and splits the statements of one node."""
+
+    def __init__(self, source: bytes, incarnation: int) -> None:
+        self._source = source
+        self._incarnation = incarnation
+        self._number = 0
+
+    def split(self, kind: int, statement: bytes, mtu: int, destination: bytes = ZERO) -> list[bytes]:
+        """Return the frames of a statement.
+
+        Args:
+            mtu: bytes after the Ethernet header on the first link. A statement that goes further than a neighbour is
+                split for the smallest link there may be.
+            destination: zero for the neighbour itself.
+
+        Raises:
+            LocalError: a statement above the limit.
+        """
+        room = (mtu if destination == ZERO else min(mtu, _FAR_MTU)) - HEADER_BYTES
+        chunks = [statement[at : at + room] for at in range(0, len(statement), room)] or [b""]
+        if len(statement) > CONTROL_MAX_BYTES + RECORD_OVERHEAD_BYTES or len(chunks) > CONTROL_PARTS_MAX:
+            raise LocalError(f"a statement of {len(statement)} bytes is above the limit")
+        self._number += 1
+        header = Header(
+            kind, 0, HOPS_MAX, 0, 0, self._number, 0, len(chunks), self._incarnation, destination, self._source
+        )
+        return [
+            encode(header._replace(part=part, length=len(chunk), flags=Flag.LAST if part == len(chunks) - 1 else 0))
+            + chunk
+            for part, chunk in enumerate(chunks)
+        ]
+
+
+@dataclass(slots=True)
+class _PartialStatement:
+    parts: int
+    begun_s: float
+    chunks: dict[int, bytes] = field(default_factory=dict)
+    held_bytes: int = _COST_BYTES
+
+
+class ControlReassembler:
+    """Joins statements of any source."""
+
+    def __init__(self) -> None:
+        self._budget = ReassemblyQuota(CONTROL_JOIN_BYTES, CONTROL_JOIN_SOURCE_BYTES)
+        self._unfinished: dict[_Key, _PartialStatement] = {}
+        self._by_source: dict[bytes, dict[_Key, None]] = {}  # in order of their beginning
+        self.drops: Counter[DropReason] = Counter()
+
+    @property
+    def unfinished(self) -> Mapping[_Key, object]:
+        """Return what waits for parts, keyed by (origin, kind, incarnation, number)."""
+        return self._unfinished
+
+    @property
+    def held_bytes(self) -> int:
+        """Return how much memory unfinished statements hold."""
+        return self._budget.held_bytes
+
+    def add(self, header: Header, frame: bytes, now_s: float, via: bytes = b"") -> bytes | None:
+        """Take a part; return the statement when it is whole.
+
+        Args:
+            via: whom it came from on which port. With the source it makes the origin, which has its own memory, and
+                whose parts alone are put together: a stranger on the link cannot spoil a neighbour's statement.
+
+        Raises:
+            FrameError: it cannot be a part of a statement.
+        """
+        payload = frame[HEADER_BYTES : HEADER_BYTES + header.length]
+        if header.parts == 1:
+            return payload
+        if header.parts > CONTROL_PARTS_MAX:
+            raise FrameError(DropReason.BAD_PARTS, f"a statement in {header.parts} parts")
+        self.drop_expired(now_s)
+        origin = header.source + via
+        key = (origin, header.kind, header.incarnation, header.number)
+        waiting = self._unfinished.get(key)
+        if waiting is None:
+            self._reserve(origin, _COST_BYTES)
+            waiting = self._unfinished[key] = _PartialStatement(header.parts, now_s)
+            self._by_source.setdefault(origin, {})[key] = None
+        if waiting.parts != header.parts:
+            raise FrameError(DropReason.BAD_PARTS, "the number of parts changed")
+        if header.part in waiting.chunks:
+            raise FrameError(DropReason.DUPLICATE, "statement")
+        if waiting.held_bytes + len(payload) > CONTROL_MAX_BYTES + RECORD_OVERHEAD_BYTES + _COST_BYTES:
+            self._drop(key)
+            raise FrameError(DropReason.TOO_BIG, "statement")
+        self._reserve(origin, len(payload))
+        if key not in self._unfinished:  # it was the oldest itself
+            self._budget.release(origin, len(payload))
+            raise FrameError(DropReason.MEMORY_FULL, "statements")
+        waiting.held_bytes += len(payload)
+        waiting.chunks[header.part] = payload
+        if len(waiting.chunks) < waiting.parts:
+            return None
+        self._drop(key)
+        return b"".join(waiting.chunks[part] for part in range(waiting.parts))
+
+    def drop_expired(self, now_s: float) -> None:
+        """Give back what waited longer than ``CONTROL_PATIENCE_S``."""
+        while self._unfinished:
+            key, oldest = next(iter(self._unfinished.items()))
+            if now_s - oldest.begun_s < CONTROL_PATIENCE_S:
+                break
+            self._drop(key)
+            self.drops[DropReason.ABANDONED] += 1
+
+    def _reserve(self, source: bytes, size: int) -> None:
+        """Take memory, from the oldest of this source or of all where there is none left."""
+        while not self._budget.reserve(source, size):
+            mine = self._by_source.get(source)
+            held = sum(self._unfinished[key].held_bytes for key in mine or ())
+            is_mine = held + size > CONTROL_JOIN_SOURCE_BYTES
+            self._drop(next(iter(mine if mine and is_mine else self._unfinished)))
+            self.drops[DropReason.MEMORY_FULL] += 1
+
+    def _drop(self, key: _Key) -> None:
+        source = key[0]
+        self._budget.release(source, self._unfinished.pop(key).held_bytes)
+        del self._by_source[source][key]
+        if not self._by_source[source]:
+            del self._by_source[source]

@@ -1,0 +1,94 @@
+"""Two nodes with one identity (copied keys, a cloned disk), as a neighbour of both sees them.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds). A node says in its hellos when its life began. Of two lives
+of one identity that are alive at once, the older one keeps its place; hellos of the other one are refused. Both are
+told: for ``_TOLD_S`` after the last refusal hellos name the sessions of both (``Hello.rivals``). Whoever finds its own
+session there, but not among those that are heard, is the refused one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, TypeVar
+
+from gdp.control.hello import echo_of
+from gdp.names import Name
+
+__all__ = ["IdentityConflicts"]
+
+_TOLD_S: Final = 3.0
+_K = TypeVar("_K")
+_V = TypeVar("_V")
+_CONFLICTS_MAX: Final = 64  # sessions, and identities; the one named first makes room
+
+
+@dataclass(slots=True)
+class _Session:
+    name: Name
+    until_s: float
+
+
+@dataclass(slots=True)
+class _Refused:
+    life: bytes
+    until_s: float
+
+
+class IdentityConflicts:
+    """The sessions at this node's ports whose identity another node has, too.
+
+    Attributes:
+        refusals: hellos that were refused because an older node has their identity.
+        changes: how often an identity came to be refused, or is no more because the same node was taken.
+    """
+
+    def __init__(self) -> None:
+        self._sessions: dict[tuple[int, bytes], _Session] = {}
+        self._refused: dict[Name, _Refused] = {}
+        self.refusals = 0
+        self.changes = 0
+
+    def refuse(self, name: Name, life: bytes, now_s: float) -> None:
+        """Note that a hello was refused."""
+        self.refusals += 1
+        known = self._refused.get(name)
+        self.changes += known is None or known.until_s <= now_s
+        _put(self._refused, name, _Refused(life, now_s + _TOLD_S))
+
+    def accept(self, name: Name, life: bytes) -> None:
+        """Note that a hello was taken; if it was refused before, the older life was only not known to be dead."""
+        known = self._refused.get(name)
+        if known is not None and known.life == life:
+            del self._refused[name]
+            self.changes += 1
+
+    def tell(self, port: int, nonce: bytes, name: Name, now_s: float) -> bool:
+        """See that a session hears of its rival; return whether it has not yet."""
+        known = self._sessions.get((port, nonce))
+        _put(self._sessions, (port, nonce), _Session(name, now_s + _TOLD_S))
+        return known is None or known.until_s <= now_s
+
+    def on(self, port: int, now_s: float) -> tuple[bytes, ...]:
+        """Return the echoes of the sessions at a port that have rivals."""
+        if not self._sessions:
+            return ()
+        self._sessions = {key: each for key, each in self._sessions.items() if each.until_s > now_s}
+        return tuple(echo_of(nonce, each.name) for (its, nonce), each in self._sessions.items() if its == port)
+
+    def refused(self, now_s: float) -> list[Name]:
+        """Return the identities of which a hello was refused lately."""
+        if not self._refused:
+            return []
+        self._refused = {name: each for name, each in self._refused.items() if each.until_s > now_s}
+        return sorted(self._refused)
+
+    def next_expiry(self) -> float | None:
+        """Return the monotonic second at which ``refused`` changes by itself, or None."""
+        return min((each.until_s for each in self._refused.values()), default=None)
+
+
+def _put(held: dict[_K, _V], key: _K, value: _V) -> None:
+    held.pop(key, None)
+    if len(held) >= _CONFLICTS_MAX:
+        del held[next(iter(held))]
+    held[key] = value

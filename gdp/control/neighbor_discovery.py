@@ -1,0 +1,829 @@
+"""Finding neighbours, proving who they are, and noticing when they are gone.
+
+Place: pure; every node that has a port greets: switches, RIBs, proxies.
+
+A hello is signed by a member of a trusted domain and carries its certificate. It counts as two-way when it echoes the
+nonce of our port's present session, and is newer than all that came of its own, so a recorded hello brings nobody up:
+of sessions that ended, too, the last sequence number is remembered.
+
+Whose signature is verified, and how often, ``admission.py`` decides. Who has not echoed our nonce is a candidate. Its
+place is apart from those of neighbours, and where none is left the oldest makes room. Candidates are answered
+with no more bytes than they have sent.
+
+Hellos also say what each end takes: a link is as wide as its narrowest end. Where an end changes, both know at once.
+
+Between neighbours that are up, keepalives (``keepalive.py``) take over from most hellos: a silent cut is noticed after
+the negotiated detection time. Time in which this node itself was not called counts for nobody's silence.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Final
+
+from gdp.control.admission import (
+    NEIGHBOUR_HELLOS,
+    Admission,
+    Cookies,
+    TokenBucket,
+    cookie_payload,
+    read_cookie,
+    seal_cookie,
+)
+from gdp.control.fragments import ControlFragmenter, ControlReassembler
+from gdp.control.hello import (
+    DIGEST_BYTES,
+    HELLO_MAX_BYTES,
+    LIFE_BYTES,
+    NO_KEEPALIVES,
+    NONCE_BYTES,
+    RTCERTS_MAX,
+    Hello,
+    Timing,
+    echo_of,
+)
+from gdp.control.identity_conflicts import IdentityConflicts
+from gdp.control.join import Join
+from gdp.control.keepalive import KeepaliveSession, Slowness
+from gdp.control.neighbour import TRANSITIONS, Neighbour, NeighbourEvent, NeighbourState
+from gdp.control.settings import NodeSettings
+from gdp.control.strangers import Strangers
+from gdp.crypto.certificates import Membership, Role
+from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
+from gdp.crypto.identity import Identity
+from gdp.crypto.statements import Statement, StatementType
+from gdp.errors import DropReason, FrameError, StatementError
+from gdp.frame.codec import HEADER_BYTES, Header, decode
+from gdp.frame.kinds import Kind
+from gdp.limits import DEAD_S, HELLO_IDLE, HELLO_S, MTU_MIN_BYTES
+from gdp.message.replay import ReplayWindow
+from gdp.names import Name
+from gdp.sansio import BROADCAST, OutgoingFrames, ReceivedFrame, Timestamps
+from gdp.trust.domain import Policy
+from gdp.trust.rtcert import RtCertCache
+
+__all__ = ["Change", "HelloPort", "HelloProtocol"]
+
+NEIGHBOURS_MAX: Final = 64  # on one port
+CANDIDATES_MAX: Final = 32  # on one port, who have not echoed our nonce; the one silent for longest makes room
+PADDED_BYTES: Final = 1_400  # of a hello with its header; what it draws from who does not know us is not longer
+_PARTS_MAX: Final = -(-HELLO_MAX_BYTES // (MTU_MIN_BYTES - HEADER_BYTES))
+_ADDRESSES_MAX: Final = 96  # of neighbours and former ones, whose frames the data plane keeps apart from strangers'
+_CREDIT_MAX_BYTES: Final = 16 << 10
+_UNREACHABLE: Final = (-1, -1)
+_NOTHING: Final[Mapping[int, frozenset[bytes]]] = MappingProxyType({})
+_RTCERTS_REMEMBERED: Final = 256
+_ENDED_MAX: Final = 1_024  # sessions of the far ends, remembered for one session of a port
+_JOINS_WINDOW: Final = 1_024  # how far joins may overtake each other
+_ANSWER_S: Final = 0.02  # a stranger's hello is answered at once, but not more often than this
+_EAGER_HELLOS: Final = 4  # after a change, so that a lost one delays nobody
+_HELLOS_MISSED: Final = 5  # idle hello intervals after which keepalives alone keep nobody up
+_RECHECK_S: Final = 1.0  # a membership may be revoked or run out while keepalives come
+_LATE_S: Final = 0.02  # called later than this, a node had no time of its own
+_CLASH_S: Final = 3.0  # for so long another node must have our identity
+_CLASH_PAUSE_S: Final = 10.0  # above the time between two idle hellos
+_TOGETHER: Final = 0.125  # of an interval: keepalives due within it leave at once
+
+# A neighbour after the change, and its state before; the same state where only the link to it changed, MTU or cost.
+Change = tuple[Neighbour, NeighbourState]
+
+
+@dataclass(slots=True)
+class HelloPort:
+    """A port as the control plane sees it."""
+
+    owner: Name  # the node whose port it is
+    index: int
+    mac: bytes
+    own_mtu: int  # what our end takes, in bytes after the Ethernet header
+    cost: int
+    nonce: bytes
+    exchange_key: ExchangeKey
+    admission: Admission
+    is_up: bool = True
+    sequence: int = 0
+    keepalive_sequence: int = 0
+    eager: int = _EAGER_HELLOS  # hellos until they become rare
+    hello_at_s: float = 0.0
+    answer_at_s: float = float("inf")  # of a hello to candidates, as far as ``credit_bytes`` go
+    credit_bytes: int = 0  # that came of them, and were not answered yet
+    owes_answer: bool = False  # for want of bytes
+    said_s: float = float("-inf")
+    neighbours: dict[Name, Neighbour] = field(default_factory=dict)
+    ended: dict[tuple[Name, bytes], tuple[int, int]] = field(default_factory=dict)  # last numbers
+    joins: dict[bytes, ReplayWindow] = field(default_factory=dict)  # which were taken, by session of the far end
+    said_mtus: dict[Name, int] = field(default_factory=dict)  # what each neighbour's end takes
+    addresses: dict[bytes, None] = field(default_factory=dict)  # of neighbours, former ones too; the last proven last
+    strangers: Strangers = field(default_factory=Strangers)  # whose hellos were refused
+
+    @property
+    def echo(self) -> bytes:
+        """Return how others refer to our present session."""
+        return echo_of(self.nonce, self.owner)
+
+    @property
+    def mtu(self) -> int:
+        """Return what our end and those of all neighbours that are up take, in bytes after the Ethernet header."""
+        up = [n.mtu for n in self.neighbours.values() if n.state is NeighbourState.UP]
+        return min([self.own_mtu, *up])
+
+    @property
+    def hello_mtu(self) -> int:
+        """Return what everybody takes who was heard at all: a neighbour behind a narrow end must hear us to be up."""
+        return min([self.own_mtu, *self.said_mtus.values()])
+
+    def last_of(self, name: Name, nonce: bytes) -> int:
+        """Return the last sequence number that came of a neighbour's session, or -1."""
+        known = self.neighbours.get(name)
+        if known is not None and nonce in (known.nonce, known.candidate):
+            return known.sequence if known.nonce == nonce else known.candidate_sequence
+        return self.ended.get((name, nonce), _UNREACHABLE)[0]
+
+    @property
+    def is_idle(self) -> bool:
+        """Return whether all neighbours hear us, and we them, by keepalives; whoever else is heard does not count."""
+        sessions = [each.keepalives for each in self.neighbours.values() if each.is_proven]
+        return bool(sessions) and all(each is not None and each.is_alive and each.hears_us for each in sessions)
+
+    def hurry(self, at_s: float) -> None:
+        """Say hello at ``at_s`` or before, and then often for a while: what it says has changed."""
+        self.hello_at_s, self.eager = min(self.hello_at_s, at_s), _EAGER_HELLOS
+
+    def schedule_hello(self, received_bytes: int, now_s: float) -> None:
+        """Say hello soon to who has not proved itself, with at most as many bytes as came of such."""
+        self.credit_bytes = min(self.credit_bytes + received_bytes, _CREDIT_MAX_BYTES)
+        self.answer_at_s = min(self.answer_at_s, max(now_s, self.said_s + _ANSWER_S))
+
+    def note_address(self, mac: bytes) -> bool:
+        """Note that a neighbour has this address; return whether that is news."""
+        is_new = mac not in self.addresses
+        self.addresses.pop(mac, None)
+        self.addresses[mac] = None
+        if len(self.addresses) > _ADDRESSES_MAX:
+            del self.addresses[next(iter(self.addresses))]
+        return is_new
+
+    def candidates(self) -> list[Neighbour]:
+        """Return who was heard, and has not echoed our nonce."""
+        return [each for each in self.neighbours.values() if not each.is_proven]
+
+    def is_neighbour_at(self, mac: bytes) -> bool:
+        """Return whether a neighbour that is up has this address."""
+        return any(each.mac == mac and each.state is NeighbourState.UP for each in self.neighbours.values())
+
+    def heard(self) -> tuple[bytes, ...]:
+        """Return what a hello echoes: neighbours first, then candidates, the newest first."""
+        proven = [each for each in self.neighbours.values() if each.is_proven]
+        others = sorted(self.candidates(), key=lambda each: each.heard_s, reverse=True)
+        restarts = [echo_of(each.candidate, each.name) for each in proven if each.candidate]
+        return *(each.echo for each in proven), *(each.echo for each in others), *restarts
+
+    def end(self, neighbour: Neighbour) -> None:
+        """Remember how far a session came that has proved itself; others cannot bring anybody up again."""
+        if neighbour.is_proven:
+            session = neighbour.name, neighbour.nonce  # a nonce alone could be said by another member, too
+            _, received = self.ended.pop(session, _UNREACHABLE)
+            if neighbour.keepalives is not None:
+                received = neighbour.keepalives.received
+            self.ended[session] = neighbour.sequence, received
+            if len(self.ended) > _ENDED_MAX:
+                del self.ended[next(iter(self.ended))]
+
+    def receive_join(self, join: Join, neighbour: Neighbour) -> None:
+        """Note a verified join or leave of a neighbour.
+
+        Raises:
+            StatementError: REPLAYED: it is of another session of either end, came before, or is too old to tell.
+        """
+        if (join.session, join.sender_session) != (self.echo, neighbour.nonce):
+            raise StatementError(DropReason.REPLAYED, "a join of another session")
+        window = self.joins.get(neighbour.nonce)
+        if window is None:
+            if len(self.joins) >= _ENDED_MAX:
+                del self.joins[next(iter(self.joins))]
+            window = self.joins[neighbour.nonce] = ReplayWindow(_JOINS_WINDOW)
+        if window.is_finished(join.sequence):
+            raise StatementError(DropReason.REPLAYED, "join")
+        window.finish(join.sequence)
+
+
+class HelloProtocol:
+    """Greets on every port.
+
+    Args:
+        random_bytes: source of nonces and of session keys.
+        timing: what this node wants of keepalives, where ``set_timing`` says nothing else of a port.
+        life: mark of this node's life, ``LIFE_BYTES``.
+        digest_for: what to say of our link state to the far end of a port.
+        life_elsewhere: the mark of a node with a name that is known to be alive, but at none of our ports; or None.
+        rtcert_for: of a RIB, its RtCert for a switch; None of any other node.
+
+    Attributes:
+        rivals: nodes that share an identity with another one, at our ports.
+        clashes: how often we heard of another node with our own identity.
+        clash_told_by: the neighbour that said so last.
+    """
+
+    def __init__(
+        self,
+        identity: Identity,
+        policy: Policy,
+        fragmenter: ControlFragmenter,
+        random_bytes: Callable[[int], bytes],
+        *,
+        hello_s: float = HELLO_S,
+        dead_s: float = DEAD_S,
+        timing: Timing = NO_KEEPALIVES,
+        incarnation: int = 0,
+        life: bytes = bytes(LIFE_BYTES),
+        digest_for: Callable[[HelloPort], bytes] = lambda _: bytes(DIGEST_BYTES),
+        life_elsewhere: Callable[[Name], bytes | None] = lambda _: None,
+        rtcert_for: Callable[[Name], bytes] | None = None,
+    ) -> None:
+        self._identity = identity
+        self._policy = policy
+        self._fragmenter = fragmenter
+        self._random_bytes = random_bytes
+        self._hello_s = hello_s
+        self._dead_s = dead_s
+        self._timing = timing
+        self._timings: dict[int, Timing] = {}
+        self._incarnation = incarnation
+        self._due_s = float("inf")  # when the next call was asked for
+        self._next_s: float | None = None  # no timer is due before; None: to be looked up
+        self._lateness_s = 0.0  # how long, in all, this node was called later than it had asked to be
+        self._slowness = Slowness()
+        self._digest_for = digest_for
+        self._life = life
+        self._life_elsewhere = life_elsewhere
+        self._rtcert_for = rtcert_for
+        self._rtcerts = RtCertCache(_RTCERTS_REMEMBERED)
+        self.conflicts = IdentityConflicts()
+        self._cookies = Cookies(random_bytes)
+        self._replies: list[OutgoingFrames] = []
+        self._reply_at_s = float("inf")
+        self._has_moved = False  # there is a new address
+        self._told_addresses: dict[int, frozenset[bytes]] = {}
+        self._reassembler = ControlReassembler()  # of neighbours' hellos
+        self._strangers_reassembler = ControlReassembler()
+        self.clashes = 0
+        self.clash_told_by: Name | None = None
+        self._clash_since_s = self._clash_s = float("-inf")
+        self.ports: dict[int, HelloPort] = {}
+
+    @classmethod
+    def of_node(
+        cls,
+        identity: Identity,
+        policy: Policy,
+        fragmenter: ControlFragmenter,
+        settings: NodeSettings,
+        *,
+        digest_for: Callable[[HelloPort], bytes] = lambda _: bytes(DIGEST_BYTES),
+        life_elsewhere: Callable[[Name], bytes | None] = lambda _: None,
+        rtcert_for: Callable[[Name], bytes] | None = None,
+    ) -> HelloProtocol:
+        """Return the greeter of a node with these settings."""
+        return cls(
+            identity,
+            policy,
+            fragmenter,
+            settings.random_bytes,
+            hello_s=settings.hello_s,
+            dead_s=settings.dead_s,
+            timing=settings.timing,
+            incarnation=settings.incarnation,
+            life=settings.life,
+            digest_for=digest_for,
+            life_elsewhere=life_elsewhere,
+            rtcert_for=rtcert_for,
+        )
+
+    def set_timing(self, index: int, timing: Timing) -> None:
+        """Want other keepalives on one port, from its next session on."""
+        self._timings[index] = timing
+        self._next_s = None
+
+    def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now_s: float) -> list[Change]:
+        """Begin to greet on a port, or learn that the MTU or cost of one that is up has changed.
+
+        Returns the neighbours to which the link has changed, and those that another address of ours takes away.
+        """
+        self._next_s = None
+        port, own_mtu = self.ports.get(index), max(mtu, MTU_MIN_BYTES)
+        if port is None or not port.is_up or port.mac != mac:
+            lost = [] if port is None else self._lose(port, list(port.neighbours.values()), NeighbourEvent.LINK_LOST)
+            nonce, key = self._session()
+            self.ports[index] = HelloPort(
+                self._identity.name, index, mac, own_mtu, cost, nonce, key, Admission(now_s), hello_at_s=now_s,
+                addresses={} if port is None else port.addresses,
+            )  # fmt: skip
+            return lost
+        if (port.own_mtu, port.cost) == (own_mtu, cost):
+            return []
+        port.own_mtu, port.cost = own_mtu, cost
+        port.hurry(now_s)  # the other ends must know
+        for neighbour in port.neighbours.values():
+            neighbour.mtu = min(port.said_mtus[neighbour.name], own_mtu)
+        return [(each, each.state) for each in port.neighbours.values() if each.state is NeighbourState.UP]
+
+    def neighbour(self, port: int, name: Name) -> Neighbour | None:
+        """Return the neighbour of that name that is up on a port, or None."""
+        on = self.ports.get(port)
+        found = on.neighbours.get(name) if on is not None else None
+        return found if found is not None and found.state is NeighbourState.UP else None
+
+    def poll_addresses(self) -> Mapping[int, frozenset[bytes]]:
+        """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
+        if not self._has_moved:
+            return _NOTHING
+        self._has_moved = False
+        changed = {}
+        for index, port in self.ports.items():
+            macs = frozenset(port.addresses)
+            if macs != self._told_addresses.get(index, frozenset()):
+                changed[index] = self._told_addresses[index] = macs
+        return changed
+
+    def all_up(self) -> list[Neighbour]:
+        """Return every neighbour that is up."""
+        return [n for port in self.ports.values() for n in port.neighbours.values() if n.state is NeighbourState.UP]
+
+    @property
+    def drops(self) -> Counter[DropReason]:
+        """Return which unfinished hellos were given up."""
+        return self._reassembler.drops + self._strangers_reassembler.drops
+
+    @property
+    def held_bytes(self) -> int:
+        """Return how much memory unfinished hellos of strangers hold."""
+        return self._strangers_reassembler.held_bytes
+
+    def join(self, arrival: ReceivedFrame, header: Header, now_s: float) -> bytes | None:
+        """Take a frame of a hello; return the statement when it is whole.
+
+        Raises:
+            FrameError: BAD_PARTS, MEMORY_FULL and the like; RATE_LIMITED, its address has used up its share.
+        """
+        port = self.ports.get(arrival.port)
+        if header.parts > _PARTS_MAX:
+            raise FrameError(DropReason.BAD_PARTS, f"a hello in {header.parts} parts")
+        if port is None or not port.is_up:
+            return None
+        if port.is_neighbour_at(arrival.mac):
+            return self._reassembler.add(header, arrival.frame, now_s, arrival.via)
+        port.admission.look(arrival.mac, now_s)
+        return self._strangers_reassembler.add(header, arrival.frame, now_s, arrival.via)
+
+    def receive_cookie(self, arrival: ReceivedFrame, header: Header) -> None:
+        """Take a cookie: of a neighbour that was heard, at its address, in answer to a hello of this session.
+
+        Raises:
+            FrameError: UNKNOWN_SENDER or TRUNCATED.
+        """
+        port = self.ports.get(arrival.port)
+        known = port.neighbours.get(Name(header.source)) if port is not None else None
+        session, nonce, cookie = read_cookie(arrival.frame[HEADER_BYTES : HEADER_BYTES + header.length])
+        if port is None or known is None or (known.mac, known.nonce, port.nonce) != (arrival.mac, session, nonce):
+            raise FrameError(DropReason.UNKNOWN_SENDER, "a cookie")
+        self._next_s = None
+        known.cookie = cookie
+        port.hello_at_s = min(port.hello_at_s, port.said_s + self._hello_s)
+
+    def receive(self, arrival: ReceivedFrame, statement: Statement, now: Timestamps) -> Change | None:
+        """Take a hello; return what it changed.
+
+        Raises:
+            StatementError: it does not hold, or no more are verified now; nothing has changed.
+        """
+        port = self.ports.get(arrival.port)
+        if port is None or not port.is_up:
+            return None
+        hello, member = self._verified(port, arrival, statement, now)
+        proof = self._proof_of_place(hello, member)
+        received_bytes = _received_bytes(arrival, statement)
+        self._refuse_conflict(port, hello, member.name, (arrival.mac, received_bytes), now.mono_s)
+        self.conflicts.accept(member.name, hello.life)
+        is_two_way = port.echo in hello.heard
+        known = port.neighbours.get(member.name)
+        self._make_room(port, known, is_two_way=is_two_way)
+        if known is None:
+            known = port.neighbours[member.name] = Neighbour(
+                member.name, member.role, member.domain, member.key, port.index, arrival.mac, 0, b"", 0, b"", 0.0
+            )
+        is_new_session = known.nonce != hello.nonce
+        if is_two_way:
+            has_news = is_new_session or (port.owes_answer and not known.is_proven)
+        else:
+            has_news = known.is_proven and not is_new_session  # it does not hear us any more
+            if not has_news:
+                port.schedule_hello(received_bytes, now.mono_s)
+        if has_news:
+            port.hurry(max(now.mono_s, port.said_s + _ANSWER_S))
+        if is_new_session and not is_two_way and known.is_proven:
+            known.candidate, known.candidate_sequence = hello.nonce, hello.sequence
+            # a restart, or an old hello played back: only an echo of our nonce will tell
+            return None
+        if is_new_session or not is_two_way:
+            port.end(known)
+            known.keepalives = None
+        said_mtu = port.said_mtus[known.name] = max(hello.mtu, MTU_MIN_BYTES)
+        mtu = min(said_mtu, port.own_mtu)
+        is_resized = known.mtu != mtu
+        known.mac, known.mtu, known.nonce, known.candidate = arrival.mac, mtu, hello.nonce, b""
+        known.is_proven = is_two_way or (known.is_proven and not is_new_session)
+        if known.is_proven:
+            self._has_moved = port.note_address(arrival.mac) or self._has_moved
+        known.cookie = b"" if is_new_session else known.cookie
+        known.sequence, known.digest, known.greeted_s = hello.sequence, hello.digest, now.mono_s
+        known.member, known.checked_s, known.life = member, now.mono_s, hello.life
+        known.role = member.role  # a root may have made a leaf of a switch
+        had_proof, known.proof = known.proof is not None, proof
+        self._note_clash(port, known, hello, now.mono_s)
+        self._alive(known, now.mono_s)
+        if is_two_way and known.keepalives is None:
+            self._begin_keepalives(port, known, hello, now.mono_s)
+        change = self._step(known, NeighbourEvent.TWO_WAY if is_two_way else NeighbourEvent.ONE_WAY)
+        if change is None and is_new_session and is_two_way:
+            return known, NeighbourState.GONE  # it restarted, and has forgotten what we told it
+        is_placed = (known.proof is not None) is not had_proof
+        if change is None and (is_resized or is_placed) and known.state is NeighbourState.UP:
+            return known, known.state
+        return change
+
+    def _verified(
+        self, port: HelloPort, arrival: ReceivedFrame, statement: Statement, now: Timestamps
+    ) -> tuple[Hello, Membership]:
+        """Return a hello and whose it is, cheap checks first.
+
+        Raises:
+            StatementError: it does not hold, or no more are verified now.
+        """
+        if len(statement.wire) > HELLO_MAX_BYTES:
+            raise StatementError(DropReason.TOO_BIG, "hello")
+        hello = Hello.from_fields(statement.expect(StatementType.HELLO))
+        if statement.signer == self._identity.name:
+            raise StatementError(DropReason.NOT_FOR_US, "our own hello came back")
+        if hello.sequence <= port.last_of(statement.signer, hello.nonce):
+            port.admission.refused(now.mono_s)
+            raise StatementError(DropReason.REPLAYED, "hello")
+        self._admit(port, arrival, statement.signer, hello, now.mono_s)
+        self._next_s = None
+        try:
+            member = self._policy.verify_membership(hello.membership, now.unix_s)
+        except StatementError as error:
+            port.strangers.note(hello.membership, error.reason, now.mono_s)
+            raise
+        if member.name != statement.signer:
+            raise StatementError(DropReason.BAD_CERTIFICATE, "a hello under another's certificate")
+        statement.verify(member.key)
+        roles = member.role, self._identity.role
+        if Role.LEAF in roles and all(each.is_switch for each in roles) and member.domain != self._identity.root.domain:
+            port.strangers.note(hello.membership, DropReason.THROUGH_LEAF, now.mono_s)
+            raise StatementError(DropReason.THROUGH_LEAF, "a leaf joins switches of its own domain only")
+        return hello, member
+
+    def _admit(self, port: HelloPort, arrival: ReceivedFrame, signer: Name, hello: Hello, now_s: float) -> None:
+        """Decide by what is cheap to see whether a hello's signature is verified.
+
+        Raises:
+            StatementError: RATE_LIMITED; COOKIE_REQUIRED, and a cookie is on its way.
+        """
+        known = port.neighbours.get(signer)
+        member = known.member if known is not None else None
+        seen = arrival.mac, hello.membership
+        if known is not None and member is not None and known.is_proven and (known.mac, member.wire) == seen:
+            known.hellos = known.hellos or TokenBucket(*NEIGHBOUR_HELLOS, now_s)
+            port.admission.admit_neighbour(known.hellos, now_s)
+            return
+        try:
+            port.admission.admit_stranger(
+                arrival.mac, now_s, lambda: self._cookies.proves(hello, port.nonce, arrival.mac, now_s)
+            )
+        except StatementError as error:
+            if error.reason is DropReason.COOKIE_REQUIRED and port.admission.may_send_cookie(now_s):
+                cookie = self._cookies.make(port.nonce, arrival.mac, now_s)
+                payload = cookie_payload(port.nonce, hello.nonce, cookie)
+                frames = self._fragmenter.split(Kind.COOKIE, payload, MTU_MIN_BYTES)
+                self._replies.append(OutgoingFrames(port.index, arrival.mac, frames))
+                self._next_s, self._reply_at_s = None, min(self._reply_at_s, now_s)
+            raise
+
+    @staticmethod
+    def _make_room(port: HelloPort, known: Neighbour | None, *, is_two_way: bool) -> None:
+        """See that there is a place: neighbours keep theirs, candidates give way to the next one.
+
+        Raises:
+            StatementError: QUOTA, there are too many neighbours.
+        """
+        if known is not None and (known.is_proven or not is_two_way):
+            return
+        candidates = port.candidates()
+        if is_two_way:
+            if len(port.neighbours) - len(candidates) >= NEIGHBOURS_MAX:
+                raise StatementError(DropReason.QUOTA, "neighbours on one port")
+        elif len(candidates) >= CANDIDATES_MAX:
+            oldest = min(candidates, key=lambda each: each.heard_s)
+            del port.neighbours[oldest.name], port.said_mtus[oldest.name]
+
+    def _proof_of_place(self, hello: Hello, member: Membership) -> tuple[bytes, bytes] | None:
+        """Return what proves to others that a RIB is attached to this switch, or None.
+
+        Raises:
+            StatementError: its hello carries what it did not sign.
+        """
+        if member.role is not Role.RIB:
+            return None
+        for wire in hello.rtcerts:
+            rtcert = self._rtcerts.verified(wire, member.name, member.key)
+            if rtcert.switch == self._identity.name:
+                return hello.membership, wire
+        return None
+
+    def _refuse_conflict(
+        self, port: HelloPort, hello: Hello, name: Name, arrived: tuple[bytes, int], now_s: float
+    ) -> None:
+        """Take a hello's word only if no older node with its identity is alive; a younger one is let go.
+
+        Args:
+            arrived: from which address, and how many bytes.
+
+        Raises:
+            StatementError: IN_USE.
+        """
+        others = [
+            other
+            for each in self.ports.values()
+            if (other := each.neighbours.get(name)) is not None
+            and other.is_proven
+            and other.life != hello.life
+            and now_s < self._gone_at_s(other)
+        ]
+        mac, received_bytes = arrived
+        if any((other.port, other.mac) == (port.index, mac) for other in others):
+            return  # it was restarted there
+        elsewhere = self._life_elsewhere(name)
+        is_outlived_here = any(other.life < hello.life for other in others)
+        is_proven = port.echo in hello.heard  # else it may be an old one played back
+        tell = self._tell_conflict if is_proven else self.conflicts.tell
+        for other in others:
+            if is_outlived_here:
+                tell(other.port, other.nonce, name, now_s)
+            elif is_proven:
+                self.let_go(other, now_s)
+        if not is_outlived_here and (elsewhere is None or hello.life <= elsewhere):
+            return
+        self.conflicts.refuse(name, hello.life, now_s)
+        tell(port.index, hello.nonce, name, now_s)
+        if not is_proven:
+            port.schedule_hello(received_bytes, now_s)
+        raise StatementError(DropReason.IN_USE, "an older node with this identity is alive")
+
+    def recheck(self, fingerprint: bytes, now: Timestamps) -> None:
+        """Have ``expire`` let neighbours go whose membership, of this fingerprint, was revoked."""
+        for port in self.ports.values():
+            for neighbour in port.neighbours.values():
+                member = neighbour.member
+                if member is None or member.fingerprint != fingerprint:
+                    continue
+                try:
+                    self._policy.check_member(member, now.unix_s)
+                except StatementError:
+                    self._next_s = None
+                    neighbour.heard_s = float("-inf")
+
+    def let_go(self, neighbour: Neighbour, now_s: float) -> None:
+        """Have ``expire`` let a neighbour go, for an older node with its identity is alive."""
+        self._next_s = None
+        self.conflicts.refuse(neighbour.name, neighbour.life, now_s)
+        self._tell_conflict(neighbour.port, neighbour.nonce, neighbour.name, now_s)
+        neighbour.let_go_s = now_s
+
+    def tell_conflicts(self, name: Name, now_s: float) -> None:
+        """Tell a neighbour, where it is one, that another node has its identity."""
+        for port in self.ports.values():
+            held = port.neighbours.get(name)
+            if held is not None:
+                self._tell_conflict(port.index, held.nonce, name, now_s)
+
+    def _tell_conflict(self, port: int, nonce: bytes, name: Name, now_s: float) -> None:
+        """See that hellos tell a session of its rival, soon if that is news to it."""
+        if self.conflicts.tell(port, nonce, name, now_s):
+            self._next_s = None
+            self.ports[port].hurry(now_s)
+
+    def note_clash(self, told_by: Name, now_s: float, *, is_proven: bool = False) -> None:
+        """Note that another node has our own identity.
+
+        Args:
+            is_proven: it counts at once; else when it lasts, for an earlier life of ours may linger.
+        """
+        if now_s > self._clash_s + _CLASH_PAUSE_S:
+            self._clash_since_s = now_s
+        self._clash_s = now_s
+        if is_proven or now_s >= self._clash_since_s + _CLASH_S:
+            self.clashes += 1
+            self.clash_told_by = told_by
+
+    def _note_clash(self, port: HelloPort, neighbour: Neighbour, hello: Hello, now_s: float) -> None:
+        """Note what a neighbour's hello says of our identity."""
+        neighbour.refuses_us = port.echo in hello.conflicts and port.echo not in hello.heard
+        if port.echo in hello.conflicts:
+            self.note_clash(neighbour.name, now_s)
+
+    def receive_keepalive(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> Neighbour:
+        """Take a keepalive; return the neighbour that it is of.
+
+        Raises:
+            FrameError: UNKNOWN_SENDER, REPLAYED, BAD_TAG or TRUNCATED; nothing has changed.
+            StatementError: the neighbour's membership holds no longer.
+        """
+        port = self.ports.get(arrival.port)
+        known = port.neighbours.get(Name(header.source)) if port is not None else None
+        if known is None or known.keepalives is None:
+            raise FrameError(DropReason.UNKNOWN_SENDER, "a keepalive")
+        if known.member is not None and now.mono_s >= known.checked_s + _RECHECK_S:
+            self._policy.check_member(known.member, now.unix_s)
+            known.checked_s = now.mono_s
+        known.digest = known.keepalives.open(header, arrival.frame, now.mono_s)
+        if known.keepalives.is_final_due:
+            self._next_s = None  # anything else only puts timers off
+        self._alive(known, now.mono_s - arrival.waited_s)
+        return known
+
+    def port_changed(self, index: int, up: bool, now_s: float) -> list[Change]:
+        """Learn that a link came or went; return the neighbours that this took away."""
+        self._next_s = None
+        port = self.ports.get(index)
+        if port is None or port.is_up == up:
+            return []
+        port.is_up = up
+        if up:
+            port.nonce, port.exchange_key = self._session()
+            port.ended.clear()
+            port.joins.clear()
+            port.answer_at_s, port.credit_bytes = float("inf"), 0
+            port.hurry(now_s)
+            return []
+        return self._lose(port, list(port.neighbours.values()), NeighbourEvent.LINK_LOST)
+
+    def drop_silent(self, now_s: float) -> list[Change]:
+        """Let silent neighbours go; return them. What waits at the sockets must have been taken before."""
+        if float("-inf") < self._due_s < now_s - _LATE_S:  # who is let go is due at once: nobody is late
+            self._lateness_s += now_s - self._due_s
+            self._slowness.late(now_s - self._due_s, now_s)
+        self._due_s, self._next_s = float("inf"), None
+        self._reassembler.drop_expired(now_s)
+        self._strangers_reassembler.drop_expired(now_s)
+        changes: list[Change] = []
+        for port in self.ports.values():
+            silent = [n for n in port.neighbours.values() if now_s >= self._gone_at_s(n)]
+            if silent:
+                if any(each.is_proven for each in silent):
+                    port.hurry(now_s)  # who still hears us hears at once that we do not hear it
+                changes += self._lose(port, silent, NeighbourEvent.SILENCE)
+        return changes
+
+    def hellos_to_send(self, now_s: float) -> list[OutgoingFrames]:
+        """Return the hellos, keepalives and cookies that are due."""
+        self._next_s = None
+        out, self._replies, self._reply_at_s = self._replies, [], float("inf")
+        for port in self.ports.values():
+            if not port.is_up:
+                continue
+            if port.hello_at_s <= now_s:
+                out.append(OutgoingFrames(port.index, BROADCAST, self._scheduled_hello(port, now_s)))
+            elif port.answer_at_s <= now_s:
+                answer = self._answer(port, now_s)
+                if answer:
+                    out.append(OutgoingFrames(port.index, BROADCAST, answer))
+            for neighbour in port.neighbours.values():
+                session = neighbour.keepalives
+                if session is None:
+                    continue
+                is_suspect = session.suspect_at_s(neighbour.heard_s) <= now_s
+                if is_suspect or session.send_at_s <= now_s + session.out_interval_s * _TOGETHER:
+                    port.keepalive_sequence += 1
+                    timing = self._timings.get(port.index, self._timing)
+                    frame = session.seal(
+                        (self._identity.name, self._incarnation),
+                        port.keepalive_sequence,
+                        self._slowness.multiplier(timing, self._dead_s, now_s),
+                        self._digest_for(port),
+                        now_s,
+                        poll=is_suspect,
+                    )
+                    out.append(OutgoingFrames(port.index, neighbour.mac, [frame]))
+        return out
+
+    def get_timer(self) -> float | None:
+        """Return a monotonic second that is no later than the next hello, keepalive or silence of a neighbour."""
+        if self._next_s is None:
+            self._next_s = self._look_ahead()
+        self._due_s = self._next_s
+        return None if self._due_s == float("inf") else self._due_s
+
+    def _look_ahead(self) -> float:
+        due_s = self._reply_at_s
+        for port in self.ports.values():
+            if port.is_up:
+                due_s = min(due_s, port.hello_at_s, port.answer_at_s)
+            for neighbour in port.neighbours.values():
+                session, at_s = neighbour.keepalives, self._gone_at_s(neighbour)
+                if session is not None and port.is_up:
+                    at_s = min(at_s, session.send_at_s, session.suspect_at_s(neighbour.heard_s))
+                due_s = min(due_s, at_s)
+        return due_s
+
+    def _gone_at_s(self, neighbour: Neighbour) -> float:
+        """Return when a neighbour is gone if nothing comes of it; the node's own lateness is no silence of theirs."""
+        if neighbour.let_go_s is not None:
+            return neighbour.let_go_s
+        late_s = self._lateness_s - neighbour.lateness_s
+        session = neighbour.keepalives
+        if session is None or not session.is_alive:
+            return neighbour.heard_s + self._dead_s + late_s
+        flooded_until_s = self.ports[neighbour.port].admission.flooded_until_s  # its hellos may be among those refused
+        hellos_end_s = max(neighbour.greeted_s, flooded_until_s) + _HELLOS_MISSED * HELLO_IDLE * self._hello_s
+        return min(neighbour.heard_s + session.detect_s, hellos_end_s) + late_s
+
+    def _alive(self, neighbour: Neighbour, heard_s: float) -> None:
+        neighbour.heard_s, neighbour.lateness_s, neighbour.let_go_s = heard_s, self._lateness_s, None
+
+    def _session(self) -> tuple[bytes, ExchangeKey]:
+        """Return nonce and key of a new session of a port."""
+        return self._random_bytes(NONCE_BYTES), ExchangeKey.from_random(self._random_bytes(EXCHANGE_KEY_BYTES))
+
+    def _begin_keepalives(self, port: HelloPort, neighbour: Neighbour, hello: Hello, now_s: float) -> None:
+        timing = self._timings.get(port.index, self._timing)
+        ends = port.nonce + self._identity.name, neighbour.nonce + neighbour.name
+        _, received = port.ended.get((neighbour.name, neighbour.nonce), _UNREACHABLE)
+        neighbour.keepalives = KeepaliveSession.begin(
+            port.exchange_key, hello.exchange_key, ends, (timing, hello.timing), received, now_s
+        )
+
+    def _scheduled_hello(self, port: HelloPort, now_s: float) -> list[bytes]:
+        """Return a hello, padded: who does not know us yet may answer with as many bytes."""
+        port.eager = max(port.eager - 1, 0)
+        is_rare = port.is_idle and not port.eager and not port.admission.is_loaded(now_s)
+        port.hello_at_s = now_s + self._hello_s * (HELLO_IDLE if is_rare else 1)
+        frames = self._hello(port, now_s)
+        port.owes_answer = False
+        frames[-1] = frames[-1].ljust(min(PADDED_BYTES, port.hello_mtu), b"\0")
+        return frames
+
+    def _answer(self, port: HelloPort, now_s: float) -> list[bytes]:
+        """Return a hello for those who have not proved themselves, or nothing if they have sent fewer bytes."""
+        port.answer_at_s = float("inf")
+        frames = self._hello(port, now_s)
+        size = sum(map(len, frames))
+        port.owes_answer = size > port.credit_bytes
+        if port.owes_answer:
+            return []
+        port.credit_bytes -= size
+        return frames
+
+    def _hello(self, port: HelloPort, now_s: float) -> list[bytes]:
+        port.sequence += 1
+        port.said_s, port.answer_at_s = now_s, float("inf")
+        heard = port.heard()
+        identity, timing = self._identity, self._timings.get(port.index, self._timing)
+        hello = Hello(
+            port.nonce, port.sequence, heard, port.own_mtu, self._digest_for(port), identity.membership,
+            timing, port.exchange_key.public, self._life, self.conflicts.on(port.index, now_s), self._rtcerts_on(port),
+            tuple(
+                (each.nonce, seal_cookie(each.cookie, port.nonce, port.sequence))
+                for each in port.neighbours.values() if each.cookie
+            ),
+        )  # fmt: skip
+        return self._fragmenter.split(Kind.HELLO, hello.to_wire(identity.name, identity.key), port.hello_mtu)
+
+    def _rtcerts_on(self, port: HelloPort) -> tuple[bytes, ...]:
+        """Return a RIB's RtCerts for the switches that it hears on a port."""
+        if self._rtcert_for is None:
+            return ()
+        heard = [each for each in port.neighbours.values() if each.role.is_switch]
+        switches = sorted((not each.is_proven, each.name) for each in heard)
+        return tuple(self._rtcert_for(name) for _, name in switches[:RTCERTS_MAX])
+
+    def _lose(self, port: HelloPort, lost: list[Neighbour], event: NeighbourEvent) -> list[Change]:
+        for neighbour in lost:
+            del port.neighbours[neighbour.name], port.said_mtus[neighbour.name]
+            port.end(neighbour)
+        return [change for neighbour in lost if (change := self._step(neighbour, event)) is not None]
+
+    @staticmethod
+    def _step(neighbour: Neighbour, event: NeighbourEvent) -> Change | None:
+        before = neighbour.state
+        neighbour.state = TRANSITIONS[before, event]
+        return None if neighbour.state is before else (neighbour, before)
+
+
+def _received_bytes(arrival: ReceivedFrame, statement: Statement) -> int:
+    """Return the bytes of all frames of a statement whose last one to come has arrived, its padding included."""
+    header = decode(arrival.frame)
+    padding = len(arrival.frame) - HEADER_BYTES - header.length
+    return header.parts * HEADER_BYTES + len(statement.wire) + max(padding, 0)

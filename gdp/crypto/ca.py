@@ -1,0 +1,195 @@
+"""Making certificates: a domain founds itself, a node asks, the domain admits it.
+
+Place: pure, but for the randomness of serial numbers and signatures.
+Source: RFC 5280 (certificates), RFC 2986 (requests). What is written here, ``openssl x509`` and ``openssl verify``
+read; what ``openssl x509 -req -copy_extensions copy`` issues from such a request, ``certificates`` reads.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from typing import Final
+
+from cryptography import x509
+
+from gdp.crypto.certificates import Membership, Role, Root
+from gdp.crypto.keys import PublicKey, SigningKey
+from gdp.crypto.subject import Subject
+from gdp.crypto.validity import Validity
+from gdp.crypto.x509_profile import (
+    DOMAIN_UNIT,
+    SubjectInfo,
+    alternative_names,
+    distinguished_name,
+    read_request,
+)
+from gdp.crypto.x509_sign import signed_certificate, signed_request
+from gdp.errors import DropReason, LocalError, StatementError
+from gdp.metadata import Metadata
+
+__all__ = ["CertificateAuthority", "request_membership"]
+
+_KEY_ID_BYTES: Final = 20
+
+
+@dataclass(frozen=True, slots=True)
+class CertificateAuthority:
+    """A trust domain's root with its private key: who holds it decides who belongs."""
+
+    key: SigningKey
+    root: Root
+
+    def __post_init__(self) -> None:
+        if self.key.public != self.root.key:
+            raise LocalError("this private key is not that of the domain's root")
+
+    @classmethod
+    def create(cls, label: str, key: SigningKey, validity: Validity) -> CertificateAuthority:
+        """Return a new domain; its id is the name that kind, label and key give.
+
+        Raises:
+            LocalError: the label is empty, too long or not printable.
+        """
+        subject = Subject.of(Metadata({"kind": DOMAIN_UNIT, "name": label}), key.public.compressed)
+        distinguished = distinguished_name(DOMAIN_UNIT, label)
+        builder = (
+            _builder(distinguished, distinguished, subject, key.public, validity)
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(_key_usage(is_authority=True), critical=True)
+            .add_extension(x509.SubjectKeyIdentifier(subject.name[:_KEY_ID_BYTES]), critical=False)
+        )
+        return cls(key, Root.from_wire(signed_certificate(builder, key)))
+
+    def succeed(self, key: SigningKey, validity: Validity, retires_unix_s: int) -> CertificateAuthority:
+        """Return the domain under another root key, which this one vouches for; the domain keeps its name.
+
+        Args:
+            key: the successor's.
+            validity: of the successor.
+            retires_unix_s: until when what this key signed is believed, by whoever has the successor's root.
+
+        Raises:
+            LocalError: it is the same key.
+        """
+        if key.public == self.root.key:
+            raise LocalError("a successor has another key")
+        name = x509.load_der_x509_certificate(self.root.wire).subject
+        builder = (
+            _builder(name, name, self.root.subject, key.public, validity, retires_unix_s)
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(_key_usage(is_authority=True), critical=True)
+            .add_extension(x509.SubjectKeyIdentifier(_key_id(key.public)), critical=False)
+            .add_extension(x509.AuthorityKeyIdentifier(self.root.key_id, None, None), critical=False)
+        )
+        return CertificateAuthority(key, self.root.succeeded_by(signed_certificate(builder, self.key)))
+
+    def renew(self, member: Membership, validity: Validity) -> Membership:
+        """Issue a membership again, with the same key, role and label.
+
+        Raises:
+            LocalError: it is of another domain, it would outlive the root, or the root has run out.
+        """
+        if member.domain != self.root.domain:
+            raise LocalError("a membership of another domain")
+        return self._issue(SubjectInfo(member.subject, member.role.value, member.label, member.key), validity)
+
+    def issue(self, request: bytes, validity: Validity) -> Membership:
+        """Issue the membership that a request asks for.
+
+        Whoever calls has decided that this node belongs, in the role and under the label that it asks for.
+
+        Args:
+            request: PKCS #10, DER or PEM.
+            validity: as long as the node may stay; at most as long as the root's.
+
+        Raises:
+            StatementError: BAD_CERTIFICATE or WRONG_NAME, the request does not hold.
+            LocalError: it would outlive the root, or the root has run out.
+        """
+        holder = read_request(request)
+        if holder.unit not in [role.value for role in Role]:
+            raise StatementError(DropReason.BAD_CERTIFICATE, f"{holder.unit!r} is no role of a node")
+        return self._issue(holder, validity)
+
+    def _issue(self, holder: SubjectInfo, validity: Validity) -> Membership:
+        if validity.not_after_unix_s > self.root.validity.not_after_unix_s:
+            raise LocalError("a membership cannot outlive the root of its domain")
+        issuer = x509.load_der_x509_certificate(self.root.wire).subject
+        subject = distinguished_name(holder.unit, holder.label)
+        key_id = x509.AuthorityKeyIdentifier(self.root.key_id or None, None, None)
+        builder = (
+            _builder(issuer, subject, holder.subject, holder.key, validity)
+            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            .add_extension(_key_usage(is_authority=False), critical=True)
+            .add_extension(x509.SubjectKeyIdentifier(holder.subject.name[:_KEY_ID_BYTES]), critical=False)
+            .add_extension(key_id, critical=False)
+        )
+        return Membership.from_wire(signed_certificate(builder, self.key), self.root, validity.not_before_unix_s)
+
+
+def request_membership(key: SigningKey, role: Role, label: str, digest: bytes) -> bytes:
+    """Return a PKCS #10 request, PEM, by which a node asks a domain to admit it.
+
+    Args:
+        key: the node's own.
+        role: what it wants to be.
+        label: its name for people.
+        digest: that of the node's metadata.
+
+    Raises:
+        LocalError: the label is empty, too long or not printable.
+    """
+    builder = (
+        x509.CertificateSigningRequestBuilder()
+        .subject_name(distinguished_name(role.value, label))
+        .add_extension(alternative_names(Subject(digest, key.public.compressed)), critical=False)
+    )
+    return signed_request(builder, key)
+
+
+def _builder(
+    issuer: x509.Name,
+    holder: x509.Name,
+    subject: Subject,
+    key: PublicKey,
+    validity: Validity,
+    retires_unix_s: int | None = None,
+) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .serial_number(x509.random_serial_number())
+        .issuer_name(issuer)
+        .subject_name(holder)
+        .public_key(key.point)
+        .not_valid_before(_moment(validity.not_before_unix_s))
+        .not_valid_after(_moment(validity.not_after_unix_s))
+        .add_extension(alternative_names(subject, retires_unix_s), critical=False)
+    )
+
+
+def _key_id(key: PublicKey) -> bytes:
+    """Return a successor's key id: another than the founder's, which is the domain's name."""
+    return hashlib.sha256(key.compressed).digest()[:_KEY_ID_BYTES]
+
+
+def _moment(unix_s: int) -> datetime:
+    try:
+        return datetime.fromtimestamp(unix_s, timezone.utc)
+    except (ValueError, OverflowError, OSError) as error:
+        raise LocalError(f"no calendar reaches second {unix_s}") from error
+
+
+def _key_usage(*, is_authority: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not is_authority,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=is_authority,
+        crl_sign=is_authority,
+        encipher_only=False,
+        decipher_only=False,
+    )

@@ -1,0 +1,149 @@
+"""A short sealed note from one member of a topic to another, such as a reader's report; not signed.
+
+Place: pure.
+Source: docs/explanation/design.md, section 4;
+AES-256-GCM-SIV (RFC 8452), HKDF (RFC 5869), X25519 (RFC 7748). Layout: ``header | topic (32)
+| ciphertext | tag``; the nonce is number || 0; additional data is the header without hops left, the topic, and the
+incarnation of the one it is for.
+
+The key of a report belongs to one life of each end: it comes from the agreement of their two X25519 keys and from the
+topic's secret. So a note proves which reader wrote it, and that this reader holds the secret of the note's epoch. A
+process that was copied, as by two machines resumed from one snapshot, may use a number twice: under GCM-SIV that tells
+no more than whether two notes are the same.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from typing import Final
+
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.ciphers.aead import AESGCMSIV
+from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+
+from gdp.crypto.envelope import TAG_BYTES
+from gdp.errors import DropReason, EnvelopeError
+from gdp.frame.codec import HEADER_BYTES, Header, authenticated, encode
+from gdp.frame.kinds import Flag
+from gdp.limits import HOPS_MAX
+from gdp.names import NAME_BYTES
+
+__all__ = ["JUMP_MAX", "ControlOpener", "ControlReplayWindow", "ControlSealer", "note_key", "topic_of"]
+
+_NONCE: Final = struct.Struct("!QI")
+_INCARNATION: Final = struct.Struct("!Q")
+JUMP_MAX: Final = 4_096  # numbers between two notes that come together; a reader's feeds share its numbers
+_NUMBERS_PER_S: Final = 100_000  # more than one process sends
+_BODY_AT: Final = HEADER_BYTES + NAME_BYTES
+
+
+def note_key(
+    shared: bytes,
+    secret: bytes,
+    kind: int,
+    source: bytes,
+    incarnation: int,
+    destination: bytes,
+    destination_incarnation: int,
+    topic: bytes,
+) -> bytes:
+    """Return the 32-byte key of the notes that one life of a node sends to one life of another about one topic.
+
+    Args:
+        shared: what the X25519 keys of both lives agree on.
+        secret: topic secret of the epoch.
+    """
+    ends = source + _INCARNATION.pack(incarnation) + destination + _INCARNATION.pack(destination_incarnation)
+    info = b"gdp-note-1" + bytes([kind]) + ends + topic
+    return HKDF(algorithm=hashes.SHA256(), length=32, salt=secret, info=info).derive(shared)
+
+
+def topic_of(header: Header, frame: bytes) -> bytes:
+    """Return the topic that a note is about; not yet authenticated.
+
+    Raises:
+        EnvelopeError: too short for one.
+    """
+    if header.length < NAME_BYTES + TAG_BYTES or header.parts != 1:
+        raise EnvelopeError(DropReason.TRUNCATED, "note")
+    return frame[HEADER_BYTES:_BODY_AT]
+
+
+class ControlSealer:
+    """Seals notes of one source's incarnation about one topic to one incarnation of a destination.
+
+    Args:
+        key: 32 bytes.
+        numbers: rising, from 1 on, and one iterator for all sealers of the source's incarnation: some share a key.
+    """
+
+    def __init__(
+        self,
+        key: bytes,
+        epoch: int,
+        kind: int,
+        source: bytes,
+        incarnation: int,
+        destination: bytes,
+        topic: bytes,
+        destination_incarnation: int,
+        numbers: Iterator[int],
+    ) -> None:
+        self._aead = AESGCMSIV(key)
+        self._header = Header(kind, Flag.LAST, HOPS_MAX, epoch, 0, 0, 0, 1, incarnation, destination, source)
+        self._topic = topic
+        self._context = topic + _INCARNATION.pack(destination_incarnation)
+        self._numbers = numbers
+
+    def seal(self, body: bytes) -> bytes:
+        """Return the frame of the next note."""
+        number = next(self._numbers)
+        length = NAME_BYTES + len(body) + TAG_BYTES
+        header = encode(self._header._replace(number=number, length=length))
+        sealed = self._aead.encrypt(_NONCE.pack(number, 0), body, authenticated(header) + self._context)
+        return header + self._topic + sealed
+
+
+class ControlOpener:
+    """Opens notes under one key, whatever their numbers; ``ControlReplayWindow`` says which are news."""
+
+    def __init__(self, key: bytes, topic: bytes, destination_incarnation: int) -> None:
+        self._aead = AESGCMSIV(key)
+        self._context = topic + _INCARNATION.pack(destination_incarnation)
+
+    def open(self, header: Header, frame: bytes) -> bytes:
+        """Return the note's body.
+
+        Raises:
+            EnvelopeError: BAD_TAG, altered or under another key.
+        """
+        sealed = frame[_BODY_AT : HEADER_BYTES + header.length]
+        try:
+            return self._aead.decrypt(_NONCE.pack(header.number, 0), sealed, authenticated(frame) + self._context)
+        except (InvalidTag, ValueError):  # ValueError: shorter than a tag
+            raise EnvelopeError(DropReason.BAD_TAG, "note") from None
+
+
+class ControlReplayWindow:
+    """Which numbers of one source's incarnation are news: those above the last, and not further than time allows."""
+
+    def __init__(self) -> None:
+        self._last = 0
+        self._last_s = 0.0
+
+    def check(self, number: int, now_s: float) -> None:
+        """Return if a note of this number may be opened.
+
+        Raises:
+            EnvelopeError: REPLAYED, not newer than the last; MALFORMED, so far above it that no process counts so fast.
+        """
+        if number <= self._last:
+            raise EnvelopeError(DropReason.REPLAYED, "note")
+        if self._last and number - self._last > JUMP_MAX + max(now_s - self._last_s, 0.0) * _NUMBERS_PER_S:
+            raise EnvelopeError(DropReason.MALFORMED, "a note far ahead of its time")
+
+    def accept(self, number: int, now_s: float) -> None:
+        """Note the number of a note that opened."""
+        self._last, self._last_s = number, now_s

@@ -1,0 +1,73 @@
+"""What a reader tells its publisher: how far it is, and what it lacks.
+
+Place: pure. Wire form, big-endian: ``flags (1) | next number (8) | next part (4) | next sequence number (8) | lost (8)
+| ranges (2)`` and for each range ``number (8) | first part (4) | last part (4)``.
+"""
+
+from __future__ import annotations
+
+import struct
+from enum import IntFlag
+from typing import Final, NamedTuple
+
+from gdp.errors import DropReason, FrameError
+from gdp.limits import NACKS_PER_REPORT
+
+__all__ = ["AckNack", "AckNackFlag", "MissingRange"]
+
+_HEAD: Final = struct.Struct("!BQIQQH")
+_U64_MAX: Final = (1 << 64) - 1
+_RANGE: Final = struct.Struct("!QII")
+
+
+class AckNackFlag(IntFlag):
+    """What the reader is in the middle of."""
+
+    NONE = 0
+    NEW = 1  # it has not seen a status: tell it where to begin
+    BYE = 2  # it leaves
+
+
+class MissingRange(NamedTuple):
+    """Parts ``first`` to ``last``, both included, of one message; ``last`` may lie beyond its end."""
+
+    number: int
+    first: int
+    last: int
+
+
+class AckNack(NamedTuple):
+    """Everything before (next_number, next_part) is held; of what follows, ``missing`` is known to lack.
+
+    Messages with sequence numbers before ``sequence`` were delivered, but for ``lost`` of them. A report flagged NEW
+    names what its reader had of this publisher's life before, and zeros if nothing.
+    """
+
+    flags: AckNackFlag
+    next_number: int
+    next_part: int
+    missing: tuple[MissingRange, ...]
+    sequence: int = 0
+    lost: int = 0
+
+    def to_wire(self) -> bytes:
+        """Return the wire form; ranges beyond ``NACKS_PER_REPORT`` wait for the next report."""
+        ranges = self.missing[:NACKS_PER_REPORT]
+        counts = min(self.sequence, _U64_MAX), min(self.lost, _U64_MAX)
+        head = _HEAD.pack(self.flags, self.next_number, self.next_part, *counts, len(ranges))
+        return head + b"".join(_RANGE.pack(*each) for each in ranges)
+
+    @classmethod
+    def from_wire(cls, wire: bytes) -> AckNack:
+        """Read the wire form.
+
+        Raises:
+            FrameError: not exactly that.
+        """
+        if len(wire) < _HEAD.size:
+            raise FrameError(DropReason.TRUNCATED, "report")
+        flags, number, part, sequence, lost, count = _HEAD.unpack_from(wire)
+        if count > NACKS_PER_REPORT or len(wire) != _HEAD.size + count * _RANGE.size or flags > AckNackFlag.BYE:
+            raise FrameError(DropReason.MALFORMED, "report")
+        ranges = tuple(MissingRange(*each) for each in _RANGE.iter_unpack(wire[_HEAD.size :]))
+        return cls(AckNackFlag(flags), number, part, ranges, sequence, lost)

@@ -1,0 +1,105 @@
+"""What a publisher tells its readers about its topic: what it still holds, where each begins, what the messages are.
+
+Place: pure. It travels as a sealed and signed message. Wire form, big-endian: ``oldest (8) | its sequence number (8) |
+sent number (8) | sent part (4) | its sequence number (8) | starts (2) | moves (1) | gone (1)``, for each start ``reader
+(32) | its incarnation (8) | number (8) | sequence number (8) | confirmed (8)``, for each move ``first (8) | span (8) |
+to (8)``, for each range that is gone ``first (8) | last (8) | reason (1)``, then the description, empty when this
+status brings none.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Final, NamedTuple
+
+from gdp.errors import DropReason, FrameError
+from gdp.limits import NUMBER_MAX
+from gdp.message.loss import GONE_MAX, LossReason, LostRange
+from gdp.message.renumbering import MOVES_MAX, Renumbering
+
+__all__ = ["STARTS_MAX", "Heartbeat", "StreamStart"]
+
+STARTS_MAX: Final = 64  # readers that one status tells where to begin; more get the next one
+_HEAD: Final = struct.Struct("!QQQIQHBB")
+_START: Final = struct.Struct("!32sQQQQ")
+_MOVE: Final = struct.Struct("!QQQ")
+_GONE: Final = struct.Struct("!QQB")
+
+_REASONS: Final = frozenset(LossReason)
+
+
+class StreamStart(NamedTuple):
+    """Where a new reader begins.
+
+    Args:
+        incarnation: of the reader; a recorded status opens nothing to a later life.
+        number: the first message number that is its.
+        sequence: the first sequence number under it.
+        confirmed: below which a former life of this reader had confirmed everything; 0: not known.
+    """
+
+    incarnation: int
+    number: int
+    sequence: int
+    confirmed: int = 0
+
+
+class Heartbeat(NamedTuple):
+    """Messages from ``oldest`` on can be repaired; everything before (sent_number, sent_part) has been sent.
+
+    What has not been sent is not announced: it would be taken for lost. Sequence numbers below ``oldest_sequence`` go
+    with numbers below ``oldest``, and those below ``sent_sequence`` with numbers below ``sent_number``, or with none.
+    """
+
+    oldest: int
+    sent_number: int
+    sent_part: int
+    starts: dict[bytes, StreamStart]  # by new reader
+    description: bytes
+    moves: tuple[Renumbering, ...] = ()  # the latest, oldest first; for readers that have not heard of them
+    oldest_sequence: int = 0
+    sent_sequence: int = 0
+    gone: tuple[LostRange, ...] = ()  # messages that no reader can get, and why; the latest
+
+    def to_wire(self) -> bytes:
+        """Return the wire form."""
+        place = self.oldest, self.oldest_sequence, self.sent_number, self.sent_part, self.sent_sequence
+        head = _HEAD.pack(*place, len(self.starts), len(self.moves), len(self.gone))
+        starts = b"".join(_START.pack(reader, *start) for reader, start in self.starts.items())
+        moves = b"".join(_MOVE.pack(*each) for each in self.moves)
+        gone = b"".join(_GONE.pack(*each) for each in self.gone)
+        return head + starts + moves + gone + self.description
+
+    @classmethod
+    def from_wire(cls, wire: bytes) -> Heartbeat:
+        """Read the wire form.
+
+        Raises:
+            FrameError: too short for what it announces.
+        """
+        if len(wire) < _HEAD.size:
+            raise FrameError(DropReason.TRUNCATED, "status")
+        oldest, oldest_sequence, sent_number, sent_part, sent_sequence, starts, moves, gone = _HEAD.unpack_from(wire)
+        moves_at = _HEAD.size + starts * _START.size
+        gone_at = moves_at + moves * _MOVE.size
+        end = gone_at + gone * _GONE.size
+        too_many = starts > STARTS_MAX or moves > MOVES_MAX or gone > GONE_MAX
+        if too_many or len(wire) < end or oldest > sent_number:
+            raise FrameError(DropReason.MALFORMED, "status")
+        moved = tuple(Renumbering(*each) for each in _MOVE.iter_unpack(wire[moves_at:gone_at]))
+        if any(move.first + move.span >= move.to or 2 * move.to - move.first > NUMBER_MAX for move in moved):
+            raise FrameError(DropReason.MALFORMED, "status")
+        started = {reader: StreamStart(*start) for reader, *start in _START.iter_unpack(wire[_HEAD.size : moves_at])}
+        lost = tuple(_range(*each) for each in _GONE.iter_unpack(wire[gone_at:end]))
+        return cls(oldest, sent_number, sent_part, started, wire[end:], moved, oldest_sequence, sent_sequence, lost)
+
+
+def _range(first: int, last: int, reason: int) -> LostRange:
+    """Return a range as read.
+
+    Raises:
+        FrameError: it is none. A reason of a later version counts as GIVEN_UP.
+    """
+    if first > last:
+        raise FrameError(DropReason.MALFORMED, "status")
+    return LostRange(first, last, LossReason(reason) if reason in _REASONS else LossReason.GIVEN_UP)

@@ -1,0 +1,424 @@
+"""Joining the parts of one source's messages, in whatever order they come.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds).
+
+A part is opened before it is kept, so that nothing injected or altered costs memory. What is kept is bounded by a
+``ReassemblyQuota`` and given back after a patience. The running hash follows the parts in order; a part that came
+early keeps
+its ciphertext until the hash has reached it.
+
+Whoever holds the topic's secret can make parts that open, though never a message that verifies. So nothing that such
+a part says lasts: a message whose signature is bad is forgotten, not finished; of two counts of parts, or two
+salts, the later one holds; and when there are too many unfinished messages, the one that is needed last gives way.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from gdp.crypto.envelope import digest_of, salt_of
+from gdp.crypto.header_batch import HeaderBatch
+from gdp.errors import DropReason, EnvelopeError, RemoteError
+from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, NUMBER_AT, PARTS_AT, Header
+from gdp.frame.kinds import Flag
+from gdp.limits import HOPS_MAX, JOIN_MESSAGES_MAX, JOIN_PATIENCE_S, REPLAY_WINDOW_MESSAGES
+from gdp.message.reassembly_quota import ReassemblyQuota
+from gdp.message.replay import ReplayWindow
+from gdp.sansio import ReceivedFrame
+
+__all__ = ["ALL_PARTS", "OpensParts", "ReassembledMessage", "Reassembler", "VerifiesDigest"]
+
+ALL_PARTS = 0xFFFF_FFFF
+_SHARED_FLAGS = 0xFF & ~int(Flag.LAST)  # a plain number: an IntFlag's operators cost a microsecond each
+_PREPAID_BYTES = 32 << 10  # memory is taken ahead for so much of a message whose parts come in order
+_PART_OVERHEAD_BYTES = 128  # what a kept part costs beside its bytes
+_NUMBER_AND_PART = struct.Struct("!QI")
+_AHEAD_PARTS = 64  # heads made at once
+_SCAN_PARTS = 4_096  # above the parts that an honest publisher has under way
+
+
+class OpensParts(Protocol):
+    """An ``Opener`` of the envelope, or a stand-in."""
+
+    def open(self, header: Header, frame: bytes) -> tuple[bytes, bytes, bytes]:
+        """Return plaintext, signed payload, signature; or raise ``EnvelopeError``."""
+
+    def open_run(
+        self, headers: HeaderBatch, first: int, length: int, arrivals: Sequence[ReceivedFrame], at: int
+    ) -> tuple[list[bytes], list[bytes]]:
+        """Return plaintexts and payloads of the inner parts that follow each other from ``first`` on."""
+
+
+class VerifiesDigest(Protocol):
+    """A writer's public key."""
+
+    def verify_digest(self, signature: bytes, digest: bytes) -> None:
+        """Return, or raise a ``RemoteError``."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReassembledMessage:
+    """A whole message, opened and verified."""
+
+    number: int
+    flags: int
+    message: bytes
+    parts: int
+    hops: int  # switches passed by the part that took the longest way
+    head: bytes = b""  # what came before the message, as many bytes as its joiner was told
+
+
+class _Hash(Protocol):
+    def update(self, data: bytes, /) -> None: ...
+    def digest(self) -> bytes: ...
+
+
+@dataclass(slots=True)
+class _PartialMessage:
+    parts: int
+    salt: bytes
+    epoch: int
+    opener: OpensParts
+    running: _Hash
+    touched_s: float
+    header: Header  # of the newest part that came in order
+    headers: HeaderBatch | None = None  # of the parts expected next
+    plain: dict[int, bytes] = field(default_factory=dict)
+    early: dict[int, bytes] = field(default_factory=dict)  # ciphertext ahead of the hash
+    hashed: int = 0  # parts the hash has taken
+    top: int = -1  # highest part held
+    signature: bytes = b""
+    held_bytes: int = 0
+    prepaid_bytes: int = 0  # of ``held_bytes``, not yet used
+    hops: int = 0
+
+
+class Reassembler:
+    """Joins the messages of one source's incarnation towards one destination.
+
+    Args:
+        source: whose budget is charged.
+        opener_of: gives the opener for a key epoch, or raises ``EnvelopeError`` (UNKNOWN_EPOCH).
+        writer: the key that must have signed.
+        budget: shared by all joiners of the node.
+        patience_s: an unfinished message is given back this long after its last new part.
+        head_bytes: how many bytes come before each message; fewer than any first part has.
+    """
+
+    def __init__(
+        self,
+        source: bytes,
+        opener_of: Callable[[int], OpensParts],
+        writer: VerifiesDigest,
+        budget: ReassemblyQuota,
+        *,
+        patience_s: float = JOIN_PATIENCE_S,
+        head_bytes: int = 0,
+    ) -> None:
+        self._head_bytes = head_bytes
+        self._source = source
+        self._opener_of = opener_of
+        self._writer = writer
+        self._budget = budget
+        self._patience_s = patience_s
+        self._unfinished: dict[int, _PartialMessage] = {}
+        self._unfinished_bytes = 0
+        budget.register(self, source)
+        self.window = ReplayWindow()
+        self.drops: Counter[DropReason] = Counter()
+        self.highest = -1  # highest message number of which an authentic part came
+        self.new_parts = 0
+        self._under_way = -1  # number of the message whose next parts are expected
+
+    def add_batch(self, arrivals: Sequence[ReceivedFrame], at: int, now_s: float) -> int:
+        """Take what ``arrivals[at:]`` brings of the message under way, as long as its inner parts come in order.
+
+        Almost every part of a large message comes so, and goes this short way. What ends the run is for ``add``.
+
+        Returns:
+            how many were taken.
+        """
+        message = self._unfinished.get(self._under_way)
+        if message is None or message.early:
+            return 0
+        frame, header = arrivals[at].frame, message.header
+        if (
+            frame[NUMBER_AT:PARTS_AT] != _NUMBER_AND_PART.pack(header.number, message.hashed)
+            or frame[DESTINATION_AT:HEADER_BYTES] != header.destination + header.source
+        ):
+            return 0  # another message's turn
+        taken, first = 0, message.hashed
+        while at + taken < len(arrivals):
+            part, headers = message.hashed, message.headers
+            if headers is None or not 0 <= part - headers.first < headers.count:
+                count = min(_AHEAD_PARTS, message.parts - 1 - part)
+                if count <= 0:
+                    break
+                headers = message.headers = HeaderBatch(message.header, part, count, message.salt)
+            wanted = min(len(arrivals) - at - taken, headers.count - part + headers.first)
+            cost = message.header.length + _PART_OVERHEAD_BYTES
+            if message.prepaid_bytes < wanted * cost:
+                if not self._take(_PREPAID_BYTES + wanted * cost):
+                    break
+                message.held_bytes += _PREPAID_BYTES + wanted * cost
+                message.prepaid_bytes += _PREPAID_BYTES + wanted * cost
+            plains, payloads = message.opener.open_run(headers, part, message.header.length, arrivals, at + taken)
+            message.plain.update(enumerate(plains, part))
+            for payload in payloads:
+                message.running.update(payload)
+            message.prepaid_bytes -= len(plains) * cost
+            message.hashed += len(plains)
+            taken += len(plains)
+            if len(plains) < wanted:
+                break
+        if taken:
+            message.top = first + taken - 1
+            message.touched_s = now_s
+            self.new_parts += taken
+        return taken
+
+    def add(self, header: Header, frame: bytes, now_s: float) -> ReassembledMessage | None:
+        """Take one part; return the message it completes, if any. What is wrong with it is counted in ``drops``."""
+        number = header.number
+        if self.window.is_finished(number):
+            self.drops[DropReason.LATE] += 1
+            return None
+        message, salt = self._unfinished.get(number), salt_of(frame)
+        is_same = message is not None and message.parts == header.parts and message.salt == salt
+        if is_same and message is not None and header.part in message.plain:
+            self.drops[DropReason.DUPLICATE] += 1
+            return None
+        try:
+            opener = self._opener_of(header.epoch)
+            plain, sealed, signature = opener.open(header, frame)
+        except EnvelopeError as error:
+            self.drops[error.reason] += 1
+            return None
+        if header.parts == 1:
+            return self._take_whole(header, salt, plain, sealed, signature)
+        if message is None and not self._make_room(number):
+            self.drops[DropReason.MEMORY_FULL] += 1
+            return None
+        if message is None or not is_same:
+            message = self._start(header, salt, opener, now_s)
+        return self._keep(message, header, plain, sealed, signature, now_s)
+
+    def _take_whole(
+        self, header: Header, salt: bytes, plain: bytes, sealed: bytes, signature: bytes
+    ) -> ReassembledMessage | None:
+        number = header.number
+        running = digest_of(header, salt)
+        running.update(sealed)
+        if not self._is_signed(signature, running):
+            return None
+        if number in self._unfinished:  # somebody else said that it has more parts
+            self._drop(number)
+            self.drops[DropReason.BAD_PARTS] += 1
+        self.highest = max(self.highest, number)
+        self.new_parts += 1
+        self.window.finish(number)
+        head, message = plain[: self._head_bytes], plain[self._head_bytes :]
+        return ReassembledMessage(
+            number, header.flags & _SHARED_FLAGS, message, 1, max(HOPS_MAX - header.hops_left, 0), head
+        )
+
+    def _start(self, header: Header, salt: bytes, opener: OpensParts, now_s: float) -> _PartialMessage:
+        """Return a message of which nothing is kept yet; one with another number of parts, or salt, gives way."""
+        if header.number in self._unfinished:
+            self.drops[DropReason.BAD_PARTS] += 1
+            self._drop(header.number)
+        return _PartialMessage(header.parts, salt, header.epoch, opener, digest_of(header, salt), now_s, header)
+
+    def _keep(
+        self, message: _PartialMessage, header: Header, plain: bytes, sealed: bytes, signature: bytes, now_s: float
+    ) -> ReassembledMessage | None:
+        number = header.number
+        in_order = header.part == message.hashed
+        cost = len(plain) + _PART_OVERHEAD_BYTES + (0 if in_order else len(sealed))
+        if not self._reserve(number, cost):
+            self.drops[DropReason.MEMORY_FULL] += 1
+            return None
+        self._unfinished[number] = message
+        self.highest = max(self.highest, number)
+        self.new_parts += 1
+        message.held_bytes += cost
+        message.touched_s = now_s
+        message.plain[header.part] = plain
+        message.top = max(message.top, header.part)
+        message.hops = max(message.hops, HOPS_MAX - header.hops_left)
+        if signature:
+            message.signature = signature
+        if in_order:
+            message.header, message.headers = header, None
+            self._under_way = number
+            self._hash(message, sealed)
+        else:
+            message.early[header.part] = sealed
+        return self._finish(header, message) if message.hashed == message.parts else None
+
+    def _hash(self, message: _PartialMessage, sealed: bytes) -> None:
+        message.running.update(sealed)
+        message.hashed += 1
+        while message.early and (early := message.early.pop(message.hashed, None)) is not None:
+            message.running.update(early)
+            message.hashed += 1
+            message.held_bytes -= len(early)
+            self._give_back(len(early))
+
+    def _finish(self, header: Header, message: _PartialMessage) -> ReassembledMessage | None:
+        number = header.number
+        self._drop(number)
+        if not self._is_signed(message.signature, message.running):
+            return None  # not finished: the writer's own parts may still come
+        self.window.finish(number)
+        first, size = message.plain[0], self._head_bytes
+        whole = b"".join([first[size:], *(message.plain[part] for part in range(1, message.parts))])
+        return ReassembledMessage(
+            number, header.flags & _SHARED_FLAGS, whole, message.parts, message.hops, first[:size]
+        )
+
+    def _is_signed(self, signature: bytes, running: _Hash) -> bool:
+        try:
+            self._writer.verify_digest(signature, running.digest())
+        except RemoteError as error:
+            self.drops[error.reason] += 1
+            return False
+        return True
+
+    def _drop(self, number: int) -> None:
+        self._give_back(self._unfinished.pop(number).held_bytes)
+
+    @property
+    def unfinished_bytes(self) -> int:
+        """Return how much memory unfinished messages hold."""
+        return self._unfinished_bytes
+
+    def give_way(self) -> None:
+        """Drop the message that is needed last: somebody who holds less needs the memory."""
+        if self._unfinished:
+            self._drop(max(self._unfinished))
+            self.drops[DropReason.ABANDONED] += 1
+
+    def _take(self, size: int) -> bool:
+        is_taken = self._budget.reserve(self._source, size, self)
+        self._unfinished_bytes += size if is_taken else 0
+        return is_taken
+
+    def _give_back(self, size: int) -> None:
+        self._unfinished_bytes -= size
+        self._budget.release(self._source, size)
+
+    def _make_room(self, number: int) -> bool:
+        """Return whether one more message may be begun; the highest number gives way to a lower one."""
+        if len(self._unfinished) < JOIN_MESSAGES_MAX:
+            return True
+        highest = max(self._unfinished)
+        if number > highest:
+            return False
+        self._drop(highest)
+        self.drops[DropReason.ABANDONED] += 1
+        return True
+
+    def _reserve(self, number: int, cost: int) -> bool:
+        """Take memory for a part of a message, if need be from messages with higher numbers."""
+        while not self._take(cost):
+            highest = max(self._unfinished, default=-1)
+            if number >= highest:
+                return False
+            self._drop(highest)
+            self.drops[DropReason.ABANDONED] += 1
+        return True
+
+    def start_at(self, first: int, finished: Collection[int]) -> None:
+        """Start to count at ``first``: forget what was believed until now, but for these finished messages.
+
+        Unfinished messages from ``first`` on stay as far as the replay window reaches.
+        """
+        for number in [n for n in self._unfinished if not 0 <= n - first < REPLAY_WINDOW_MESSAGES]:
+            self._drop(number)
+        self.window = ReplayWindow()
+        for number in finished:
+            self.window.finish(number)
+        self.highest = max([first - 1, *finished, *self._unfinished])
+
+    def skip(self, number: int) -> None:
+        """Take a message as finished: it is here under another number."""
+        if number in self._unfinished:
+            self._drop(number)
+        self.window.finish(number)
+
+    def forget(self, below: int) -> int:
+        """Give up every message numbered under ``below``; return how many unfinished ones that ended."""
+        ended = 0
+        for number in [number for number in self._unfinished if number < below]:
+            self._drop(number)
+            self.window.finish(number)
+            self.drops[DropReason.ABANDONED] += 1
+            ended += 1
+        return ended
+
+    def drop_expired(self, now_s: float, *, for_good: bool = True) -> int:
+        """Give back what waited longer than the patience; return how many messages that ended.
+
+        Args:
+            for_good: their late parts are dropped; otherwise they may begin again, and be asked for.
+        """
+        late = [n for n, message in self._unfinished.items() if now_s - message.touched_s >= self._patience_s]
+        for number in late:
+            self._drop(number)
+            self.drops[DropReason.ABANDONED] += 1
+            if for_good:
+                self.window.finish(number)
+        if late and not for_good:
+            self.highest = max([self.window.top, *self._unfinished])  # what expired may never have been
+        return len(late)
+
+    def next_expiry(self) -> float | None:
+        """Return the monotonic second at which ``expire`` has something to do, or None."""
+        if not self._unfinished:
+            return None
+        return min(message.touched_s for message in self._unfinished.values()) + self._patience_s
+
+    def is_finished(self, number: int) -> bool:
+        """Return whether a message is complete or given up."""
+        return self.window.is_finished(number)
+
+    def missing(self, number: int, limit: int, *, to_end: bool = False) -> list[tuple[int, int]]:
+        """Return the lacking parts of a message as inclusive ranges; of one never seen, ``(0, 2**32 - 1)``.
+
+        Of the newest message only gaps count, unless ``to_end``: what lies beyond its highest part may be on its way.
+        No more than ``_SCAN_PARTS`` parts are looked at; further gaps show when these are filled.
+        """
+        if self.window.is_finished(number):
+            return []
+        message = self._unfinished.get(number)
+        if message is None:
+            return [(0, ALL_PARTS)] if to_end or number < self.highest else []
+        ranges: list[tuple[int, int]] = []
+        lacking_from = message.hashed
+        seen_to = min(message.top + 1, message.hashed + _SCAN_PARTS)
+        for part in range(message.hashed, seen_to):
+            if part in message.plain:
+                if lacking_from < part:
+                    ranges.append((lacking_from, part - 1))
+                lacking_from = part + 1
+        if seen_to <= message.top:
+            if not ranges:
+                ranges.append((lacking_from, seen_to - 1))
+        elif lacking_from < message.parts and (to_end or number != self.highest):
+            ranges.append((lacking_from, message.parts - 1))
+        return ranges[:limit]
+
+    def progress(self, number: int) -> int:
+        """Return the first part of a message that is lacking (0 for one never seen)."""
+        message = self._unfinished.get(number)
+        return 0 if message is None else message.hashed
+
+    def close(self) -> None:
+        """Give back everything."""
+        for number in list(self._unfinished):
+            self._drop(number)

@@ -1,0 +1,312 @@
+"""Send window of a reliable writer.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Positions count bytes of frames from the first message on.
+
+::
+
+    released | cached, acknowledged by some | under way | waiting to be sent
+             oldest                       acked        sent                end
+
+The window joins four parts: ``history_cache.py`` (what can be sent again), ``flow_control.py`` (how much may be under
+way), ``retransmission.py`` (what is sent again) and ``acknowledgement.py`` (what readers have).
+
+A suspended reader is silent, and may have moved. It blocks neither the congestion window nor ``has_room``, but what it
+lacks stays cached as long as the budget has room. When it reports again it gets repairs, and becomes active once it has
+caught up.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+from gdp.limits import FLIGHT_MESSAGES_MAX, READER_LEASE_S, WINDOW_BYTES
+from gdp.message.acknack import AckNack
+from gdp.message.acknowledgement import ReaderPositions
+from gdp.message.flow_control import FlowControl
+from gdp.message.history_cache import HistoryCache
+from gdp.message.renumbering import Renumbering
+from gdp.message.retransmission import RetransmissionQueue
+
+__all__ = ["SendWindow"]
+
+
+class SendWindow:
+    """The frames of a reliable topic, from the oldest that a reader may still lack to the newest.
+
+    Args:
+        history_depth: messages that stay for late joiners, acknowledged or not.
+        first_number: lowest message number that ``add`` will get.
+        budget_bytes: size of the cache. When it is full, ``has_room`` is false; beyond twice that ``add`` evicts the
+            oldest.
+        lag_s: how long a reader may block the window while others have acknowledged.
+
+    Attributes:
+        evicted: messages removed from a full window before every reader had them.
+    """
+
+    def __init__(
+        self,
+        *,
+        history_depth: int = 0,
+        first_number: int = 1,
+        budget_bytes: int = WINDOW_BYTES,
+        lag_s: float = READER_LEASE_S,
+    ) -> None:
+        self._budget_bytes = budget_bytes
+        self._cache = HistoryCache(history_depth)
+        self._flow = FlowControl()
+        self._readers = ReaderPositions(lag_s)
+        self._repairs = RetransmissionQueue()
+        self._best_effort_queue = deque[tuple[int, int]]()  # (number, first part not sent), oldest first
+        self._newest = first_number - 1
+        self._sent_at = 0
+        self.evicted = 0
+
+    @property
+    def oldest(self) -> int | None:
+        """Return the lowest message number that is cached, or None."""
+        return self._cache.oldest
+
+    @property
+    def cached_bytes(self) -> int:
+        """Return how many bytes of frames are cached."""
+        return self._cache.held_bytes
+
+    @property
+    def congestion_window_bytes(self) -> int:
+        """Return how many bytes may be under way."""
+        return self._flow.window_bytes
+
+    @property
+    def retransmissions(self) -> int:
+        """Return how many parts were sent again."""
+        return self._repairs.retransmissions
+
+    @property
+    def readers(self) -> int:
+        """Return how many readers are active."""
+        return len(self._readers.active)
+
+    def has_reader(self, reader: bytes) -> bool:
+        """Return whether a reader is active."""
+        return reader in self._readers.active
+
+    def is_suspended(self, reader: bytes) -> bool:
+        """Return whether a reader is suspended."""
+        return reader in self._readers.suspended
+
+    @property
+    def suspended(self) -> int:
+        """Return how many readers are suspended."""
+        return len(self._readers.suspended)
+
+    def has_room(self) -> bool:
+        """Return whether ``add`` would evict no message that a reader waits for."""
+        is_idle = bool(self._readers.suspended) and not self._readers.active
+        return is_idle or self._cache.end_at - self._acked_at() < self._budget_bytes
+
+    def is_acknowledged(self) -> bool:
+        """Return whether every reader has everything, suspended ones included."""
+        has_all = all(each.next_number > self._newest for each in self._readers.suspended.values())
+        return has_all and self._acked_at() == self._cache.end_at
+
+    @property
+    def sent(self) -> tuple[int, int]:
+        """Return the message number and the part before which everything has been sent."""
+        return self._best_effort_queue[0] if self._best_effort_queue else (self._newest + 1, 0)
+
+    @property
+    def acknowledged(self) -> int:
+        """Return the highest message number that every reader, suspended or not, has acknowledged."""
+        return min(self._readers.least(), self._newest + 1) - 1
+
+    def set_history_depth(self, depth: int, next_number: int) -> None:
+        """Change how many messages stay for late joiners; ``next_number`` is the lowest that ``add`` will get."""
+        self._cache.depth = depth
+        self._newest = max(self._newest, next_number - 1)
+        self._release_acknowledged()
+
+    def add(self, number: int, frames: Sequence[bytes], size: int) -> list[int]:
+        """Queue a message of ``size`` bytes of frames, which may be sealed when they are read; numbers rise.
+
+        Returns:
+            the numbers of messages that were evicted for it before every reader had them.
+        """
+        evicted = []
+        while self._cache and self._cache.held_bytes + size > self._budget_bytes:
+            if self._cache.held_bytes + size <= self._budget_now():
+                break
+            oldest = next(iter(self._cache.messages))
+            if oldest >= self._readers.least():
+                evicted.append(oldest)
+            self._release(oldest)
+        self.evicted += len(evicted)
+        self._newest = number
+        self._cache.add(number, frames, size)
+        self._best_effort_queue.append((number, 0))
+        return evicted
+
+    def cached(self) -> list[tuple[int, Sequence[bytes]]]:
+        """Return the numbers and frames that are cached, oldest first."""
+        return [(number, message.frames) for number, message in self._cache.messages.items()]
+
+    def renumber(self, move: Renumbering, frames: Sequence[tuple[int, Sequence[bytes], int]]) -> None:
+        """Replace all that is cached, under new numbers; what all readers have is not sent again.
+
+        Args:
+            frames: number, frames and their size; as in ``add``.
+        """
+        for number in list(self._cache.messages):
+            self._release(number)
+        self._repairs.clear()
+        self._flow.round_trip.discard_sample()
+        for number, each, size in frames:
+            self.add(number, each, size)
+        positions = self._readers.all()
+        for position in positions:
+            position.next_number = move.of(position.next_number)
+        least = self._readers.least_active() if self._readers.active else 0
+        while self._best_effort_queue and self._best_effort_queue[0][0] < least:
+            self._sent_at = self._cache.messages[self._best_effort_queue.popleft()[0]].end_at
+        for position in positions:
+            position.acked_at = position.mark_at = self._sent_at
+        self._release_acknowledged()
+
+    def add_reader(self, reader: bytes, first_number: int, now_s: float) -> None:
+        """Make a reader active from a message on."""
+        message = self._cache.messages.get(first_number)
+        acked_at = min(message.begin_at, self._sent_at) if message else self._sent_at
+        self._readers.add(reader, acked_at, first_number, now_s)
+
+    def drop_reader(self, reader: bytes) -> None:
+        """Remove a reader, and release what was cached for it alone."""
+        if self._readers.remove(reader):
+            self._release_acknowledged()
+
+    def suspend(self, reader: bytes) -> None:
+        """Suspend a silent reader: it blocks nothing, but what it lacks stays cached while there is room."""
+        self._readers.suspend(reader)
+
+    def resume(self, reader: bytes, now_s: float) -> None:
+        """Reactivate a suspended reader at its position."""
+        self._readers.resume(reader, now_s)
+
+    def slow_readers(self, now_s: float) -> list[bytes]:
+        """Return the active readers that must no longer block the window."""
+        return self._readers.slow(self._sent_at, now_s)
+
+    def next_slow_reader(self) -> float | None:
+        """Return the monotonic second at which a reader that lags behind another becomes slow, or None."""
+        return self._readers.next_slow()
+
+    def handle_acknack(self, reader: bytes, report: AckNack, now_s: float) -> None:
+        """Process the report of a known reader: release, adapt the congestion window, and queue repairs."""
+        message = self._cache.messages.get(report.next_number)
+        position = message.position(report.next_part) if message else self._cache.begin_of(report.next_number)
+        suspended = self._readers.suspended.get(reader)
+        if suspended is not None:
+            if self._readers.active and position < self._acked_at():  # the others must not wait for it
+                suspended.next_number = max(suspended.next_number, report.next_number)
+                self._request_repairs(reader, report, now_s)
+                self._release_acknowledged()
+                return
+            suspended.acked_at = min(position, self._sent_at)
+            self.resume(reader, now_s)
+        state = self._readers.active[reader]
+        state.next_number = max(state.next_number, report.next_number)
+        before = self._acked_at()
+        self._readers.acknowledge(state, min(position, self._sent_at), now_s)
+        acked_at = self._acked_at()
+        self._flow.handle_acknowledged(acked_at - before, acked_at, now_s)
+        if self._request_repairs(reader, report, now_s):
+            self._flow.handle_loss(now_s)
+        self._release_acknowledged()
+
+    def frames_to_send(self, now_s: float, limit: int = 1 << 30) -> list[bytes]:
+        """Return frames that may be sent now: repairs first, then new ones as far as the congestion window allows."""
+        frames: list[bytes] = []
+        if self._repairs and (frames := self._repairs.frames_to_send(self._cache.messages, limit, now_s)):
+            self._flow.round_trip.discard_sample()
+        acked_at = self._acked_at()
+        if self._sent_at == acked_at:
+            self._flow.restart_probe(now_s)
+        if self._best_effort_queue:
+            self._readers.reset_stall_timers(self._sent_at, now_s)
+            frames += self._new_frames(acked_at + self._flow.window_bytes, limit - len(frames))
+        if frames and not self._repairs.has_repaired:
+            self._flow.round_trip.handle_sent(self._sent_at, now_s)
+        if not self._readers.active and not self._best_effort_queue:
+            self._release_acknowledged()
+        return frames
+
+    def probe_due(self, now_s: float) -> bool:
+        """Return whether readers have been silent for too long while something is under way; backs off."""
+        return self._is_probing() and self._flow.probe_due(now_s)
+
+    def next_probe(self) -> float | None:
+        """Return the monotonic second at which ``probe_due`` may be true next, or None."""
+        return self._flow.next_probe() if self._is_probing() else None
+
+    def _is_probing(self) -> bool:
+        return bool(self._readers.active) and self._sent_at != self._acked_at()
+
+    def _acked_at(self) -> int:
+        return self._readers.acked_at(self._sent_at)
+
+    def _new_frames(self, may_reach: int, limit: int) -> list[bytes]:
+        """Return at most ``limit`` frames that were never sent, up to the position ``may_reach``."""
+        frames: list[bytes] = []
+        below = self._readers.least_active() + FLIGHT_MESSAGES_MAX
+        while (
+            self._best_effort_queue
+            and self._sent_at < may_reach
+            and len(frames) < limit
+            and self._best_effort_queue[0][0] < below
+        ):
+            number, part = self._best_effort_queue[0]
+            message = self._cache.messages[number].frames
+            count = min(max(1, (may_reach - self._sent_at) // len(message[0])), limit - len(frames))
+            batch = message[part : part + count]
+            frames += batch
+            self._sent_at += sum(map(len, batch))
+            if part + len(batch) < len(message):
+                self._best_effort_queue[0] = (number, part + len(batch))
+            else:
+                self._best_effort_queue.popleft()
+        return frames
+
+    def _budget_now(self) -> int:
+        """Return how many bytes may be cached: fewer where the oldest is cached for suspended readers alone."""
+        oldest, readers = self._cache.oldest, self._readers
+        is_spare = len(self._cache.messages) > self._cache.depth
+        is_spare = is_spare and oldest is not None and oldest < readers.least_active()
+        return self._budget_bytes if readers.suspended and is_spare else 2 * self._budget_bytes
+
+    def _request_repairs(self, reader: bytes, report: AckNack, now_s: float) -> bool:
+        """Queue what a reader lacks; return whether any was queued."""
+        position = self._readers.active.get(reader) or self._readers.suspended[reader]
+        return self._repairs.request(
+            report.missing,
+            position.allowance,
+            self._cache.messages,
+            sent_at=self._sent_at,
+            rtt_s=self._flow.round_trip.rtt_s,
+            window_bytes=self._flow.window_bytes,
+            now_s=now_s,
+        )
+
+    def _release_acknowledged(self) -> None:
+        least = self._readers.least()
+        for number in self._cache.beyond_depth():
+            is_best_effort_queue = self._readers.active and self._cache.messages[number].end_at > self._sent_at
+            if number >= least or is_best_effort_queue:
+                break
+            self._release(number)
+
+    def _release(self, number: int) -> None:
+        message = self._cache.remove(number)
+        self._repairs.forget(number)
+        self._sent_at = max(self._sent_at, message.end_at)
+        while self._best_effort_queue and self._best_effort_queue[0][0] <= number:
+            self._best_effort_queue.popleft()

@@ -1,0 +1,261 @@
+"""Many frames in one system call: a pool of slots, filled from one port and emptied into another.
+
+Place: I/O; no decision is taken here.
+Source: recvmmsg(2), sendmmsg(2), through ctypes; where the C library cannot be reached that way, ``recv_into`` and
+``sendmsg`` do the same. One slot holds one frame from its Ethernet header on::
+
+    slot i      [ Ethernet header 14 | frame ... ]     take() fills slots from the first on
+    on leaving  [ head 14 ] + [ frame ... ]            put() gathers a new Ethernet header and the frame in its slot
+
+So a frame that is forwarded is never copied here: its hops left is changed in the slot, and one head serves a whole run
+of frames to the same neighbour. Nor is a frame of our own: ``send`` points at the bytes where they lie.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import socket
+from array import array
+from collections.abc import Sequence
+from typing import Final, Protocol
+
+from gdp.errors import DropReason
+from gdp.frame.codec import ETHER_BYTES
+from gdp.frame.kinds import ETHERTYPE
+
+__all__ = ["SLOTS", "MmsgBatch", "MmsgPool", "PlainBatch", "make_batch", "put_one", "send_failure"]
+
+SLOTS: Final = 64
+_TAKE_BYTES: Final = 128 << 10  # about as much is taken at once, so that nothing urgent waits long behind it
+_ETHERTYPE: Final = ETHERTYPE.to_bytes(2, "big")
+_DONTWAIT: Final = int(socket.MSG_DONTWAIT)
+
+_SEND_ERRORS: Final = {
+    errno.ENOBUFS: (DropReason.PORT_FULL, True),
+    errno.EAGAIN: (DropReason.PORT_FULL, False),
+    errno.EMSGSIZE: (DropReason.TOO_BIG, True),
+}
+
+
+def send_failure(number: int) -> tuple[DropReason, bool]:
+    """Return what the errno of a send means, and whether the frames after it may still leave."""
+    return _SEND_ERRORS.get(number, (DropReason.PORT_DOWN, False))
+
+
+class MmsgPool(Protocol):
+    """A pool of ``SLOTS`` slots.
+
+    Attributes:
+        pool: the slots, one after the other.
+        slot_bytes: size of one; a longer frame arrives cut short.
+    """
+
+    pool: bytearray
+    slot_bytes: int
+
+    def receive(self, source: socket.socket) -> list[int]:
+        """Fill slots with what has arrived, without waiting; return the bytes after each Ethernet header."""
+
+    def fill(self, frames: list[bytes]) -> None:
+        """Put frames (from the GDP header on, at most ``SLOTS``, each fitting a slot) into the slots."""
+
+    def send(self, sink: socket.socket, frames: Sequence[bytes], macs: bytes, drops: list[int]) -> int:
+        """Send frames (from the GDP header on, at most ``SLOTS``), from where they lie.
+
+        Returns how many left; the others are counted in ``drops``.
+        """
+
+    def forward(self, sink: socket.socket, first: int, count: int, macs: bytes, drops: list[int]) -> int:
+        """Send the slots ``first`` to ``first + count``, last filled by ``take`` or ``fill``, under new addresses.
+
+        Returns how many left; the others are counted in ``drops``.
+        """
+
+
+def _take_max(slot_bytes: int) -> int:
+    """Return how many slots are filled at once."""
+    return max(8, min(SLOTS, _TAKE_BYTES // slot_bytes))
+
+
+class _IoVec(ctypes.Structure):
+    _fields_ = (("base", ctypes.c_void_p), ("length", ctypes.c_size_t))
+
+
+class _MsgHdr(ctypes.Structure):
+    _fields_ = (
+        ("name", ctypes.c_void_p),
+        ("name_length", ctypes.c_uint32),
+        ("vectors", ctypes.c_void_p),
+        ("vector_count", ctypes.c_size_t),
+        ("control", ctypes.c_void_p),
+        ("control_length", ctypes.c_size_t),
+        ("flags", ctypes.c_int),
+    )
+
+
+class _MmsgHdr(ctypes.Structure):
+    _fields_ = (("header", _MsgHdr), ("length", ctypes.c_uint))
+
+
+class MmsgBatch:
+    """``MmsgPool`` over ``recvmmsg`` and ``sendmmsg``.
+
+    Raises:
+        OSError, AttributeError: the C library cannot be reached, or lacks them.
+    """
+
+    def __init__(self, slot_bytes: int) -> None:
+        library = ctypes.CDLL(None, use_errno=True)
+        self._receive, self._send = library.recvmmsg, library.sendmmsg
+        headers = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int)
+        self._receive.argtypes, self._send.argtypes = (*headers, ctypes.c_void_p), headers
+        self.slot_bytes = slot_bytes
+        self._take_max = _take_max(slot_bytes)
+        self.pool = bytearray(SLOTS * slot_bytes)
+        self._head = bytearray(bytes(ETHER_BYTES - 2) + _ETHERTYPE)
+        base = ctypes.addressof(ctypes.c_char.from_buffer(self.pool))
+        head = ctypes.addressof(ctypes.c_char.from_buffer(self._head))
+
+        self._in_vectors, self._in = (_IoVec * SLOTS)(), (_MmsgHdr * SLOTS)()
+        self._out_vectors, self._out = (_IoVec * (2 * SLOTS))(), (_MmsgHdr * SLOTS)()
+        for slot in range(SLOTS):
+            at = base + slot * slot_bytes
+            self._in_vectors[slot] = _IoVec(at, slot_bytes)
+            self._out_vectors[2 * slot] = _IoVec(head, ETHER_BYTES)
+            self._out_vectors[2 * slot + 1] = _IoVec(at + ETHER_BYTES, 0)
+            for messages, vectors, each in (self._in, self._in_vectors, 1), (self._out, self._out_vectors, 2):
+                messages[slot].header.vectors = ctypes.addressof(vectors) + each * slot * ctypes.sizeof(_IoVec)
+                messages[slot].header.vector_count = each
+        self._own_vectors, self._own = (_IoVec * (2 * SLOTS))(), (_MmsgHdr * SLOTS)()
+        for slot in range(SLOTS):
+            self._own_vectors[2 * slot] = _IoVec(head, ETHER_BYTES)
+            self._own[slot].header.vectors = ctypes.addressof(self._own_vectors) + 2 * slot * ctypes.sizeof(_IoVec)
+            self._own[slot].header.vector_count = 2
+        self._own_at = ctypes.addressof(self._own)
+        self._pointers = (ctypes.c_char_p * SLOTS)()
+        self._addresses = memoryview(self._pointers).cast("B").cast("L")
+        own_words = memoryview(self._own_vectors).cast("B").cast("L")
+        self._own_addresses, self._own_sizes = own_words[2::4], own_words[3::4]
+        self._in_at, self._out_at = ctypes.addressof(self._in), ctypes.addressof(self._out)
+
+        # One slice reads all received lengths, one assignment sets all lengths to send.
+        words = memoryview(self._in).cast("B").cast("I")
+        self._taken = words[_MmsgHdr.length.offset // words.itemsize :: ctypes.sizeof(_MmsgHdr) // words.itemsize]
+        self._sizes = memoryview(self._out_vectors).cast("B").cast("L")[3::4]  # size_t
+
+    def receive(self, source: socket.socket) -> list[int]:
+        """Receive what waits at a socket; return the bytes of each frame after its Ethernet header, as ``MmsgPool``."""
+        got = self._receive(source.fileno(), self._in_at, self._take_max, _DONTWAIT, None)
+        if got <= 0:  # nothing there, or the device went down: the link watch tells
+            return []
+        sizes = [length - ETHER_BYTES for length in self._taken[:got].tolist()]
+        self._sizes[:got] = memoryview(array("L", sizes))
+        return sizes
+
+    def fill(self, frames: list[bytes]) -> None:
+        """Write frames of our own into the slots, as ``MmsgPool``."""
+        pool, step = self.pool, self.slot_bytes
+        for at, frame in zip(range(ETHER_BYTES, len(pool), step), frames, strict=False):
+            pool[at : at + len(frame)] = frame
+        self._sizes[: len(frames)] = memoryview(array("L", map(len, frames)))
+
+    def send(self, sink: socket.socket, frames: Sequence[bytes], macs: bytes, drops: list[int]) -> int:
+        """Send frames to one pair of addresses; return how many left, as ``MmsgPool``."""
+        count = len(frames)
+        self._pointers[:count] = list(frames)
+        self._own_addresses[:count] = self._addresses[:count]
+        self._own_sizes[:count] = memoryview(array("L", map(len, frames)))
+        return self._submit(sink, self._own_at, 0, count, macs, drops)
+
+    def forward(self, sink: socket.socket, first: int, count: int, macs: bytes, drops: list[int]) -> int:
+        """Send ``count`` slots from ``first`` on to one pair of addresses; return how many left, as ``MmsgPool``."""
+        return self._submit(sink, self._out_at, first, count, macs, drops)
+
+    def _submit(self, sink: socket.socket, table: int, first: int, count: int, macs: bytes, drops: list[int]) -> int:
+        """Send ``count`` messages of the table of messages at an address."""
+        self._head[: len(macs)] = macs
+        at, end, left = first, first + count, 0
+        while at < end:
+            sent = self._send(sink.fileno(), table + at * ctypes.sizeof(_MmsgHdr), end - at, _DONTWAIT)
+            if sent > 0:
+                left += sent
+                at += sent
+                continue
+            reason, goes_on = send_failure(ctypes.get_errno())
+            skipped = 1 if goes_on else end - at
+            drops[reason] += skipped
+            at += skipped
+        return left
+
+
+class PlainBatch:
+    """``MmsgPool`` with one system call a frame."""
+
+    def __init__(self, slot_bytes: int) -> None:
+        self.slot_bytes = slot_bytes
+        self._take_max = _take_max(slot_bytes)
+        self.pool = bytearray(SLOTS * slot_bytes)
+        self._slots = [memoryview(self.pool)[slot * slot_bytes : (slot + 1) * slot_bytes] for slot in range(SLOTS)]
+        self._head = bytearray(bytes(ETHER_BYTES - 2) + _ETHERTYPE)
+        self._sizes: list[int] = []
+
+    def receive(self, source: socket.socket) -> list[int]:
+        """Receive what waits at a socket; return the bytes of each frame after its Ethernet header, as ``MmsgPool``."""
+        sizes: list[int] = []
+        for slot in self._slots[: self._take_max]:
+            try:
+                sizes.append(source.recv_into(slot) - ETHER_BYTES)
+            except OSError:  # nothing more, or the device went down: the link watch tells
+                break
+        self._sizes = sizes
+        return sizes
+
+    def fill(self, frames: list[bytes]) -> None:
+        """Write frames of our own into the slots, as ``MmsgPool``."""
+        for slot, frame in zip(self._slots, frames, strict=False):
+            slot[ETHER_BYTES : ETHER_BYTES + len(frame)] = frame
+        self._sizes = [len(frame) for frame in frames]
+
+    def send(self, sink: socket.socket, frames: Sequence[bytes], macs: bytes, drops: list[int]) -> int:
+        """Send frames to one pair of addresses; return how many left, as ``MmsgPool``."""
+        return self._submit(sink, frames, macs, drops)
+
+    def forward(self, sink: socket.socket, first: int, count: int, macs: bytes, drops: list[int]) -> int:
+        """Send ``count`` slots from ``first`` on to one pair of addresses; return how many left, as ``MmsgPool``."""
+        slots = [self._slots[at][ETHER_BYTES : ETHER_BYTES + self._sizes[at]] for at in range(first, first + count)]
+        return self._submit(sink, slots, macs, drops)
+
+    def _submit(self, sink: socket.socket, frames: Sequence[bytes | memoryview], macs: bytes, drops: list[int]) -> int:
+        self._head[: len(macs)] = macs
+        left = 0
+        for at, frame in enumerate(frames):
+            try:
+                sink.sendmsg((self._head, frame))
+            except OSError as error:
+                reason, goes_on = send_failure(error.errno or 0)
+                if not goes_on:
+                    drops[reason] += len(frames) - at
+                    break
+                drops[reason] += 1
+            else:
+                left += 1
+        return left
+
+
+def put_one(sink: socket.socket, frame: bytes, macs: bytes, drops: list[int]) -> int:
+    """Send one frame (from the GDP header on), quicker so than by a batch; return how many left: 0 or 1."""
+    try:
+        sink.send(macs + _ETHERTYPE + frame)
+    except OSError as error:
+        drops[send_failure(error.errno or 0)[0]] += 1
+        return 0
+    return 1
+
+
+def make_batch(slot_bytes: int) -> MmsgPool:
+    """Return the quicker kind that this C library allows."""
+    try:
+        return MmsgBatch(slot_bytes)
+    except (OSError, AttributeError):
+        return PlainBatch(slot_bytes)

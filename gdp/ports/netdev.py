@@ -1,0 +1,290 @@
+"""What the planes on real devices share: ports that come and go with their devices, one epoll, the counters.
+
+Place: I/O; how a frame is read, decided on and sent is left to the plane that builds on this.
+A port outlives its device. When the device is deleted, or moved away, the port is down; when one of that name appears,
+the port opens it anew. The kernel's own word (netlink) decides, so a cut link is known within milliseconds. A device
+that cannot be opened (another process may still have it) is tried again until it can.
+
+A port's life::
+
+    add_port -> open, up or down <-> up or down (carrier) -> absent (device deleted) -> open (device of that name) ...
+       `-----> absent, where it may be
+"""
+
+from __future__ import annotations
+
+import logging
+import select
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import Final
+
+from gdp.errors import DropReason, LocalError
+from gdp.frame.codec import ETHER_BYTES
+from gdp.limits import FRAME_MAX_BYTES, MTU_MIN_BYTES
+from gdp.ports.plane import MAC_BYTES, Counters, HasFileno, LinkCallback, Port, ReceivedFrame
+from gdp.ports.rtnetlink import Link, LinkMonitor
+from gdp.switch.table import Hops, Table
+
+__all__ = ["NetdevPlane", "NoDeviceError"]
+
+log = logging.getLogger(__name__)
+
+_OPEN_AGAIN_S: Final = 0.2
+_MTU_MAX_BYTES: Final = FRAME_MAX_BYTES - ETHER_BYTES
+_AUDIT_POLLS: Final = 256  # a busy plane asks the kernel for its drops this often, an idle one each time
+
+
+class NoDeviceError(LocalError):
+    """There is no device of that name."""
+
+
+class NetdevPlane(ABC):
+    """Base of the planes whose ports are Linux devices.
+
+    Args:
+        ifnames: devices to open at once.
+        table: what to forward by; None hands every frame up.
+
+    Raises:
+        LocalError: as ``add_port``.
+    """
+
+    def __init__(self, ifnames: Sequence[str] = (), table: Table | None = None) -> None:
+        self._entries: Mapping[bytes, Hops] | None = None if table is None else table.entries
+        self._sides: Mapping[bytes, int] = {} if table is None else table.sides
+        self._ports: dict[int, Port] = {}
+        self._mtus: dict[int, int] = {}  # of the ports that are up
+        self._devices: dict[int, int] = {}  # ifindex of an open device -> port index
+        self._unopened: dict[int, str] = {}  # port index to why its device cannot be opened
+        self._open_again_s = 0.0
+        self._counters = Counters()
+        self._polls = 0
+        self._next_index = 0
+        self._epoll = select.epoll()
+        self._ready: dict[int, Callable[[], None]] = {}
+        self._ranks: dict[int, int] = {}  # the lowest are served first
+        self._arrivals: list[ReceivedFrame] = []
+        self._on_link: list[LinkCallback] = []
+        self._links = LinkMonitor()
+        self.watch(self._links, self._hear)
+        try:
+            for ifname in ifnames:
+                self.add_port(ifname)
+        except LocalError:
+            self.close()
+            raise
+
+    # what a plane adds
+
+    @abstractmethod
+    def _open(self, port: Port) -> None:
+        """Open the port's device and watch it.
+
+        Raises:
+            LocalError: it cannot be opened.
+        """
+
+    @abstractmethod
+    def _shut(self, index: int) -> None:
+        """Close whatever ``_open`` opened; nothing may be open."""
+
+    @abstractmethod
+    def _is_open(self, index: int) -> bool: ...
+
+    def _widen(self, port: Port) -> None:
+        """Make room for the larger frames of an open device; to open it anew loses what waits at its socket.
+
+        Raises:
+            LocalError: it cannot be opened.
+        """
+        self._close_device(port.index)
+        self._open(port)
+
+    @abstractmethod
+    def _kernel_drops(self) -> int:
+        """Return the frames that the kernel dropped at open ports since last asked."""
+
+    @abstractmethod
+    def transmit(self, port: int, destination_mac: bytes, frames: Sequence[bytes]) -> int:
+        """Send frames to one neighbour; return how many left, as ``Plane.transmit``."""
+
+    # the Plane protocol
+
+    @property
+    def ports(self) -> Mapping[int, Port]:
+        """Return the ports by index, up or not."""
+        return self._ports
+
+    @property
+    def counters(self) -> Counters:
+        """Return the live counts, as ``Plane.counters``."""
+        return self._counters
+
+    def poll(self, timeout_s: float | None) -> list[ReceivedFrame]:
+        """Wait for events and serve them, the lowest rank first; return what is handed up, as ``Plane.poll``."""
+        if self._unopened:
+            timeout_s = self._open_again(timeout_s)
+        events = self._epoll.poll(timeout_s)
+        self._polls += 1
+        if not events or not self._polls % _AUDIT_POLLS:
+            self._audit()
+        if len(events) > 1:
+            events.sort(key=lambda event: self._ranks[event[0]])
+        for fd, _ in events:
+            ready = self._ready.get(fd)
+            if ready is not None:  # an earlier one of this round may have closed it
+                ready()
+        arrivals, self._arrivals = self._arrivals, []
+        self._counters.punted += len(arrivals)
+        return arrivals
+
+    def fileno(self) -> int:
+        """Return a descriptor that can be read while ``poll`` has something to do, for another event loop."""
+        return self._epoll.fileno()
+
+    def watch(self, source: HasFileno, ready: Callable[[], None], *, rank: int = 0) -> None:
+        """Call ``ready`` from within ``poll`` whenever ``source`` can be read; a lower ``rank`` comes first."""
+        fd = source.fileno()
+        self._epoll.register(fd, select.EPOLLIN)
+        self._ready[fd] = ready
+        self._ranks[fd] = rank
+
+    def unwatch(self, source: HasFileno) -> None:
+        """Undo ``watch``; nothing happens if the source is not watched."""
+        fd = source.fileno()
+        if self._ready.pop(fd, None) is not None:
+            del self._ranks[fd]
+            self._epoll.unregister(fd)
+
+    def add_port(self, ifname: str, *, may_be_absent: bool = False) -> int:
+        """Open a device and return its port index; one that may be absent is opened when it appears.
+
+        Raises:
+            NoDeviceError: there is no such device.
+            LocalError: as ``Plane.add_port``.
+        """
+        if any(port.ifname == ifname for port in self._ports.values()):
+            raise LocalError(f"port {ifname}: given twice")
+        link = self._links.get(ifname)
+        if link is None and may_be_absent:
+            self._know(Port(self._next_index, ifname, bytes(MAC_BYTES), MTU_MIN_BYTES, up=False))
+            self._next_index += 1
+            return self._next_index - 1
+        if link is None:
+            raise NoDeviceError(f"port {ifname}: no such device")
+        if link.mtu < MTU_MIN_BYTES:
+            raise LocalError(f"port {ifname}: MTU {link.mtu} is below {MTU_MIN_BYTES}")
+        if len(link.mac) != MAC_BYTES:
+            raise LocalError(f"port {ifname}: not an Ethernet device")
+        port = Port(self._next_index, ifname, link.mac, min(link.mtu, _MTU_MAX_BYTES), link.up)
+        self._open(port)
+        self._next_index += 1
+        self._devices[link.ifindex] = port.index
+        self._know(port)
+        return port.index
+
+    def remove_port(self, index: int) -> None:
+        """Close a port; nothing happens if there is none of this index."""
+        if self._ports.pop(index, None) is not None:
+            self._unopened.pop(index, None)
+            self._close_device(index)
+            self._mtus.pop(index, None)
+            self._devices = {ifindex: port for ifindex, port in self._devices.items() if port != index}
+
+    def port_state(self, index: int) -> bool:
+        """Return whether the port exists, is up and has a carrier."""
+        return index in self._mtus
+
+    def on_link(self, callback: LinkCallback) -> None:
+        """Call ``callback(port, up)`` when a port goes up or down, as ``Plane.on_link``."""
+        self._on_link.append(callback)
+
+    @abstractmethod
+    def set_neighbours(self, port: int, macs: Collection[bytes]) -> None:
+        """Store the addresses of a port's neighbours, as ``Plane.set_neighbours``."""
+
+    def close(self) -> None:
+        """Close every port, the link monitor and the poll."""
+        for index in list(self._ports):
+            self.remove_port(index)
+        self._links.close()
+        self._epoll.close()
+
+    # links
+
+    def _close_device(self, index: int) -> None:
+        """Close, not losing what the kernel counted."""
+        self._audit()
+        self._shut(index)
+
+    def _audit(self) -> None:
+        """Bring the kernel's own drops into the counters."""
+        self._counters.drops[DropReason.PORT_FULL] += self._kernel_drops()
+
+    def _know(self, port: Port) -> None:
+        """Remember a port as it now is, and tell if it went up or down, or came to be another while up."""
+        before = self._ports.get(port.index)
+        self._ports[port.index] = port
+        if port.up:
+            self._mtus[port.index] = port.mtu
+        else:
+            self._mtus.pop(port.index, None)
+        if before is None or before == port or not (before.up or port.up):
+            return
+        is_moved = before.up and port.up and before.mac != port.mac
+        for up in (False, True) if is_moved else (port.up,):
+            for callback in self._on_link:
+                callback(port.index, up)
+
+    def _hear(self) -> None:
+        for link in self._links.poll():
+            index = self._devices.get(link.ifindex)
+            if index is None:
+                index = next((port.index for port in self._ports.values() if port.ifname == link.ifname), None)
+                if index is None or index in self._devices.values() or link.gone:
+                    continue
+            self._follow(self._ports[index], link)
+
+    def _open_again(self, timeout_s: float | None) -> float:
+        """Try the devices that could not be opened, if it is time; return how long to wait at most."""
+        now_s = time.monotonic()
+        if now_s >= self._open_again_s:
+            self._open_again_s = now_s + _OPEN_AGAIN_S
+            for index in list(self._unopened):
+                link = self._links.get(self._ports[index].ifname)
+                if link is not None:
+                    self._follow(self._ports[index], link)
+        left_s = self._open_again_s - now_s
+        return left_s if timeout_s is None else min(timeout_s, left_s)
+
+    def _follow(self, port: Port, link: Link) -> None:
+        """Bring a port in step with its device."""
+        if link.gone:
+            self._unopened.pop(port.index, None)
+            self._close_device(port.index)
+            del self._devices[link.ifindex]
+        after = replace(port, up=False)
+        if not link.gone and link.mtu >= MTU_MIN_BYTES and len(link.mac) == MAC_BYTES:
+            self._devices[link.ifindex] = port.index
+            after = replace(port, mac=link.mac, mtu=min(link.mtu, _MTU_MAX_BYTES), up=link.up)
+            after = self._reopen_if_needed(port, after)
+        self._know(after)
+
+    def _reopen_if_needed(self, before: Port, after: Port) -> Port:
+        """Open a device that is new, and make room where its frames have become larger."""
+        is_open = self._is_open(before.index)
+        if is_open and after.mtu <= before.mtu:
+            return after
+        try:
+            self._widen(after) if is_open else self._open(after)
+        except LocalError as error:  # gone again, not ready, or another process has it
+            if before.index not in self._unopened:
+                log.warning("%s; it is tried again", error)
+            self._unopened[before.index] = str(error)
+            return replace(after, up=False)
+        if self._unopened.pop(before.index, None) is not None:
+            log.info("port opened ifname=%s", after.ifname)
+        return after

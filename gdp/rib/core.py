@@ -1,0 +1,864 @@
+"""A RIB: who advertises a name, and where, by proof alone.
+
+Place: pure; it takes statements and gives back statements to send, each for a name. How they travel is its host's
+business (``gdp/client/rib_host.py``).
+
+It accepts an advertisement only if the name's hash comes out, the chain from the owner's key to the claimant holds, the
+relay is a member of this domain (or a RIB of a trusted one), the sequence number is newer, the lease is in bounds and
+the quota not spent. Global names climb to the tier above; what this tier does not know is asked there.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+from gdp.control.advertise_ack import AdvertiseAck
+from gdp.control.boundary import ErrorBoundary
+from gdp.control.presence import IdentityChecks, Presence
+from gdp.control.query import Query, Response
+from gdp.control.relay import Relay
+from gdp.control.replica import Digest, Entry, Fetch, Inventory, Key, Replicas
+from gdp.crypto.certificates import Membership, Role
+from gdp.crypto.fields import Fields, check_sequence
+from gdp.crypto.identity import Identity
+from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.errors import DropReason, RemoteError, StatementError, StoreError
+from gdp.frame.kinds import Kind
+from gdp.limits import (
+    ANSWER_BYTES_BURST,
+    ANSWER_BYTES_PER_S,
+    CLOCK_SKEW_S,
+    LEASE_MAX_S,
+    NEGATIVE_LEASE_S,
+    RIB_NAMES_PER_SENDER,
+    RIB_WATCHES_MAX,
+    WITHDRAWAL_MAX_BYTES,
+)
+from gdp.message.token_bucket import Paces
+from gdp.names import Name
+from gdp.rib.digest_tree import DigestTree
+from gdp.rib.replication import Message, Replication
+from gdp.rib.revocations import RibRevocations
+from gdp.rib.route import Route, Withdrawn
+from gdp.rib.store import Store
+from gdp.rib.upstream_advertisements import PROBE_S, Passed, UpstreamAdvertisements
+from gdp.rib.upstream_queries import UpstreamQueries
+from gdp.rib.watches import Asker, Watches
+from gdp.sansio import Timestamps
+from gdp.trust.adcert import AdCert
+from gdp.trust.advertisement import Advertisement, UnverifiedAdvertisement
+from gdp.trust.audit import Action
+from gdp.trust.domain import Policy
+from gdp.trust.right import Right
+from gdp.trust.verifier import AdvertisementVerifier
+
+__all__ = ["OutgoingStatement", "RibCore", "RibSettings"]
+
+_ADVISED_S: Final = 30.0  # who was answered is told of a move for so long
+_UNTOLD_S: Final = 1.0  # ... where there are too many for that
+_NAMES_OF_ISSUER_MAX: Final = 256  # whose watchers are told of what somebody revoked who is not their owner
+_QUESTION_BYTES: Final = 1_024  # what a question costs, asked on above or denied
+_ANSWER_BYTES: Final = 1_024  # what an answer costs beside the claim in it
+_DOUBT_S: Final = 0.1  # a RIB above that said nothing for so long is asked for a sign of life beside a question
+_PEER_MESSAGES: Final[dict[StatementType, type[Message]]] = {
+    StatementType.DIGEST: Digest,
+    StatementType.FETCH: Fetch,
+    StatementType.INVENTORY: Inventory,
+    StatementType.REPLICAS: Replicas,
+}
+
+
+class OutgoingStatement(NamedTuple):
+    """A statement to send to a name."""
+
+    to: Name
+    kind: Kind
+    statement: bytes
+    about: Key | None = None  # what it says was kept: not sent if the store did not take that
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RibSettings:
+    """What an operator may choose.
+
+    Args:
+        upper: RIBs of the tier above, any of which may be used; empty at the top.
+        peers: other RIBs of this domain, with which this one replicates.
+    """
+
+    upper: tuple[Name, ...] = ()
+    peers: tuple[Name, ...] = ()
+    allow_unowned: bool = False
+    names_per_sender: int = RIB_NAMES_PER_SENDER
+    watches: int = RIB_WATCHES_MAX
+    lease_max_s: float = LEASE_MAX_S
+
+
+class RibCore:
+    """The machine of one RIB."""
+
+    def __init__(self, identity: Identity, policy: Policy, store: Store, settings: RibSettings) -> None:
+        self._identity = identity
+        self._audit = policy.audit
+        self._policy = policy
+        self._store = store
+        self._settings = settings
+        self._verifier = AdvertisementVerifier(policy, allow_unowned=settings.allow_unowned)
+        self._watches = Watches(settings.watches)
+        self._revocations = RibRevocations(
+            self._verifier, store, lambda name: bool(self._watches.watchers(name, self._now_s))
+        )
+        self._holders = Watches(settings.watches)  # who was answered, for the lease of the answer
+        self._above = UpstreamQueries(is_top=not settings.upper)
+        self._upstream = UpstreamAdvertisements(settings.upper)
+        self._replication = self._replication_over(store.digests)
+        self._answer_paces = Paces(ANSWER_BYTES_PER_S, ANSWER_BYTES_BURST)
+        self._now_s = 0.0  # of the last call
+        self._letters: list[OutgoingStatement] = []
+        self.boundary = ErrorBoundary()
+        self.identities = IdentityChecks()
+        self.refusals: Counter[DropReason] = Counter()
+        self.accepted = 0
+        self.answers = 0
+        self.negative_answers = 0
+
+    @property
+    def names(self) -> int:
+        """Return how many routes are kept."""
+        return len(self._store)
+
+    @property
+    def watching(self) -> int:
+        """Return how many watches stand."""
+        return len(self._watches)
+
+    def receive(self, wire: bytes, sender: Name, now: Timestamps) -> None:
+        """Take a statement that came from ``sender`` (as the frame says; unproven). What does not hold is counted."""
+        self._now_s = now.mono_s
+        try:
+            statement = parse(wire)
+            if statement.signer != sender:
+                raise StatementError(DropReason.UNKNOWN_SENDER, "signed by another than its sender")
+            if statement.type is StatementType.RELAY:
+                self._take_relay(statement, now)
+            elif statement.type is StatementType.QUERY:
+                self._take_query(statement, now)
+            elif statement.type is StatementType.ANSWER:
+                self._take_answer_from_above(statement, now)
+            elif statement.type is StatementType.ADVERTISE_ACK:
+                self._take_ack_from_above(statement, now)
+            elif statement.type is StatementType.PRESENCE:
+                self._take_presence(statement, now)
+            elif statement.type in _PEER_MESSAGES:
+                self._take_peer_message(statement, now)
+            else:
+                raise StatementError(DropReason.MALFORMED, f"a RIB takes no {statement.type.value}")
+        except RemoteError as error:
+            self.refusals[error.reason] += 1
+        except StoreError:
+            self.refusals[DropReason.UNAVAILABLE] += 1  # no answer: who sent it will try again
+        except Exception as error:  # one statement must not end the RIB
+            self.boundary.note(error)
+            self.refusals[DropReason.INTERNAL] += 1
+
+    def receive_all(self, wires: Sequence[tuple[bytes, Name]], now: Timestamps) -> None:
+        """Take statements, each with its sender; what they are about is read from the store in one go."""
+        if self._store.digests is None:
+            self._store.prefetch([name for wire, _ in wires if (name := _name_in(wire)) is not None], now)
+        for wire, sender in wires:
+            self.receive(wire, sender, now)
+
+    def changed(self, names: Iterable[tuple[Name, list[Route]]], now: Timestamps) -> None:
+        """Tell who watches what another RIB changed in a shared store, given the routes that were known before."""
+        self._now_s = now.mono_s
+        concerned = [(name, before) for name, before in names if self._concerns(name, now.mono_s)]
+        self._store.prefetch([name for name, _ in concerned], now)
+        for name, before in concerned:
+            try:
+                routes = {route.advertiser: route for route in self._store.routes(name)}
+            except StoreError:
+                self.refusals[DropReason.UNAVAILABLE] += 1
+                continue
+            known = {route.advertiser: route for route in before}
+            for advertiser, route in routes.items():
+                self._tell(route, known.get(advertiser), now.mono_s, self._above.answered(name, now.mono_s))
+            for advertiser in known.keys() - routes.keys():
+                self._tell_gone(known[advertiser], now.mono_s)
+
+    def load(self, entries: Iterable[Entry], now: Timestamps) -> int:
+        """Take entries of a snapshot, each verified; return how many are live. What does not hold is counted."""
+        before = self.names
+        for entry in entries:
+            try:
+                self._take_entry(entry, now)
+            except StatementError as error:
+                self.refusals[error.reason] += 1
+        return self.names - before
+
+    def revoke(self, wire: bytes, origin: Name, now: Timestamps) -> None:
+        """Take a certificate back: what rests on it is gone, and whomever it concerns is told.
+
+        What does not hold is counted.
+
+        Args:
+            giver: the neighbour that it came over.
+        """
+        self._now_s = now.mono_s
+        try:
+            self._take_revocation(parse(wire), origin, now)
+        except RemoteError as error:
+            self.refusals[error.reason] += 1
+        except StoreError:
+            self.refusals[DropReason.UNAVAILABLE] += 1
+
+    def handle_timer(self, now: Timestamps) -> None:
+        """Let expired routes go and tell who watched them; ask above again what is open."""
+        for route in self._store.expire(now.mono_s, now.unix_s):
+            self._tell_gone(route, now.mono_s)
+        self._now_s = now.mono_s
+        self._watches.expire(now.mono_s)
+        self._holders.expire(now.mono_s)
+        if self._replication is not None:
+            self._replication.handle_timer(now.mono_s)
+        self._ask_what_is_due(now.mono_s)
+        for passed in self._upstream.due(now.mono_s):
+            self._send_up(passed)
+
+    def connected(self, now: Timestamps) -> None:
+        """Note that what is sent arrives from now on: there is a switch."""
+        self._now_s = now.mono_s
+        if self._replication is not None:
+            self._replication.connected(now.mono_s)
+
+    def get_timer(self) -> float | None:
+        """Return the monotonic second of the next timer, or None."""
+        times = [self._store.next_expiry(), self._above.next_due(), self._upstream.next_due()]
+        if self._replication is not None:
+            times.append(self._replication.next_due())
+        return min((time for time in times if time is not None), default=None)
+
+    def statements_to_send(self) -> list[OutgoingStatement]:
+        """Return, once, what is to be sent."""
+        if refused := set(self._store.commit()):
+            self._letters = [outgoing for outgoing in self._letters if outgoing.about not in refused]
+        letters, self._letters = self._letters, []
+        if self._replication is not None:
+            letters += [
+                OutgoingStatement(to, Kind.RIB_REQUEST, wire)
+                for to, wire in self._replication.statements_to_send(self._now_s)
+            ]
+        return letters
+
+    # -- advertisements
+
+    def _take_relay(self, statement: Statement, now: Timestamps) -> None:
+        relay = Relay.from_fields(statement.fields)
+        member = self._sender(relay.membership, statement, now)
+        if not (member.role.is_switch or member.role is Role.RIB):
+            raise StatementError(DropReason.WRONG_DOMAIN, "relays are switches or RIBs")
+        statement.verify(member.key)
+        passed_on = parse(relay.statement)
+        if passed_on.type is StatementType.REVOKE:
+            self._take_revocation(passed_on, member.name, now)
+            return
+        if passed_on.type is StatementType.WITHDRAW:
+            self._take_withdrawal(passed_on, member, now)
+            return
+        try:
+            advertisement = self._verifier.verify_statement(passed_on, now.unix_s)
+            if member.role.is_switch and advertisement.switch != member.name:
+                raise StatementError(DropReason.NOT_DELEGATED, "the RtCert names another switch than the relay")
+            if relay.domain is not None and not self._policy.trusts(relay.domain):
+                raise StatementError(DropReason.WRONG_DOMAIN, "a claim of a domain that is not trusted")
+            if member.domain != self._policy.own and not advertisement.is_global:
+                raise StatementError(DropReason.WRONG_DOMAIN, "a local name of another domain")
+            self._check_identity(advertisement, now)
+            if advertisement.right is Right.ATTACH and self.identities.is_refused_above(
+                advertisement.node, advertisement.incarnation, now.mono_s
+            ):
+                route = self._route(advertisement, relay.transit, member, now)
+                self._pass_up(route, relay.statement, route.sequence, now.mono_s)
+                raise StatementError(DropReason.IN_USE, "another node with this identity, says the tier above")
+            known = self._check_news(advertisement, member)
+        except StatementError as error:
+            self._refuse(passed_on, member, error, now.mono_s)
+            raise
+        route = self._route(advertisement, relay.transit, member, now)
+        if relay.domain is not None and member.role is Role.RIB:
+            route = replace(route, domain=relay.domain)
+        self._store.put(route)
+        self.accepted += 1
+        if not isinstance(known, Route):
+            self._audit.note(Action.ACCEPTED, "name", who=route.advertiser.to_text(), about=route.name.to_text())
+        self._judge(route.name, route.advertiser, None, route.sequence, member.name)
+        self._tell(route, known, now.mono_s)
+        self._replicate(route.name, route.advertiser)
+        if advertisement.is_global and not self._upstream.has(member.name):
+            self._pass_up(route, relay.statement, route.sequence, now.mono_s)
+
+    def _check_identity(self, advertisement: Advertisement, now: Timestamps) -> None:
+        """Refuse a node's own name in another incarnation while the older node lives at another switch.
+
+        Raises:
+            StatementError: IN_USE; the older one's switch has been asked whether it is there.
+        """
+        held = self._store.get(advertisement.name, advertisement.node) if advertisement.right is Right.ATTACH else None
+        if not isinstance(held, Route) or held.switch == advertisement.switch:
+            return
+        older = UnverifiedAdvertisement.from_statement(parse(held.advertisement)).incarnation
+        if older == advertisement.incarnation or self.identities.is_free(
+            advertisement.node, older, held.switch, now.mono_s
+        ):
+            return
+        number = int(now.unix_s * 1_000)
+        if self.identities.must_ask(advertisement.node, older, held.switch, number, now.mono_s):
+            question = Presence(advertisement.node, older, advertisement.switch, number)
+            wire = question.to_wire(self._identity.name, self._identity.key, self._identity.membership)
+            self._letters.append(OutgoingStatement(held.switch, Kind.RIB_ANSWER, wire))
+        raise StatementError(DropReason.IN_USE, "another node with this identity")
+
+    def _take_presence(self, statement: Statement, now: Timestamps) -> None:
+        member = self._sender(statement.fields.bytes_("c"), statement, now)
+        statement.verify(member.key)
+        presence = Presence.from_fields(statement.fields)
+        if presence.is_answer:
+            self.identities.answered(presence, member.name, now.mono_s)
+
+    def _check_news(self, advertisement: Advertisement, member: Membership) -> Route | Withdrawn | None:
+        """Return what was known before of a claim that may be taken.
+
+        Raises:
+            StatementError: STALE, LEASE_BOUNDS or QUOTA.
+        """
+        if advertisement.lease_s > self._settings.lease_max_s:
+            raise StatementError(DropReason.LEASE_BOUNDS)
+        known = self._store.get(advertisement.name, advertisement.node)
+        if known is not None and advertisement.sequence <= known.sequence:
+            is_repeated = isinstance(known, Route) and (known.advertisement, known.via) == (
+                advertisement.wire,
+                member.domain,
+            )
+            if not is_repeated:
+                raise StatementError(DropReason.STALE, str(known.sequence))
+        if known is None or known.sender != member.name:
+            self._check_quota(member.name, advertisement.node)
+        return known
+
+    def _check_quota(self, sender: Name, node: Name) -> None:
+        """Return if a sender may bring another name, and a node have one: as many as the sender has left, at most.
+
+        Raises:
+            StatementError: QUOTA.
+        """
+        free = self._settings.names_per_sender - self._store.count_of(sender)
+        if free <= 0:
+            raise StatementError(DropReason.QUOTA, "names of one sender")
+        if self._store.count_of(node) >= free:
+            raise StatementError(DropReason.QUOTA, "names of one node")
+
+    def _route(
+        self, advertisement: Advertisement, transit: tuple[Name, ...], member: Membership, now: Timestamps
+    ) -> Route:
+        left_s = max(advertisement.valid_until_unix_s - now.unix_s, 1.0)
+        return Route.of(
+            advertisement,
+            sender=member.name,
+            domain=member.domain,
+            via=member.domain,
+            transit=tuple(sorted(self._policy.transit)) if self._is_own_switch(member) else transit,
+            expires_s=now.mono_s + min(advertisement.lease_s, left_s),
+        )
+
+    def _take_withdrawal(self, withdrawal: Statement, member: Membership, now: Timestamps) -> None:
+        fields = _withdrawal(withdrawal, now)
+        name, advertiser, sequence = fields.name("n"), withdrawal.signer, fields.uint("s")
+        known = self._store.get(name, advertiser)
+        if not isinstance(known, Route) or sequence < known.sequence:
+            raise StatementError(DropReason.STALE, "nothing to withdraw")
+        pending_advertisement = UnverifiedAdvertisement.from_statement(parse(known.advertisement))
+        withdrawal.verify(self._policy.verify_membership(pending_advertisement.membership, now.unix_s).key)
+        self._withdraw(known, sequence, withdrawal.wire, pending_advertisement.membership)
+        self._judge(name, advertiser, None, sequence, member.name)
+        self._tell_gone(known, now.mono_s, by=member.name)
+        self._replicate(name, advertiser)
+        if known.is_global and not self._upstream.has(member.name):
+            self._pass_up(known, withdrawal.wire, sequence, now.mono_s)
+
+    def _withdraw(self, route: Route, sequence: int, proof: bytes, membership: bytes) -> None:
+        gone = Withdrawn(route.sender, max(sequence, route.sequence), route.valid_until_unix_s, proof, membership)
+        self._store.withdraw(route.name, route.advertiser, gone)
+
+    def _pass_up(self, route: Route, statement: bytes, sequence: int, now_s: float) -> None:
+        if self._upstream.rib is not None:
+            key = (route.name, route.advertiser)
+            passed = Passed(
+                key=key,
+                sequence=sequence,
+                statement=statement,
+                domain=route.domain,
+                transit=route.transit,
+                until_s=route.expires_s,
+            )
+            self._upstream.put(passed, now_s)
+            for passed in self._upstream.due(now_s):
+                self._send_up(passed)
+
+    def _send_up(self, passed: Passed) -> None:
+        upper = self._upstream.rib
+        assert upper is not None
+        relay = Relay(passed.statement, passed.transit, self._identity.membership, passed.domain)
+        self._letters.append(
+            OutgoingStatement(upper, Kind.RIB_REQUEST, relay.to_wire(self._identity.name, self._identity.key))
+        )
+
+    def _refuse(self, passed_on: Statement, member: Membership, error: StatementError, now_s: float) -> None:
+        """Tell a proven relay why a claim was not taken, and where its maker is now if it has moved."""
+        try:
+            name = UnverifiedAdvertisement.from_statement(passed_on).subject.name
+        except StatementError:
+            return  # not even a claim: nothing to name in an answer; the caller counts it
+        who, reason = passed_on.signer.to_text(), error.reason.label
+        self._audit.note(Action.REFUSED, "name", who=who, about=name.to_text(), reason=reason)
+        known = self._store.get(name, passed_on.signer)
+        if error.reason is DropReason.REVOKED:
+            self._send_revocations(self._revocations.behind(_revocable(passed_on)), [member.name])
+        self._judge(name, passed_on.signer, error.reason, 0 if known is None else known.sequence, member.name)
+        has_moved = error.reason is DropReason.STALE and isinstance(known, Route) and known.sender != member.name
+        if has_moved and isinstance(known, Route) and self._may_tell(known, _asker(member)):
+            self._answer(known, _asker(member), now_s)
+
+    def _judge(self, name: Name, advertiser: Name, refused: DropReason | None, sequence: int, to: Name) -> None:
+        ack = AdvertiseAck(name, advertiser, refused, sequence)
+        wire = ack.to_wire(self._identity.name, self._identity.key, self._identity.membership)
+        about = (name, advertiser) if refused is None else None
+        self._letters.append(OutgoingStatement(to, Kind.RIB_ANSWER, wire, about))
+
+    # -- questions
+
+    def _take_query(self, statement: Statement, now: Timestamps) -> None:
+        fields = statement.fields
+        member = self._sender(fields.bytes_("c"), statement, now)
+        if not (member.role.is_switch or member.role is Role.RIB):
+            raise StatementError(DropReason.NOT_DELEGATED, "only switches and RIBs ask")
+        statement.verify(member.key)
+        query = Query.from_fields(fields)
+        if query.name == self._identity.name:
+            self._deny(query.name, member.name)  # a probe for a sign of life
+            return
+        asker = _asker(member)
+        routes = [route for route in self._store.routes(query.name) if self._may_tell(route, asker)]
+        cost = _QUESTION_BYTES + sum(len(route.advertisement) + _ANSWER_BYTES for route in routes)
+        if not self._answer_paces.spend(member.name, now.mono_s, cost):
+            raise StatementError(DropReason.QUOTA, "answers to one asker")
+        if query.watch_s > 0:
+            self._watch(query, asker, now.mono_s)
+        if query.revoked is not None:
+            lacked = self._revocations.lacked_by(member.name, query.name, query.revoked, now.mono_s)
+            self._send_revocations(lacked, [member.name])
+        for route in routes:
+            self._answer(route, asker, now.mono_s)
+        is_below = not self._upstream.has(member.name)
+        if is_below and self._above.want(query.name, asker, query.watch_s, now.mono_s, is_known=bool(routes)):
+            self._ask_above(query.name, self._above.watch_s(query.name))
+        elif not routes and not self._above.is_waiting(query.name):
+            self._answer_nobody(query.name, member.name)
+
+    def _watch(self, query: Query, asker: Asker, now_s: float) -> None:
+        """Watch for an asker; where there are too many watches it is answered all the same, and will ask again."""
+        try:
+            self._watches.add(query.name, asker, now_s + query.watch_s)
+        except StatementError as error:
+            self.refusals[error.reason] += 1
+
+    def _may_tell(self, route: Route, asker: Asker) -> bool:
+        """Return whether an asker may learn of a route.
+
+        A local name stays in its domain. A RIB below is not told what its own domain brought.
+        """
+        if asker.domain == self._policy.own:
+            return True
+        return route.is_global and not (asker.is_rib and asker.domain in (route.domain, route.via))
+
+    def _answer(self, route: Route, to: Asker, now_s: float) -> None:
+        lease_s = min(max(route.expires_s - now_s, 0.0), _ADVISED_S)
+        try:
+            self._holders.add(route.name, to, now_s + lease_s)
+        except StatementError:
+            lease_s = min(lease_s, _UNTOLD_S)
+        answer = Response(route.name, route.advertiser, route.advertisement, route.domain, route.transit, lease_s)
+        self.answers += 1
+        self._send(answer, to.name, (route.name, route.advertiser))
+
+    def _answer_nobody(self, name: Name, to: Name) -> None:
+        if self._replication is not None and self._replication.is_cold(self._now_s):
+            return  # a peer may know; who asks will ask again, or ask that peer
+        self._deny(name, to)
+
+    def _deny(self, name: Name, to: Name) -> None:
+        self.negative_answers += 1
+        self._send(Response(name, name, b"", self._policy.own, (), NEGATIVE_LEASE_S), to)
+
+    def _send(self, answer: Response, to: Name, about: Key | None = None) -> None:
+        wire = answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)
+        self._letters.append(OutgoingStatement(to, Kind.RIB_ANSWER, wire, about))
+
+    def _concerns(self, name: Name, now_s: float) -> bool:
+        """Return whether anybody is to be told of a name."""
+        is_held = self._watches.watchers(name, now_s) or self._holders.watchers(name, now_s)
+        return bool(is_held) or self._above.is_waiting(name)
+
+    def _tell(self, route: Route, known: Route | Withdrawn | None, now_s: float, askers: Sequence[Asker] = ()) -> None:
+        """Tell of a route: ``askers``, who watches its name, and after a move who holds or brought the old place."""
+        told = dict.fromkeys((*askers, *self._watches.watchers(route.name, now_s)))
+        if isinstance(known, Route) and known.place != route.place:
+            told |= dict.fromkeys(self._holders.watchers(route.name, now_s))
+            if known.sender != route.sender:
+                told |= self._sender_of(known)
+        for asker in told:
+            if self._may_tell(route, asker):
+                self._answer(route, asker, now_s)
+
+    def _sender_of(self, route: Route) -> dict[Asker, None]:
+        """Return who relayed a route, unless that was the tier above."""
+        is_rib = route.sender != route.switch
+        return {} if route.is_from_above else {Asker(route.sender, route.via, is_rib): None}
+
+    def _tell_gone(self, route: Route, now_s: float, by: Name | None = None) -> None:
+        """Tell those who watch a name, hold a route of it or brought it that one is gone; ``by`` knows."""
+        told = dict.fromkeys((*self._watches.watchers(route.name, now_s), *self._holders.watchers(route.name, now_s)))
+        if by not in (None, route.sender):
+            told |= self._sender_of(route)
+        for asker in told:
+            if self._may_tell(route, asker):
+                gone = Response(route.name, route.advertiser, b"", route.domain, (), 0.0, route.sequence)
+                self._send(gone, asker.name)
+
+    # -- the tier above
+
+    def _ask_what_is_due(self, now_s: float) -> None:
+        """Repeat questions to the tier above; of several RIBs there, leave one that is silent."""
+        if self._upstream.turn_over(now_s):
+            self._above.ask_again(now_s)
+        ask, given_up = self._above.due(now_s)
+        for name, watch_s in ask:
+            self._ask_above(name, watch_s)
+        for name, askers in given_up:
+            for asker in askers:
+                self._answer_nobody(name, asker.name)
+        self._probe(now_s, PROBE_S)
+
+    def _probe(self, now_s: float, quiet_s: float) -> None:
+        """Ask one of several RIBs above for a sign of life if it gave none for ``quiet_s``."""
+        if self._upstream.probe(now_s, quiet_s):
+            self._query_above(self._upstream.rib, 0.0)
+
+    def _ask_above(self, name: Name, watch_s: float) -> None:
+        self._query_above(name, watch_s)
+        self._probe(self._now_s, _DOUBT_S)
+
+    def _query_above(self, name: Name | None, watch_s: float) -> None:
+        upper = self._upstream.rib
+        assert upper is not None
+        assert name is not None
+        query = Query(name, watch_s, self._policy.revoked.digest_about(name) if watch_s > 0 else None)
+        wire = query.to_wire(self._identity.name, self._identity.key, self._identity.membership)
+        self._letters.append(OutgoingStatement(upper, Kind.RIB_REQUEST, wire))
+
+    def _upper_member(self, statement: Statement, now: Timestamps) -> Membership:
+        """Return who signed what came from the tier above.
+
+        Raises:
+            StatementError: it is not from there.
+        """
+        member = self._sender(statement.fields.bytes_("c"), statement, now)
+        if not self._upstream.has(member.name) or member.role is not Role.RIB:
+            raise StatementError(DropReason.WRONG_DOMAIN, "not from the tier above")
+        statement.verify(member.key)
+        self._upstream.heard(member.name, now.mono_s)
+        return member
+
+    def _take_ack_from_above(self, statement: Statement, now: Timestamps) -> None:
+        self._upper_member(statement, now)
+        ack = AdvertiseAck.from_fields(statement.fields)
+        key = ack.name, ack.advertiser
+        if ack.refused in (None, DropReason.STALE):
+            self._upstream.settle(key, ack.sequence)
+            self.identities.taken_above(ack.name)
+            return
+        self._upstream.refused(key)
+        known = self._store.get(*key)
+        if ack.refused is DropReason.IN_USE and isinstance(known, Route) and not known.is_from_above:
+            incarnation = UnverifiedAdvertisement.from_statement(parse(known.advertisement)).incarnation
+            self.identities.refused_above(ack.name, incarnation, now.mono_s)
+            self._store.withdraw(*key)
+            self._tell_gone(known, now.mono_s)
+            self._judge(*key, DropReason.IN_USE, known.sequence, known.sender)
+
+    def _take_answer_from_above(self, statement: Statement, now: Timestamps) -> None:
+        fields = statement.fields
+        member = self._upper_member(statement, now)
+        answer = Response.from_fields(fields)
+        if answer.is_nobody:
+            askers = self._above.answered(answer.name, now.mono_s)
+            if not self._store.routes(answer.name):
+                for asker in askers:
+                    self._answer_nobody(answer.name, asker.name)
+            return
+        known = self._store.get(answer.name, answer.advertiser)
+        if not answer.advertisement:
+            if isinstance(known, Route) and known.is_from_above and known.sequence <= answer.sequence:
+                self._store.withdraw(answer.name, answer.advertiser)
+                self._tell_gone(known, now.mono_s)
+            return
+        self._learn_from_above(answer, member, known, now)
+
+    def _learn_from_above(
+        self, answer: Response, member: Membership, known: Route | Withdrawn | None, now: Timestamps
+    ) -> None:
+        advertisement = self._verifier.verify(answer.advertisement, now.unix_s)
+        if advertisement.name != answer.name or advertisement.node != answer.advertiser:
+            raise StatementError(DropReason.WRONG_NAME, "an answer about something else than its claim")
+        is_from_below = (
+            isinstance(known, Route) and not known.is_from_above and known.advertisement == advertisement.wire
+        )
+        if answer.domain == self._policy.own or is_from_below:
+            return  # our own, or of a tier below, come back from above
+        if isinstance(known, Route) and advertisement.sequence < known.sequence:
+            raise StatementError(DropReason.STALE, "the tier above is behind")
+        route = replace(
+            self._route(advertisement, answer.transit, member, now),
+            domain=answer.domain,
+            is_from_above=True,
+            expires_s=now.mono_s + answer.lease_s,
+        )
+        self._store.put(route)
+        if isinstance(known, Route) and not known.is_from_above:
+            self._replicate(route.name, route.advertiser)  # a peer holds the old place
+        self._tell(route, known, now.mono_s, self._above.answered(answer.name, now.mono_s))
+
+    # -- revocations
+
+    def _take_revocation(self, statement: Statement, origin: Name, now: Timestamps) -> None:
+        """Take a revocation that a neighbour or a relay brought.
+
+        Raises:
+            StatementError: it does not hold, concerns nothing here, or there is no room for it.
+            StoreError: a shared store did not answer.
+        """
+        try:
+            revocation = self._revocations.receive_revocation(statement, origin, now)
+        except StatementError as error:
+            if error.reason is DropReason.UNCONCERNED:
+                self._pass_revocation_up(statement, origin, now)
+            raise
+        if revocation is None:
+            self._pass_revocation_up(statement, origin, now)  # it is repeated for those that did not know it
+            return
+        who, about = revocation.issuer.name.to_text(), revocation.fingerprint.hex()
+        self._audit.note(Action.REVOKED, "certificate", who=who, about=about)
+        told: dict[Asker, None] = {}
+        closed = self._revocations.closed(revocation, now)
+        if not self._policy.revoked.is_root(revocation.issuer.owner_key):  # switches carry those of roots everywhere
+            for name in dict.fromkeys((revocation.issuer.name, *(route.name for route in closed))):
+                told |= self._concerned_by(name, now.mono_s)
+            if not told:  # it signs in its own name: an owner's successor, or a delegate
+                others = self._store.resting_on(revocation.issuer.owner_key)
+                for name in list(dict.fromkeys(route.name for route in others))[:_NAMES_OF_ISSUER_MAX]:
+                    told |= self._concerned_by(name, now.mono_s)
+            ribs = self._above_and_beside(origin)
+            self._send_revocations([statement.wire], ribs, Kind.RIB_REQUEST)
+            self._send_revocations([statement.wire], [each.name for each in told if each.name not in (origin, *ribs)])
+        for route in closed:
+            self._store.withdraw(route.name, route.advertiser)
+            self._tell_gone(route, now.mono_s)
+
+    def _pass_revocation_up(self, statement: Statement, sender: Name, now: Timestamps) -> None:
+        """Send a revocation that changes nothing here to the tier above, where it may."""
+        upper = self._upstream.rib
+        is_root = self._policy.revoked.is_root(statement.fields.bytes_("owner"))
+        if upper is None or is_root or self._upstream.has(sender) or sender in self._settings.peers:
+            return
+        if self._revocations.may_pass_up(statement, sender, now):
+            self._send_revocations([statement.wire], [upper], Kind.RIB_REQUEST)
+
+    def _concerned_by(self, name: Name, now_s: float) -> dict[Asker, None]:
+        """Return who brought, holds or watches a name."""
+        told = dict.fromkeys((*self._watches.watchers(name, now_s), *self._holders.watchers(name, now_s)))
+        for route in self._store.routes(name):
+            told |= self._sender_of(route)
+        return told
+
+    def _above_and_beside(self, origin: Name) -> list[Name]:
+        """Return the RIBs that a revocation goes to, whatever they asked for: the tier above, and peers."""
+        if self._upstream.has(origin):
+            return list(self._settings.peers)
+        above = [] if self._upstream.rib is None else [self._upstream.rib]
+        return above if origin in self._settings.peers else [*above, *self._settings.peers]
+
+    def _send_revocations(self, wires: Iterable[bytes], to: Iterable[Name], kind: Kind = Kind.RIB_ANSWER) -> None:
+        names = list(to)
+        for wire in wires if names else ():
+            relay = Relay(wire, (), self._identity.membership).to_wire(self._identity.name, self._identity.key)
+            self._letters += [OutgoingStatement(name, kind, relay) for name in names]
+
+    # -- other RIBs of the domain
+
+    def _replication_over(self, digests: DigestTree | None) -> Replication | None:
+        if digests is None:
+            return None
+        return Replication(self._identity, digests, self._settings.peers, self.entry_of, self._rank_of)
+
+    def _replicate(self, name: Name, advertiser: Name) -> None:
+        if self._replication is not None:
+            self._replication.news((name, advertiser))
+
+    def _rank_of(self, key: Key) -> int | None:
+        known = self._store.get(*key)
+        return None if known is None else _rank(known)
+
+    def entry_of(self, key: Key, now_s: float) -> Entry | None:
+        """Return what is kept of an advertiser of a name, for a peer or a snapshot, or None."""
+        known = self._store.get(*key)
+        if isinstance(known, Route) and known.expires_s > now_s:
+            lease_s = min(known.expires_s - now_s, LEASE_MAX_S)
+            return Entry(
+                known.advertisement, b"", known.sender, known.domain, known.via, known.transit, lease_s,
+                known.is_from_above,
+            )  # fmt: skip
+        if isinstance(known, Withdrawn) and known.proof:
+            own = self._policy.own
+            return Entry(
+                known.proof, known.membership, known.sender, own, own, (), 0.0,
+                is_from_above=False, until_unix_s=known.valid_until_unix_s,
+            )  # fmt: skip
+        return None
+
+    def _take_peer_message(self, statement: Statement, now: Timestamps) -> None:
+        member = self._sender(statement.fields.bytes_("c"), statement, now)
+        if member.role is not Role.RIB or member.domain != self._policy.own or self._replication is None:
+            raise StatementError(DropReason.WRONG_DOMAIN, "replicates with RIBs of this domain only")
+        statement.verify(member.key)
+        if not self._replication.add_peer(member.name):
+            raise StatementError(DropReason.QUOTA, "peers")
+        message = _PEER_MESSAGES[statement.type].from_fields(statement.fields)
+        for entry in self._replication.receive(message, member.name, now.mono_s):
+            try:
+                self._take_entry(entry, now)
+            except StatementError as error:
+                self.refusals[error.reason] += 1
+
+    def _take_entry(self, entry: Entry, now: Timestamps) -> None:
+        """Take what a peer holds, as if it had come here.
+
+        Raises:
+            StatementError: it does not hold; what is merely no news raises nothing.
+        """
+        statement = parse(entry.statement)
+        if statement.type is StatementType.WITHDRAW:
+            self._take_withdrawn_entry(entry, statement, now)
+            return
+        advertisement = self._verifier.verify_statement(statement, now.unix_s)
+        known = self._store.get(advertisement.name, advertisement.node)
+        lease_s = min(entry.lease_s, advertisement.lease_s, advertisement.valid_until_unix_s - now.unix_s)
+        if lease_s <= 0 or advertisement.lease_s > self._settings.lease_max_s:
+            raise StatementError(DropReason.LEASE_BOUNDS)
+        if known is not None and not self._is_newer(advertisement, known, now.mono_s + lease_s):
+            return
+        if entry.is_from_above and (not isinstance(known, Route) or known.is_from_above):
+            return  # nothing here that it corrects
+        if known is None:
+            self._check_quota(entry.sender, advertisement.node)
+        route = Route.of(
+            advertisement,
+            sender=entry.sender,
+            domain=entry.domain,
+            via=entry.via,
+            transit=entry.transit,
+            expires_s=now.mono_s + lease_s,
+            is_from_above=entry.is_from_above,
+        )
+        self._store.put(route)
+        self._tell(route, known, now.mono_s, self._above.answered(route.name, now.mono_s))
+
+    def _is_newer(self, advertisement: Advertisement, known: Route | Withdrawn, expires_s: float) -> bool:
+        """Return whether a peer's claim replaces what is known: a higher sequence, or the same for longer."""
+        if advertisement.sequence != known.sequence:
+            return advertisement.sequence > known.sequence
+        is_same = isinstance(known, Route) and known.advertisement == advertisement.wire
+        return is_same and isinstance(known, Route) and (known.is_from_above or expires_s > known.expires_s)
+
+    def _take_withdrawn_entry(self, entry: Entry, withdrawal: Statement, now: Timestamps) -> None:
+        fields = _withdrawal(withdrawal, now)
+        name, sequence = fields.name("n"), fields.uint("s")
+        known = self._store.get(name, withdrawal.signer)
+        if known is not None and _rank(known) >= 2 * sequence + 1:
+            return
+        member = self._sender(entry.membership, withdrawal, now)
+        withdrawal.verify(member.key)
+        until_unix_s = min(entry.until_unix_s, member.not_after_unix_s + int(CLOCK_SKEW_S))
+        if known is not None:  # a peer cannot have us forget sooner what we know
+            until_unix_s = max(until_unix_s, known.valid_until_unix_s)
+        if until_unix_s <= now.unix_s:
+            return  # forgotten here already
+        if known is None:
+            self._check_quota(entry.sender, withdrawal.signer)
+        gone = Withdrawn(entry.sender, sequence, until_unix_s, withdrawal.wire, entry.membership)
+        route = self._store.withdraw(name, withdrawal.signer, gone)
+        if route is not None:
+            self._tell_gone(route, now.mono_s, by=entry.sender)
+
+    def _is_own_switch(self, member: Membership) -> bool:
+        return member.role.is_switch and member.domain == self._policy.own
+
+    def _sender(self, membership: bytes, statement: Statement, now: Timestamps) -> Membership:
+        member = self._policy.verify_membership(membership, now.unix_s)
+        if member.name != statement.signer:
+            raise StatementError(DropReason.BAD_CERTIFICATE, "the membership is of another node")
+        return member
+
+
+def _name_in(wire: bytes) -> Name | None:
+    """Return the name that a query or a relay is about, unverified; None for anything else."""
+    try:
+        statement = parse(wire)
+        if statement.type is StatementType.RELAY:
+            statement = parse(statement.fields.bytes_("q"))
+        return statement.fields.name("name" if statement.type is StatementType.ADVERTISE else "n")
+    except StatementError:
+        return None
+
+
+def _revocable(statement: Statement) -> list[tuple[bytes, bytes]]:
+    """Return the fingerprints in a claim's evidence, each with every key that may revoke it; nothing is verified."""
+    body = UnverifiedAdvertisement.from_statement(statement)
+    found, issuer_key = [], body.subject.owner_key
+    for wire in body.chain:
+        link = AdCert.from_statement(parse(wire))
+        found += [(link.fingerprint, key) for key in dict.fromkeys((body.subject.owner_key, issuer_key))]
+        issuer_key = link.delegate_key
+    return found
+
+
+def _withdrawal(statement: Statement, now: Timestamps) -> Fields:
+    """Return what a withdrawal says.
+
+    Raises:
+        StatementError: MALFORMED, or TOO_BIG to be passed on.
+    """
+    fields = statement.expect(StatementType.WITHDRAW)
+    if len(statement.wire) > WITHDRAWAL_MAX_BYTES:
+        raise StatementError(DropReason.TOO_BIG, "a withdrawal")
+    check_sequence(fields.uint("s"), now.unix_s)
+    return fields
+
+
+def _rank(known: Route | Withdrawn) -> int:
+    """Return ``Item.rank`` of what is kept; a lease that ended ranks like the claim."""
+    return 2 * known.sequence + (isinstance(known, Withdrawn) and bool(known.proof))
+
+
+def _asker(member: Membership) -> Asker:
+    return Asker(member.name, member.domain, member.role is Role.RIB)

@@ -1,0 +1,160 @@
+"""Advertisements on their way to the tier above: repeated until one of its RIBs has judged them.
+
+Layer: sans-I/O; time comes in as ``now_s`` (monotonic seconds). Of several RIBs above one is used; where it does not
+answer, the next one is. While none answers, what waits is kept to the end of its lease, within a bound.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+from typing import Final
+
+from gdp.control.replica import Key
+from gdp.names import Name
+
+__all__ = ["Passed", "UpstreamAdvertisements"]
+
+RETRY_S: Final = 0.3
+RETRY_MAX_S: Final = 5.0
+SILENT_MIN_S: Final = 0.12  # a RIB above that leaves a probe unanswered for so long, or three round trips more ...
+SILENT_MAX_S: Final = 1.0  # ... but no longer than this, makes room for the next one
+PROBE_S: Final = 1.0  # with several RIBs above, the one in use is asked something at least this often
+SEND_MAX: Final = 256  # at once, so that verdicts are heard in between
+GONE_S: Final = 1.0  # a tier above that is silent for so long is sent one advertisement at a time
+WAITING_MAX: Final = 65_536
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Passed:
+    """A claim or withdrawal to pass up, until ``until_s`` at most."""
+
+    key: Key
+    sequence: int
+    statement: bytes
+    domain: Name
+    transit: tuple[Name, ...]
+    until_s: float
+
+
+@dataclass(slots=True)
+class _Waiting:
+    passed: Passed
+    again_s: float
+    pause_s: float = RETRY_S
+
+
+class UpstreamAdvertisements:
+    """The tier above as one RIB sees it.
+
+    Args:
+        ribs: of the tier above, the preferred one first; empty at the top.
+    """
+
+    def __init__(self, ribs: tuple[Name, ...]) -> None:
+        self._ribs = ribs
+        self._at = 0
+        self._waiting: dict[Key, _Waiting] = {}
+        self._due: list[tuple[float, Key]] = []
+        self._asked_s: float | None = None  # since when something is unanswered
+        self._heard_s = float("-inf")
+        self._round_trip_s = 0.0  # smoothed, as RFC 6298 does it
+        self.given_up = 0
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    @property
+    def rib(self) -> Name | None:
+        """Return the RIB above that is in use, or None at the top."""
+        return self._ribs[self._at] if self._ribs else None
+
+    def has(self, name: Name) -> bool:
+        """Return whether this is a RIB of the tier above."""
+        return name in self._ribs
+
+    def put(self, passed: Passed, now_s: float) -> None:
+        """Pass something up, at once and until it is judged; it replaces what waited for the same advertiser."""
+        if passed.key not in self._waiting and len(self._waiting) >= WAITING_MAX:
+            self._drop(next(iter(self._waiting)))
+        self._waiting[passed.key] = _Waiting(passed, now_s)
+        heapq.heappush(self._due, (now_s, passed.key))
+
+    def settle(self, key: Key, sequence: int) -> None:
+        """Note a verdict on a sequence number, or on an older claim than one that is held above."""
+        waiting = self._waiting.get(key)
+        if waiting is not None and sequence >= waiting.passed.sequence:
+            del self._waiting[key]
+
+    def refused(self, key: Key) -> None:
+        """Note that what waits for an advertiser will not be taken."""
+        self._waiting.pop(key, None)
+
+    def probe(self, now_s: float, quiet_s: float) -> bool:
+        """Return whether to ask the RIB in use, one of several and silent for ``quiet_s``, for a sign of life."""
+        if len(self._ribs) < 2 or self._asked_s is not None or now_s - self._heard_s < quiet_s:
+            return False
+        self._asked_s = now_s
+        return True
+
+    def heard(self, rib: Name, now_s: float) -> None:
+        """Note a sign of life of the RIB in use; after a long silence all that waits is due."""
+        if rib != self.rib:
+            return
+        if self._asked_s is not None:
+            if self._is_gone(now_s):
+                self._all_due(now_s)
+            self._round_trip_s += (now_s - self._asked_s - self._round_trip_s) / 8
+        self._asked_s, self._heard_s = None, now_s
+
+    def turn_over(self, now_s: float) -> bool:
+        """Go on to the next RIB above if the one in use is silent; return whether that is so."""
+        if len(self._ribs) < 2 or self._asked_s is None or now_s - self._asked_s < self._silent_s():
+            return False
+        self._at = (self._at + 1) % len(self._ribs)
+        self._asked_s = None
+        self._all_due(now_s)
+        return True
+
+    def due(self, now_s: float) -> list[Passed]:
+        """Return what to send to ``rib`` now; what outlived its lease is given up, and counted."""
+        found: list[Passed] = []
+        most = 1 if self._is_gone(now_s) else SEND_MAX
+        while self._due and self._due[0][0] <= now_s and len(found) < SEND_MAX:
+            at_s, key = heapq.heappop(self._due)
+            waiting = self._waiting.get(key)
+            if waiting is None or waiting.again_s != at_s:
+                continue
+            if waiting.passed.until_s <= now_s:
+                self._drop(key)
+                continue
+            waiting.again_s = now_s + waiting.pause_s
+            waiting.pause_s = min(2 * waiting.pause_s, RETRY_MAX_S)
+            heapq.heappush(self._due, (waiting.again_s, key))
+            if len(found) < most:
+                found.append(waiting.passed)
+        if found and self._asked_s is None:
+            self._asked_s = now_s
+        return found
+
+    def next_due(self) -> float | None:
+        """Return a monotonic second that is no later than the next thing to do, or None."""
+        times = [self._due[0][0]] if self._due else []
+        if len(self._ribs) > 1:
+            times.append(self._heard_s + PROBE_S if self._asked_s is None else self._asked_s + self._silent_s())
+        return min(times, default=None)
+
+    def _silent_s(self) -> float:
+        return min(SILENT_MIN_S + 3 * self._round_trip_s, SILENT_MAX_S)
+
+    def _is_gone(self, now_s: float) -> bool:
+        return self._asked_s is not None and now_s - self._asked_s >= GONE_S
+
+    def _all_due(self, now_s: float) -> None:
+        for waiting in self._waiting.values():
+            waiting.again_s, waiting.pause_s = now_s, RETRY_S
+        self._due = [(now_s, key) for key in self._waiting]
+
+    def _drop(self, key: Key) -> None:
+        del self._waiting[key]
+        self.given_up += 1

@@ -1,0 +1,223 @@
+"""A topology realised in memory: domains with keys, switches, RIBs and members, ready to run.
+
+Place: shell, without I/O. ``namespaces`` realises the same topology with kernel namespaces and real processes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+
+from gdp.client.participant import Participant, Topic
+from gdp.client.rib_host import RibHost
+from gdp.control.settings import NodeSettings
+from gdp.crypto.ca import CertificateAuthority
+from gdp.crypto.certificates import Role
+from gdp.crypto.identity import Identity, NodeKeys
+from gdp.crypto.keys import SigningKey
+from gdp.crypto.validity import Validity
+from gdp.limits import ADVERTISEMENT_LEASE_S, DEAD_S, HELLO_S
+from gdp.metadata import Metadata
+from gdp.names import Name
+from gdp.rib.core import RibCore, RibSettings
+from gdp.rib.store import MemoryStore
+from gdp.simulation.network import EPOCH_UNIX_S, SimLink, SimNetwork
+from gdp.simulation.topology import Attachment, Topology
+from gdp.switch.core import SwitchCore
+from gdp.switch.table import Table
+from gdp.trust.domain import Policy
+from gdp.trust.node_descriptor import NodeDescriptor
+from gdp.trust.owner import Owner
+from gdp.trust.right import Right
+
+__all__ = ["Simulation"]
+
+_YEAR_S = 365 * 86_400
+
+
+@dataclass(slots=True)
+class Simulation:
+    """A running network in memory.
+
+    Args:
+        topology: what to build. Nodes are called by their switch's name, or ``switch/device`` for what is attached.
+        trusts: for each domain label, the labels it trusts; None: everyone trusts everyone.
+        transits: for a domain label, the labels through which its traffic may pass; all trusted ones if not given.
+        delay_s: of every link between switches.
+        lease_s: of claims and watches.
+        lead_mtu: of the links to members and RIBs, in bytes after the Ethernet header.
+        keepalive_ms: as in ``NodeSettings``; slower ones where no link fails save most of the time.
+        leaves: switches whose certificate says ``leaf``.
+    """
+
+    topology: Topology
+    seed: int = 1
+    delay_s: float = 0.0005
+    lead_mtu: int = 1_500
+    hello_s: float = HELLO_S
+    dead_s: float = DEAD_S
+    lease_s: float = ADVERTISEMENT_LEASE_S
+    keepalive_ms: int | None = None
+    trusts: dict[str, tuple[str, ...]] | None = None
+    transits: Mapping[str, tuple[str, ...]] | None = None
+    leaves: Collection[str] = ()
+    network: SimNetwork = field(init=False)
+    authorities: dict[str, CertificateAuthority] = field(default_factory=dict)
+    identities: dict[str, Identity] = field(default_factory=dict)
+    switches: dict[str, SwitchCore] = field(default_factory=dict)
+    ribs: dict[str, RibHost] = field(default_factory=dict)  # by domain; further ones of a domain: ``domain#2``, ...
+    members: dict[str, Participant] = field(default_factory=dict)
+    cables: dict[frozenset[str], SimLink] = field(default_factory=dict)
+    leads: dict[str, SimLink] = field(default_factory=dict)  # of members and RIBs, by label
+    owner: Owner = field(init=False)
+    settled_s: float = field(init=False)  # when ``settle`` last ended; before that, when the world began
+    _incarnation: int = 0
+
+    def __post_init__(self) -> None:
+        self.network = SimNetwork(self.seed)
+        self.settled_s = self.network.now.mono_s
+        self.owner = Owner(SigningKey.generate(), bytes(range(32)))
+        self.validity = Validity(int(EPOCH_UNIX_S) - _YEAR_S, int(EPOCH_UNIX_S) + _YEAR_S)
+        for domain in self.topology.domains:
+            self.authorities[domain.label] = CertificateAuthority.create(
+                domain.label, SigningKey.generate(), self.validity
+            )
+        for node in self.topology.nodes:
+            self._add_switch(node, self.topology.domain_of(node).label)
+        for link in self.topology.links:
+            sim_link = SimLink(self.delay_s, mtu=link.mtu)
+            self.cables[link.ends()] = self.network.connect(link.a, link.b, sim_link, link.cost)
+        for label, at in self._rib_places().items():
+            identity = self.identity(Role.RIB, f"{at.switch}/{at.ifname}", self.topology.domain_of(at.switch).label)
+            self.identities[f"rib:{label}"] = identity
+        for label, at in self._rib_places().items():
+            self._add_rib(label, at)
+        for at in self.topology.attached("proxy"):
+            self.add_member(f"{at.switch}/{at.ifname}", at.switch)
+
+    validity: Validity = field(init=False)
+
+    def identity(self, role: Role, label: str, domain: str) -> Identity:
+        """Return (making it the first time) the identity of a node."""
+        known = self.identities.get(label)
+        if known is None:
+            keys = NodeKeys.generate(role, label.replace("/", "-"))
+            known = self.identities[label] = keys.join(self.authorities[domain], self.validity)
+        return known
+
+    def policy(self, domain: str) -> Policy:
+        """Return the policy of a domain's nodes."""
+        trusted = self.authorities if self.trusts is None else self.trusts.get(domain, ())
+        through = None if self.transits is None else self.transits.get(domain)
+        return Policy(
+            self.authorities[domain].root,
+            [self.authorities[label].root for label in trusted],
+            None if through is None else [self.authorities[label].root.domain for label in through],
+        )
+
+    def add_member(self, label: str, switch: str, domain: str | None = None) -> Participant:
+        """Attach a member to a switch; its domain is the switch's unless given."""
+        domain = domain or self.topology.domain_of(switch).label
+        member = Participant(self.identity(Role.PROXY, label, domain), self.policy(domain), self._settings())
+        self.members[label] = member
+        self.network.add(label, member)
+        self.leads[label] = self.network.connect(switch, label, SimLink(0.0001, mtu=self.lead_mtu))
+        return member
+
+    def restart_member(self, label: str) -> Participant:
+        """Start a member anew with nothing remembered, no topic either."""
+        before = self.members[label]
+        identity = next(each for each in self.identities.values() if each.name == before.name)
+        domain = next(domain for domain, each in self.authorities.items() if each.root.domain == identity.root.domain)
+        member = self.members[label] = Participant(identity, self.policy(domain), self._settings())
+        self.network.replace(label, member)
+        return member
+
+    def roam(self, label: str, switch: str) -> None:
+        """Pull a member's cable and put one in at another switch."""
+        self.network.set_link(self.leads[label], up=False)
+        self.leads[label] = self.network.connect(switch, label, SimLink(0.0001, mtu=self.lead_mtu))
+
+    def topic(self, name: str, member: Participant, rights: Collection[Right], **metadata: str) -> Topic:
+        """Return a topic of the owner's, delegated to a member."""
+        identity = next(each for each in self.identities.values() if each.name == member.name)
+        described = Metadata({"kind": "topic", "name": name, **metadata})
+        card = NodeDescriptor.from_wire(NodeDescriptor.make(identity))
+        delegation = self.owner.delegate(card, described, rights, [1], self.validity)
+        grants = delegation.open(identity)
+        return Topic(delegation, {epoch: grant.secret for epoch, grant in grants.items()})
+
+    def restart_switch(self, name: str) -> SwitchCore:
+        """Start a switch anew with nothing remembered."""
+        switch, table = self._switch(name, self.topology.domain_of(name).label)
+        self.network.replace(name, switch, table)
+        return switch
+
+    def restart_rib(self, label: str) -> RibHost:
+        """Start a RIB anew with nothing remembered; ``label`` as in ``ribs``."""
+        host = self._rib(label)
+        self.network.replace(self.rib_node(label), host)
+        return host
+
+    def kill_rib(self, label: str) -> None:
+        """Stop a RIB without a goodbye; ``restart_rib`` brings it back."""
+        self.network.stop(self.rib_node(label))
+
+    def rib_node(self, label: str) -> str:
+        """Return what a RIB is called in ``network`` and ``leads``: ``switch/device``."""
+        at = self._rib_places()[label]
+        return f"{at.switch}/{at.ifname}"
+
+    def settle(self, duration_s: float = 10.0) -> bool:
+        """Let time go on until every member is attached; return whether that came true."""
+        settled = self.network.run(duration_s, lambda: all(m.attachment.is_attached for m in self.members.values()))
+        self.settled_s = self.network.now.mono_s
+        return settled
+
+    def _add_switch(self, name: str, domain: str) -> None:
+        self.identity(Role.LEAF if name in self.leaves else Role.SWITCH, name, domain)
+        self.network.add(name, *self._switch(name, domain))
+
+    def _switch(self, name: str, domain: str) -> tuple[SwitchCore, Table]:
+        table = Table()
+        switch = self.switches[name] = SwitchCore(self.identities[name], self.policy(domain), table, self._settings())
+        return switch, table
+
+    def _rib_places(self) -> dict[str, Attachment]:
+        """Return where the RIBs stand: a domain's first by its label, further ones as ``domain#2``, ``domain#3``."""
+        places: dict[str, Attachment] = {}
+        for domain in self.topology.domains:
+            of_domain = [at for at in self.topology.attached("rib") if at.switch in domain.switches]
+            for number, at in enumerate(of_domain, 1):
+                places[domain.label if number == 1 else f"{domain.label}#{number}"] = at
+        return places
+
+    def _rib_names(self, domain: str | None) -> tuple[Name, ...]:
+        labels = [label for label in self._rib_places() if label.split("#", maxsplit=1)[0] == domain]
+        return tuple(self.identities[f"rib:{label}"].name for label in labels)
+
+    def _add_rib(self, label: str, at: Attachment) -> None:
+        node = self.rib_node(label)
+        self.network.add(node, self._rib(label))
+        self.leads[node] = self.network.connect(at.switch, node, SimLink(0.0001, mtu=self.lead_mtu))
+
+    def _rib(self, label: str) -> RibHost:
+        domain = next(each for each in self.topology.domains if each.label == label.split("#", maxsplit=1)[0])
+        upper, peers = self._rib_names(domain.upper), self._rib_names(domain.label)
+        identity = self.identities[f"rib:{label}"]
+        policy = self.policy(domain.label)
+        rib = RibCore(identity, policy, MemoryStore(), RibSettings(upper=upper, peers=peers))
+        host = self.ribs[label] = RibHost(identity, policy, rib, self._settings())
+        return host
+
+    def _settings(self) -> NodeSettings:
+        self._incarnation += 1
+        return NodeSettings(
+            self._incarnation,
+            int(self.network.now.unix_s * 1000),
+            self.network.random_bytes,
+            self.hello_s,
+            self.dead_s,
+            self.lease_s,
+            self.keepalive_ms,
+        )

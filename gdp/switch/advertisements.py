@@ -1,0 +1,215 @@
+"""What attached nodes bring to their switch: claims and withdrawals, checked before anything is done for them.
+
+Place: pure. The claim of whoever hears others on a name (``HEARS``) plants trees. A reader's is judged here; any other
+is kept, relayed, and judged by the RIB: those who hear it must find it.
+
+A node numbers its claims in one count, and says all of them again in each session with a switch. So a claim of another
+life of the node, one below the first that came in its present session, and one that came before, are recordings.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import Final
+
+from gdp.control.advertise_ack import AdvertiseAck
+from gdp.control.neighbour import Neighbour
+from gdp.crypto.fields import check_sequence
+from gdp.crypto.identity import Identity
+from gdp.crypto.statements import Statement, StatementType
+from gdp.errors import DropReason, StatementError
+from gdp.frame.kinds import Kind
+from gdp.limits import ADVERTISEMENTS_WINDOW, WITHDRAWAL_MAX_BYTES
+from gdp.message.replay import ReplayWindow
+from gdp.names import ZERO, Name
+from gdp.sansio import Timestamps
+from gdp.switch.dependents import Dependents
+from gdp.switch.local_advertisements import LocalAdvertisements
+from gdp.switch.location_updates import LocationUpdates
+from gdp.switch.multicast import MulticastTrees
+from gdp.switch.name_resolver import NameResolver
+from gdp.switch.outbox import Outbox
+from gdp.switch.relocation import Relocations
+from gdp.switch.rib_client import RibClient
+from gdp.switch.unicast import Unicast
+from gdp.trust.advertisement import Advertisement, UnverifiedAdvertisement
+from gdp.trust.audit import Action
+from gdp.trust.right import HEARS, Right
+from gdp.trust.verifier import AdvertisementVerifier
+
+__all__ = ["AdvertisementHandler"]
+
+_SESSIONS_MAX: Final = 4_096  # above the neighbours that a switch has
+_INCARNATION_BYTES: Final = 8  # at the end of a life
+_TOLD_S: Final = 1.0
+
+
+class _Session:
+    """Which claims came in one session of a node."""
+
+    __slots__ = ("first", "told_s", "window")
+
+    def __init__(self, first: int) -> None:
+        self.first = first
+        self.told_s = float("-inf")  # when its node was last told that it is behind
+        self.window = ReplayWindow(ADVERTISEMENTS_WINDOW)
+
+
+class AdvertisementHandler:
+    """Takes the claims of attached nodes."""
+
+    def __init__(
+        self,
+        *,
+        identity: Identity,
+        verifier: AdvertisementVerifier,
+        attached: LocalAdvertisements,
+        resolver: NameResolver,
+        multicast: MulticastTrees,
+        unicast: Unicast,
+        rib_client: RibClient,
+        locations: LocationUpdates,
+        relocations: Relocations,
+        held: Dependents,
+        outbox: Outbox,
+    ) -> None:
+        self._identity = identity
+        self._verifier = verifier
+        self._audit = verifier.policy.audit
+        self._attached = attached
+        self._resolver = resolver
+        self._multicast = multicast
+        self._unicast = unicast
+        self._rib_client = rib_client
+        self._locations = locations
+        self._relocations = relocations
+        self._held = held
+        self._outbox = outbox
+        self._sessions: OrderedDict[bytes, _Session] = OrderedDict()  # by the nonce of the node
+
+    def receive_advertisement(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
+        """Take a claim that an attached node brought; whether it is taken or refused, the node is told.
+
+        Raises:
+            StatementError: it does not hold, or is not the node's newest.
+        """
+        if statement.signer != neighbour.name:
+            raise StatementError(DropReason.UNKNOWN_SENDER, "a claim that its maker did not bring")
+        try:
+            advertisement = self._verifier.verify_statement(statement, now.unix_s)
+            if advertisement.switch != self._identity.name:
+                raise StatementError(DropReason.NOT_FOR_US, "the RtCert names another switch")
+        except StatementError as error:
+            self._refuse(neighbour, statement, error)
+            raise
+        self._check_fresh(neighbour, advertisement, now.mono_s)
+        at = (neighbour.port, neighbour.mac)
+        newest = self._sequence_of(advertisement.name, neighbour)
+        if advertisement.sequence < newest:
+            self._judge(neighbour, advertisement.name, DropReason.STALE, newest)
+            raise StatementError(DropReason.STALE, "a claim that its maker has renewed")
+        if advertisement.right in HEARS:
+            cache = self._resolver.cache
+            try:
+                is_first = self._multicast.add_reader(
+                    advertisement, at, cache.of(advertisement.name, now.mono_s), now.mono_s
+                )
+            except StatementError as error:
+                self._refuse(neighbour, statement, error)
+                raise
+            self._held.note_advertisement(advertisement, at)
+            if is_first:
+                self._resolver.watch(advertisement.name, now.mono_s)
+            for place in cache.of(advertisement.name, now.mono_s):
+                self._locations.send_to_reader(at, advertisement.right, place, now.mono_s)
+        is_alone = (
+            self._rib_client.rib is None and advertisement.previous != ZERO
+        )  # no RIB will judge a node that has moved
+        if advertisement.right is Right.READ or is_alone:
+            self._judge(neighbour, advertisement.name, None, advertisement.sequence)
+        if advertisement.right is not Right.READ:
+            known = self._attached.get(advertisement.name, advertisement.node)
+            try:
+                self._attached.put(advertisement, *at, now.mono_s)
+            except StatementError as error:
+                self._refuse(neighbour, statement, error)
+                raise
+            self._held.note_advertisement(advertisement, at)
+            if known is None or (known.port, known.mac) != at:
+                self._audit.note(
+                    Action.ACCEPTED, "name", who=advertisement.node.to_text(), about=advertisement.name.to_text()
+                )
+                self._unicast.forget(advertisement.name)
+            self._unicast.release(advertisement.name, now.mono_s)
+            self._multicast.publisher_attached(advertisement, now.mono_s)
+        self._relocations.arrived(advertisement, now.mono_s)
+        self._rib_client.ask(now.mono_s)
+
+    def _check_fresh(self, neighbour: Neighbour, advertisement: Advertisement, now_s: float) -> None:
+        """Note a verified claim of a neighbour; one that is far behind is told by how much, now and then.
+
+        Raises:
+            StatementError: REPLAYED, it is of another life or session of it, or came before.
+        """
+        if advertisement.incarnation.to_bytes(_INCARNATION_BYTES, "big") != neighbour.life[-_INCARNATION_BYTES:]:
+            raise StatementError(DropReason.REPLAYED, "a claim of another life of its maker")
+        session = self._sessions.get(neighbour.nonce)
+        if session is None:
+            session = self._sessions[neighbour.nonce] = _Session(advertisement.sequence)
+            if len(self._sessions) > _SESSIONS_MAX:
+                self._sessions.popitem(last=False)
+        if advertisement.sequence < session.first or session.window.is_finished(advertisement.sequence):
+            if (
+                advertisement.sequence <= session.window.top - ADVERTISEMENTS_WINDOW
+                and now_s >= session.told_s + _TOLD_S
+            ):
+                session.told_s = now_s  # it may be the node's own, which says nothing newer unless it is told
+                self._judge(neighbour, advertisement.name, DropReason.STALE, session.window.top)
+            raise StatementError(DropReason.REPLAYED, "a claim")
+        session.window.finish(advertisement.sequence)
+        self._sessions.move_to_end(neighbour.nonce)
+
+    def _sequence_of(self, name: Name, neighbour: Neighbour) -> int:
+        """Return the highest sequence number of what an attached node claims on a name here, or -1."""
+        attachment = self._attached.get(name, neighbour.name)
+        reading = self._multicast.advertisement_of(name, (neighbour.port, neighbour.mac))
+        known = [reading] if attachment is None else [reading, attachment.advertisement]
+        return max((advertisement.sequence for advertisement in known if advertisement is not None), default=-1)
+
+    def _refuse(self, neighbour: Neighbour, statement: Statement, error: StatementError) -> None:
+        """Tell an attached node why its claim was not taken."""
+        try:
+            body = UnverifiedAdvertisement.from_statement(statement)
+        except StatementError:
+            return  # not even a claim: the caller counts it
+        about, reason = body.subject.name.to_text(), error.reason.label
+        self._audit.note(Action.REFUSED, "name", who=neighbour.name.to_text(), about=about, reason=reason)
+        self._judge(neighbour, body.subject.name, error.reason, body.sequence)
+
+    def _judge(self, neighbour: Neighbour, name: Name, refused: DropReason | None, sequence: int) -> None:
+        ack = AdvertiseAck(name, neighbour.name, refused, sequence)
+        wire = ack.to_wire(self._identity.name, self._identity.key, self._identity.membership)
+        self._outbox.say(neighbour, Kind.ADVERTISE_ACK, wire)
+
+    def withdraw(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
+        """Take a withdrawal.
+
+        Raises:
+            StatementError: it does not hold, or is older than what is claimed now.
+        """
+        fields = statement.expect(StatementType.WITHDRAW)
+        if statement.signer != neighbour.name:
+            raise StatementError(DropReason.UNKNOWN_SENDER, "a withdrawal that its maker did not bring")
+        if len(statement.wire) > WITHDRAWAL_MAX_BYTES:
+            raise StatementError(DropReason.TOO_BIG, "a withdrawal")
+        check_sequence(fields.uint("s"), now.unix_s)
+        statement.verify(neighbour.key)
+        name = fields.name("n")
+        if fields.uint("s") <= self._sequence_of(name, neighbour):
+            raise StatementError(DropReason.STALE, "a withdrawal of what was claimed anew")
+        right = Right.from_wire(fields.text("right"))
+        if right in HEARS and self._multicast.remove_reader(name, (neighbour.port, neighbour.mac)):
+            self._resolver.unwatch(name)
+        if right is not Right.READ and self._attached.remove(name, neighbour.name) is not None:
+            self._unicast.forget(name)
+            self._rib_client.relay(statement.wire, now.mono_s)

@@ -1,0 +1,567 @@
+"""A switch's control plane: what it hears from neighbours, asks of its RIB, and writes into the forwarding table.
+
+Place: pure; a shell or a simulated network feeds it the frames that its data plane hands up, and the time.
+
+The walk of a frame that was handed up::
+
+    kind >= 0x80  -> joined to a statement -> hello | link state | claim, withdrawal | join, leave
+    addressed to us -> a RIB's answer, or an echo
+    anything else -> no entry yet: Unicast finds the way, or parks the frame and asks
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Final
+
+from gdp.control.boundary import ErrorBoundary
+from gdp.control.channel import Channels, Opened
+from gdp.control.fragments import ControlFragmenter, ControlReassembler
+from gdp.control.join import Join
+from gdp.control.neighbor_discovery import Change, HelloPort, HelloProtocol
+from gdp.control.neighbour import Neighbour, NeighbourState
+from gdp.control.query import Query
+from gdp.control.revocation_sync import RevocationSync
+from gdp.control.settings import NodeSettings
+from gdp.control.waiting import Wait, WaitReason, port_waits, stranger_waits
+from gdp.crypto.certificates import Role
+from gdp.crypto.identity import Identity
+from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.errors import DropReason, FrameError, RemoteError, StatementError
+from gdp.frame.codec import HEADER_BYTES, Header, decode, encode
+from gdp.frame.kinds import CONTROL_FROM, Kind
+from gdp.limits import ADVERTISEMENTS_BURST, ADVERTISEMENTS_PER_S, HOPS_MAX, JOINS_BURST, JOINS_PER_S
+from gdp.message.token_bucket import Paces
+from gdp.names import Name
+from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
+from gdp.switch.advertisements import AdvertisementHandler
+from gdp.switch.dependents import Dependents
+from gdp.switch.evidence import Evidence
+from gdp.switch.flooding import Flooding
+from gdp.switch.local_advertisements import LocalAdvertisements
+from gdp.switch.location_updates import LocationUpdates
+from gdp.switch.multicast import MulticastTrees
+from gdp.switch.name_resolver import NameResolver
+from gdp.switch.outbox import Outbox
+from gdp.switch.presence import PresenceAnswers
+from gdp.switch.relocation import Relocations
+from gdp.switch.revocations import RevocationHandler
+from gdp.switch.rib_client import RibClient
+from gdp.switch.spf_delay import SpfDelay
+from gdp.switch.table import Table
+from gdp.switch.unicast import Unicast
+from gdp.trust.domain import Policy
+from gdp.trust.right import HEARS, Right
+from gdp.trust.verifier import AdvertisementVerifier
+
+__all__ = ["SwitchCore"]
+
+_PROTECT_S: Final = 0.1  # from new paths to their alternates, which nobody waits for
+_CONFLICTS_S: Final = 1.0  # between two looks at identities that are refused elsewhere
+_CONTROL = frozenset(kind.value for kind in Kind if kind >= CONTROL_FROM)
+
+
+class SwitchCore:
+    """The machine of one switch.
+
+    Args:
+        table: the forwarding table that the data plane reads.
+    """
+
+    def __init__(self, identity: Identity, policy: Policy, table: Table, settings: NodeSettings) -> None:
+        self._identity = identity
+        self._policy = policy
+        self.table = table
+        self._fragmenter = ControlFragmenter(identity.name, settings.incarnation)
+        self._reassembler = ControlReassembler()
+        self.hello_protocol = HelloProtocol.of_node(
+            identity, policy, self._fragmenter, settings,
+            digest_for=self._digest_for, life_elsewhere=self._life_elsewhere,
+        )  # fmt: skip
+        self._outbox = Outbox(self.hello_protocol, self._fragmenter)
+        self._flooding = Flooding(
+            identity=identity, policy=policy, hello_protocol=self.hello_protocol, send=self._send_link_state,
+            first_sequence=settings.first_sequence, life=settings.life,
+        )  # fmt: skip
+        self._paths = self._flooding.paths
+        self._verifier = AdvertisementVerifier(policy)
+        self._incarnation = settings.incarnation
+        self.attached = LocalAdvertisements()
+        self.resolver = NameResolver(identity.name, settings.lease_s)
+        self.multicast = MulticastTrees(
+            identity=identity, policy=policy, table=table, paths=self._paths, attached=self.attached,
+            outbox=self._outbox, first_sequence=settings.first_sequence,
+        )  # fmt: skip
+        self.unicast = Unicast(
+            me=identity.name, own_domain=policy.own, transit=policy.transit, table=table, paths=self._paths,
+            resolver=self.resolver, attached=self.attached, outbox=self._outbox,
+        )  # fmt: skip
+        self._evidence = Evidence(policy, self._verifier)
+        self._held = Dependents(self.attached, self.resolver.cache, self.multicast)
+        self._sync = RevocationSync(
+            identity, policy.revoked, self.hello_protocol,
+            lambda neighbour, wire: self._outbox.say(neighbour, Kind.REVOKED, wire), settings.first_sequence,
+        )  # fmt: skip
+        self._revoker = RevocationHandler(
+            verifier=self._verifier, hello_protocol=self.hello_protocol, attached=self.attached,
+            multicast=self.multicast, unicast=self.unicast, resolver=self.resolver,
+            evidence=self._evidence, held=self._held, sync=self._sync,
+            outbox=self._outbox,
+        )  # fmt: skip
+        self.relocations = Relocations(identity, policy, self.multicast, self.unicast, self._outbox)
+        self._seen_version = -1
+        self._spf_delay = SpfDelay()
+        self._protect_at_s: float | None = None  # when alternates are computed
+        self._followed_s = self._conflicts_sought_s = float("-inf")
+        self._presence = PresenceAnswers(identity, self.hello_protocol, self.attached, self.unicast, self._outbox)
+        self._channels = Channels(identity, policy, settings.random_bytes, accepts=False)
+        self._locations = LocationUpdates(
+            identity=identity, policy=policy, attached=self.attached, resolver=self.resolver, multicast=self.multicast,
+            unicast=self.unicast, relocations=self.relocations, held=self._held, outbox=self._outbox,
+        )  # fmt: skip
+        self.rib_client = RibClient(
+            identity=identity, policy=policy, paths=self._paths, attached=self.attached, resolver=self.resolver,
+            multicast=self.multicast, unicast=self.unicast, relocations=self.relocations, evidence=self._evidence,
+            locations=self._locations, outbox=self._outbox, presence=self._presence, channels=self._channels,
+        )  # fmt: skip
+        self._advertisements = AdvertisementHandler(
+            identity=identity, verifier=self._verifier, attached=self.attached, resolver=self.resolver,
+            multicast=self.multicast, unicast=self.unicast, rib_client=self.rib_client, locations=self._locations,
+            relocations=self.relocations, held=self._held, outbox=self._outbox,
+        )  # fmt: skip
+        self.boundary = ErrorBoundary()
+        self._join_paces = Paces(JOINS_PER_S, JOINS_BURST)
+        self._advertisement_paces = Paces(ADVERTISEMENTS_PER_S, ADVERTISEMENTS_BURST)
+        self._drops: Counter[DropReason] = Counter()
+        self._rest_due_s: float | None = None  # when something other than the greeter is due; None: to be looked up
+
+    @property
+    def name(self) -> Name:
+        """Return the switch's name."""
+        return self._identity.name
+
+    @property
+    def rib(self) -> Name | None:
+        """Return the RIB that is asked, or None while none is known."""
+        return self.rib_client.rib
+
+    @property
+    def severed(self) -> frozenset[Name]:
+        """Return the switches of the domain that leaves alone join to this one, so that no way leads to them."""
+        return self._paths.severed()
+
+    @property
+    def is_displaced(self) -> bool:
+        """Return whether an older switch with this identity is alive, so that this one has to end."""
+        return self._flooding.is_displaced
+
+    @property
+    def link_states(self) -> int:
+        """Return how many link states are known."""
+        return len(self._flooding.link_states)
+
+    def waits(self, attachments: Collection[int], now_s: float) -> list[Wait]:
+        """Return what this switch waits for before it can serve; empty when nothing is missing.
+
+        Args:
+            attachments: ports made for nodes of the same host, which may start at any time: an empty one is no reason.
+        """
+        waits = list(stranger_waits(self.hello_protocol, now_s))
+        refusing = {wait.port for wait in waits}
+        for port in self.hello_protocol.ports.values():
+            if port.index not in attachments:
+                found = port_waits(port, tuple(Role))
+                waits += (each for each in found if port.index not in refusing or each.reason is WaitReason.LINK_DOWN)
+        if severed := self.severed:
+            waits.append(Wait(WaitReason.THROUGH_LEAF, name=min(severed)))
+        if self.rib is None:
+            waits.append(Wait(WaitReason.NO_RIB))
+        return waits
+
+    def drops(self) -> Mapping[DropReason, int]:
+        """Return what the control plane dropped, by reason."""
+        own = self._drops + self._reassembler.drops + self.hello_protocol.drops + self._channels.drops
+        return own + self._flooding.drops + self.resolver.drops + self.multicast.drops + self.unicast.drops
+
+    def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Timestamps) -> None:
+        """Begin to use a port, or learn that the MTU or cost of one that is up has changed."""
+        self._rest_due_s = None
+        self._flooding.look_at_clock(now)
+        changes = self.hello_protocol.add_port(index, mac, mtu, cost, now.mono_s)
+        for change in changes:
+            self._neighbour_changed(change, now.mono_s)
+        if changes:
+            self._follow_links(now.mono_s)
+
+    def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
+        """Learn that a port's link came or went."""
+        self._rest_due_s = None
+        self._flooding.look_at_clock(now)
+        for change in self.hello_protocol.port_changed(port, up, now.mono_s):
+            self._neighbour_changed(change, now.mono_s)
+        self._follow_links(now.mono_s)  # at once: these frames would be lost
+
+    def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
+        """Take frames that the data plane handed up."""
+        has_others = False
+        self._flooding.look_at_clock(now)
+        for arrival in arrivals:
+            try:
+                header = decode(arrival.frame)
+                if header.kind == Kind.KEEPALIVE:
+                    self._take_keepalive(arrival, header, now)
+                else:
+                    has_others = True
+                    self._take(arrival, header, now)
+            except RemoteError as error:
+                self._drops[error.reason] += 1
+            except Exception as error:  # one frame must not end the switch
+                self.boundary.note(error)
+                self._drops[DropReason.INTERNAL] += 1
+        if has_others:
+            self._rest_due_s = None
+            self._presence.answer(now.mono_s)
+            self._flooding.tell_of_conflicts(now.mono_s)
+            self._plan_follow(now.mono_s)
+
+    def handle_timer(self, now: Timestamps) -> None:
+        """Do what is due."""
+        now_s = now.mono_s
+        self._flooding.look_at_clock(now)
+        lost = self.hello_protocol.drop_silent(now_s)
+        for change in lost:
+            self._neighbour_changed(change, now_s)
+        for hello in self.hello_protocol.hellos_to_send(now_s):
+            self._outbox.put(hello)
+        if not lost and self._rest_due_s is not None and now_s < self._rest_due_s:
+            return  # keepalives are most of what is due
+        self._rest_due_s = None
+        self._flooding.handle_timer(now_s)
+        if lost or (self._spf_delay.due_s is not None and self._spf_delay.due_s <= now_s):
+            self._follow_links(now_s)
+        else:
+            self._plan_follow(now_s)
+        if self._protect_at_s is not None and self._protect_at_s <= now_s:
+            self._protect_at_s = None
+            self._paths.has_alternates = True
+            self.unicast.refresh(now_s)
+        if self.unicast.is_refreshing:
+            self.unicast.refresh_more(now_s)
+        if now_s >= self._conflicts_sought_s + _CONFLICTS_S:
+            self._look_for_conflicts(now_s)
+        self._reassembler.drop_expired(now_s)
+        self._locations.expire(now_s)
+        for key in self.table.expire(now_s):
+            self.unicast.expired(key)
+        for attachment in self.attached.expire(now_s):
+            self.unicast.forget(attachment.advertisement.name)
+        for topic in self.multicast.handle_timer(now_s):
+            self.resolver.unwatch(topic)
+        self.relocations.handle_timer(now_s)
+        self.rib_client.ask(now_s)
+        self._sync.handle_timer(now_s)
+        self._tell_rib_of_revocations(now_s)
+        self._presence.answer(now_s)
+
+    def get_timer(self) -> float | None:
+        """Return the monotonic second of the next timer, or None."""
+        if self._rest_due_s is None:
+            self._rest_due_s = self._next_of_rest()
+        hello_protocol_s = self.hello_protocol.get_timer()
+        return self._rest_due_s if hello_protocol_s is None else min(hello_protocol_s, self._rest_due_s)
+
+    def _next_of_rest(self) -> float:
+        """Return the monotonic second of the next timer that is not the greeter's."""
+        times = [
+            self._spf_delay.due_s,
+            self._protect_at_s,
+            self._flooding.get_timer(),
+            self.table.next_expiry(),
+            self.multicast.get_timer(),
+            self.resolver.next_expiry(),
+            self.relocations.get_timer(),
+            self.rib_client.get_timer(),
+            self._sync.get_timer(),
+        ]
+        if self.rib_client.rib is not None:
+            times.append(self._revoker.next_due_for_rib())
+        if self.unicast.is_refreshing:
+            times.append(self._followed_s)  # past: at once
+        if self._paths.refused_elsewhere():
+            times.append(self._conflicts_sought_s + _CONFLICTS_S)
+        if self.rib_client.rib is None:
+            times.append(self.attached.next_expiry())
+        return min(time for time in times if time is not None)
+
+    def poll_neighbours(self) -> Mapping[int, frozenset[bytes]]:
+        """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
+        return self.hello_protocol.poll_addresses()
+
+    def frames_to_send(self) -> list[OutgoingFrames]:
+        """Return, once, what is to be sent: nothing from a switch whose identity an older one has."""
+        return [] if self.is_displaced else self._outbox.poll_frames()
+
+    def _unwatch(self, orphaned: Iterable[Name]) -> None:
+        for topic in orphaned:
+            self.resolver.unwatch(topic)
+
+    def _take_revoked(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
+        """Take part in the comparison of revocations with a neighbour."""
+        if statement.type is StatementType.REVOKE:
+            self._unwatch(self._revoker.receive_lacking(statement, neighbour, now))
+        else:
+            self._sync.receive(neighbour, statement, now)
+
+    def _tell_rib_of_revocations(self, now_s: float) -> None:
+        """Pass on to the RIB what the operator handed in."""
+        if self.rib_client.rib is not None:
+            for wire in self._revoker.due_for_rib(self.rib_client.rib, now_s):
+                self.rib_client.relay(wire, now_s)
+
+    def _digest_for(self, port: HelloPort) -> bytes:
+        return self._flooding.digest_for(port)
+
+    def revoke(self, wire: bytes, now: Timestamps) -> None:
+        """Take a revocation from this node's operator, and spread it.
+
+        Raises:
+            StatementError: it does not hold.
+        """
+        self._rest_due_s = None
+        self._unwatch(self._revoker.hand_in(parse(wire), now))
+        self._tell_rib_of_revocations(now.mono_s)
+
+    # -- frames
+
+    def _take_keepalive(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> None:
+        neighbour = self.hello_protocol.receive_keepalive(arrival, header, now)
+        if neighbour.role.is_switch:
+            self._flooding.compare(neighbour, now.mono_s)
+
+    def _take(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> None:
+        if header.kind >= CONTROL_FROM:
+            if header.kind not in _CONTROL:
+                raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
+            if header.kind == Kind.COOKIE:
+                self.hello_protocol.receive_cookie(arrival, header)
+                return
+            if header.kind == Kind.HELLO:
+                wire = self.hello_protocol.join(arrival, header, now.mono_s)
+            else:
+                self._sender(arrival)  # for strangers no state is kept
+                wire = self._reassembler.add(header, arrival.frame, now.mono_s, arrival.via)
+            if wire is not None:
+                statement = parse(wire)
+                with self.boundary.guard(arrival.via + statement.signer, now.mono_s):
+                    self._take_control(arrival, header.kind, statement, now)
+            return
+        neighbour = self._sender(arrival)  # nor is anything answered or looked for in their name
+        if header.destination == self.name:
+            self._take_own(header, arrival, now)
+        else:
+            frame = arrival.frame[: HEADER_BYTES + header.length]
+            sought = self.unicast.miss(header, frame, neighbour, now.mono_s)
+            if sought is not None and self.resolver.cache.serves_stale:
+                self.relocations.ask_neighbour(sought, neighbour, now.mono_s)
+            self.relocations.frame_came(Name(header.destination), neighbour, now.mono_s)
+
+    def _take_control(self, arrival: ReceivedFrame, kind: int, statement: Statement, now: Timestamps) -> None:
+        if kind == Kind.HELLO:
+            change = self.hello_protocol.receive(arrival, statement, now)
+            if change is not None:
+                self._neighbour_changed(change, now.mono_s)
+            known = self.hello_protocol.neighbour(arrival.port, statement.signer)
+            if known is not None and known.role.is_switch and not self._flooding.is_in_step(known):
+                self._flooding.sync(known, now.mono_s)
+            return
+        neighbour = self._sender(arrival)
+        if kind == Kind.LINK_STATE:
+            if not neighbour.role.is_switch:
+                raise StatementError(DropReason.NOT_DELEGATED, "only switches speak of links")
+            self._flooding.receive(neighbour, statement, now)
+        elif kind in (Kind.ADVERTISE, Kind.WITHDRAW):
+            if not self._advertisement_paces.spend(neighbour.name, now.mono_s):
+                raise StatementError(DropReason.QUOTA, "claims of one neighbour")  # it is told nothing: that costs, too
+            take = (
+                self._advertisements.receive_advertisement if kind == Kind.ADVERTISE else self._advertisements.withdraw
+            )
+            take(neighbour, statement, now)
+        elif kind in (Kind.JOIN, Kind.LEAVE):
+            self._take_join(neighbour, statement, now)
+        elif kind == Kind.REVOKE:
+            self._unwatch(self._revoker.receive_revocation(statement, neighbour, now))
+        elif kind == Kind.REVOKED:
+            self._take_revoked(neighbour, statement, now)
+        elif kind == Kind.REDIRECT:
+            self._redirected(statement, now)
+        elif kind == Kind.WHERE:
+            self._where(neighbour, statement, now)
+        else:
+            raise FrameError(DropReason.UNKNOWN_KIND, str(kind))
+
+    def _sender(self, arrival: ReceivedFrame) -> Neighbour:
+        """Return the neighbour with the sender's address.
+
+        Raises:
+            FrameError: UNKNOWN_SENDER, it is not up.
+        """
+        port = self.hello_protocol.ports.get(arrival.port)
+        for neighbour in port.neighbours.values() if port is not None else ():
+            if neighbour.mac == arrival.mac and neighbour.state is NeighbourState.UP:
+                return neighbour
+        raise FrameError(DropReason.UNKNOWN_SENDER)
+
+    def _take_own(self, header: Header, arrival: ReceivedFrame, now: Timestamps) -> None:
+        if header.kind in (Kind.RIB_ANSWER, Kind.RELOCATE):
+            wire = self._reassembler.add(header, arrival.frame, now.mono_s, arrival.via)
+            if wire is None:
+                return
+            opened: Opened | None = Opened(wire, is_fresh=False)
+            if header.kind == Kind.RIB_ANSWER:
+                opened = self.rib_client.open(wire, Name(header.source), now)
+            if opened is None:
+                return
+            statement = parse(opened.wire)
+            if opened.is_fresh and statement.signer != header.source:
+                raise StatementError(DropReason.UNKNOWN_SENDER, "signed by another than its sender")
+            with self.boundary.guard(arrival.via + statement.signer, now.mono_s):
+                if header.kind == Kind.RIB_ANSWER and statement.type is StatementType.RELAY:
+                    revocation, rib = self.rib_client.revocation_in(statement, now)
+                    self._unwatch(self._revoker.receive_from_rib(revocation, rib, now))
+                elif header.kind == Kind.RIB_ANSWER:
+                    self.rib_client.receive(statement, now, is_fresh=opened.is_fresh)
+                else:
+                    self._relocated(statement, now)
+        elif header.kind == Kind.ECHO_REQUEST:
+            back = header._replace(
+                kind=Kind.ECHO_REPLY, hops_left=HOPS_MAX, destination=header.source, source=self.name,
+                incarnation=self._incarnation,
+            )  # fmt: skip
+            reply = encode(back) + arrival.frame[HEADER_BYTES : HEADER_BYTES + header.length]
+            self.unicast.send([reply], Name(header.source), self.name, now.mono_s)
+        else:
+            raise FrameError(DropReason.NOT_FOR_US, str(header.kind))
+
+    # -- neighbours and links
+
+    def _neighbour_changed(self, change: Change, now_s: float) -> None:
+        neighbour, before = change
+        if NeighbourState.UP in (neighbour.state, before):
+            self._flooding.neighbour_changed(now_s)
+        if neighbour.state is not before:
+            self._neighbour_moved(change, now_s)
+        self.multicast.link_resized(neighbour.port)
+
+    def _neighbour_moved(self, change: Change, now_s: float) -> None:
+        """Greet who came up, and let go of who is gone."""
+        neighbour, before = change
+        if neighbour.state is NeighbourState.UP:
+            self._sync.neighbour_up(neighbour, now_s)
+            self.multicast.neighbour_up((neighbour.port, neighbour.mac), now_s)
+            self._seen_version = -1  # it may have another address now: what leads to it is computed anew
+            if neighbour.role.is_switch:
+                self._flooding.sync(neighbour, now_s)
+        elif before is NeighbourState.UP:
+            self._sync.neighbour_lost(neighbour)
+            if neighbour.role.is_switch:
+                self._flooding.damping.went((neighbour.port, neighbour.name), now_s)
+            self.multicast.neighbour_lost((neighbour.port, neighbour.mac), now_s)
+            for attachment in self.attached.of(neighbour.name):
+                if attachment.port == neighbour.port:
+                    self.relocations.departed(attachment.advertisement, now_s)
+                    self.attached.remove(attachment.advertisement.name, neighbour.name)
+                    self.unicast.forget(attachment.advertisement.name)
+
+    def _plan_follow(self, now_s: float) -> None:
+        """See that a change of the links is followed soon, together with those that come right behind it.
+
+        Link states come in bursts (``spf_delay.py``).
+        """
+        if self._spf_delay.due_s is None and self._flooding.link_states.version != self._seen_version:
+            self._spf_delay.news(now_s)
+
+    def _follow_links(self, now_s: float) -> None:
+        """Let everything that depends on paths follow a change of the links."""
+        self._spf_delay.computed()
+        version = self._flooding.link_states.version
+        if version == self._seen_version:
+            return
+        self._flooding.neighbour_changed(now_s)  # what lies inside our domain may have moved
+        self._seen_version = self._flooding.link_states.version
+        self._followed_s = now_s
+        self._paths.has_alternates, self._protect_at_s = False, now_s + _PROTECT_S
+        self.unicast.refresh(now_s)
+        self.multicast.reroute(now_s)
+        self.rib_client.links_changed(now_s)
+        self._look_for_conflicts(now_s)
+
+    def _life_elsewhere(self, name: Name) -> bytes | None:
+        role = Role.SWITCH if self._paths.is_switch(name) else Role.RIB
+        return self._paths.life_of(name, role)
+
+    def _look_for_conflicts(self, now_s: float) -> None:
+        """Let RIBs go that an older node with their identity outlives elsewhere; tell those that younger ones copy."""
+        self._conflicts_sought_s = now_s
+        for neighbour in self.hello_protocol.all_up():
+            elsewhere = self._life_elsewhere(neighbour.name) if neighbour.role is Role.RIB else None
+            if elsewhere is not None and elsewhere < neighbour.life:
+                self.hello_protocol.let_go(neighbour, now_s)
+        for name in self._paths.refused_elsewhere():
+            self.hello_protocol.tell_conflicts(name, now_s)
+            if name == self.name:
+                self.hello_protocol.note_clash(name, now_s)
+
+    def _send_link_state(self, neighbour: Neighbour, wire: bytes) -> None:
+        self._outbox.say(neighbour, Kind.LINK_STATE, wire)
+
+    # -- moved nodes
+
+    def _relocated(self, statement: Statement, now: Timestamps) -> None:
+        """Take from the new switch of a node that was attached here where it is, and tell whom it hears."""
+        place = self._evidence.from_relay(statement, now)
+        if place.right in HEARS and self.multicast.reader_moved(place):
+            self.resolver.unwatch(place.name)
+        self._locations.acknowledge_relocation(place, now.mono_s)
+        if place.right is not Right.READ and self._locations.is_newer(place):
+            self._locations.receive(place, statement.wire, now.mono_s)
+
+    def _redirected(self, statement: Statement, now: Timestamps) -> None:
+        """Take from a neighbour, to whom our frames for a node went, where that node is now."""
+        if statement.type is StatementType.RELAY:
+            place = self._evidence.from_relay(statement, now)
+        else:
+            place = self.rib_client.verify_answer(statement, now)
+        if self._locations.is_newer(place):
+            is_known = self._locations.get(place.name, place.advertiser) is not None
+            has_moved = is_known or self.multicast.trees.get(place.name, place.advertiser) is not None
+            self._locations.receive(place, statement.wire, now.mono_s)
+            if has_moved:
+                self.relocations.moved(place, statement.wire, now.mono_s)
+
+    def _where(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
+        """Tell a neighbour, to whom our frames for a node go, where that node is."""
+        query = Query.from_fields(statement.expect(StatementType.QUERY))
+        if not neighbour.role.is_switch or statement.signer != neighbour.name:
+            raise StatementError(DropReason.UNKNOWN_SENDER, "a question that a neighbouring switch did not ask")
+        statement.verify(neighbour.key)
+        for known in self._locations.proofs_of(query.name, now.mono_s):
+            self._outbox.say(neighbour, Kind.REDIRECT, known)
+
+    # -- trees
+
+    def _take_join(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
+        join = Join.from_fields(statement.expect(StatementType.JOIN))
+        if not neighbour.role.is_switch or statement.signer != neighbour.name:
+            raise StatementError(DropReason.UNKNOWN_SENDER, "a join is from a neighbouring switch")
+        if not self._join_paces.spend(neighbour.name, now.mono_s):
+            raise StatementError(DropReason.QUOTA, "joins of one neighbour")
+        statement.verify(neighbour.key)
+        self.hello_protocol.ports[neighbour.port].receive_join(join, neighbour)
+        if join.lease_s > 0:
+            advertisement = self._evidence.of_join(join, now)
+            if neighbour.role is Role.LEAF and advertisement.switch != neighbour.name:
+                raise StatementError(DropReason.THROUGH_LEAF, "a leaf that joins for a node of another switch")
+            self._held.note_branch(join.topic, join.publisher, (neighbour.port, neighbour.mac), advertisement)
+        if self.multicast.join(join, neighbour, now.mono_s):
+            self.relocations.redirect_join(join.topic, join.publisher, neighbour, now.mono_s)

@@ -1,0 +1,81 @@
+"""What a switch holds that rests on certificates: claims of attached nodes, places of names, branches of trees.
+
+Sans-I/O. The index finds what a revocation concerns; what has gone meanwhile is left out (``trust/evidence_index.py``).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from gdp.names import Name
+from gdp.switch.local_advertisements import LocalAdvertisements
+from gdp.switch.multicast import MulticastTrees
+from gdp.switch.name_cache import Location, NameCache
+from gdp.switch.trees import Downstream
+from gdp.trust.advertisement import Advertisement
+from gdp.trust.evidence_index import Holdings
+
+__all__ = ["AttachedAdvertisement", "Dependents", "JoinedBranch", "KnownLocation"]
+
+
+class AttachedAdvertisement(NamedTuple):
+    """A claim that a node attached at ``at`` brought."""
+
+    name: Name
+    node: Name
+    at: Downstream
+
+
+class KnownLocation(NamedTuple):
+    """Where an advertiser of a name is."""
+
+    name: Name
+    advertiser: Name
+
+
+class JoinedBranch(NamedTuple):
+    """A branch that a switch below asked for."""
+
+    topic: Name
+    publisher: Name
+    at: Downstream
+
+
+class Dependents:
+    """The index of one switch."""
+
+    def __init__(self, attached: LocalAdvertisements, places: NameCache, multicast: MulticastTrees) -> None:
+        self._attached = attached
+        self._places = places
+        self._multicast = multicast
+        self._holdings = Holdings[AttachedAdvertisement | KnownLocation | JoinedBranch](self._is_held)
+
+    def note_advertisement(self, advertisement: Advertisement, at: Downstream) -> None:
+        """Note the claim of an attached node."""
+        self._holdings.note(AttachedAdvertisement(advertisement.name, advertisement.node, at), advertisement)
+
+    def note_place(self, place: Location) -> None:
+        """Note what a RIB or a switch proved of an advertiser."""
+        if place.proof is not None:
+            self._holdings.note(KnownLocation(place.name, place.advertiser), place.proof)
+
+    def note_branch(self, topic: Name, publisher: Name, at: Downstream, evidence: Advertisement) -> None:
+        """Note the reader's claim that a join from below carried."""
+        self._holdings.note(JoinedBranch(topic, publisher, at), evidence)
+
+    def resting_on(self, fingerprint: bytes) -> list[AttachedAdvertisement | KnownLocation | JoinedBranch]:
+        """Return what rests on a certificate."""
+        return self._holdings.resting_on(fingerprint)
+
+    def has_issuer(self, key: bytes) -> bool:
+        """Return whether something rests on a certificate that this key, 33 bytes, issued."""
+        return self._holdings.has_issuer(key)
+
+    def _is_held(self, holder: AttachedAdvertisement | KnownLocation | JoinedBranch) -> bool:
+        if isinstance(holder, AttachedAdvertisement):
+            is_reader = self._multicast.advertisement_of(holder.name, holder.at) is not None
+            return is_reader or self._attached.get(holder.name, holder.node) is not None
+        if isinstance(holder, KnownLocation):
+            return self._places.get(holder.name, holder.advertiser) is not None
+        tree = self._multicast.trees.get(holder.topic, holder.publisher)
+        return tree is not None and holder.at in tree.branches

@@ -1,0 +1,169 @@
+"""What attached nodes claim through this switch, and whether the RIB has taken it.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds).
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+from typing import Final
+
+from gdp.errors import DropReason, StatementError
+from gdp.limits import ATTACHED_MAX
+from gdp.message.shares import Shares
+from gdp.names import Name
+from gdp.trust.advertisement import Advertisement
+from gdp.trust.right import Right
+
+__all__ = ["LocalAdvertisement", "LocalAdvertisements"]
+
+RELAY_AGAIN_S: Final = 0.4
+RELAY_TRIES: Final = 20
+
+
+@dataclass(slots=True, kw_only=True)
+class LocalAdvertisement:
+    """One claim of one attached node."""
+
+    advertisement: Advertisement
+    port: int
+    mac: bytes
+    expires_s: float
+    relay_at_s: float
+    tries: int = 0
+    is_settled: bool = False  # the RIB has answered
+
+
+class LocalAdvertisements:
+    """The claims of all attached nodes, by (name, advertiser); bounded, and shared among the nodes."""
+
+    def __init__(self) -> None:
+        self._by_name: dict[Name, dict[Name, LocalAdvertisement]] = {}
+        self._shares = Shares(ATTACHED_MAX)
+        self._relays: list[
+            tuple[float, int, LocalAdvertisement]
+        ] = []  # heaps; entries that a renewal made stale are skipped
+        self._ends: list[tuple[float, int, LocalAdvertisement]] = []
+        self._pushed = 0
+
+    def __len__(self) -> int:
+        return len(self._shares)
+
+    def get(self, name: Name, advertiser: Name) -> LocalAdvertisement | None:
+        """Return a claim, or None."""
+        return self._by_name.get(name, {}).get(advertiser)
+
+    def at(self, name: Name) -> LocalAdvertisement | None:
+        """Return an attachment that takes unicast frames for a name, or None."""
+        for attachment in self._by_name.get(name, {}).values():
+            if attachment.advertisement.right in (Right.ATTACH, Right.SERVE):
+                return attachment
+        return None
+
+    def put(self, advertisement: Advertisement, port: int, mac: bytes, now_s: float) -> LocalAdvertisement:
+        """Note a verified claim; it is to be relayed at once.
+
+        Raises:
+            StatementError: QUOTA, the node has too many.
+        """
+        if self.get(advertisement.name, advertisement.node) is None and not self._shares.reserve(advertisement.node):
+            raise StatementError(DropReason.QUOTA, "claims of one node")
+        attachment = LocalAdvertisement(
+            advertisement=advertisement, port=port, mac=mac, expires_s=now_s + advertisement.lease_s, relay_at_s=now_s
+        )
+        self._by_name.setdefault(advertisement.name, {})[advertisement.node] = attachment
+        self._push(self._relays, now_s, attachment)
+        self._push(self._ends, attachment.expires_s, attachment)
+        return attachment
+
+    def remove(self, name: Name, advertiser: Name) -> LocalAdvertisement | None:
+        """Forget a claim; return it, if it was there."""
+        advertisements = self._by_name.get(name, {})
+        gone = advertisements.pop(advertiser, None)
+        if gone is not None:
+            self._shares.release(advertiser)
+        if not advertisements:
+            self._by_name.pop(name, None)
+        return gone
+
+    def all(self) -> list[LocalAdvertisement]:
+        """Return every claim."""
+        return [each for advertisements in self._by_name.values() for each in advertisements.values()]
+
+    def of(self, advertiser: Name) -> list[LocalAdvertisement]:
+        """Return all claims of one node."""
+        return [advertisements[advertiser] for advertisements in self._by_name.values() if advertiser in advertisements]
+
+    def settle(self, name: Name, advertiser: Name, taken: int | None) -> LocalAdvertisement | None:
+        """Note that the RIB has answered; return the claim.
+
+        Args:
+            taken: the sequence number that it took, if it did: what was claimed anew since is not settled by that.
+        """
+        attachment = self.get(name, advertiser)
+        if attachment is None or (taken is not None and taken < attachment.advertisement.sequence):
+            return None
+        attachment.is_settled = True
+        return attachment
+
+    def relay_all(self, now_s: float) -> None:
+        """Have everything relayed again: there is a new RIB."""
+        for attachment in self.all():
+            attachment.is_settled, attachment.relay_at_s, attachment.tries = False, now_s, 0
+            self._push(self._relays, now_s, attachment)
+
+    def due(self, now_s: float) -> list[LocalAdvertisement]:
+        """Return the claims to relay now."""
+        due = []
+        while self._next_relay() <= now_s:
+            each = heapq.heappop(self._relays)[2]
+            each.tries += 1
+            each.relay_at_s = now_s + RELAY_AGAIN_S
+            self._push(self._relays, each.relay_at_s, each)
+            due.append(each)
+        return due
+
+    def expire(self, now_s: float) -> list[LocalAdvertisement]:
+        """Forget and return what was not renewed."""
+        late = []
+        while self._next_end() <= now_s:
+            late.append(heapq.heappop(self._ends)[2])
+            self.remove(late[-1].advertisement.name, late[-1].advertisement.node)
+        return late
+
+    def next_event(self) -> float | None:
+        """Return the monotonic second of the next relay or lease end, or None."""
+        next_s = min(self._next_relay(), self._next_end())
+        return None if next_s == float("inf") else next_s
+
+    def next_expiry(self) -> float | None:
+        """Return the monotonic second of the next lease end, or None."""
+        next_s = self._next_end()
+        return None if next_s == float("inf") else next_s
+
+    def _push(
+        self, heap: list[tuple[float, int, LocalAdvertisement]], at_s: float, attachment: LocalAdvertisement
+    ) -> None:
+        self._pushed += 1
+        heapq.heappush(heap, (at_s, self._pushed, attachment))
+
+    def _is_held(self, attachment: LocalAdvertisement) -> bool:
+        return self.get(attachment.advertisement.name, attachment.advertisement.node) is attachment
+
+    def _next_relay(self) -> float:
+        while self._relays:
+            at_s, _, each = self._relays[0]
+            is_open = not each.is_settled and each.tries < RELAY_TRIES
+            if is_open and each.relay_at_s == at_s and self._is_held(each):
+                return at_s
+            heapq.heappop(self._relays)
+        return float("inf")
+
+    def _next_end(self) -> float:
+        while self._ends:
+            at_s, _, each = self._ends[0]
+            if self._is_held(each):
+                return at_s
+            heapq.heappop(self._ends)
+        return float("inf")

@@ -1,0 +1,159 @@
+"""News of where advertisers are: verified statements in; name cache, routes, trees and attached readers follow.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). The caller has verified every statement (``evidence.py``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+from gdp.control.advertise_ack import AdvertiseAck
+from gdp.control.query import Response
+from gdp.control.relay import relayed
+from gdp.crypto.identity import Identity
+from gdp.errors import DropReason, StatementError
+from gdp.frame.kinds import Kind
+from gdp.names import Name
+from gdp.switch.dependents import Dependents
+from gdp.switch.local_advertisements import LocalAdvertisements
+from gdp.switch.multicast import MulticastTrees
+from gdp.switch.name_cache import Location
+from gdp.switch.name_resolver import NameResolver
+from gdp.switch.outbox import Outbox
+from gdp.switch.relocation import Relocations
+from gdp.switch.trees import Downstream
+from gdp.switch.unicast import Unicast
+from gdp.trust.domain import Policy
+from gdp.trust.right import HEARS, Right
+
+__all__ = ["LocationUpdates"]
+
+PROOFS_MAX: Final = 8  # statements in one reply to a neighbour
+
+
+class LocationUpdates:
+    """Applies news of locations at one switch, and tells others what is known."""
+
+    def __init__(
+        self,
+        *,
+        identity: Identity,
+        policy: Policy,
+        attached: LocalAdvertisements,
+        resolver: NameResolver,
+        multicast: MulticastTrees,
+        unicast: Unicast,
+        relocations: Relocations,
+        held: Dependents,
+        outbox: Outbox,
+    ) -> None:
+        self._identity = identity
+        self._policy = policy
+        self._attached = attached
+        self._resolver = resolver
+        self._multicast = multicast
+        self._unicast = unicast
+        self._relocations = relocations
+        self._held = held
+        self._outbox = outbox
+
+    def get(self, name: Name, advertiser: Name) -> Location | None:
+        """Return the known place of one advertiser of a name, or None."""
+        return self._resolver.cache.get(name, advertiser)
+
+    def is_newer(self, place: Location) -> bool:
+        """Return whether a place is newer than what is known of its advertiser, here or elsewhere."""
+        attachment = self._attached.get(place.name, place.advertiser)
+        known = self.get(place.name, place.advertiser)
+        newest = max(
+            -1 if attachment is None else attachment.advertisement.sequence, -1 if known is None else known.sequence
+        )
+        return place.sequence > newest
+
+    def receive(self, place: Location, statement: bytes, now_s: float) -> None:
+        """Store where an advertiser is, and update everything that depends on it.
+
+        Args:
+            statement: the proof of it.
+        """
+        is_ours = place.switch == self._identity.name
+        attachment = self._attached.get(place.name, place.advertiser)
+        was_here = self._relocations.was_here(place.name, place.advertiser, now_s)
+        if attachment is not None and attachment.advertisement.sequence < place.sequence and not is_ours:
+            self._attached.remove(place.name, place.advertiser)  # it has moved to another switch
+            self._relocations.departed(attachment.advertisement, now_s)
+            self._unicast.forget(place.name)
+            was_here = True
+        before = self.get(place.name, place.advertiser)
+        if before is not None and before.sequence > place.sequence:
+            place = replace(before, expires_s=max(before.expires_s, place.expires_s))  # the sender lags behind
+        self._held.note_place(place)
+        self._resolver.receive_location(place, now_s, is_ours=is_ours, has_left=is_ours and attachment is None)
+        if before is None or (before.switch, before.domain) != (place.switch, place.domain):
+            self._unicast.forget(place.name)
+            self._unicast.forget(place.advertiser)
+            self._multicast.publisher_moved(place, now_s)
+            if was_here and not is_ours:
+                self._relocations.moved(place, statement, now_s)
+        self._multicast.publisher_found(place, now_s)
+        if before is None or before.advertisement != place.advertisement:
+            for at, right in self._multicast.readers(place.name):
+                self.send_to_reader(at, right, place, now_s)
+        for name in (place.name, place.advertiser):
+            self._unicast.release(name, now_s)
+
+    def receive_removal(self, answer: Response, now_s: float) -> None:
+        """Remove an advertiser that has withdrawn.
+
+        Raises:
+            StatementError: STALE, its claim that is known is newer.
+        """
+        known = self.get(answer.name, answer.advertiser)
+        if known is not None and known.sequence > answer.sequence:
+            raise StatementError(DropReason.STALE, "a removal of an earlier claim")
+        self._resolver.receive_removal(answer.name, answer.advertiser, now_s)
+        self._multicast.publisher_gone(answer.name, answer.advertiser)
+        self._unicast.forget(answer.name)
+        wire = answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)
+        for at, _ in self._multicast.readers(answer.name):
+            self._outbox.say_at(*at, Kind.ADVERTISE_ACK, wire)
+
+    def expire(self, now_s: float) -> None:
+        """Remove what no RIB has confirmed for a lease, and the frames that waited too long."""
+        for place in self._resolver.expire(now_s):
+            self._multicast.publisher_gone(place.name, place.advertiser)
+
+    def send_to_reader(self, at: Downstream, right: Right, place: Location, now_s: float) -> None:
+        """Send the claim of an advertiser to an attached node that reads it by ``right``; the node verifies it."""
+        if HEARS[right] is place.right:
+            self._outbox.say_at(*at, Kind.ADVERTISE_ACK, self._as_answer(place, now_s))
+
+    def acknowledge_relocation(self, moved: Location, now_s: float) -> None:
+        """Send the new switch of a node an acknowledgement, and the locations of those advertisers that it reads."""
+        identity = self._identity
+        ack = AdvertiseAck(moved.name, moved.advertiser, None, moved.sequence)
+        statements = [ack.to_wire(identity.name, identity.key, identity.membership)]
+        for place in self._resolver.cache.of(moved.name, now_s):
+            if HEARS.get(moved.right) is place.right:
+                statements.append(self._as_answer(place, now_s))
+        for statement in statements:
+            frames = self._outbox.far(Kind.RIB_ANSWER, statement, moved.switch)
+            self._unicast.send(frames, moved.switch, identity.name, now_s)
+
+    def proofs_of(self, name: Name, now_s: float) -> list[bytes]:
+        """Return statements that prove where a node, or an advertiser of a name, is; at most ``PROOFS_MAX``."""
+        attachment = self._attached.at(name)
+        if attachment is not None:
+            return [relayed(attachment.advertisement.wire, self._identity, self._policy.transit)]
+        cache = self._resolver.cache
+        node = cache.of_node(name, now_s)
+        places = cache.of(name, now_s) + ([] if node is None else [node])
+        return [self._as_answer(place, now_s) for place in places[:PROOFS_MAX]]
+
+    def _as_answer(self, place: Location, now_s: float) -> bytes:
+        lease_s = max(place.expires_s - now_s, 0.0)
+        answer = Response(
+            place.name, place.advertiser, place.advertisement, place.domain, tuple(sorted(place.transit)), lease_s
+        )
+        return answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)

@@ -1,0 +1,156 @@
+"""What is known of everybody's links: the newest link state of each switch and scope.
+
+Place: pure.
+Source: after RFC 2328, section 13.1 (which of two is newer) and 13.4 (one's own that comes back newer).
+
+What was forgotten stays known by its number for as long as anybody could believe its time (``PAST_S``): a recorded link
+state of a dead switch is refused. Numbers are kept for each life of an origin, so that one that has restarted is heard
+at once, whatever its clock says.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from typing import Final
+
+from gdp.control.hello import DIGEST_BYTES
+from gdp.control.link_state import LinkState, Scope
+from gdp.errors import DropReason, StatementError
+from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_LEASE_S
+from gdp.names import Name
+
+__all__ = ["LINK_STATES_MAX", "PAST_S", "LinkStateDatabase"]
+
+LINK_STATES_MAX = 8_192
+PAST_S: Final = 2 * LINK_STATE_AGE_MAX_S  # what was signed by a clock ahead holds for so long at clocks behind
+_LIVES_MAX: Final = 8  # of one origin that are told apart; then the highest number of all counts
+
+
+@dataclass(slots=True)
+class _Entry:
+    state: LinkState
+    wire: bytes
+    expires_s: float
+
+
+@dataclass(slots=True)
+class _Past:
+    """Numbers of one origin and scope that are over."""
+
+    until_s: float
+    lives: dict[bytes, int] = field(default_factory=dict)
+    floor: int = -1  # of all lives that are not listed
+
+    def note(self, life: bytes, sequence: int, until_s: float) -> None:
+        self.until_s = until_s
+        self.lives[life] = max(sequence, self.lives.pop(life, -1))
+        if len(self.lives) > _LIVES_MAX:
+            self.floor = max(self.floor, self.lives.pop(next(iter(self.lives))))
+
+
+class LinkStateDatabase:
+    """The link-state database of one switch.
+
+    Attributes:
+        version: rises with every change that may move a path, or of whose identity is whose.
+    """
+
+    def __init__(self, domain: Name) -> None:
+        self._domain = domain
+        self._entries: dict[tuple[Name, Scope], _Entry] = {}
+        self._digests: dict[bool, bytes] = {}
+        self._past: dict[tuple[Name, Scope], _Past] = {}  # in order of their end
+        self.version = 0
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def is_news(self, origin: Name, scope: Scope, sequence: int) -> bool:
+        """Return whether a link state is newer than the present one."""
+        known = self._entries.get((origin, scope))
+        return known is None or sequence > known.state.sequence
+
+    def is_past(self, origin: Name, scope: Scope, sequence: int, life: bytes) -> bool:
+        """Return whether a link state is of what was forgotten or replaced."""
+        past = self._past.get((origin, scope))
+        return past is not None and sequence <= past.lives.get(life, past.floor)
+
+    def sequence_of(self, origin: Name, scope: Scope) -> int:
+        """Return the newest sequence number known, or 0."""
+        known = self._entries.get((origin, scope))
+        return 0 if known is None else known.state.sequence
+
+    def put(self, state: LinkState, wire: bytes, now_s: float) -> bool:
+        """Take a verified link state; return whether it was news.
+
+        Raises:
+            StatementError: QUOTA, the database is full.
+        """
+        key = (state.origin, state.scope)
+        if not self.is_news(*key, state.sequence) or self.is_past(*key, state.sequence, state.life):
+            return False
+        known = self._entries.get(key)
+        if known is None and len(self._entries) >= LINK_STATES_MAX:
+            raise StatementError(DropReason.QUOTA, "link states")
+        if known is not None and known.state.life != state.life:
+            self._bury(known.state, now_s)
+        self._entries[key] = _Entry(state, wire, now_s + LINK_STATE_LEASE_S)
+        self._digests.clear()
+        if known is None or _ways(known.state) != _ways(state):
+            self.version += 1
+        return True
+
+    def expire(self, now_s: float) -> None:
+        """Forget what was not renewed."""
+        late = [key for key, entry in self._entries.items() if entry.expires_s <= now_s]
+        for key in late:
+            self._bury(self._entries.pop(key).state, now_s)
+            self.version += 1
+        while self._past:
+            key, past = next(iter(self._past.items()))
+            if past.until_s > now_s:
+                break
+            del self._past[key]
+        if late:
+            self._digests.clear()
+
+    def _bury(self, state: LinkState, now_s: float) -> None:
+        key = state.origin, state.scope
+        past = self._past.pop(key, None) or _Past(now_s)
+        past.note(state.life, state.sequence, now_s + PAST_S)
+        self._past[key] = past
+        if len(self._past) > 2 * LINK_STATES_MAX:
+            del self._past[next(iter(self._past))]
+
+    def next_expiry(self) -> float | None:
+        """Return the monotonic second of the next expiry, or None."""
+        return min((entry.expires_s for entry in self._entries.values()), default=None)
+
+    def states(self, scope: Scope) -> list[LinkState]:
+        """Return all link states of a scope."""
+        return [entry.state for (_, its), entry in self._entries.items() if its is scope]
+
+    def shared_with(self, domain: Name) -> list[bytes]:
+        """Return the statements that a neighbour of this domain should have."""
+        return [entry.wire for key, entry in self._entries.items() if self._is_shared(key, domain)]
+
+    def digest(self, domain: Name) -> bytes:
+        """Return a short digest of what is shared with a neighbour of this domain; equal at both ends when in step."""
+        is_home = domain == self._domain
+        digest = self._digests.get(is_home)
+        if digest is None:
+            lines = sorted(
+                origin + scope.value.encode() + entry.state.sequence.to_bytes(8, "big")
+                for (origin, scope), entry in self._entries.items()
+                if self._is_shared((origin, scope), domain)
+            )
+            digest = self._digests[is_home] = hashlib.sha256(b"".join(lines)).digest()[:DIGEST_BYTES]
+        return digest
+
+    def _is_shared(self, key: tuple[Name, Scope], domain: Name) -> bool:
+        return key[1] is Scope.BORDER or domain == self._domain
+
+
+def _ways(state: LinkState) -> tuple[object, ...]:
+    return state.links, state.inside, state.ribs, state.members, state.life, state.refused, state.is_leaf

@@ -1,0 +1,564 @@
+"""Growing and pruning trees: joins from below, joins upwards, and the table entries in between.
+
+Place: pure; time comes in as ``now_s`` (monotonic seconds).
+
+A reader's claim and each known publisher of its topic make a tree; so do a server's with each client, and a client's
+with each server, which are called reader and publisher here. A switch asks the next switch towards the publisher,
+again and again while a branch stands, and asks another one at once when the way changes. A join is said several times
+at first, since one may be lost. A join says the smallest MTU below, so it is said anew at once when that changes: a
+reader came or left, or a link got narrower or wider.
+
+Make before break: where the one above changes because a better way has come up, the former one is left only after
+``_OVERLAP_S``; readers drop what comes twice. Where the publisher has moved it is left at once, for the former one may
+now have to take its messages from here.
+
+A tree that has settled asks its loop-free alternate for a backup branch (``backups.py``). Where both ways part, the
+data plane takes it as soon as the port of the protected branch is down; the branch itself is lost a moment later, and
+the backup then counts as one for ``_ACTIVE_S``, in which the switch below joins anew.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from gdp.control.join import Join
+from gdp.control.neighbour import Neighbour
+from gdp.crypto.certificates import Role
+from gdp.crypto.identity import Identity
+from gdp.errors import DropReason, StatementError
+from gdp.frame.kinds import Kind
+from gdp.limits import JOIN_LEASE_S, JOIN_REFRESH_S, READERS_MAX, TREES_MAX
+from gdp.message.shares import Shares
+from gdp.names import ZERO, Name
+from gdp.switch.backups import Backups
+from gdp.switch.local_advertisements import LocalAdvertisements
+from gdp.switch.name_cache import Location
+from gdp.switch.outbox import Outbox
+from gdp.switch.paths import Paths
+from gdp.switch.table import Table
+from gdp.switch.trees import Branch, Downstream, Tree, Trees
+from gdp.trust.advertisement import Advertisement
+from gdp.trust.domain import Policy
+from gdp.trust.right import HEARS, Right
+
+__all__ = ["MulticastTrees"]
+
+_JOIN_AGAIN_S: Final = (0.1, 0.3)  # a new join is said again after so long, then every JOIN_REFRESH_S
+_OVERLAP_S: Final = 0.3  # the former one above is left so long after the new one was asked
+_ACTIVE_S: Final = 1.0  # for which a backup takes the place of a branch that was lost
+
+
+@dataclass(slots=True)
+class _Reader:
+    """A node attached here that reads a topic, serves or calls."""
+
+    advertisement: Advertisement
+    expires_s: float
+
+
+class MulticastTrees:
+    """All trees of one switch.
+
+    Args:
+        first_sequence: of our joins.
+    """
+
+    def __init__(
+        self,
+        *,
+        identity: Identity,
+        policy: Policy,
+        table: Table,
+        paths: Paths,
+        attached: LocalAdvertisements,
+        outbox: Outbox,
+        first_sequence: int,
+    ) -> None:
+        self._sequence = first_sequence
+        self._identity = identity
+        self._is_leaf = identity.role is Role.LEAF
+        self._policy = policy
+        self._table = table
+        self._paths = paths
+        self._attached = attached
+        self._outbox = outbox
+        self._backups = Backups(identity.name, policy.own, paths, outbox)
+        self._readers: dict[Name, dict[Downstream, _Reader]] = {}
+        self._reader_shares = Shares(READERS_MAX)
+        self._readers_end_s = float("inf")  # no reader's lease ends before
+        self._branch_shares = Shares(TREES_MAX)
+        self.trees = Trees()
+        self.drops: Counter[DropReason] = Counter()
+
+    def readers(self, topic: Name) -> list[tuple[Downstream, Right]]:
+        """Return where the readers of a topic are attached, and by which right they read."""
+        return [(at, reader.advertisement.right) for at, reader in self._readers.get(topic, {}).items()]
+
+    def advertisement_of(self, topic: Name, at: Downstream) -> Advertisement | None:
+        """Return the claim of a reader attached there, or None."""
+        reader = self._readers.get(topic, {}).get(at)
+        return None if reader is None else reader.advertisement
+
+    def add_reader(self, advertisement: Advertisement, at: Downstream, places: list[Location], now_s: float) -> bool:
+        """Take the verified claim of an attached node that hears others; return whether it is the name's first here.
+
+        Raises:
+            StatementError: QUOTA, the node reads too many topics.
+        """
+        is_first = advertisement.name not in self._readers
+        if at not in self._readers.get(advertisement.name, {}) and not self._reader_shares.reserve(_owner(at)):
+            raise StatementError(DropReason.QUOTA, "topics that one node reads")
+        readers = self._readers.setdefault(advertisement.name, {})
+        readers[at] = _Reader(advertisement, now_s + advertisement.lease_s)
+        self._readers_end_s = min(self._readers_end_s, now_s + advertisement.lease_s)
+        for place in places:
+            self.publisher_found(place, now_s)
+        return is_first
+
+    def remove_reader(self, topic: Name, at: Downstream) -> bool:
+        """Let a reader go; return whether the topic has none left here."""
+        readers = self._readers.get(topic, {})
+        if readers.pop(at, None) is not None:
+            self._reader_shares.release(_owner(at))
+        for tree in self.trees.of_topic(topic):
+            self._cut(tree, at)
+        if readers:
+            return False
+        self._readers.pop(topic, None)
+        return True
+
+    def publisher_found(self, place: Location, now_s: float) -> None:
+        """Join, or follow, a publisher of a topic that has readers here."""
+        for at, reader in self._readers.get(place.name, {}).items():
+            if reader.advertisement.node == place.advertiser or HEARS[reader.advertisement.right] is not place.right:
+                continue  # one's own messages do not come back
+            allowed = (self._policy.transit & place.transit) | {self._policy.own, place.domain}
+            tree = self._tree(place.name, place.advertiser, allowed)
+            if place.sequence >= tree.version:
+                self._place_at(tree, place.switch, place.domain, place.sequence, place.advertisement)
+                tree.allowed = allowed
+            branch = Branch(
+                expires_s=reader.expires_s, mtu=self._outbox.mtu_of(at[0]), evidence=reader.advertisement.wire
+            )
+            if not self._put_branch(tree, at, branch):
+                self.drops[DropReason.QUOTA] += 1
+                continue
+            self._plant(tree)
+            self._follow(tree, now_s)
+            self._ask_above(tree, now_s)
+
+    def publisher_attached(self, advertisement: Advertisement, now_s: float) -> None:
+        """Take in that a publisher claims its topic here: trees that pass here are asked of itself at once."""
+        tree = self.trees.get(advertisement.name, advertisement.node)
+        if tree is not None:
+            version = max(advertisement.sequence, tree.version)
+            self._place_at(tree, self._identity.name, self._policy.own, version, advertisement.wire)
+            tree.renew_at_s = now_s
+
+    def publisher_moved(self, place: Location, now_s: float) -> None:
+        """Let the tree of a publisher follow it, if it passes here and its readers let it pass there."""
+        tree = self.trees.get(place.name, place.advertiser)
+        if tree is not None and place.sequence >= tree.version and place.domain in tree.allowed:
+            self._place_at(tree, place.switch, place.domain, place.sequence, place.advertisement)
+            self._follow(tree, now_s)
+
+    def below(self, topic: Name, publisher: Name) -> list[Downstream]:
+        """Return the neighbouring switches that take a tree from here."""
+        tree = self.trees.get(topic, publisher)
+        readers = self._readers.get(topic, {})
+        return [] if tree is None else [at for at in tree.branches if at not in readers]
+
+    def publisher_gone(self, topic: Name, publisher: Name) -> None:
+        """Take the readers attached here off a tree whose publisher is gone."""
+        tree = self.trees.get(topic, publisher)
+        if tree is not None:
+            for at in self._readers.get(topic, {}):
+                self._cut(tree, at)
+
+    def reader_moved(self, place: Location) -> bool:
+        """Let a reader go that is attached elsewhere now; return whether the topic has none left here."""
+        for at, reader in list(self._readers.get(place.name, {}).items()):
+            if reader.advertisement.node == place.advertiser and reader.advertisement.sequence < place.sequence:
+                return self.remove_reader(place.name, at)
+        return False
+
+    def join(self, join: Join, neighbour: Neighbour, now_s: float) -> bool:
+        """Take a verified join (or, with no lease, a leave) from the switch below.
+
+        Returns:
+            Whether it looks for the publisher where that is no longer.
+
+        Raises:
+            StatementError: the way is not allowed to lead through here.
+        """
+        at = (neighbour.port, neighbour.mac)
+        if join.lease_s == 0:
+            tree = self.trees.get(join.topic, join.publisher)
+            if tree is not None and at in tree.branches and not _is_overtaken(join, tree.branches[at]):
+                self._cut(tree, at)
+            return False
+        if self._is_leaf and join.switch != self._identity.name:
+            raise StatementError(DropReason.THROUGH_LEAF, "a tree that would pass a leaf")
+        if self._policy.own not in join.allowed or neighbour.domain not in join.allowed:
+            raise StatementError(DropReason.WRONG_DOMAIN, "a tree that must not pass here")
+        if join.backup_for != ZERO and neighbour.domain != self._policy.own:
+            raise StatementError(DropReason.WRONG_DOMAIN, "a backup for another domain")
+        if self._paths.domain_of(join.switch) not in (None, join.domain):
+            raise StatementError(DropReason.WRONG_DOMAIN, "the publisher's switch is of another domain")
+        tree = self._tree(join.topic, join.publisher, join.allowed)
+        before = tree.branches.get(at)
+        if before is not None and _is_overtaken(join, before):
+            return False
+        if tree.former is not None and tree.former[0] == at and join.backup_for == ZERO:
+            self._leave_former(tree)  # it takes the messages from here now
+        is_behind = join.version < tree.version
+        is_same_place = (tree.switch, tree.domain) == (join.switch, join.domain) or is_behind
+        if join.version >= tree.version:
+            self._place_at(tree, join.switch, join.domain, join.version, join.proof)
+            tree.allowed = join.allowed
+        branch = Branch(
+            expires_s=now_s + min(join.lease_s, JOIN_LEASE_S),
+            mtu=join.mtu,
+            evidence=join.evidence,
+            said_mtu=join.mtu,
+            sequence=join.sequence,
+            session=join.sender_session,
+        )
+        branch.fit(self._outbox.mtu_of(neighbour.port))
+        if join.backup_for != ZERO:
+            branch.backup_for = join.backup_for
+            branch.active_until_s = None if before is None else before.active_until_s
+        if not self._put_branch(tree, at, branch):
+            raise StatementError(DropReason.QUOTA, "branches of one neighbour")
+        self._plant(tree)
+        if not self._follow(tree, now_s):
+            if (before is None and branch.is_active) or not is_same_place or tree.is_doubted:
+                self._ask_above(tree, now_s)
+            else:
+                self._restate(tree)
+        return is_behind and tree.switch != join.switch
+
+    def neighbour_up(self, at: Downstream, now_s: float) -> None:
+        """Ask a neighbour again for what it was asked before its present session, of which it knows nothing."""
+        for tree in self.trees.all():
+            if tree.above == at:
+                self._ask_above(tree, now_s)
+
+    def neighbour_lost(self, at: Downstream, now_s: float) -> None:
+        """Cut every branch to a neighbour that is gone; what backups they have take their place."""
+        for topic in [topic for topic, readers in self._readers.items() if at in readers]:
+            self.remove_reader(topic, at)
+        for tree in self.trees.all():
+            backup = tree.protection.get(at)
+            if backup is not None:
+                tree.branches[backup].active_until_s = now_s + _ACTIVE_S
+            self._cut(tree, at)
+
+    def link_resized(self, port: int) -> None:
+        """Tell the ones above of every tree to which the link on a port made a difference."""
+        for tree in self.trees.all():
+            for (its, _), branch in tree.branches.items():
+                if its == port:
+                    branch.fit(self._outbox.mtu_of(port))
+            self._restate(tree)
+
+    def invalidate_evidence(
+        self,
+        topic: Name,
+        publisher: Name,
+        at: Downstream,
+        proves: Callable[[bytes], bool],
+        until_s: float,
+        now_s: float,
+    ) -> None:
+        """Let a branch whose evidence holds no more end at ``until_s``, unless another reader's is shown by then.
+
+        The next switch is shown another branch's evidence at once, or when one is shown here.
+        """
+        tree = self.trees.get(topic, publisher)
+        if tree is None:
+            return
+        branch = tree.branches.get(at)
+        if branch is not None and not proves(branch.evidence):
+            branch.expires_s = min(branch.expires_s, until_s)
+        if not proves(tree.shown):
+            tree.is_doubted, tree.renew_at_s = True, now_s
+        self._plant(tree)
+
+    def reroute(self, now_s: float) -> None:
+        """Ask anew where the way to a publisher has changed."""
+        for tree in self.trees.all():
+            if not self._follow(tree, now_s) and self._backups.protection(tree) != tree.protection:
+                self._plant(tree)
+
+    def handle_timer(self, now_s: float) -> list[Name]:
+        """Prune, renew upwards; return the topics that lost their last reader here."""
+        orphaned = []
+        if now_s >= self._readers_end_s:
+            for topic in list(self._readers):
+                for at in [at for at, reader in self._readers[topic].items() if reader.expires_s <= now_s]:
+                    if self.remove_reader(topic, at):
+                        orphaned.append(topic)
+            ends = [reader.expires_s for readers in self._readers.values() for reader in readers.values()]
+            self._readers_end_s = min(ends, default=float("inf"))
+        for tree in self.trees.due(now_s):
+            self._tree_due(tree, now_s)
+        return orphaned
+
+    def _tree_due(self, tree: Tree, now_s: float) -> None:
+        for at in [at for at, branch in tree.branches.items() if branch.expires_s <= now_s]:
+            self._cut(tree, at)
+        if not tree.branches:
+            self.trees.remove(tree)
+            return
+        rested = [
+            branch
+            for branch in tree.branches.values()
+            if branch.active_until_s is not None and branch.active_until_s <= now_s
+        ]
+        for branch in rested:
+            branch.active_until_s = None
+        if rested:
+            self._plant(tree)
+            self._restate(tree)
+        if tree.renew_at_s <= now_s:
+            self._ask_above(tree, now_s)
+        if tree.former is not None and tree.former_until_s <= now_s:
+            self._leave_former(tree)
+
+    def get_timer(self) -> float | None:
+        """Return the monotonic second of the next timer, or None."""
+        tree_s = self.trees.next_event()
+        next_s = self._readers_end_s if tree_s is None else min(tree_s, self._readers_end_s)
+        return None if next_s == float("inf") else next_s
+
+    def _tree(self, topic: Name, publisher: Name, allowed: frozenset[Name]) -> Tree:
+        tree = self.trees.get(topic, publisher)
+        if tree is None:
+            tree = Tree(
+                topic=topic,
+                publisher=publisher,
+                switch=self._identity.name,
+                domain=self._policy.own,
+                allowed=allowed,
+            )
+            self.trees.put(tree)
+        return tree
+
+    def _plant(self, tree: Tree) -> None:
+        tree.protection = self._backups.protection(tree)
+        if not self._table.install(tree.key, tree.hops(self._outbox.mac_of()), tree.expires_s(), tree.sides):
+            self.drops[DropReason.QUOTA] += 1
+
+    def _put_branch(self, tree: Tree, at: Downstream, branch: Branch) -> bool:
+        """Add or replace a branch; return False, and let go of a bare tree, where its neighbour has too many."""
+        if at not in tree.branches and not self._branch_shares.reserve(_owner(at)):
+            if not tree.branches:
+                self.trees.remove(tree)
+            return False
+        tree.branches[at] = branch
+        return True
+
+    def _cut(self, tree: Tree, at: Downstream) -> None:
+        if tree.branches.pop(at, None) is not None:
+            self._branch_shares.release(_owner(at))
+            self._after_cut(tree)
+
+    def _after_cut(self, tree: Tree) -> None:
+        if tree.branches:
+            self._plant(tree)
+            self._restate(tree)
+            return
+        self._table.remove(tree.key)
+        self._leave_former(tree)
+        self._leave_backup(tree)
+        self._leave(tree)
+        self.trees.remove(tree)
+
+    def _above(self, tree: Tree) -> tuple[int, bytes, Name] | None:
+        """Return port, address and name of the next one towards the publisher; None when there is no way now."""
+        if tree.switch == self._identity.name:
+            attachment = self._attached.get(tree.topic, tree.publisher)
+            return None if attachment is None else (attachment.port, attachment.mac, tree.publisher)
+        way = self._paths.to_switch(tree.switch, tree.domain, tree.allowed)
+        neighbour = None if way is None else self._outbox.neighbour(way.first)
+        return None if neighbour is None else (neighbour.port, neighbour.mac, neighbour.name)
+
+    def _follow(self, tree: Tree, now_s: float) -> bool:
+        """Leave the one above and ask another where the way to the publisher has changed; return whether it has."""
+        above = self._above(tree)
+        if (None if above is None else above[:2]) == tree.above:
+            return False
+        self._ask_above(tree, now_s)
+        return True
+
+    def _ask_above(self, tree: Tree, now_s: float) -> None:
+        above = self._above(tree)
+        tree.renew_at_s = now_s + JOIN_REFRESH_S
+        if (None if above is None else above[:2]) != tree.above:
+            self._part_from_above(tree, now_s, keep=above is not None)
+            if above is not None:
+                tree.above, tree.above_name = above[:2], above[2]
+                if tree.backup is not None and tree.backup[0] == tree.above:
+                    tree.backup = None  # an ordinary join takes its place
+            self._plant(tree)
+        if above is None and self._paths.leads_through_leaf(tree.switch, tree.domain):
+            self.drops[DropReason.THROUGH_LEAF] += 1
+        if above is None or not tree.is_wanted_below:
+            return
+        has_settled = tree.joins >= len(_JOIN_AGAIN_S)
+        if not has_settled:
+            tree.renew_at_s = now_s + _JOIN_AGAIN_S[tree.joins]
+            tree.joins += 1
+        tree.asked_mtu = min(tree.mtu, self._outbox.mtu_of(above[0]))
+        self._show(tree)
+        if has_settled and self._paths.has_alternates:
+            self._ask_for_backup(tree)
+        if has_settled and tree.left:
+            tree.left.clear()
+            self._plant(tree)
+
+    def _restate(self, tree: Tree) -> None:
+        """Say at once, to the one above, that what fits this tree, or whether anybody wants copies, has changed."""
+        if tree.above is None:
+            return
+        mtu = min(tree.mtu, self._outbox.mtu_of(tree.above[0]))
+        if mtu != tree.asked_mtu or tree.backup_for != tree.asked_backup_for:
+            tree.asked_mtu = mtu
+            self._show(tree)
+
+    def _ask_for_backup(self, tree: Tree) -> None:
+        """Ask, or leave, the one above that could take the place of the best one."""
+        other = self._backups.above(tree)
+        if other != tree.backup:
+            self._leave_backup(tree)
+            tree.backup = other
+            self._plant(tree)
+        evidence = self._evidence(tree)
+        if other is not None and evidence:
+            (port, _), _ = other
+            mtu = min(tree.mtu, self._outbox.mtu_of(port))
+            self._say(tree, *other, mtu, JOIN_LEASE_S, evidence, backup_for=self._identity.name)
+
+    def _leave_backup(self, tree: Tree) -> None:
+        if tree.backup is not None:
+            (at, name), tree.backup = tree.backup, None
+            tree.left.add(at[0])
+            if at != tree.above:
+                self._say(tree, at, name, 1, 0.0, b"")
+
+    def _show(self, tree: Tree) -> None:
+        """Join the one above, with the evidence of a reader below."""
+        evidence = self._evidence(tree)
+        tree.is_doubted = tree.is_doubted and evidence == tree.shown
+        tree.shown = evidence
+        tree.asked_backup_for = tree.backup_for
+        if tree.above is None or tree.above_name is None or not evidence:
+            return
+        backup_for = tree.backup_for or ZERO
+        if backup_for != ZERO and self._paths.domain_of(tree.above_name) != self._policy.own:
+            return  # what a domain does to survive is its own matter
+        self._say(tree, tree.above, tree.above_name, tree.asked_mtu, JOIN_LEASE_S, evidence, backup_for=backup_for)
+
+    def _evidence(self, tree: Tree) -> bytes:
+        """Return the claim to show the one above; of a leaf that of a reader attached here, empty where none is.
+
+        A neighbour may still take a tree from a leaf that its publisher has just left. Nobody joins for that one.
+        """
+        if not self._is_leaf or tree.switch == self._identity.name:
+            return tree.evidence
+        own = self._readers.get(tree.topic, {}).keys() & tree.branches.keys()
+        return max((tree.branches[at] for at in own), key=lambda each: each.expires_s).evidence if own else b""
+
+    def _place_at(self, tree: Tree, switch: Name, domain: Name, version: int, proof: bytes) -> None:
+        """Take in where a tree's publisher is; where that is news, the one above is left before another is asked."""
+        if (tree.switch, tree.domain) != (switch, domain):
+            self._leave_former(tree)
+            tree.has_moved = True
+        tree.switch, tree.domain, tree.version, tree.proof = switch, domain, version, proof
+
+    def _part_from_above(self, tree: Tree, now_s: float, *, keep: bool) -> None:
+        """Leave the one above: at once, or where the way to the same place has changed, after a while."""
+        self._leave_former(tree)
+        if keep and tree.above is not None and tree.above_name is not None and self._is_loop_free(tree):
+            tree.former, tree.former_until_s = (tree.above, tree.above_name), now_s + _OVERLAP_S
+            tree.above = tree.above_name = None
+        else:
+            self._leave(tree)
+        tree.joins, tree.has_moved = 0, False
+
+    def _is_loop_free(self, tree: Tree) -> bool:
+        """Return whether the one above, which is not the best any more, cannot take the messages from here itself.
+
+        Source: RFC 5286, inequality 3 (a downstream neighbour is nearer to the destination than we are). Nobody takes
+        messages of others from a leaf.
+        """
+        if tree.has_moved or tree.above_name is None:
+            return False
+        if self._is_leaf:
+            return True
+        own = self._paths.to_switch(tree.switch, tree.domain, tree.allowed)
+        its = self._paths.distance_from(tree.above_name, tree.switch, tree.domain, tree.allowed)
+        return own is not None and its is not None and its < own.distance
+
+    def _leave_former(self, tree: Tree) -> None:
+        if tree.former is not None:
+            (at, name), tree.former = tree.former, None
+            tree.left.add(at[0])
+            if at != tree.above:
+                self._say(tree, at, name, 1, 0.0, b"")
+
+    def _leave(self, tree: Tree) -> None:
+        if tree.above is not None and tree.above_name is not None:
+            tree.left.add(tree.above[0])
+            self._say(tree, tree.above, tree.above_name, 1, 0.0, b"")
+        tree.above = tree.above_name = None
+
+    def _say(
+        self,
+        tree: Tree,
+        above: Downstream,
+        name: Name,
+        mtu: int,
+        lease_s: float,
+        evidence: bytes,
+        *,
+        backup_for: Name = ZERO,
+    ) -> None:
+        """Send a join, or with no lease a leave, to one above."""
+        sessions = self._outbox.sessions_with(above[0], name)
+        if sessions is None:
+            return  # it is gone, and with it what it knew of us
+        own_session, its_echo = sessions
+        self._sequence += 1
+        join = Join(
+            tree.topic,
+            tree.publisher,
+            tree.switch,
+            tree.domain,
+            tree.allowed,
+            mtu,
+            lease_s,
+            evidence,
+            its_echo,
+            self._sequence,
+            tree.version,
+            backup_for,
+            own_session,
+            tree.proof if lease_s else b"",
+        )
+        kind = Kind.JOIN if lease_s else Kind.LEAVE
+        self._outbox.say_at(*above, kind, join.to_wire(self._identity.name, self._identity.key))
+
+
+def _owner(at: Downstream) -> bytes:
+    """Return in whose name room is taken for something of a neighbour."""
+    return at[0].to_bytes(4, "big") + at[1]
+
+
+def _is_overtaken(join: Join, branch: Branch) -> bool:
+    """Return whether a newer join or leave of the same session of the neighbour came before."""
+    return join.sender_session == branch.session and join.sequence <= branch.sequence

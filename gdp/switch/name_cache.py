@@ -1,0 +1,149 @@
+"""Cache of locations: where names are, as RIBs and neighbours proved it, and which names nobody advertises.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). While no RIB answers, an entry is served beyond its lease,
+until the proofs of its claim end themselves (RFC 8767 in spirit).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from gdp.limits import ADVERTISEMENT_LEASE_S, NEGATIVE_LEASE_S
+from gdp.names import Name
+from gdp.trust.advertisement import Advertisement
+from gdp.trust.right import Right
+
+__all__ = ["Location", "NameCache"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Location:
+    """One advertiser of a name, and where it is attached."""
+
+    name: Name
+    advertiser: Name
+    right: Right
+    switch: Name
+    domain: Name
+    transit: frozenset[Name]  # domains through which that domain lets its traffic pass
+    advertisement: bytes
+    expires_s: float
+    proof: Advertisement | None = None  # what was verified; None where a test makes a place by hand
+    stale_until_s: float = 0.0  # the proofs hold so long: it is served until then while no RIB answers
+
+    @property
+    def sequence(self) -> int:
+        """Return the sequence number of the claim, or 0."""
+        return 0 if self.proof is None else self.proof.sequence
+
+
+class NameCache:
+    """The locations that one switch knows, and negative entries.
+
+    Args:
+        lease_s: of a claim; when a RIB answers again, it has half of that to confirm stale entries.
+
+    Attributes:
+        serves_stale: no RIB answers, so entries outlive their leases.
+    """
+
+    def __init__(self, lease_s: float = ADVERTISEMENT_LEASE_S) -> None:
+        self._confirm_s = lease_s / 2
+        self._places: dict[Name, dict[Name, Location]] = {}
+        self._names_of: dict[Name, set[Name]] = {}  # what each advertiser advertises, of ``_places``
+        self._nobody: dict[Name, float] = {}
+        self._expire_at_s = float("inf")  # no lease ends before
+        self.serves_stale = False
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def of(self, name: Name, now_s: float) -> list[Location]:
+        """Return the known places of a name."""
+        known = self._places.get(name)
+        return [] if known is None else [place for place in known.values() if self._ends_s(place) > now_s]
+
+    def get(self, name: Name, advertiser: Name) -> Location | None:
+        """Return the place of one advertiser of a name, or None."""
+        return self._places.get(name, {}).get(advertiser)
+
+    def of_node(self, node: Name, now_s: float) -> Location | None:
+        """Return the newest place of anything that a node advertises: it is attached there itself. None: not known."""
+        known = (self._places[name][node] for name in self._names_of.get(node, ()))
+        held = [place for place in known if self._ends_s(place) > now_s]
+        return max(held, key=lambda place: place.sequence, default=None)
+
+    def all(self) -> list[Location]:
+        """Return every place."""
+        return [place for known in self._places.values() for place in known.values()]
+
+    def is_negative(self, name: Name, now_s: float) -> bool:
+        """Return whether the RIB said a moment ago that nobody advertises the name."""
+        return self._nobody.get(name, 0.0) > now_s
+
+    def put(self, place: Location) -> Location | None:
+        """Store a place; return what was known of this advertiser before."""
+        self._nobody.pop(place.name, None)
+        known = self._places.setdefault(place.name, {})
+        before = known.get(place.advertiser)
+        known[place.advertiser] = place
+        self._names_of.setdefault(place.advertiser, set()).add(place.name)
+        self._expire_at_s = min(self._expire_at_s, self._ends_s(place))
+        return before
+
+    def remove(self, name: Name, advertiser: Name) -> None:
+        """Remove one advertiser of a name; nothing happens where it is not known."""
+        known = self._places.get(name, {})
+        if known.pop(advertiser, None) is None:
+            return
+        if not known:
+            del self._places[name]
+        names = self._names_of[advertiser]
+        names.discard(name)
+        if not names:
+            del self._names_of[advertiser]
+
+    def put_negative(self, name: Name, now_s: float) -> None:
+        """Replace what is known of a name by a negative entry, for ``NEGATIVE_LEASE_S``."""
+        for advertiser in list(self._places.get(name, ())):
+            self.remove(name, advertiser)
+        self._nobody[name] = now_s + NEGATIVE_LEASE_S
+        self._expire_at_s = min(self._expire_at_s, now_s + NEGATIVE_LEASE_S)
+
+    def serve_stale(self, stale: bool, now_s: float) -> None:
+        """Begin or end to serve entries beyond their leases.
+
+        When a RIB answers again, entries that it does not confirm within half a lease expire.
+        """
+        if stale == self.serves_stale:
+            return
+        self.serves_stale = stale
+        if not stale:
+            for known in self._places.values():
+                for advertiser, place in known.items():
+                    if place.expires_s < now_s + self._confirm_s < place.stale_until_s:
+                        known[advertiser] = replace(place, expires_s=now_s + self._confirm_s)
+        self._look_ahead()
+
+    def expire(self, now_s: float) -> list[Location]:
+        """Remove entries whose leases have ended; return the places among them."""
+        if now_s < self._expire_at_s:
+            return []
+        gone = [place for place in self.all() if self._ends_s(place) <= now_s]
+        for place in gone:
+            self.remove(place.name, place.advertiser)
+        for name in [name for name, until_s in self._nobody.items() if until_s <= now_s]:
+            del self._nobody[name]
+        self._look_ahead()
+        return gone
+
+    def next_expiry(self) -> float | None:
+        """Return a monotonic second that is no later than the end of what is believed, or None."""
+        return None if self._expire_at_s == float("inf") else self._expire_at_s
+
+    def _look_ahead(self) -> None:
+        ends = [self._ends_s(place) for known in self._places.values() for place in known.values()]
+        self._expire_at_s = min([*ends, *self._nobody.values()], default=float("inf"))
+
+    def _ends_s(self, place: Location) -> float:
+        return max(place.expires_s, place.stale_until_s) if self.serves_stale else place.expires_s

@@ -1,0 +1,248 @@
+"""Revocations at a switch: take them, close what rested on them, pass them on to whom they concern.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
+
+A revocation of a trusted domain's root goes to every neighbour, once; neighbours compare what they keep by digests
+(``control/revocation_sync.py``). One of an owner is taken where a certificate of that owner is held, goes on from there
+to the neighbours, and is dropped by those who hold none. What the operator hands in also goes to the RIB, which sends
+it to whoever brought, watches or heard of the name, in every tier.
+
+What a revoked certificate had opened ends at once: attachments, readers, and, unless the switch below shows another
+reader within ``GRACE_S``, the branches that rested on it. A revoked neighbour is let go.
+"""
+
+from __future__ import annotations
+
+import heapq
+from typing import Final
+
+from gdp.control.neighbor_discovery import HelloProtocol
+from gdp.control.neighbour import Neighbour
+from gdp.control.revocation_sync import RevocationSync
+from gdp.crypto.statements import Statement, parse
+from gdp.errors import StatementError
+from gdp.frame.kinds import Kind
+from gdp.names import Name
+from gdp.sansio import Timestamps
+from gdp.switch.dependents import AttachedAdvertisement, Dependents, JoinedBranch, KnownLocation
+from gdp.switch.evidence import Evidence
+from gdp.switch.local_advertisements import LocalAdvertisements
+from gdp.switch.multicast import MulticastTrees
+from gdp.switch.name_resolver import NameResolver
+from gdp.switch.outbox import Outbox
+from gdp.switch.unicast import Unicast
+from gdp.trust.advertisement import Advertisement
+from gdp.trust.audit import Action
+from gdp.trust.revocation import Revocation
+from gdp.trust.revocations import OPERATOR, hash_of
+from gdp.trust.verifier import AdvertisementVerifier
+
+__all__ = ["RevocationHandler"]
+
+GRACE_S: Final = 0.5
+_FIRST_S: Final = (0.3, 1.0, 3.0)  # from the first time that the RIB is sent a revocation to the next ones
+_AGAIN_S: Final = 60.0
+_TICK_S: Final = 0.1
+_PER_TICK: Final = 4
+
+
+class RevocationHandler:
+    """Takes, applies and spreads revocations at one switch."""
+
+    def __init__(
+        self,
+        *,
+        verifier: AdvertisementVerifier,
+        hello_protocol: HelloProtocol,
+        attached: LocalAdvertisements,
+        multicast: MulticastTrees,
+        unicast: Unicast,
+        resolver: NameResolver,
+        evidence: Evidence,
+        held: Dependents,
+        sync: RevocationSync,
+        outbox: Outbox,
+    ) -> None:
+        self._verifier = verifier
+        self._revoked = verifier.revoked
+        self._hello_protocol = hello_protocol
+        self._attached = attached
+        self._multicast = multicast
+        self._unicast = unicast
+        self._resolver = resolver
+        self._evidence = evidence
+        self._held = held
+        self._sync = sync
+        self._outbox = outbox
+        self._handed_in = _SubmittedRevocations()
+        self._sent_to: Name | None = None  # the RIB that revocations of the operator went to
+
+    def receive_revocation(self, statement: Statement, neighbour: Neighbour, now: Timestamps) -> list[Name]:
+        """Take a revocation from a neighbour; return the topics that lost all readers here.
+
+        Raises:
+            StatementError: it does not hold, concerns nobody here, or there is no room for it.
+        """
+        revocation = self._revoked.receive_revocation(statement, neighbour.name, now, self._held.has_issuer)
+        return [] if revocation is None else self._spread(revocation, statement, neighbour, now)
+
+    def receive_lacking(self, statement: Statement, neighbour: Neighbour, now: Timestamps) -> list[Name]:
+        """Take a revocation that was lacking here; the other neighbours hear of it by digests.
+
+        Raises:
+            StatementError: as ``take``.
+        """
+        revocation = self._revoked.receive_revocation(statement, neighbour.name, now, self._held.has_issuer)
+        if revocation is None:
+            return []
+        self._sync.took(neighbour, hash_of(revocation.issuer.owner_key), now.mono_s)
+        return self._apply(revocation, now)
+
+    def receive_from_rib(self, statement: Statement, rib: Name, now: Timestamps) -> list[Name]:
+        """Take a revocation that a RIB sent.
+
+        Raises:
+            StatementError: as ``take``.
+        """
+        revocation = self._revoked.receive_revocation(statement, rib, now, self._held.has_issuer)
+        return [] if revocation is None else self._spread(revocation, statement, None, now)
+
+    def hand_in(self, statement: Statement, now: Timestamps) -> list[Name]:
+        """Take a revocation from this node's operator, whoever issued it.
+
+        Raises:
+            StatementError: it does not hold.
+        """
+        revocation = self._revoked.receive_revocation(statement, OPERATOR, now, self._held.has_issuer)
+        issued = revocation or Revocation.read(statement)
+        if not self._revoked.is_root(issued.issuer.owner_key):
+            self._handed_in.add(statement.fingerprint, statement.wire, now.mono_s)
+        return [] if revocation is None else self._spread(revocation, statement, None, now)
+
+    def due_for_rib(self, rib: Name, now_s: float) -> list[bytes]:
+        """Return the revocations of the operator that are due at this RIB; those that have run out are removed."""
+        if rib != self._sent_to:
+            self._sent_to = rib
+            self._handed_in.say_again(now_s)
+        wires = []
+        for fingerprint, wire in self._handed_in.poll_due(now_s):
+            revocation = Revocation.read(parse(wire))
+            if self._revoked.has(revocation.fingerprint, revocation.issuer.owner_key):
+                wires.append(wire)
+            else:
+                self._handed_in.remove(fingerprint)
+        return wires
+
+    def next_due_for_rib(self) -> float | None:
+        """Return the monotonic second at which the next revocation is due at the RIB, or None."""
+        return self._handed_in.next_due()
+
+    def _spread(
+        self, revocation: Revocation, statement: Statement, origin: Neighbour | None, now: Timestamps
+    ) -> list[Name]:
+        for other in self._hello_protocol.all_up():
+            if origin is None or (other.port, other.name) != (origin.port, origin.name):
+                self._outbox.say(other, Kind.REVOKE, statement.wire)
+        return self._apply(revocation, now)
+
+    def _apply(self, revocation: Revocation, now: Timestamps) -> list[Name]:
+        """Close what carries the revoked certificate; return the topics that lost all readers here."""
+        issuer, about = revocation.issuer.name.to_text(), revocation.fingerprint.hex()
+        self._verifier.policy.audit.note(Action.REVOKED, "certificate", who=issuer, about=about)
+        orphaned: list[Name] = []
+        for holder in self._held.resting_on(revocation.fingerprint):
+            if isinstance(holder, AttachedAdvertisement):
+                orphaned += self._close_advertisement(holder, now)
+            elif isinstance(holder, KnownLocation):
+                self._close_place(holder, now)
+            else:
+                self._doubt(holder, now)
+        self._hello_protocol.recheck(revocation.fingerprint, now)
+        return orphaned
+
+    def _close_advertisement(self, holder: AttachedAdvertisement, now: Timestamps) -> list[Name]:
+        attachment = self._attached.get(holder.name, holder.node)
+        if attachment is not None and not self._holds(attachment.advertisement, now):
+            self._attached.remove(holder.name, holder.node)
+            self._unicast.forget(holder.name)
+        advertisement = self._multicast.advertisement_of(holder.name, holder.at)
+        if advertisement is None or self._holds(advertisement, now):
+            return []
+        is_last = self._multicast.remove_reader(holder.name, holder.at)
+        for tree in self._multicast.trees.of_topic(holder.name):
+            self._doubt(JoinedBranch(tree.topic, tree.publisher, holder.at), now)
+        return [holder.name] if is_last else []
+
+    def _close_place(self, holder: KnownLocation, now: Timestamps) -> None:
+        place = self._resolver.cache.get(holder.name, holder.advertiser)
+        if place is not None and not self._evidence.still_holds(place, now):
+            self._resolver.receive_removal(place.name, place.advertiser, now.mono_s)
+            self._multicast.publisher_gone(place.name, place.advertiser)
+            self._unicast.forget(place.name)
+
+    def _doubt(self, branch: JoinedBranch, now: Timestamps) -> None:
+        proves = lambda evidence: self._proves(evidence, now)  # noqa: E731
+        self._multicast.invalidate_evidence(
+            branch.topic, branch.publisher, branch.at, proves, now.mono_s + GRACE_S, now.mono_s
+        )
+
+    def _holds(self, advertisement: Advertisement, now: Timestamps) -> bool:
+        try:
+            self._verifier.recheck(advertisement, now.unix_s)
+        except StatementError:
+            return False
+        return True
+
+    def _proves(self, evidence: bytes, now: Timestamps) -> bool:
+        try:
+            self._verifier.verify(evidence, now.unix_s)
+        except StatementError:
+            return False
+        return True
+
+
+class _SubmittedRevocations:
+    """Revocations of owners that the operator handed in, by fingerprint, and when each is due at the RIB.
+
+    A RIB keeps one only while a name that it concerns is stored or watched there, and acknowledges none. So each is
+    sent four times at first, then once every ``_AGAIN_S``: a user of the name who comes later receives it.
+    """
+
+    def __init__(self) -> None:
+        self._wires: dict[bytes, bytes] = {}
+        self._due: list[tuple[float, int, bytes]] = []  # when, how often it was said, fingerprint
+        self._tick_at_s = float("-inf")
+
+    def add(self, fingerprint: bytes, wire: bytes, now_s: float) -> None:
+        """Send a statement from now on."""
+        if fingerprint not in self._wires:
+            heapq.heappush(self._due, (now_s, 0, fingerprint))
+        self._wires[fingerprint] = wire
+
+    def remove(self, fingerprint: bytes) -> None:
+        """Stop sending a statement: it has run out."""
+        self._wires.pop(fingerprint, None)
+
+    def say_again(self, now_s: float) -> None:
+        """Send every statement again: there is another RIB."""
+        self._due = [(now_s, 0, fingerprint) for fingerprint in self._wires]
+
+    def poll_due(self, now_s: float) -> list[tuple[bytes, bytes]]:
+        """Return the few statements to send now, each with its fingerprint."""
+        if now_s < self._tick_at_s:
+            return []
+        said: list[tuple[bytes, bytes]] = []
+        while self._due and self._due[0][0] <= now_s and len(said) < _PER_TICK:
+            _, times, fingerprint = heapq.heappop(self._due)
+            wire = self._wires.get(fingerprint)
+            if wire is not None:
+                said.append((fingerprint, wire))
+                pause_s = _FIRST_S[times] if times < len(_FIRST_S) else _AGAIN_S
+                heapq.heappush(self._due, (now_s + pause_s, times + 1, fingerprint))
+        if said:
+            self._tick_at_s = now_s + _TICK_S
+        return said
+
+    def next_due(self) -> float | None:
+        """Return the monotonic second of the next statement, or None."""
+        return max(self._due[0][0], self._tick_at_s) if self._due else None

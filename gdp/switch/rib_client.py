@@ -1,0 +1,302 @@
+"""A switch's RIB client: it relays claims, sends queries, and verifies the answers.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
+
+The nearest RIB of the switch's own domain is asked, over other domains where its own is parted. Where the own domain
+has none, it is the nearest RIB of a domain through which traffic may pass. One that owes an answer for ``SILENT_S`` is
+left for the next one. While none answers, what is known is served on (``name_cache.py``). The name resolver says which
+queries are due; ``location_updates.py`` applies the answers.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from gdp.control.advertise_ack import AdvertiseAck
+from gdp.control.channel import Channels, Opened
+from gdp.control.presence import Presence
+from gdp.control.query import Query, Response
+from gdp.control.relay import Relay, relayed
+from gdp.crypto.certificates import Membership, Role
+from gdp.crypto.identity import Identity
+from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.errors import DropReason, StatementError
+from gdp.frame.kinds import Kind
+from gdp.names import Name
+from gdp.sansio import Timestamps
+from gdp.switch.evidence import Evidence
+from gdp.switch.local_advertisements import LocalAdvertisements
+from gdp.switch.location_updates import LocationUpdates
+from gdp.switch.multicast import MulticastTrees
+from gdp.switch.name_cache import Location
+from gdp.switch.name_resolver import NameResolver
+from gdp.switch.outbox import Outbox
+from gdp.switch.paths import Paths
+from gdp.switch.presence import PresenceAnswers
+from gdp.switch.relocation import Relocations
+from gdp.switch.unicast import Unicast
+from gdp.trust.domain import Policy
+
+__all__ = ["SILENT_S", "RibClient"]
+
+SILENT_S: Final = 1.6  # longer than a RIB waits for the tier above
+_AVOID_S: Final = 10.0  # a RIB that owed an answer for too long is left for so long, if there is another
+_REFILL_S: Final = 10.0  # how long a RIB that is new here may say "nobody" of what is known
+
+
+class RibClient:
+    """Speaks with the nearest RIB.
+
+    Attributes:
+        rib: whom it asks, or None while none is known.
+    """
+
+    def __init__(
+        self,
+        *,
+        identity: Identity,
+        policy: Policy,
+        paths: Paths,
+        attached: LocalAdvertisements,
+        resolver: NameResolver,
+        multicast: MulticastTrees,
+        unicast: Unicast,
+        relocations: Relocations,
+        evidence: Evidence,
+        locations: LocationUpdates,
+        outbox: Outbox,
+        presence: PresenceAnswers,
+        channels: Channels,
+    ) -> None:
+        self._identity = identity
+        self._policy = policy
+        self._paths = paths
+        self._attached = attached
+        self._resolver = resolver
+        self._multicast = multicast
+        self._unicast = unicast
+        self._relocations = relocations
+        self._evidence = evidence
+        self._locations = locations
+        self._outbox = outbox
+        self._presence = presence
+        self._channels = channels
+        self.rib: Name | None = None
+        self._session = b""  # of that RIB with its switch: another one means that it restarted or moved
+        self._chosen_s = float("-inf")
+        self._owed_s: float | None = None  # since when it owes an answer
+        self._avoided: dict[Name, float] = {}  # RIBs that did not answer, until when
+        self._review_s = float("inf")  # when one of them may be asked again
+        self._asked: dict[Name, None] = {}  # RIBs whose answers are taken, the newest last
+
+    def links_changed(self, now_s: float) -> None:
+        """Choose the RIB anew; a new one is told and asked everything."""
+        rib = self._nearest_rib(now_s)
+        known = None if rib is None else self._paths.ribs().get(rib)
+        session = b"" if known is None else known.session
+        if (rib, session) != (self.rib, self._session):
+            self.rib, self._session, self._chosen_s, self._owed_s = rib, session, now_s, None
+            if rib is not None:
+                self._channels.renew(rib)
+            self._attached.relay_all(now_s)
+            self._resolver.rib_changed(now_s, has_rib=rib is not None)
+        self.ask(now_s)
+
+    def _nearest_rib(self, now_s: float) -> Name | None:
+        own, transit = self._policy.own, self._policy.transit
+        reached = []
+        for name, rib in self._paths.ribs().items():
+            if rib.domain not in transit:
+                continue
+            way, host = self._paths.to_rib(name, transit)
+            if host is not None:
+                is_avoided = self._avoided.get(name, 0.0) > now_s
+                reached.append((is_avoided, rib.domain != own, 0 if way is None else way.distance, name))
+        return min(reached)[3] if reached else None
+
+    def ask(self, now_s: float) -> None:
+        """Relay and ask what is due."""
+        self._channels.handle_timer(now_s)
+        self._send(now_s)
+        if self.rib is None:
+            return
+        if now_s >= self._review_s:
+            self._review_s = float("inf")
+            self.links_changed(now_s)
+        if self._owed_s is not None and now_s - self._owed_s >= SILENT_S:
+            self._leave_silent_rib(now_s)
+        for attachment in self._attached.due(now_s):
+            self.relay(attachment.advertisement.wire, now_s)
+        for name, watch_s in self._resolver.queries_to_send(now_s):
+            is_heard = bool(self._multicast.readers(name))
+            query = Query(name, watch_s, self._policy.revoked.digest_about(name) if is_heard else None)
+            self._to_rib(query.to_wire(self._identity.name, self._identity.key, self._identity.membership), now_s)
+
+    def _leave_silent_rib(self, now_s: float) -> None:
+        """Ask another RIB; where there is none, serve what is known."""
+        assert self.rib is not None
+        self._avoided = {rib: until_s for rib, until_s in self._avoided.items() if until_s > now_s}
+        self._avoided[self.rib] = self._review_s = now_s + _AVOID_S
+        self._owed_s = None
+        before = self.rib
+        self._resolver.serve_stale(now_s, stale=True)
+        if self._nearest_rib(now_s) != before:
+            self.links_changed(now_s)
+
+    def relay(self, statement: bytes, now_s: float) -> None:
+        """Pass an attached node's claim or withdrawal, or a revocation, on to the RIB."""
+        self._to_rib(relayed(statement, self._identity, self._policy.transit), now_s)
+
+    def _to_rib(self, statement: bytes, now_s: float) -> None:
+        if self.rib is None:
+            return
+        if self._owed_s is None:
+            self._owed_s = now_s
+        self._asked.pop(self.rib, None)
+        self._asked[self.rib] = None
+        if len(self._asked) > 8:
+            del self._asked[next(iter(self._asked))]
+        self._channels.ask(self.rib, statement, now_s)
+        self._send(now_s)
+
+    def _send(self, now_s: float) -> None:
+        for each in self._channels.records_to_send():
+            frames = self._outbox.far(Kind.RIB_REQUEST, each.wire, each.to)
+            self._unicast.send(frames, each.to, self._identity.name, now_s)
+
+    def open(self, wire: bytes, sender: Name, now: Timestamps) -> Opened | None:
+        """Take what came for this switch; return the statement in it, if it is for more than the channel to a RIB.
+
+        Raises:
+            RemoteError: it does not hold.
+        """
+        opened = self._channels.receive(wire, sender, now)
+        self._send(now.mono_s)
+        return opened
+
+    def receive(self, statement: Statement, now: Timestamps, *, is_fresh: bool) -> None:
+        """Take a RIB's answer, verdict or question, or what a node's former switch knows.
+
+        Whether a node is there any RIB of a trusted domain may ask: a tier above may know of another one.
+
+        Args:
+            is_fresh: it came in the channel to its signer.
+
+        Raises:
+            StatementError: it does not hold, or is from nobody who was asked.
+        """
+        fields = statement.fields
+        member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
+        if statement.type is StatementType.PRESENCE and member.role is Role.RIB and member.name == statement.signer:
+            statement.verify(member.key)
+            self._presence.ask(Presence.from_fields(fields), member.name, statement.wire, now.mono_s)
+            return
+        self._check_asked(statement, member, now.mono_s)
+        if member.role.is_switch:
+            self._take_context(statement, now)
+            return
+        if not is_fresh:
+            raise StatementError(DropReason.NO_CHANNEL, "an answer that may be a recorded one")
+        self._rib_answered(member.name, now.mono_s)
+        if statement.type is StatementType.ADVERTISE_ACK:
+            self._take_ack(statement)
+            return
+        statement.expect(StatementType.ANSWER)
+        answer = Response.from_fields(fields)
+        if answer.is_nobody:
+            self._receive_negative(answer.name, now.mono_s)
+        elif not answer.advertisement:
+            self._locations.receive_removal(answer, now.mono_s)
+        else:
+            self._found(answer, statement.wire, now)
+
+    def revocation_in(self, statement: Statement, now: Timestamps) -> tuple[Statement, Name]:
+        """Return the revocation, to be verified, that a RIB passed on, and the RIB.
+
+        Raises:
+            StatementError: it is no RIB that was asked, or another statement.
+        """
+        relay = Relay.from_fields(statement.expect(StatementType.RELAY))
+        member = self._policy.verify_membership(relay.membership, now.unix_s)
+        if member.role is not Role.RIB:
+            raise StatementError(DropReason.WRONG_DOMAIN, "a revocation that no RIB passed on")
+        self._check_asked(statement, member, now.mono_s)
+        return parse(relay.statement), member.name
+
+    def _check_asked(self, statement: Statement, member: Membership, now_s: float) -> None:
+        if member.name != statement.signer or not self._was_asked(member, now_s):
+            raise StatementError(DropReason.WRONG_DOMAIN, "an answer from nobody who was asked")
+        statement.verify(member.key)
+
+    def verify_answer(self, statement: Statement, now: Timestamps) -> Location:
+        """Return the place in an answer that was passed on; any RIB of a trusted domain may have given it.
+
+        Raises:
+            StatementError: it does not hold, or tells of no place.
+        """
+        fields = statement.expect(StatementType.ANSWER)
+        member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
+        if member.name != statement.signer or not (member.role.is_switch or member.role is Role.RIB):
+            raise StatementError(DropReason.BAD_CERTIFICATE, "an answer from nobody who may give one")
+        statement.verify(member.key)
+        answer = Response.from_fields(fields)
+        if not answer.advertisement:
+            raise StatementError(DropReason.MALFORMED, "a redirect to nowhere")
+        return self._evidence.from_answer(answer, now)
+
+    def _was_asked(self, member: Membership, now_s: float) -> bool:
+        if member.role is Role.RIB:
+            return member.domain == self._policy.own or member.name in self._asked
+        return member.role.is_switch and self._relocations.is_former(member.name, now_s)
+
+    def _rib_answered(self, rib: Name, now_s: float) -> None:
+        self._avoided.pop(rib, None)
+        if rib == self.rib:
+            self._owed_s = None
+            self._resolver.serve_stale(now_s, stale=False)
+
+    def _found(self, answer: Response, wire: bytes, now: Timestamps) -> None:
+        try:
+            place = self._evidence.from_answer(answer, now)
+        except StatementError:
+            self._receive_negative(answer.name, now.mono_s)  # it is of no use here, and an answer all the same
+            raise
+        self._locations.receive(place, wire, now.mono_s)
+
+    def _receive_negative(self, name: Name, now_s: float) -> None:
+        """Store that no node advertises a name; a RIB that has just started does not know all advertisers yet."""
+        self._resolver.receive_negative(name, now_s, keep=now_s - self._chosen_s < _REFILL_S)
+
+    def _take_context(self, statement: Statement, now: Timestamps) -> None:
+        """Take from a node's former switch whom the node hears; a RIB's word counts more."""
+        if statement.type is StatementType.ADVERTISE_ACK:
+            ack = AdvertiseAck.from_fields(statement.fields)
+            self._relocations.acknowledged(ack.name, ack.advertiser, ack.sequence)
+            return
+        statement.expect(StatementType.ANSWER)
+        place = self._evidence.from_answer(Response.from_fields(statement.fields), now)
+        known = self._locations.get(place.name, place.advertiser)
+        if known is None or known.sequence < place.sequence:
+            self._locations.receive(place, statement.wire, now.mono_s)
+
+    def _take_ack(self, statement: Statement) -> None:
+        ack = AdvertiseAck.from_fields(statement.fields)
+        taken = ack.sequence if ack.refused is None else None
+        attachment = self._attached.settle(ack.name, ack.advertiser, taken)
+        if attachment is not None:
+            self._outbox.say_at(attachment.port, attachment.mac, Kind.ADVERTISE_ACK, statement.wire)
+            if ack.refused is DropReason.IN_USE:  # the older node with this identity is elsewhere
+                self._attached.remove(ack.name, ack.advertiser)
+                self._unicast.forget(ack.name)
+
+    def get_timer(self) -> float | None:
+        """Return the monotonic second of the next question, or of the moment to leave a silent RIB."""
+        owed_s = None if self._owed_s is None else self._owed_s + SILENT_S
+        times = [
+            self._attached.next_event(),
+            self._resolver.next_query(),
+            owed_s,
+            self._review_s,
+            self._channels.get_timer(),
+        ]
+        return None if self.rib is None else min((time for time in times if time is not None), default=None)

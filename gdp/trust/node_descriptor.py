@@ -1,0 +1,87 @@
+"""A node's card: what an owner needs to delegate to it, and nothing secret.
+
+Place: pure. The card binds the key that receives secrets to the node's name. Whoever handed it over vouches that this
+is the node that the owner means; the name on it cannot be another's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from gdp.crypto.certificates import Membership, Root, Unverified
+from gdp.crypto.identity import Identity
+from gdp.crypto.kem import KemPublicKey
+from gdp.crypto.statements import StatementType, parse
+from gdp.crypto.subject import Subject
+from gdp.errors import DropReason, StatementError
+from gdp.names import Name
+
+__all__ = ["NodeDescriptor", "Recipient"]
+
+
+class Recipient(Protocol):
+    """Whom an owner delegates to: a node's name, and the key that secrets for it are sealed to."""
+
+    @property
+    def subject(self) -> Subject: ...
+
+    @property
+    def kem(self) -> KemPublicKey: ...
+
+
+@dataclass(frozen=True, slots=True)
+class NodeDescriptor:
+    """A verified card.
+
+    Args:
+        subject: the node's name and what proves it.
+        kem: what secrets for it are sealed to.
+        stranger: its certificate, whose issuer has not been asked for.
+        wire: the signed statement.
+    """
+
+    subject: Subject
+    kem: KemPublicKey
+    stranger: Unverified
+    wire: bytes = field(repr=False)
+
+    @property
+    def name(self) -> Name:
+        """Return the node's name."""
+        return self.subject.name
+
+    @property
+    def label(self) -> str:
+        """Return the node's name for people, as its domain wrote it."""
+        return self.stranger.label
+
+    @staticmethod
+    def make(identity: Identity) -> bytes:
+        """Return the node's signed statement."""
+        body = {"member": identity.membership, "kem": identity.kem.public.wire}
+        return identity.sign(StatementType.CARD, body)
+
+    @classmethod
+    def from_wire(cls, wire: bytes) -> NodeDescriptor:
+        """Read a card and verify that the node itself made it.
+
+        Raises:
+            StatementError: MALFORMED, BAD_CERTIFICATE, WRONG_NAME or BAD_SIGNATURE.
+        """
+        statement = parse(wire)
+        fields = statement.expect(StatementType.CARD)
+        stranger = Unverified.from_wire(fields.bytes_("member"))
+        if stranger.subject.name != statement.signer:
+            raise StatementError(DropReason.BAD_CERTIFICATE, "a card under another's certificate")
+        kem = KemPublicKey.from_wire(fields.bytes_("kem"))
+        statement.verify(stranger.key)
+        return cls(stranger.subject, kem, stranger, wire)
+
+    def member_of(self, root: Root, unix_s: float) -> Membership:
+        """Return the membership if ``root`` issued it and it holds now.
+
+        Raises:
+            StatementError: WRONG_DOMAIN, BAD_CERTIFICATE or EXPIRED.
+        """
+        return self.stranger.verify(root, unix_s)

@@ -1,0 +1,118 @@
+"""Which local things are to cross, by the rules and by what is live.
+
+Place: pure. What no rule names stays local. Concrete rules come before patterns; the first that matches holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Final, NamedTuple
+
+from gdp.metadata import Metadata
+from gdp.names import Name
+from proxy.bridge.action_interface import action_of, is_part
+from proxy.bridge.faults import Fault
+from proxy.config import matching
+from proxy.config.matching import choose
+from proxy.config.rule import Kind, Rule
+from proxy.endpoints.endpoint import Graph, GraphEntity, Role
+
+__all__ = ["ConfigProblem", "FlowSpec", "exposed", "imported"]
+
+_SHOWS: Final[dict[Kind, Role]] = {"topic": Role.PUBLISHES, "service": Role.SERVES, "action": Role.SERVES}
+_WANTS: Final[dict[Kind, Role]] = {"topic": Role.SUBSCRIBES, "service": Role.CALLS, "action": Role.CALLS}
+
+_PLAIN: Final[tuple[Kind, ...]] = ("topic", "service")
+
+
+class FlowSpec(NamedTuple):
+    """One local name that is to cross, as which overlay name, by which rule."""
+
+    is_exposed: bool
+    local: str
+    type_name: str
+    name: Name
+    rule: Rule
+
+
+class ConfigProblem(NamedTuple):
+    """Why something that a rule names cannot cross as it is."""
+
+    local: str
+    fault: Fault
+    detail: str
+
+
+def exposed(rules: Sequence[Rule], graph: Graph, complaints: list[ConfigProblem]) -> Iterator[FlowSpec]:
+    """Yield what local nodes publish or serve, and a rule makes global; what is odd goes to ``complaints``."""
+    for (kind, local), types in _shown(graph, _SHOWS).items():
+        first = choose(rules, kind, local)
+        if first is None:
+            continue
+        wanted: dict[int, tuple[str, Rule]] = {}  # of each rule the first type: topics of a recording may have several
+        for type_name in sorted(types):
+            rule = choose(rules, kind, local, type_name)
+            if rule is not None:
+                wanted.setdefault(id(rule), (type_name, rule))
+        if len(wanted) < len(types):
+            said = f"; the rule says {first.type_name}" if first.type_name else ""
+            complaints.append(
+                ConfigProblem(local, Fault.OTHER_TYPE, f"local nodes use {', '.join(sorted(types))}{said}")
+            )
+        for type_name, rule in wanted.values():
+            yield FlowSpec(True, local, type_name, rule.overlay_name_of(local, type_name), rule)
+
+
+def imported(
+    rules: Sequence[Rule], graph: Graph, held: Iterable[tuple[Metadata, Name]], complaints: list[ConfigProblem]
+) -> Iterator[FlowSpec]:
+    """Yield what is to be had from elsewhere: by concrete rules, by delegations held, by what local nodes ask for."""
+    seen: set[Name] = set()
+    wanted = _shown(graph, _WANTS)
+    had: dict[tuple[Kind, str], set[str]] = {}
+    for flow_spec in _imported(rules, wanted, held):
+        had.setdefault((flow_spec.rule.kind, flow_spec.local), set()).add(flow_spec.type_name)
+        if flow_spec.name not in seen:
+            seen.add(flow_spec.name)
+            yield flow_spec
+    for (kind, local), types in wanted.items():
+        if has := had.get((kind, local)):
+            for other in sorted(types - has):
+                detail = f"local nodes ask for {other}; what comes is {', '.join(sorted(has))}"
+                complaints.append(ConfigProblem(local, Fault.OTHER_TYPE, detail))
+
+
+def _imported(
+    rules: Sequence[Rule], wanted: Mapping[tuple[Kind, str], set[str]], held: Iterable[tuple[Metadata, Name]]
+) -> Iterator[FlowSpec]:
+    for rule in rules:
+        if not rule.is_pattern and rule.type_name:
+            yield FlowSpec(False, rule.local, rule.type_name, rule.overlay_name, rule)
+    for metadata, name in held:
+        found = matching.imported(rules, name, metadata)
+        if found is not None:
+            yield FlowSpec(False, found[1], str(metadata["type"]), name, found[0])
+    for (kind, local), types in wanted.items():
+        for type_name in sorted(types):
+            asked = choose(rules, kind, local, type_name)
+            if asked is not None:
+                yield FlowSpec(False, local, type_name, asked.overlay_name_of(local, type_name), asked)
+
+
+def _shown(graph: Graph, roles: Mapping[Kind, Role]) -> dict[tuple[Kind, str], set[str]]:
+    """Return the types of what nodes other than proxies show, by kind and local name."""
+    shown: dict[tuple[Kind, str], set[str]] = {}
+    for end in sorted((end for end in graph if not end.is_proxy and end.type_name), key=lambda end: end.name):
+        for kind, name, type_name in _things(end, roles):
+            shown.setdefault((kind, name), set()).add(type_name)
+    return shown
+
+
+def _things(end: GraphEntity, roles: Mapping[Kind, Role]) -> Iterator[tuple[Kind, str, str]]:
+    action = action_of(end)
+    if action is not None and end.role is roles["action"]:
+        yield "action", *action
+    elif not is_part(end.name):
+        for kind in _PLAIN:
+            if end.role is roles[kind]:
+                yield kind, end.name, end.type_name

@@ -1,0 +1,73 @@
+"""What went wrong on this machine with something that a rule names: counted each time, told once.
+
+Place: shell; it logs. A warning names the topic as the robot calls it, on the machine that owns it and nowhere else.
+What goes on is told again by its count, at a thousand, ten thousand and so on. A detail may hold words of a far node:
+it is escaped and cut.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Mapping
+from enum import Enum
+from typing import Final
+
+from proxy.printable import printable
+
+__all__ = ["Fault", "Faults"]
+
+log = logging.getLogger(__name__)
+
+_TOLD_MAX: Final = 4_096
+_COUNT_TOLD: Final = 1_000  # the first count that is told
+
+
+class Fault(str, Enum):
+    """Why something is not carried, or not as it should be. The value is the metric's label."""
+
+    NO_DELEGATION = "no-delegation"
+    UNKNOWN_TYPE = "unknown-type"  # this machine, or this ROS, has no such type
+    OTHER_TYPE = "other-type"  # not the rule's, or definitions that differ
+    QOS = "qos"  # a local reader or publisher that cannot match
+    TOO_LARGE = "too-large"
+    TOO_FAST = "too-fast"  # the path does not keep up
+    MALFORMED = "malformed"  # bytes that do not fit their definition
+    NO_GRAPH = "no-graph"  # a master, a domain or a peer that cannot be had
+    NO_SERVER = "no-server"
+    TIMED_OUT = "timed-out"
+    REFUSED = "refused"  # a service, or the overlay, said no
+    CONFLICT = "rival"  # another proxy of this graph does it already
+
+
+class Faults:
+    """All faults of one proxy."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[Fault] = Counter()
+        self._told: dict[tuple[str, Fault], int] = {}
+
+    def report(self, what: str, fault: Fault, detail: str) -> None:
+        """Count a fault; warn of the first of its kind about ``what``, a local name."""
+        self._counts[fault] += 1
+        count = self._told[what, fault] = self._told.get((what, fault), 0) + 1
+        if len(self._told) > _TOLD_MAX:
+            del self._told[next(iter(self._told))]
+        if count == 1:
+            log.warning("%s: %s: %s", printable(what), fault.value, printable(detail))
+        elif count >= _COUNT_TOLD and str(count).strip("0") == "1":
+            log.warning("%s: %s: %d times by now", printable(what), fault.value, count)
+
+    def clear(self, what: str, fault: Fault) -> None:
+        """Learn that a fault is over: another one will be told again."""
+        self._told.pop((what, fault), None)
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """Return how often each happened, by label."""
+        return {fault.value: self._counts[fault] for fault in Fault}
+
+    @property
+    def total(self) -> int:
+        """Return how many there were."""
+        return sum(self._counts.values())

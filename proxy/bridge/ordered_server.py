@@ -1,0 +1,156 @@
+"""A local server that keeps state: given one log's entries in order, asked for its state, given another's.
+
+Place: shell; the endpoint does the I/O, ``gdp/service/follower.py`` decides. The state is a parameter of the server's
+node (``state_parameter.py``), where the rule names one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Final, TypeAlias
+
+from gdp.names import Name
+from gdp.service.follower import Apply, Doing, Effect, Fetch, Follower, Load, Refuse, Say
+from gdp.service.replication_messages import FollowerMessage, SequencerMessage
+from proxy.bridge.endpoint_dispatch import EndpointDispatcher, EventHandler
+from proxy.bridge.state_parameter import GET, SET, read_request, state_in, was_set, write_request
+from proxy.endpoints.endpoint import CallFailed, GraphEntity, ResponseReceived
+from proxy.wire.replication import STATE_MAX_BYTES
+
+__all__ = ["OrderedServer"]
+
+DOUBT_S: Final = 2.0  # a server that was exchanged may have had an entry for so long before the graph shows it
+AWAY_S: Final = 1.0  # a keeper that is not heard for so long is gone
+
+Give: TypeAlias = Callable[[int, bytes], None]  # an entry's number here, and its request
+Tell: TypeAlias = Callable[[Name, "FollowerMessage | Refuse"], None]
+
+
+class OrderedServer:
+    """One local server in its order.
+
+    Args:
+        node: whose parameter is the server's state; None: it tells none.
+        number: the first of ours for the local server, random.
+        give: gives the local server an entry.
+        tell: tells a client.
+        complain: says what is wrong with the node.
+    """
+
+    def __init__(
+        self,
+        *,
+        seat: EndpointDispatcher,
+        owner: EventHandler,
+        node: str | None,
+        number: int,
+        give: Give,
+        tell: Tell,
+        complain: Callable[[str], None],
+    ) -> None:
+        self._endpoint = seat.endpoint
+        self._follower = Follower(tells=node is not None)
+        self._give, self._tell, self._complain = give, tell, complain
+        parts = () if node is None else tuple((f"{node}/{part}", type_name) for part, type_name in (GET, SET))
+        self.handles = [seat.create_client(owner, *part) for part in parts]
+        self._number = number  # of what the server is at
+        self._apply: Apply | None = None
+        self._given_s = -DOUBT_S
+        self._heard_s = 0.0  # when the keeper was there last
+        self._keys: frozenset[str] | None = None
+        self._is_closed = False
+
+    @property
+    def is_idle(self) -> bool:
+        """Return whether the server is at nothing."""
+        return self._follower.doing is Doing.NOTHING
+
+    def heard(self, client: Name, word: SequencerMessage, now_s: float) -> None:
+        """Take a keeper's word."""
+        self._follower.heard(client, word)
+        if client == self._follower.sequencer:
+            self._heard_s = now_s
+        self._act(now_s)
+
+    def entry(self, client: Name, call: int, request: bytes, now_s: float) -> None:
+        """Take a client's request."""
+        if client == self._follower.sequencer:
+            self._heard_s = now_s
+        if not self._is_closed:
+            self._follower.entry(client, call, request)
+            self._act(now_s)
+
+    def close(self) -> None:
+        """Take no more entries."""
+        self._is_closed = True
+
+    def done(self, event: ResponseReceived | CallFailed, now_s: float) -> Apply | None:
+        """Learn what became of what the server was at; return the entry, if it was one."""
+        apply = None
+        if event.call != self._number:
+            return None
+        if event.handle in self.handles:
+            self._take_parameter(event)
+        elif self._apply is not None:
+            apply, self._apply = self._apply, None
+            if isinstance(event, ResponseReceived):
+                self._follower.applied()
+            else:
+                self._complain(f"its state is not known any more: {event.reason}")
+                self._follower.failed()
+        self._act(now_s)
+        return apply
+
+    def follow(self, ends: Sequence[GraphEntity], now_s: float) -> None:
+        """Look whether it is still the same server; another is as it started."""
+        keys = frozenset(end.key for end in ends)
+        if self._keys is not None and keys - self._keys:
+            self._number += 1  # what the other was at is over
+            self._apply = None
+            self._follower.renewed(is_doubtful=now_s - self._given_s < DOUBT_S)
+        self._keys = keys
+        self._act(now_s)
+
+    def look(self, clients: Sequence[Name], now_s: float) -> None:
+        """Let another client keep the order when the one that did is gone."""
+        if self._follower.sequencer in clients:
+            self._heard_s = now_s
+        elif self._follower.sequencer is not None and now_s - self._heard_s >= AWAY_S:
+            self._follower.gone()
+
+    def _act(self, now_s: float) -> None:
+        while effects := self._follower.poll_effects():
+            for effect in effects:
+                self._do(effect, now_s)
+
+    def _do(self, effect: Effect, now_s: float) -> None:
+        match effect:
+            case Apply():
+                self._number += 1
+                self._apply, self._given_s = effect, now_s
+                self._give(self._number, effect.request)
+            case Fetch():
+                self._number += 1
+                self._endpoint.call(self.handles[0], self._number, read_request())
+            case Load(state):
+                self._number += 1
+                self._endpoint.call(self.handles[1], self._number, write_request(state))
+            case Say(client, word):
+                self._tell(client, word)
+            case Refuse(client):
+                self._tell(client, effect)
+
+    def _take_parameter(self, event: ResponseReceived | CallFailed) -> None:
+        if event.handle == self.handles[0]:
+            state = state_in(event.raw) if isinstance(event, ResponseReceived) else None
+            if state is None:
+                self._complain("its node tells no parameter 'state' that is a byte array")
+            elif len(state) > STATE_MAX_BYTES:
+                self._complain(f"its state has {len(state)} bytes; at most {STATE_MAX_BYTES} can travel")
+                state = None
+            self._follower.told(state)
+        else:
+            why_not = was_set(event.raw) if isinstance(event, ResponseReceived) else event.reason
+            if why_not:
+                self._complain(f"its node does not take on a state: {why_not}")
+            self._follower.loaded(is_done=not why_not)

@@ -1,0 +1,74 @@
+"""Far clients as a server's side understands them: what their requests are, or why they are none.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from gdp.errors import DropReason, LocalError, RemoteError
+from proxy.bridge.decoder import MessageDecoder
+from proxy.serial.channel import RosVersion
+from proxy.serial.schema import DefinitionError
+from proxy.wire.service import Exchange
+
+__all__ = ["RemoteClients"]
+
+REMOTE_CLIENTS_MAX: Final = 1_024  # clients kept ready; the oldest go
+
+
+@dataclass(frozen=True, slots=True)
+class _Caller:
+    """One client as it describes itself; a refusal is kept as well, so that it costs once."""
+
+    description: bytes
+    requests: tuple[MessageDecoder, ...] = ()
+    unlike: str = ""
+    unread: tuple[DropReason, str] | None = None
+
+
+class RemoteClients:
+    """All clients of one service.
+
+    Args:
+        ours: the service as it is here.
+    """
+
+    def __init__(self, ours: Exchange, ros: RosVersion) -> None:
+        self._ours = ours
+        self._ros = ros
+        self._known: dict[bytes, _Caller] = {}
+
+    def incoming(self, client: bytes, description: bytes, part: int) -> MessageDecoder:
+        """Return what a client's requests for a part are.
+
+        Raises:
+            DefinitionError: not what the service here takes.
+            RemoteError: the description cannot be read.
+        """
+        caller = self._known.get(client)
+        if caller is None or caller.description != description:
+            self._known.pop(client, None)
+            caller = self._known[client] = self._learn(description)
+            if len(self._known) > REMOTE_CLIENTS_MAX:
+                del self._known[next(iter(self._known))]
+        if caller.unread is not None:
+            raise RemoteError(*caller.unread)
+        if caller.unlike:
+            raise DefinitionError(caller.unlike)
+        if part >= len(caller.requests):
+            raise DefinitionError("the client asks for a part that this service has not")
+        return caller.requests[part]
+
+    def _learn(self, description: bytes) -> _Caller:
+        try:
+            theirs = Exchange.from_wire(description)
+            pairs = zip(theirs.services, self._ours.services, strict=False)
+            ready = (MessageDecoder.ready(a.request, theirs.encoding, b.request, self._ros) for a, b in pairs)
+            return _Caller(description, tuple(ready))
+        except LocalError as error:
+            return _Caller(description, unlike=str(error))
+        except RemoteError as error:
+            return _Caller(description, unread=(error.reason, error.detail))

@@ -1,0 +1,107 @@
+"""A far server as this machine understands it: its answers and news made ready, and what its service is called here.
+
+Place: pure, but for the local endpoint, which is asked what it knows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from gdp.errors import LocalError
+from proxy.bridge.action_interface import ActionInterface
+from proxy.bridge.decoder import MessageDecoder
+from proxy.endpoints.endpoint import Endpoint
+from proxy.serial.channel import Channel
+from proxy.serial.converter import translated_channel
+from proxy.serial.serializer import Encoding
+from proxy.serial.service import Service
+from proxy.serial.service_converter import translated_service
+from proxy.wire.service import Exchange
+
+__all__ = ["RemoteServer"]
+
+
+@dataclass(frozen=True, slots=True)
+class RemoteServer:
+    """One life of a far server.
+
+    Args:
+        description: what it says of itself.
+        exchange: the same, read; None where it cannot be understood here.
+        ours: the service as this machine knows it.
+        answers: by service.
+        news: by topic.
+    """
+
+    incarnation: int
+    description: bytes
+    exchange: Exchange | None = None
+    ours: Exchange | None = None
+    answers: tuple[MessageDecoder, ...] = ()
+    news: tuple[MessageDecoder, ...] = ()
+
+    @classmethod
+    def learn(
+        cls, incarnation: int, description: bytes, parts: ActionInterface, endpoint: Endpoint, encoding: Encoding
+    ) -> RemoteServer:
+        """Make ready for a server's answers.
+
+        Raises:
+            LocalError: it serves something else, or this machine cannot know it.
+            RemoteError: it cannot be read.
+        """
+        theirs, ros = Exchange.from_wire(description), endpoint.ros
+        types = [*(each.type_name for each in theirs.services), *(each.type_name for each in theirs.topics)]
+        if types != [type_name for _, type_name in (*parts.services, *parts.topics)]:
+            raise LocalError(f"the far side serves something else under this name: {', '.join(types)}")
+        ours = _ours(theirs, parts, endpoint, encoding)
+        services = zip(theirs.services, ours.services, strict=True)
+        topics = zip(theirs.topics, ours.topics, strict=True)
+        server = cls(
+            incarnation,
+            description,
+            theirs,
+            ours,
+            tuple(MessageDecoder.ready(a.response, theirs.encoding, b.response, ros) for a, b in services),
+            tuple(MessageDecoder.ready(a, theirs.encoding, b, ros) for a, b in topics),
+        )
+        for our, their in zip(ours.services, theirs.services, strict=True):
+            MessageDecoder.ready(our.request, ours.encoding, their.request, their.ros)  # or it says why not
+        return server
+
+    def said_anew(self, description: bytes) -> RemoteServer | None:
+        """Return the same server after it said that it leaves, or stays; None where it says something else."""
+        if self.exchange is None:
+            return None
+        exchange = replace(self.exchange, is_leaving=not self.exchange.is_leaving)
+        if exchange.to_wire() != description:
+            return None
+        return replace(self, description=description, exchange=exchange)
+
+    @property
+    def is_leaving(self) -> bool:
+        """Return whether it goes soon."""
+        return self.exchange is not None and self.exchange.is_leaving
+
+
+def _ours(theirs: Exchange, parts: ActionInterface, endpoint: Endpoint, encoding: Encoding) -> Exchange:
+    """Return how this machine knows the service, from the far side's definitions where it does not by itself.
+
+    Raises:
+        LocalError: it cannot be known here.
+    """
+    services = list[Service]()
+    for (name, type_name), their in zip(parts.services, theirs.services, strict=True):
+        try:
+            services.append(endpoint.service(name, type_name))
+        except LocalError:
+            same = their if their.ros == endpoint.ros else translated_service(their, endpoint.ros)
+            services.append(replace(same, name=name))
+    topics = list[Channel]()
+    for (name, type_name), channel in zip(parts.topics, theirs.topics, strict=True):
+        try:
+            topics.append(endpoint.channel(name, type_name))
+        except LocalError:
+            same_channel = channel if channel.ros == endpoint.ros else translated_channel(channel, endpoint.ros)
+            topics.append(replace(same_channel, topic=name))
+    return Exchange(encoding, tuple(services), tuple(topics))

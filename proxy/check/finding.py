@@ -1,0 +1,80 @@
+"""What there is to say about a rule of ``proxy.yaml``.
+
+Place: pure. ``explain`` finds it, ``explain_table`` draws it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from gdp.names import Name
+from proxy.config.rule import Kind
+
+__all__ = ["Direction", "Finding", "Match"]
+
+Direction: TypeAlias = Literal["expose", "import"]
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """One name under a rule.
+
+    Args:
+        local: what this machine calls it.
+        type_name: empty while unknown.
+        nodes: local nodes at its other end; empty: none is there.
+        qos: what they offer or ask for, such as ``reliable, transient local``; empty where there is no such thing.
+        overlay: the name everywhere; None while the type is unknown.
+        is_held: whether this node may do what the rule says.
+        faults: what keeps it from crossing.
+        notes: what may well be so.
+    """
+
+    local: str
+    type_name: str
+    nodes: tuple[str, ...]
+    qos: tuple[str, ...]
+    overlay: Name | None
+    is_held: bool
+    faults: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    def to_fields(self) -> dict[str, object]:
+        """Return the JSON form."""
+        return {
+            "local": self.local,
+            "type": self.type_name or None,
+            "nodes": list(self.nodes),
+            "qos": list(self.qos),
+            "overlay": self.overlay.to_text() if self.overlay is not None else None,
+            "held": self.is_held,
+            "faults": list(self.faults),
+            "notes": list(self.notes),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One rule: what is under it, and what concerns no single name of it."""
+
+    direction: Direction
+    kind: Kind
+    name: str
+    matches: tuple[Match, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def is_faulty(self) -> bool:
+        """Return whether something of it cannot cross."""
+        return any(match.faults for match in self.matches)
+
+    def to_fields(self) -> dict[str, object]:
+        """Return the JSON form."""
+        return {
+            "direction": self.direction,
+            "kind": self.kind,
+            "rule": self.name,
+            "matches": [match.to_fields() for match in self.matches],
+            "notes": list(self.notes),
+        }

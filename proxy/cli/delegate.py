@@ -1,0 +1,143 @@
+"""The ``gdp-delegate`` command: an owner gives proxies what the rules of their files need.
+
+Place: command.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gdp.cli.node import Json, emit, failing_clearly
+from gdp.cli.version import Version
+from gdp.crypto.keys import PublicKey
+from gdp.errors import LocalError, StatementError
+from gdp.limits import CHAIN_MAX
+from gdp.nodes.yaml_source import read_yaml
+from gdp.stores.issue import DELEGATION_DAYS, delegate
+from gdp.stores.keyring import CARD, OWNER_PUBLIC, load_card, load_delegations, load_owner, save_delegation
+from gdp.trust.adcert import AdCertCache, Chain
+from gdp.trust.delegation import Delegation
+from gdp.trust.node_descriptor import NodeDescriptor
+from proxy.check.graph_snapshot import look
+from proxy.check.required_delegations import Machine, RequiredDelegation, needs, unmet
+from proxy.config.config import ProxyConfig
+from proxy.endpoints.endpoint import Graph
+
+__all__ = ["app", "main"]
+
+
+Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="the proxy.yaml of each machine")]
+OwnerDir = Annotated[Path, typer.Option("--owner", metavar="DIR", help="the owner's directory")]
+Live = Annotated[bool, typer.Option("--live", help="for patterns and missing types: what the first file's ROS has now")]
+Days = Annotated[float, typer.Option("--days", min=0.001, help="how long a delegation is valid")]
+Renew = Annotated[bool, typer.Option("--renew", help="make those again that are there")]
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+@app.command(epilog="Example: gdp-delegate --owner owner --live robot/proxy.yaml server/proxy.yaml")
+def delegate_what_is_needed(
+    files: Files,
+    owner: OwnerDir,
+    live: Live = False,
+    days: Days = DELEGATION_DAYS,
+    renew: Renew = False,
+    json: Json = False,
+    version: Version = False,
+) -> None:
+    """Let each proxy publish, read, serve or call what its rules say; what it may already is left as it is."""
+    del version  # it ends the command by itself
+    with failing_clearly():
+        key = load_owner(owner).public
+        configs = [ProxyConfig.load(file) for file in files]
+        _refuse_other_owners(owner, key, files, configs)
+        cards = [load_card(config.identity / CARD) for config in configs]
+        machines = [
+            Machine(config, load_delegations(config.delegations), _graphs(config, card) if live and not index else ())
+            for index, (config, card) in enumerate(zip(configs, cards, strict=True))
+        ]
+        for file, machine, card, found in zip(files, machines, cards, needs(machines, key), strict=True):
+            for need in found:
+                held = _held(machine.held, card, need)
+                is_new = renew or held is None or not need.rights <= held.rights
+                if is_new:
+                    save_delegation(machine.config.delegations, _made(owner, card, need, held, days), force=True)
+                _tell(file, need, is_new=is_new, json=json)
+            for rule in unmet([*machine.config.expose, *machine.config.imports], key, found):
+                typer.echo(f"{file}: {rule.name}: nothing is known yet that it means; try --live", err=True)
+
+
+def main() -> None:
+    """Run the command."""
+    app(prog_name="gdp-delegate")
+
+
+def _refuse_other_owners(owner: Path, key: PublicKey, files: Sequence[Path], configs: Sequence[ProxyConfig]) -> None:
+    """Refuse to delegate where no rule is of this owner; warn of a single file where other files have such rules.
+
+    Raises:
+        LocalError: none of the files has a rule of this owner.
+    """
+    missing = [
+        f"no rule of {file} names this owner ({owner / OWNER_PUBLIC}); {_owners_named(file)}"
+        for file, config in zip(files, configs, strict=True)
+        if all(rule.owner.compressed != key.compressed for rule in (*config.expose, *config.imports))
+    ]
+    if len(missing) == len(files):
+        raise LocalError("\n".join(missing))
+    for text in missing:
+        typer.echo(text, err=True)
+
+
+def _owners_named(file: Path) -> str:
+    """Return the owners that a file's rules name, as it writes them."""
+    data = read_yaml(file).data
+    sides = [data.get(side) for side in ("expose", "import")] if isinstance(data, dict) else []
+    rules = [rule for side in sides if isinstance(side, list) for rule in side if isinstance(rule, dict)]
+    named = dict.fromkeys(str(rule.get("owner")) for rule in rules)
+    return f"they name {', '.join(str(file.parent / each) for each in named)}" if named else "it has no rules"
+
+
+def _graphs(config: ProxyConfig, card: NodeDescriptor) -> list[Graph]:
+    return [graph for _, graph in look(config.ros, card.name.to_text(), "delegate")]
+
+
+def _held(delegations: Iterable[Delegation], card: NodeDescriptor, need: RequiredDelegation) -> Delegation | None:
+    """Return what the node has of a name, if it holds now."""
+    for delegation in delegations:
+        if delegation.name == need.name:
+            try:
+                chain = Chain.walk(delegation.chain, delegation.subject, card.subject, AdCertCache(CHAIN_MAX))
+                for right in delegation.rights:
+                    chain.check(right, time.time())
+            except StatementError:
+                return None  # run out, or of a node that was here before: a new one takes its place
+            return delegation
+    return None
+
+
+def _made(
+    owner: Path, card: NodeDescriptor, need: RequiredDelegation, held: Delegation | None, days: float
+) -> Delegation:
+    """Return a delegation of what is needed; what was given before is in it as well."""
+    rights, epochs = (held.rights, held.grants.keys()) if held is not None else (frozenset(), (0,))
+    return delegate(owner, card, need.metadata, need.rights | rights, epochs, days=days)
+
+
+def _tell(file: Path, need: RequiredDelegation, *, is_new: bool, json: bool) -> None:
+    rights = sorted(right.value for right in need.rights)
+    if json:
+        fields = {"name": need.name.to_text(), "rights": rights, "metadata": dict(need.metadata)}
+        emit("delegated" if is_new else "held", file=str(file), **fields)
+        return
+    kind, name, type_name = (need.metadata[key] for key in ("kind", "name", "type"))
+    typer.echo(f"{file}: {'+' if is_new else '='} {', '.join(rights)} {kind} {name} [{type_name}]")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""The ``gdp-proxy`` command.
+
+Place: command. Of what it can do only that is imported which is asked for: that is most of the time to its start.
+"""
+
+from __future__ import annotations
+
+import typer
+
+from gdp.cli.node import AwaitIface, Check, Config, Json, Verbose, failing_clearly, set_up_logging
+from gdp.cli.version import Version
+from gdp.nodes.wait_for_device import wait_for_device
+from proxy.cli.schema import Schema
+from proxy.config.config import ProxyConfig
+
+__all__ = ["main"]
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+@app.command(epilog="Example: gdp-proxy --config proxy.yaml --check")
+def proxy(
+    config: Config,
+    await_iface: AwaitIface = 0.0,
+    check: Check = False,
+    json: Json = False,
+    verbose: Verbose = False,
+    schema: Schema = False,
+    version: Version = False,
+) -> None:
+    """Carry what the configuration names between ROS and the overlay, until Ctrl-C; SIGHUP reads it again.
+
+    With a ros section it takes part in that graph; without one it records what it imports.
+    """
+    del schema, version  # they end the command by themselves
+    set_up_logging(verbose=verbose)
+    with failing_clearly():
+        settings = ProxyConfig.load(config)
+        if check:
+            from proxy.check.command import check_proxy
+
+            if not settings.ros:
+                from proxy.node.recorder import refuse_existing_file
+
+                refuse_existing_file(settings)
+            check_proxy(settings, json=json)
+            return
+        if settings.ros:
+            from proxy.node.bridge_node import run
+
+            wait_for_device(settings.iface, await_iface)
+            run(config, settings, json=json)
+        else:
+            from proxy.node.recorder import record
+
+            wait_for_device(settings.iface, await_iface)
+            record(settings, json=json)
+
+
+def main() -> None:
+    """Run the command."""
+    app(prog_name="gdp-proxy")
+
+
+if __name__ == "__main__":
+    main()

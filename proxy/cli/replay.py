@@ -1,0 +1,190 @@
+"""The ``gdp-replay`` command.
+
+Place: command.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from gdp.cli.node import Check, Config, Json, Verbose, emit, emit_wait, failing_clearly, set_up_logging
+from gdp.cli.version import Version
+from gdp.errors import LocalError
+from proxy.check.command import check_proxy
+from proxy.config.config import ProxyConfig
+from proxy.config.recorded import RecordedRules
+from proxy.node.node import GOODBYE_S, ProxyNode, run_node
+from proxy.node.recording_bridge import open_recording_bridge
+from proxy.node.replayer import Replay, Unconfirmed
+from proxy.recordings.endpoint import ReplayEndpoint
+from proxy.recordings.limits import BagLimits
+from proxy.recordings.process import RecordingError
+from proxy.recordings.reader import BagReader
+
+__all__ = ["main"]
+
+log = logging.getLogger(__name__)
+
+ATTACH_PATIENCE_S: Final = 30.0
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+@app.command(epilog="Example: gdp-replay drive.mcap --config proxy.yaml --rate 2")
+def replay(
+    bag: Annotated[Path, typer.Argument(help="A ROS 1 bag, an MCAP file, a .db3 file or a rosbag2 folder.")],
+    config: Config,
+    rate: Annotated[float, typer.Option(min=0.0, help="1: as recorded; 0: as fast as readers confirm.")] = 1.0,
+    wait_readers: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for a reader of every topic.")] = 15.0,
+    memory: Annotated[
+        int | None,
+        typer.Option(min=64, metavar="MIB", help="Memory to decode the recording; 1 to 4 GiB, by its length."),
+    ] = None,
+    cpu: Annotated[
+        float | None,
+        typer.Option(min=1.0, metavar="SECONDS", help="Processor time to decode it; 30 s and 2 s for each MiB."),
+    ] = None,
+    check: Check = False,
+    json: Json = False,
+    verbose: Verbose = False,
+    version: Version = False,
+) -> None:
+    """Replay a recording's exposed topics onto the overlay with the recorded timing.
+
+    Exit 1: a message of a reliable topic was not confirmed by every reader of it, or had none, latched or not; or was
+    too large, or the overlay refused a topic; or the recording takes more memory or time than it may. Best effort is
+    sent, and confirmed by nobody.
+    """
+    del version  # it ends the command by itself
+    set_up_logging(verbose=verbose)
+    limits = BagLimits(None if memory is None else memory << 20, cpu)
+    with failing_clearly(), _failing_decoder():
+        settings = ProxyConfig.load(config)
+        with BagReader(bag, limits) as reader:
+            if check:
+                check_proxy(settings, json=json)
+                return
+            with run_node(settings, emit_wait if json else None) as node:
+                is_complete = _replay(node, reader, settings, rate, wait_readers, json=json)
+    raise typer.Exit(0 if is_complete else 1)
+
+
+@contextlib.contextmanager
+def _failing_decoder() -> Iterator[None]:
+    """Turn the end of the process that decodes into one line on standard error and exit code 1."""
+    try:
+        yield
+    except RecordingError as error:
+        hint = f" (see --{error.limit})" if error.limit else ""
+        typer.echo(f"error: {error}{hint}", err=True)
+        raise typer.Exit(1) from error
+
+
+def _replay(
+    node: ProxyNode, reader: BagReader, settings: ProxyConfig, rate: float, wait_s: float, *, json: bool
+) -> bool:
+    endpoint = ReplayEndpoint(reader)
+    rules = RecordedRules.of(expose=settings.expose)
+    with open_recording_bridge(node, settings, rules, endpoint) as bridge:
+
+        def report() -> None:
+            if json:
+                _report_progress(replay, total)
+
+        replay = Replay(node, bridge, endpoint, rate, report)
+        total = _exposed_total(reader, endpoint)
+        if not replay.topics:
+            raise LocalError(f"{reader.path}: no topic of it is exposed by the configuration")
+        if not node.runtime.run(lambda: node.member.attachment.is_attached, time.monotonic() + ATTACH_PATIENCE_S):
+            raise LocalError(f"no switch answered on {settings.iface} within {ATTACH_PATIENCE_S:g} s")
+        refused = [each for each in node.member.attachment.advertisements if each.refused is not None]
+        for each in refused:
+            log.warning("claim refused name=%s reason=%s", each.subject.name.short, each.refused)
+        if json:
+            emit("ready", name=node.member.name.to_text())
+        for topic in replay.wait_for_readers(wait_s):
+            log.warning("nobody reads topic=%s", topic)
+        is_whole = replay.run() and replay.finish()
+        report()
+        unconfirmed = replay.unconfirmed()
+        _report(reader, replay, unconfirmed, json=json)
+        node.member.leave()
+        node.linger(GOODBYE_S)
+    return is_whole and not (unconfirmed or refused or replay.too_large)
+
+
+def _report_progress(replay: Replay, total: int | None) -> None:
+    emit(
+        "progress",
+        sent=replay.sent,
+        total=total,
+        bytes=replay.sent_bytes,
+        confirmed=replay.confirmed,
+        unconfirmed={each.topic: each.messages - each.confirmed for each in replay.unconfirmed()},
+    )
+
+
+def _exposed_total(reader: BagReader, endpoint: ReplayEndpoint) -> int | None:
+    """Return how many messages of the recording are exposed; None where its index does not say."""
+    if all(endpoint.is_subscribed(index) for index in range(len(reader.channels))):
+        return reader.count
+    if reader.counts is None:
+        return None
+    return sum(count for index, count in enumerate(reader.counts) if endpoint.is_subscribed(index))
+
+
+def _report(reader: BagReader, replay: Replay, unconfirmed: Sequence[Unconfirmed], *, json: bool) -> None:
+    if json:
+        emit(
+            "done",
+            sent=replay.sent,
+            confirmed=replay.confirmed,
+            best_effort=replay.sent_best_effort,
+            unconfirmed=[asdict(each) for each in unconfirmed],
+            topics=_topic_fields(replay),
+            unread=reader.unread or None,
+        )
+        return
+    confirming = [each for each in replay.topics if each.publisher.confirms]
+    reliable = sum(each.flow.published.total() for each in confirming)
+    lines = [f"{reliable} messages sent, {replay.confirmed} confirmed"] if confirming else []
+    if reliable < replay.sent:
+        lines.append(f"{replay.sent - reliable} messages sent, best effort")
+    typer.echo("; ".join(lines) or "0 messages sent")
+    if reader.unread:
+        typer.echo(f"the recording could not be read to its end: {reader.unread}", err=True)
+    for each in unconfirmed:
+        typer.echo(each.words(), err=True)
+
+
+def _topic_fields(replay: Replay) -> list[dict[str, object]]:
+    """Return the figures of each channel of which something was sent, in the recording's order."""
+    channels = [(index, number, each) for each in replay.topics for number, index in enumerate(each.indexes)]
+    return [
+        {
+            "topic": each.topic,
+            "type": each.type_name,
+            "messages": each.flow.published[number],
+            "bytes": each.flow.published_bytes[number],
+            "reliable": each.publisher.confirms,
+        }
+        for _, number, each in sorted(channels, key=lambda channel: channel[0])
+        if each.flow.published[number]
+    ]
+
+
+def main() -> None:
+    """Run the command."""
+    app(prog_name="gdp-replay")
+
+
+if __name__ == "__main__":
+    main()

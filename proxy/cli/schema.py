@@ -1,0 +1,37 @@
+"""The option that prints the schema of ``proxy.yaml``.
+
+Place: command.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated
+
+import typer
+
+from proxy.config.config import ProxyConfig
+
+__all__ = ["Schema", "schema_text"]
+
+
+def schema_text() -> str:
+    """Return what ``docs/proxy.schema.json`` holds."""
+    return json.dumps(ProxyConfig.json_schema(), indent=2) + "\n"
+
+
+def _print_and_end(wanted: bool) -> None:
+    if wanted:
+        typer.echo(schema_text(), nl=False)
+        raise typer.Exit
+
+
+Schema = Annotated[
+    bool,
+    typer.Option(
+        "--schema",
+        is_eager=True,
+        callback=_print_and_end,
+        help="Print the JSON schema of the configuration, for editors, and end.",
+    ),
+]

@@ -1,0 +1,178 @@
+"""The configuration of a proxy: what crosses (``proxy/rules``), and between which graphs and devices.
+
+Place: shell; loading reads files and changes nothing. What no rule names stays local.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import (
+    AfterValidator,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+    model_validator,
+)
+from pydantic.config import JsonDict
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from gdp.errors import LocalError
+from gdp.limits import ADVERTISEMENT_LEASE_S
+from gdp.nodes.busy_poll import SPIN_MAX_US, SPIN_US
+from gdp.nodes.config import LeaseSeconds
+from gdp.nodes.schema import Directory, Domain, Ifname, Metrics, NewFile, Section, load
+from proxy.config.drop_ins import DROP_INS, DropIns, add_drop_in_rules
+from proxy.config.graph import RosGraphConfig
+from proxy.config.json_schema import JsonSchema, editor_schema
+from proxy.config.matching import Fault, clashes
+from proxy.config.rule import Rule
+from proxy.serial.serializer import Encoding
+
+__all__ = ["Encoding", "ProxyConfig", "Record", "RosGraphConfig", "Rule"]
+
+
+def _one_or_several(value: object, validate: ValidatorFunctionWrapHandler, info: ValidationInfo) -> object:
+    """Take a single mapping for a list of one; what is wrong in it is told at its own key."""
+    if isinstance(value, dict):
+        return (RosGraphConfig.model_validate(value, strict=True, context=info.context),)
+    if not isinstance(value, list):
+        raise ValueError("expected a mapping such as {endpoint: ros2, domain: 0}, or a list of such")
+    return validate(tuple(value))
+
+
+def _or_one(schema: JsonDict) -> None:
+    schema["anyOf"] = [schema["items"], {"type": schema.pop("type"), "items": schema.pop("items")}]
+
+
+class Record(Section):
+    """Where what arrives is written."""
+
+    path: NewFile = Field(description="File that is written; its directory must exist.")
+    format: Literal["mcap", "ros1"] = Field(default="mcap", description="`mcap` or `ros1` (a bag).")
+
+
+class ProxyConfig(Section):
+    """``proxy.yaml``. ``expose`` lists what leaves this machine, ``import`` what is wanted from elsewhere."""
+
+    renamed: ClassVar[Mapping[str, str]] = {"spin_us": "busy_poll_us"}
+
+    identity: Directory = Field(description="Directory of the proxy's keys and membership.")
+    domain: Domain = Field(description="The trust domain, and the others whose members are believed.")
+    iface: Ifname = Field(description="Device towards the switch: a name of its `attach`, or a NIC.")
+    delegations: Directory = Field(description="Directory of what owners gave this node.")
+    ros: Annotated[tuple[RosGraphConfig, ...], WrapValidator(_one_or_several)] = Field(
+        default=(),
+        description="The ROS graph, or a list of graphs, to take part in. Without it there are only recordings.",
+        json_schema_extra=_or_one,
+    )
+    expose: Annotated[tuple[Rule, ...], AfterValidator(add_drop_in_rules)] = Field(
+        default=(), validate_default=True, description="Rules for what leaves this machine."
+    )
+    imports: Annotated[tuple[Rule, ...], AfterValidator(add_drop_in_rules)] = Field(
+        default=(), alias="import", validate_default=True, description="Rules for what comes from elsewhere."
+    )
+    record: Record | None = Field(default=None, description="Write what arrives into a file.")
+    state: Directory | None = Field(
+        default=None, description="Directory that keeps revocations across restarts, for this user alone."
+    )
+    metrics: Metrics | None = Field(default=None, description="Serve Prometheus text on 127.0.0.1.")
+    lease_s: LeaseSeconds = Field(
+        default=ADVERTISEMENT_LEASE_S,
+        description="Lease of this node's claims, in seconds; each is renewed after a third of it.",
+    )
+    busy_poll_us: int = Field(
+        default=SPIN_US,
+        ge=0,
+        le=SPIN_MAX_US,
+        description="Microseconds to look for more frames before sleeping, where most waits were shorter. 0: never.",
+    )
+    control_socket: NewFile | None = Field(
+        default=None, description="Socket for `gdp reload`, `status` and `drain`. Default: beside the locks of nodes."
+    )
+    sandbox: bool = Field(
+        default=True, description="Whether the process gives away the rights that it needs no more once it is up."
+    )
+
+    @classmethod
+    def load(cls, path: Path) -> ProxyConfig:
+        """Read ``proxy.yaml`` and the rules of its drop-in directory ``proxy.yaml.d``.
+
+        Raises:
+            ConfigError: every error of a file, each with line and column.
+        """
+        drop_ins = DropIns.load(path)
+        return load(cls, path, more={DROP_INS: drop_ins}, locate=drop_ins.locate)
+
+    @classmethod
+    def json_schema(cls) -> JsonSchema:
+        """Return the schema of the file, for editors."""
+        return editor_schema(cls, "proxy.yaml")
+
+    def endpoint_of(self, rule: Rule) -> int:
+        """Return which of ``ros`` a rule is about; of a loaded file every rule has exactly one, if ``ros`` has any.
+
+        Raises:
+            LocalError: none, or more than one.
+        """
+        fitting = [index for index, end in enumerate(self.ros) if end.fits(rule)]
+        if len(fitting) > 1:
+            raise LocalError("several graphs under ros fit; say which: ros: 1 or 2, domain: its number")
+        if not fitting:
+            raise LocalError("none of the graphs under ros fits" if self.ros else "no graph is stated under ros")
+        return fitting[0]
+
+    @model_validator(mode="after")
+    def _holds_together(self) -> ProxyConfig:
+        errors: list[InitErrorDetails] = [
+            {"type": PydanticCustomError("rule", "{why}", {"why": why}), "loc": key, "input": None}
+            for key, why in self._faults()
+        ]
+        if errors:
+            raise ValidationError.from_exception_data("proxy.yaml", errors)
+        return self
+
+    def _misplaced(self) -> Iterator[Fault]:
+        """Yield the keys that mean nothing on their side."""
+        for side, rules, only in (
+            ("expose", self.expose, {"replication": "import"}),
+            ("import", self.imports, dict.fromkeys(("stop", "at_once", "state_node"), "expose")),
+        ):
+            for index, rule in enumerate(rules):
+                for key in only.keys() & rule.model_fields_set:
+                    yield (side, index, key), f"this stands in rules under {only[key]}"
+                if rule.state_node is not None and not rule.is_ordered:
+                    yield (side, index, "state_node"), "this needs 'state: ordered'"
+                if side == "expose" and rule.stop is not None and rule.at_once != 1:
+                    ordered, needs = "with 'state: ordered' nothing is broken off", "this needs 'at_once: 1'"
+                    yield (side, index, "stop"), ordered if rule.is_ordered else needs
+                if rule.is_ordered and rule.at_once is not None:
+                    yield (side, index, "at_once"), "with 'state: ordered' it is always 1"
+
+    def _faults(self) -> Iterator[Fault]:
+        if self.record is not None and not self.imports:
+            yield ("record",), "there is nothing to record without a rule under import"
+        try:
+            wheres = [end.where for end in self.ros]
+        except LocalError as error:
+            yield ("ros",), str(error)
+            return
+        for index, where in enumerate(wheres):
+            if where in wheres[:index]:
+                yield ("ros", index), f"ros[{wheres.index(where)}] is the same graph"
+        places: dict[int, int | None] = {}
+        for side, rules in (("expose", self.expose), ("import", self.imports)):
+            for index, rule in enumerate(rules):
+                places[id(rule)] = None
+                if not self.ros and rule.kind == "topic" and rule.ros is None and rule.domain is None:
+                    continue  # recordings are enough for it
+                try:
+                    places[id(rule)] = self.endpoint_of(rule)
+                except LocalError as error:
+                    yield (side, index), str(error)
+        yield from self._misplaced()
+        yield from clashes(self.expose, self.imports, lambda rule: places[id(rule)])

@@ -1,0 +1,93 @@
+"""Drop-in directory of a proxy: further rules in files of their own.
+
+I/O; reads files. ``proxy.yaml.d`` lies in the folder of ``proxy.yaml``. Its files ``*.yaml`` are read in the order of
+their names, and their lists ``expose`` and ``import`` are appended to those of ``proxy.yaml``. A drop-in has no other
+keys, and its relative paths start at its own folder. Programs that manage rules, such as ``fog``, write a file there
+and leave ``proxy.yaml`` alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from pydantic import Field, ValidationInfo
+
+from gdp.errors import ConfigError
+from gdp.nodes.schema import Section, load
+from gdp.nodes.yaml_source import KeyPath, YamlSource, read_yaml
+from proxy.config.rule import Rule
+
+__all__ = ["DROP_INS", "DropIn", "DropIns", "add_drop_in_rules", "drop_in_directory"]
+
+DROP_INS: Final = "drop_ins"  # key of the validation context
+_FILES_MAX: Final = 1_000
+
+
+class DropIn(Section):
+    """One file of a drop-in directory."""
+
+    expose: tuple[Rule, ...] = Field(default=(), description="Rules for what leaves this machine.")
+    imports: tuple[Rule, ...] = Field(default=(), alias="import", description="Rules for what comes from elsewhere.")
+
+    def rules(self, side: str) -> tuple[Rule, ...]:
+        """Return the rules of ``expose`` or ``import``."""
+        return self.expose if side == "expose" else self.imports
+
+
+def drop_in_directory(path: Path) -> Path:
+    """Return the drop-in directory of a proxy's configuration, whether it is there or not."""
+    return path.with_name(f"{path.name}.d")
+
+
+@dataclass(frozen=True, slots=True)
+class DropIns:
+    """The drop-in files of one proxy, in the order in which their rules are appended."""
+
+    files: tuple[tuple[Path, DropIn], ...] = ()
+
+    @classmethod
+    def load(cls, path: Path) -> DropIns:
+        """Read the drop-in files of the configuration at ``path``; without a directory there are none.
+
+        Raises:
+            ConfigError: every error of the first wrong file, each with line and column; or the directory is unreadable.
+        """
+        directory = drop_in_directory(path)
+        try:
+            files = sorted(each for each in directory.iterdir() if each.suffix == ".yaml" and each.name[0] != ".")
+        except FileNotFoundError:
+            return cls()
+        except OSError as error:
+            raise ConfigError(str(directory), "", f"a readable directory is expected: {error.strerror}") from error
+        if len(files) > _FILES_MAX:
+            raise ConfigError(str(directory), "", f"at most {_FILES_MAX} files are expected")
+        return cls(tuple((file, load(DropIn, file)) for file in files))
+
+    def rules(self, side: str) -> tuple[Rule, ...]:
+        """Return the rules of ``expose`` or ``import``, in the order of the files."""
+        return tuple(rule for _, drop_in in self.files for rule in drop_in.rules(side))
+
+    def locate(self, main: YamlSource, key: KeyPath) -> tuple[YamlSource, KeyPath]:
+        """Return the file that a key of the joined configuration comes from, and the key there."""
+        if len(key) < 2 or key[0] not in ("expose", "import") or not isinstance(key[1], int):
+            return main, key
+        side, index = key[0], key[1]
+        own = main.data.get(side) if isinstance(main.data, dict) else None
+        index -= len(own) if isinstance(own, list) else 0
+        if index < 0:
+            return main, key
+        for file, drop_in in self.files:
+            if index < len(drop_in.rules(side)):
+                return read_yaml(file), (side, index, *key[2:])
+            index -= len(drop_in.rules(side))
+        return main, key
+
+
+def add_drop_in_rules(rules: tuple[Rule, ...], info: ValidationInfo) -> tuple[Rule, ...]:
+    """Append the rules of drop-in files to the rules of ``proxy.yaml``; a validator of ``expose`` and ``import``."""
+    drop_ins = info.context.get(DROP_INS) if isinstance(info.context, dict) else None
+    if not isinstance(drop_ins, DropIns):
+        return rules
+    return rules + drop_ins.rules("expose" if info.field_name == "expose" else "import")

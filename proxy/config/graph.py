@@ -1,0 +1,108 @@
+"""A ROS graph that the proxy takes part in: one of the ``ros`` entries of ``proxy.yaml``.
+
+Place: a section of a file; what is not stated is read from the environment, as every ROS program does.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import ClassVar, Final, Literal
+from urllib.parse import urlsplit
+
+from pydantic import Field, ValidationInfo, field_validator
+
+from gdp.errors import LocalError
+from gdp.nodes.schema import Section
+from proxy.config.rule import DOMAIN_MAX, Rule
+from proxy.serial.channel import RosVersion
+
+__all__ = ["RosGraphConfig"]
+
+DEFAULT_MASTER: Final = "http://localhost:11311"
+
+
+class RosGraphConfig(Section):
+    """Which graph, and through what."""
+
+    renamed: ClassVar[Mapping[str, str]] = {"alone": "exclusive"}
+
+    endpoint: Literal["ros2", "ros1", "dds"] = Field(
+        description="`ros2`: through rclpy; `dds`: ROS 2 through Cyclone DDS, where no ROS is installed; `ros1`: rospy."
+    )
+    domain: int | None = Field(
+        default=None,
+        ge=0,
+        le=DOMAIN_MAX,
+        description="ROS 2 domain. `null`: ROS_DOMAIN_ID of the environment, else 0.",
+    )
+    master: str | None = Field(
+        default=None,
+        description=f"URI of the ROS 1 master. `null`: ROS_MASTER_URI of the environment, else {DEFAULT_MASTER}.",
+        json_schema_extra={"pattern": "^http://[^/]+:[0-9]+/?$"},
+    )
+    exclusive: bool = Field(
+        default=False,
+        description="No other proxy takes part in this graph: what it carries begins without looking for one (2 s).",
+    )
+
+    @property
+    def ros(self) -> RosVersion:
+        """Return which ROS it is."""
+        return 1 if self.endpoint == "ros1" else 2
+
+    @property
+    def domain_id(self) -> int:
+        """Return the ROS 2 domain.
+
+        Raises:
+            LocalError: the environment states one that is none.
+        """
+        if self.domain is not None:
+            return self.domain
+        text = os.environ.get("ROS_DOMAIN_ID") or "0"
+        if not (text.isascii() and text.isdigit() and int(text) <= DOMAIN_MAX):
+            raise LocalError(f"the environment's ROS_DOMAIN_ID is {text!r}, not a number from 0 to {DOMAIN_MAX}")
+        return int(text)
+
+    @property
+    def master_uri(self) -> str:
+        """Return where the ROS 1 master is."""
+        return self.master or os.environ.get("ROS_MASTER_URI") or DEFAULT_MASTER
+
+    @property
+    def where(self) -> tuple[RosVersion, int | str]:
+        """Return what tells one graph from another; raises as ``domain_id``."""
+        return (1, self.master_uri) if self.ros == 1 else (2, self.domain_id)
+
+    def fits(self, rule: Rule) -> bool:
+        """Return whether a rule may be about this graph; raises as ``domain_id``."""
+        return rule.ros in (None, self.ros) and (
+            rule.domain is None or (self.ros == 2 and rule.domain == self.domain_id)
+        )
+
+    @field_validator("domain")
+    @classmethod
+    def _is_of_ros_2(cls, value: int | None, info: ValidationInfo) -> int | None:
+        if info.data.get("endpoint") == "ros1" and value is not None:
+            raise ValueError("ROS 1 has no domains; it has a master")
+        return value
+
+    @field_validator("master")
+    @classmethod
+    def _is_of_ros_1(cls, value: str | None, info: ValidationInfo) -> str | None:
+        if value is None:
+            return value
+        if info.data.get("endpoint", "ros1") != "ros1":
+            raise ValueError("ROS 2 has no master; it has a domain")
+        if not _is_master(value):
+            raise ValueError(f"expected a URI such as {DEFAULT_MASTER}")
+        return value
+
+
+def _is_master(text: str) -> bool:
+    try:
+        uri = urlsplit(text)
+        return uri.scheme == "http" and bool(uri.hostname) and uri.port is not None and uri.path in ("", "/")
+    except ValueError:  # a port that is none
+        return False

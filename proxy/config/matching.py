@@ -1,0 +1,95 @@
+"""Which rule holds: a rule with a full name before every pattern, and among equals the first of the file.
+
+Place: pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from typing import TypeAlias
+
+from gdp.metadata import Metadata
+from gdp.names import Name
+from proxy.config.rule import Kind, Rule
+
+__all__ = ["Fault", "choose", "clashes", "imported"]
+
+Fault: TypeAlias = "tuple[tuple[str | int, ...], str]"  # the key that is wrong, and what about it
+
+
+def choose(rules: Sequence[Rule], kind: Kind, local_name: str, type_name: str = "") -> Rule | None:
+    """Return the rule of one direction for what this machine calls so, None: it stays local.
+
+    A rule with that full name settles it: where its type is another, no pattern takes its place.
+
+    Args:
+        type_name: empty while unknown.
+    """
+    fitting = [rule for rule in rules if rule.kind == kind and rule.matches(local_name)]
+    full = [rule for rule in fitting if not rule.is_pattern]
+    return next((rule for rule in full or fitting if rule.fits_type(type_name)), None)
+
+
+def imported(rules: Sequence[Rule], name: Name, metadata: Metadata) -> tuple[Rule, str] | None:
+    """Return the rule about an overlay name, and what this machine calls it; None: no rule is about it."""
+    for rule in sorted(rules, key=lambda rule: rule.is_pattern):
+        local = rule.local_of(metadata)
+        if local is not None and metadata.name(rule.owner.compressed) == name:
+            return rule, local
+    return None
+
+
+def clashes(
+    expose: Sequence[Rule], imports: Sequence[Rule], place_of: Callable[[Rule], Hashable | None]
+) -> Iterator[Fault]:
+    """Yield what is wrong between rules: two of one direction, or a service on both sides, for one thing.
+
+    Args:
+        place_of: which graph a rule is about.
+    """
+    for side, rules in (("expose", expose), ("import", imports)):
+        seen = _Seen(side, place_of)
+        for index, rule in enumerate(rules):
+            reason = seen.find(rule)
+            if reason is not None:
+                yield (side, index, "name"), reason
+            seen.add(index, rule)
+    exposed = _Seen("expose", place_of)
+    for index, rule in enumerate(expose):
+        if rule.kind != "topic" and not rule.is_pattern:
+            exposed.add(index, rule)
+    for index, rule in enumerate(imports):
+        if rule.kind != "topic" and (reason := exposed.find(rule)) is not None:
+            yield ("import", index, "name"), f"{reason}; one machine serves {_a(rule.kind)} or calls it, not both"
+
+
+class _Seen:
+    """Rules of one direction by what only one of them may be about."""
+
+    def __init__(self, side: str, place_of: Callable[[Rule], Hashable | None]) -> None:
+        self._side = side
+        self._place_of = place_of
+        self._rules: dict[Hashable, list[tuple[int, Rule]]] = {}
+
+    def add(self, index: int, rule: Rule) -> None:
+        for key, _ in self._keys(rule):
+            self._rules.setdefault(key, []).append((index, rule))
+
+    def find(self, rule: Rule) -> str | None:
+        """Return how an earlier rule is about the same thing."""
+        for key, what in self._keys(rule):
+            for index, earlier in self._rules.get(key, ()):
+                if rule.fits_type(earlier.type_name):
+                    return f"{self._side}[{index}] {what}"
+        return None
+
+    def _keys(self, rule: Rule) -> Iterator[tuple[Hashable, str]]:
+        overlay = (rule.kind, rule.name, tuple(sorted(rule.extra.items())), rule.owner.compressed)
+        yield overlay, f"gives the same name: {rule.name}"
+        if not rule.is_pattern or self._side == "expose":  # patterns of several owners may be imported into one graph
+            local = (rule.kind, rule.local, self._place_of(rule))
+            yield local, f"is about {rule.local} of this machine, too"
+
+
+def _a(kind: Kind) -> str:
+    return "an action" if kind == "action" else f"a {kind}"

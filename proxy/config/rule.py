@@ -1,0 +1,399 @@
+"""One rule of ``proxy.yaml``: what crosses, under which name, in which form.
+
+Place: a section of a file; validating one reads the owner's public key and changes nothing.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Final, Literal, TypeAlias
+
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    WithJsonSchema,
+    field_validator,
+)
+from pydantic.config import JsonDict, JsonValue
+
+from gdp.crypto.keys import PublicKey
+from gdp.errors import GdpError, LocalError
+from gdp.limits import MESSAGE_MAX_BYTES
+from gdp.metadata import Metadata
+from gdp.names import Name
+from gdp.nodes.schema import Section, relative
+from gdp.service.replication import Mode, Replication
+from gdp.stores.files import read_private
+from proxy.config.pattern import NAME_FORM, NAME_MAX_CHARS, PATTERN_FORM, is_name, is_pattern, matches
+from proxy.serial.serializer import Encoding
+
+__all__ = ["DOMAIN_MAX", "SALT", "Kind", "Rule", "fits_kind"]
+
+Kind: TypeAlias = Literal["topic", "service", "action"]
+
+CALL_S: Final = 5.0
+CALL_MAX_S: Final = 86_400.0
+COPIES_MAX: Final = 1_024
+AT_ONCE_MAX: Final = 65_536
+RATE_MAX_HZ: Final = 1e6
+DOMAIN_MAX: Final = 232  # the ports of a higher one would lie above 65535; DDSI-RTPS 2.5, section 9.6.2
+
+_WORD: Final = "[A-Za-z][A-Za-z0-9_]*"
+_TYPES: Final[dict[Kind, tuple[str, str]]] = {
+    # A service's events and an action's feedback are topics as well.
+    "topic": (f"{_WORD}/(?:msg/{_WORD}|srv/{_WORD}_Event|action/{_WORD}_FeedbackMessage)", "sensor_msgs/msg/Image"),
+    "service": (f"{_WORD}/srv/{_WORD}", "std_srvs/srv/SetBool"),
+    "action": (f"{_WORD}/action/{_WORD}", "test_msgs/action/Fibonacci"),
+}
+SALT: Final = "salt"  # the key of the unguessable part
+_OWN_KEYS: Final = ("kind", "name", "type")
+_OF_TOPICS: Final = ("reliable", "latched", "max_hz")
+_OF_CALLS: Final = ("timeout_s", "on_timeout", "replication")
+_OF_SERVICES: Final = ("stop", "at_once", "state", "state_node")
+_FOREIGN: Final[dict[Kind, tuple[str, ...]]] = {
+    "topic": (*_OF_CALLS, *_OF_SERVICES),
+    "service": _OF_TOPICS,
+    "action": (*_OF_TOPICS, *_OF_SERVICES),
+}
+
+
+def _extra_metadata(items: dict[str, str | int]) -> dict[str, str | int]:
+    if own := sorted(items.keys() & set(_OWN_KEYS)):
+        raise ValueError(f"{', '.join(own)}: state it as a key of the rule itself")
+    try:
+        Metadata({"kind": "topic", **items})
+    except LocalError as error:
+        raise ValueError(str(error)) from error
+    return items
+
+
+def _owner_key(value: object, info: ValidationInfo) -> object:
+    """Read the public key file that ``owner`` names; anything but a text goes on to be refused as such."""
+    if not isinstance(value, str):
+        return value
+    path = relative(Path(value), info)
+    try:
+        return PublicKey.from_pem(path.read_bytes())
+    except OSError as error:
+        raise ValueError(f"expected an owner's public key file: {path}: {error.strerror}") from error
+    except GdpError as error:
+        raise ValueError(f"expected an owner's public key file: {path}: {error}") from error
+
+
+def _salt(value: object, info: ValidationInfo) -> object:
+    """Read the private file that ``salt_file`` names; anything but a text goes on to be refused as such."""
+    if not isinstance(value, str):
+        return value
+    if SALT in info.data.get("metadata", {}):
+        raise ValueError("the salt stands under metadata as well: leave one of them out")
+    path = relative(Path(value), info)
+    try:
+        salt = read_private(path).decode().strip()
+    except (LocalError, UnicodeDecodeError) as error:
+        raise ValueError(f"expected a private file with the salt as text: {error}") from error
+    if not salt:
+        raise ValueError(f"expected a private file with the salt as text: {path}: empty")
+    return salt
+
+
+Owner = Annotated[PublicKey, BeforeValidator(_owner_key), WithJsonSchema({"type": "string", "minLength": 1})]
+Salt = Annotated[str | None, BeforeValidator(_salt), Field(max_length=4_096, repr=False)]
+ExtraMetadata = Annotated[dict[str, str | int], AfterValidator(_extra_metadata)]
+CallSeconds = Annotated[float, Field(gt=0, le=CALL_MAX_S)]
+
+
+def _by_kind(kind: Kind) -> JsonValue:
+    """Return what a JSON schema says of the rules of one kind; without ``kind`` a rule is about a topic."""
+    then: JsonDict = {"type": {"pattern": f"^(?:|{_TYPES[kind][0]})$"}, **dict.fromkeys(_FOREIGN[kind], False)}
+    condition: JsonDict = {"properties": {"kind": {"const": kind}}, "required": [] if kind == "topic" else ["kind"]}
+    return {"if": condition, "then": {"properties": then}}
+
+
+class Spread(Section):
+    """How requests are spread over a service's servers."""
+
+    mode: Literal["all", "some", "hedged"] = Field(
+        default="all",
+        description="`all`: every server gets each request, by one copy on this machine's link; `some`: so many as"
+        " `copies` says, those that answered fastest lately; `hedged`: one, and a second one if it is late.",
+    )
+    copies: int = Field(default=2, ge=1, le=COPIES_MAX, description="With `some`: how many servers get each request.")
+    budget: float = Field(
+        default=0.02, ge=0, le=1, description="With `hedged`: most second copies, as a share of requests."
+    )
+
+
+class Rule(Section):
+    """What crosses: one topic, service or action, or all of a pattern.
+
+    The 256-bit names follow from kind, name, type, metadata and owner.
+    """
+
+    model_config = ConfigDict(json_schema_extra={"allOf": [_by_kind("topic"), _by_kind("service"), _by_kind("action")]})
+
+    kind: Kind = Field(default="topic", description="What it is about: `topic`, `service` or `action` (ROS 2).")
+    name: str = Field(
+        description="The name that all sides know: a full ROS name such as /camera/image, or a pattern of such: `*` is"
+        " any part of one segment, `**` one or more segments. Hidden segments (`_action`) are written out.",
+        json_schema_extra={"pattern": f"^{PATTERN_FORM}$", "maxLength": NAME_MAX_CHARS},
+    )
+    type_name: str = Field(
+        default="",
+        alias="type",
+        description="The type as ROS 2 writes it, for ROS 1 too, such as sensor_msgs/msg/Image. Without it the rule"
+        " takes what it finds: on the graph or in the recording (expose), in the delegations (import).",
+    )
+    remap: str | None = Field(
+        default=None,
+        description="What this machine calls it, where that differs from `name`; not with a pattern.",
+        json_schema_extra={"pattern": f"^{NAME_FORM}$", "maxLength": NAME_MAX_CHARS},
+    )
+    metadata: ExtraMetadata = Field(
+        default_factory=dict,
+        description="Whatever else the 256-bit name digests: text or whole numbers.",
+        json_schema_extra={"propertyNames": {"not": {"enum": list(_OWN_KEYS)}}},
+    )
+    salt: Salt = Field(
+        default=None,
+        alias="salt_file",
+        description="A private file (mode 0600) with the unguessable part of the 256-bit name: `salt` of its metadata.",
+    )
+    owner: Owner = Field(description="Public key file of the name's owner (`owner.pub`).")
+    encoding: Encoding = Field(
+        default="json", description="How messages travel: `json`, `cbor`, or `cdr` (the bytes as ROS wrote them)."
+    )
+    wants_reliable: bool | None = Field(
+        default=None,
+        alias="reliable",
+        description="Topics: whether readers ask for what they miss. `null`: as the publisher's QoS says.",
+    )
+    wants_latched: bool | None = Field(
+        default=None,
+        alias="latched",
+        description="Topics: whether late joiners get the last message. `null`: as the publisher's QoS says.",
+    )
+    max_hz: float | None = Field(
+        default=None,
+        gt=0,
+        le=RATE_MAX_HZ,
+        description="Topics: most messages a second that cross; more are left out and counted. `null`: all.",
+    )
+    max_bytes: int = Field(
+        default=MESSAGE_MAX_BYTES,
+        ge=1,
+        le=MESSAGE_MAX_BYTES,
+        description="Larger messages, as ROS wrote them, do not cross and are counted.",
+    )
+    timeout_s: CallSeconds | None = Field(
+        default=CALL_S,
+        description="Services and actions: seconds that an answer may take. An action's result may always take as long"
+        " as it wants. `null`: no limit.",
+    )
+    on_timeout: Literal["empty", "silent"] = Field(
+        default="empty",
+        description="Services and actions of ROS 2, under `import`: what a client gets when no answer came in time."
+        " `empty`: a response of zeros. `silent`: nothing. A response with `success` and `message` says why in any"
+        " case, and a client of ROS 1 gets an error.",
+    )
+    replication: Spread = Field(
+        default_factory=Spread,
+        description="Services and actions, under `import`: which of several servers get each request.",
+    )
+    stop: str | None = Field(
+        default=None,
+        description="Services, under `expose`: a local `std_srvs/srv/Trigger` that is called when nobody waits any more"
+        " for what the server works on; needs `at_once: 1`. `null`: it works on.",
+        json_schema_extra={"pattern": f"^{NAME_FORM}$", "maxLength": NAME_MAX_CHARS},
+    )
+    at_once: int | None = Field(
+        default=None,
+        ge=1,
+        le=AT_ONCE_MAX,
+        description="Services, under `expose`: how many requests the local server gets at one time; the others wait"
+        " in the proxy, where clients take turns. `null`: all.",
+    )
+    state: Literal["none", "ordered"] = Field(
+        default="none",
+        description="Services, on both sides: `ordered` where answers depend on requests before: every server gets all"
+        " of them in one order.",
+    )
+    state_node: str | None = Field(
+        default=None,
+        description="Services, under `expose` with `state: ordered`: the local node whose parameter `state`, a byte"
+        " array, is the server's state. `null`: it tells none.",
+        json_schema_extra={"pattern": f"^{NAME_FORM}$", "maxLength": NAME_MAX_CHARS},
+    )
+    priority: Literal["normal", "urgent"] = Field(
+        default="normal", description="`urgent`: goes before everything `normal`, wherever frames queue."
+    )
+    ros: Literal[1, 2] | None = Field(
+        default=None, description="Which ROS it is about, where the proxy speaks both. `null`: the one that there is."
+    )
+    domain: int | None = Field(
+        default=None,
+        ge=0,
+        le=DOMAIN_MAX,
+        description="Which ROS 2 domain it is about, where the proxy is in several. `null`: the one that there is.",
+    )
+    is_global: bool = Field(
+        default=True,
+        alias="global",
+        description="Whether the name climbs to the tier above, so that other domains can find it.",
+    )
+
+    @property
+    def extra(self) -> dict[str, str | int]:
+        """Return what the name digests beside kind, name and type."""
+        return self.metadata if self.salt is None else {**self.metadata, SALT: self.salt}
+
+    @property
+    def is_pattern(self) -> bool:
+        """Return whether it is about all names of a pattern."""
+        return "*" in self.name
+
+    @property
+    def local(self) -> str:
+        """Return the local name, or the pattern of local names."""
+        return self.remap or self.name
+
+    @property
+    def reliable(self) -> bool:
+        """Return ``wants_reliable`` for a source that says nothing about it."""
+        return self.wants_reliable is not False
+
+    @property
+    def latched(self) -> bool:
+        """Return ``wants_latched`` for a source that says nothing about it."""
+        return self.wants_latched is True
+
+    @property
+    def overlay_metadata(self) -> Metadata:
+        """Return the flat map that the name digests.
+
+        Raises:
+            LocalError: a pattern, or a rule without a type: what it means depends on what is found.
+        """
+        if self.is_pattern or not self.type_name:
+            what = "a pattern" if self.is_pattern else "a rule without a type"
+            raise LocalError(f"{self.name}: {what} has no name of its own; state a full name and its type")
+        return self.metadata_of(self.local, self.type_name)
+
+    @property
+    def overlay_name(self) -> Name:
+        """Return the 256-bit name under which it is known everywhere.
+
+        Raises:
+            LocalError: as ``overlay_metadata``.
+        """
+        return self.overlay_metadata.name(self.owner.compressed)
+
+    @property
+    def is_ordered(self) -> bool:
+        """Return whether it is about a service that keeps state."""
+        return self.state == "ordered"
+
+    @property
+    def spread(self) -> Replication:
+        """Return how requests are spread over servers."""
+        return Replication(Mode(self.replication.mode), self.replication.copies, self.replication.budget)
+
+    def matches(self, local_name: str) -> bool:
+        """Return whether it is about what this machine calls so."""
+        return matches(self.name, local_name) if self.is_pattern else local_name == self.local
+
+    def fits_type(self, type_name: str) -> bool:
+        """Return whether it takes this type; one of them may be empty: unknown."""
+        return not self.type_name or not type_name or self.type_name == type_name
+
+    def global_name_of(self, local_name: str) -> str:
+        """Return what all sides call what ``matches``."""
+        return local_name if self.is_pattern else self.name
+
+    def metadata_of(self, local_name: str, type_name: str) -> Metadata:
+        """Return what the overlay name of something that ``matches`` digests."""
+        own = {"kind": self.kind, "name": self.global_name_of(local_name), "type": type_name}
+        return Metadata({**own, **self.extra})
+
+    def overlay_name_of(self, local_name: str, type_name: str) -> Name:
+        """Return the 256-bit name of something that ``matches``."""
+        return self.metadata_of(local_name, type_name).name(self.owner.compressed)
+
+    def local_of(self, metadata: Metadata) -> str | None:
+        """Return the local name of what this metadata describes, None if the rule is not about it.
+
+        The owner is not in the metadata: compare ``overlay_name_of`` as well, or use ``choice.imported``.
+        """
+        name, type_name = metadata.get("name"), metadata.get("type")
+        if metadata["kind"] != self.kind or not isinstance(name, str) or not isinstance(type_name, str):
+            return None
+        if {key: value for key, value in metadata.items() if key not in _OWN_KEYS} != self.extra:
+            return None
+        if not fits_kind(type_name, self.kind) or not self.fits_type(type_name):
+            return None
+        if self.is_pattern:
+            return name if matches(self.name, name) else None
+        return self.local if name == self.name else None
+
+    @field_validator("name")
+    @classmethod
+    def _name(cls, text: str) -> str:
+        if not is_name(text) and not is_pattern(text):
+            raise ValueError("expected a full ROS name, such as /camera/image, or a pattern: /camera/* or /camera/**")
+        return text
+
+    @field_validator("type_name")
+    @classmethod
+    def _type(cls, text: str, info: ValidationInfo) -> str:
+        kind: Kind | None = info.data.get("kind")
+        if text and kind is not None and not fits_kind(text, kind):
+            raise ValueError(
+                f"expected the type of {'an' if kind == 'action' else 'a'} {kind} as ROS 2 writes it,"
+                f" such as {_TYPES[kind][1]} (for ROS 1 as well)"
+            )
+        return text
+
+    @field_validator("remap")
+    @classmethod
+    def _remap(cls, text: str | None, info: ValidationInfo) -> str | None:
+        if text is not None and not is_name(text):
+            raise ValueError("expected a full ROS name, such as /camera/image")
+        if text is not None and is_pattern(info.data.get("name", "")):
+            raise ValueError("a pattern cannot be remapped; write a rule for each name")
+        return text
+
+    @field_validator("wants_reliable", "wants_latched", "max_hz")
+    @classmethod
+    def _is_of_topics(cls, value: object, info: ValidationInfo) -> object:
+        if info.data.get("kind", "topic") != "topic":
+            raise ValueError("only topics have this")
+        return value
+
+    @field_validator("timeout_s", "on_timeout", "replication")
+    @classmethod
+    def _is_of_calls(cls, value: object, info: ValidationInfo) -> object:
+        if info.data.get("kind", "service") == "topic":
+            raise ValueError("only services and actions have this")
+        return value
+
+    @field_validator("stop", "at_once", "state", "state_node")
+    @classmethod
+    def _is_of_services(cls, value: object, info: ValidationInfo) -> object:
+        if info.data.get("kind", "service") != "service":
+            raise ValueError("only services have this")
+        return value
+
+    @field_validator("stop", "state_node")
+    @classmethod
+    def _local_name(cls, text: str | None) -> str | None:
+        if text is not None and not is_name(text):
+            raise ValueError("expected a full ROS name, such as /plan/stop")
+        return text
+
+
+def fits_kind(type_name: str, kind: Kind) -> bool:
+    """Return whether a type, as ROS 2 writes it, is one that a topic, a service or an action can have."""
+    return re.fullmatch(_TYPES[kind][0], type_name) is not None

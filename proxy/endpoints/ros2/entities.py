@@ -1,0 +1,275 @@
+"""What the endpoint has in the graph: things to hear with, to serve with, to call with and to publish with.
+
+Place: I/O through rclpy's handles. ``drain`` is called by the waiting thread; everything else by the endpoint's caller.
+A drain takes a bounded number, so that one busy topic does not keep the others waiting.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from threading import Lock
+from typing import Final, Literal, Protocol, TypeAlias
+
+from proxy.endpoints.endpoint import CallFailed, Event, Graph, MessageReceived, RequestReceived, ResponseReceived, Role
+from proxy.endpoints.ros2.loopback_filter import LoopbackFilter
+from proxy.endpoints.ros2.session import (
+    ClientHandle,
+    Entity,
+    Handle,
+    PublisherHandle,
+    RequestId,
+    ServiceHandle,
+    ServiceType,
+    SubscriptionHandle,
+    WaitSet,
+)
+from proxy.serial.channel import Channel, Qos
+
+__all__ = ["ClientEntity", "Kind", "PublisherEntity", "ServiceEntity", "Source", "SubscriptionEntity"]
+
+Kind: TypeAlias = Literal["subscription", "service", "client"]
+
+_AT_ONCE: Final = 64
+_TICKETS_MAX: Final = 10_000
+_WINDOW: Final = 8  # below the ten places of a server's queue
+_WINDOW_S: Final = 0.1
+_PATIENCE_S: Final = 1.0  # for a server that the graph shows, to match a new client
+
+
+class Source(Protocol):
+    """What the waiting thread waits for."""
+
+    @property
+    def number(self) -> int: ...
+
+    @property
+    def entity(self) -> Entity: ...
+
+    @property
+    def kind(self) -> Kind: ...
+
+    @property
+    def handle(self) -> Handle: ...
+
+    def join(self, wait_set: WaitSet) -> Callable[[], object]:
+        """Return what has a wait set wait for this once."""
+
+    def drain(self) -> list[Event]:
+        """Take what has come."""
+
+
+@dataclass(slots=True)
+class SubscriptionEntity:
+    """A subscription."""
+
+    number: int
+    topic: str
+    message: type
+    qos: Qos
+    channel: Channel  # as far as the graph tells
+    entity: Entity
+    handle: SubscriptionHandle
+    own: LoopbackFilter | None = None  # where this endpoint publishes the topic too
+    described: Channel | None = None
+
+    kind: Kind = "subscription"
+
+    def join(self, wait_set: WaitSet) -> Callable[[], object]:
+        return partial(wait_set.add_subscription, self.handle)
+
+    def drain(self) -> list[Event]:
+        events: list[Event] = []
+        stamp_ns = time.time_ns()
+        for _ in range(_AT_ONCE):
+            taken = self.handle.take_message(self.message, True)
+            if taken is None:
+                break
+            if self.own is None or not self.own.is_loopback(taken[0], time.monotonic()):
+                events.append(MessageReceived(self.number, stamp_ns, taken[0]))
+        return events
+
+    def describe(self, graph: Graph) -> Channel:
+        """Return the channel with what the publishers now there offer."""
+        offers = {end.qos for end in graph if end.role is Role.PUBLISHES and end.qos is not None}
+        ordered = tuple(sorted(offers, key=repr))
+        latched = any(qos.durability == "transient_local" for qos in ordered)
+        known = self.channel
+        return Channel(
+            known.topic, known.type_name, 2, known.hash, known.definition, known.definition_format, ordered, latched
+        )
+
+
+@dataclass(slots=True)
+class PublisherEntity:
+    """A publisher. ``kept``: of a transient local one, what its late joiners get; one of them may be our own."""
+
+    number: int
+    topic: str
+    qos: Qos
+    channel: Channel
+    entity: Entity
+    handle: PublisherHandle
+    kept: deque[bytes] = field(default_factory=lambda: deque(maxlen=0))
+    echoes: tuple[LoopbackFilter, ...] = ()  # of our own subscriptions to the topic
+
+    def publish(self, raw: bytes) -> None:
+        """Publish, unheard by our own subscriptions."""
+        for own in self.echoes:
+            own.add(raw, time.monotonic())
+        self.kept.append(raw)
+        self.handle.publish_raw(raw)
+
+
+class ServiceEntity:
+    """A virtual server; a request waits under its ticket, the oldest is forgotten when there are too many."""
+
+    kind: Final[Kind] = "service"
+
+    def __init__(self, number: int, service: ServiceType, entity: Entity, handle: ServiceHandle) -> None:
+        self.number = number
+        self.entity = entity
+        self.handle = handle
+        self._request = service.Request
+        self.response = service.Response
+        self._tickets: OrderedDict[int, RequestId] = OrderedDict()
+        self._next = 1
+        self._lock = Lock()
+
+    def join(self, wait_set: WaitSet) -> Callable[[], object]:
+        return partial(wait_set.add_service, self.handle)
+
+    def drain(self) -> list[Event]:
+        from rclpy.serialization import serialize_message
+
+        events: list[Event] = []
+        for _ in range(_AT_ONCE):
+            request, info = self.handle.service_take_request(self._request)
+            if info is None:
+                break
+            with self._lock:
+                ticket, self._next = self._next, self._next + 1
+                self._tickets[ticket] = info.request_id
+                if len(self._tickets) > _TICKETS_MAX:
+                    self._tickets.popitem(last=False)
+            events.append(RequestReceived(self.number, ticket, serialize_message(request)))
+        return events
+
+    def send(self, ticket: int, response: object) -> None:
+        """Answer; an unknown ticket is ignored."""
+        with self._lock:
+            request = self._tickets.pop(ticket, None)
+        if request is not None:
+            self.handle.service_send_response(response, request)
+
+    def forget(self, ticket: int) -> None:
+        """Leave a request unanswered."""
+        with self._lock:
+            self._tickets.pop(ticket, None)
+
+
+@dataclass(frozen=True, slots=True)
+class _Held:
+    """A call that was not sent yet."""
+
+    request: object
+    until_s: float  # how long it waits for a server that the graph shows, to match our client
+
+
+class ClientEntity:
+    """A client; any number of its calls may be under way.
+
+    A server's queue has ten places by default, and drops the oldest request beyond that: only so many unanswered
+    requests go out in a short time, the others are held.
+    """
+
+    kind: Final[Kind] = "client"
+
+    def __init__(self, number: int, name: str, service: ServiceType, entity: Entity, handle: ClientHandle) -> None:
+        self.number = number
+        self.name = name
+        self.entity = entity
+        self.handle = handle
+        self.request = service.Request
+        self._response = service.Response
+        self._lock = Lock()  # over sending too: a response may be here before send_request returns
+        self._calls: dict[int, int] = {}  # rcl's sequence number -> the caller's number
+        self._recent: dict[int, float] = {}  # rcl's sequence number -> when its request may be taken for taken
+        self._held: dict[int, _Held] = {}
+
+    def join(self, wait_set: WaitSet) -> Callable[[], object]:
+        return partial(wait_set.add_client, self.handle)
+
+    def drain(self) -> list[Event]:
+        from rclpy.serialization import serialize_message
+
+        events: list[Event] = []
+        for _ in range(_AT_ONCE):
+            info, response = self.handle.take_response(self._response)
+            if info is None:
+                break
+            with self._lock:
+                self._recent.pop(info.request_id.sequence_number, None)
+                call = self._calls.pop(info.request_id.sequence_number, None)
+            if call is not None:
+                events.append(ResponseReceived(self.number, call, serialize_message(response)))
+        self._send(time.monotonic())
+        return events
+
+    def begin(self, call: int, request: object, *, is_there: bool, now_s: float) -> CallFailed | None:
+        """Send a request, or hold it a moment.
+
+        Args:
+            is_there: the graph shows a server, so that it is worth while to wait until it matches our client.
+        """
+        is_matched = self.handle.service_server_is_available()
+        if not is_matched and not is_there:
+            return CallFailed(self.number, call, f"no server of {self.name}")
+        with self._lock:
+            self._held[call] = _Held(request, now_s + _PATIENCE_S)
+        if is_matched:
+            self._send(now_s)
+        return None
+
+    def drop(self, call: int) -> None:
+        """Forget a call."""
+        with self._lock:
+            self._held.pop(call, None)
+            for sequence, known in self._calls.items():
+                if known == call:
+                    del self._calls[sequence]
+                    break
+
+    @property
+    def is_holding(self) -> bool:
+        """Return whether a call was not sent yet."""
+        return bool(self._held)
+
+    def tend(self, now_s: float) -> list[Event]:
+        """Send what was held, fail what cannot be answered any more."""
+        if not self._held and not self._calls:
+            return []
+        if self.handle.service_server_is_available():
+            self._send(now_s)
+            return []
+        with self._lock:
+            late = [call for call, held in self._held.items() if held.until_s <= now_s]
+            gone = [*self._calls.values(), *late]
+            self._calls.clear()
+            self._recent.clear()
+            for call in late:
+                del self._held[call]
+        return [CallFailed(self.number, call, f"the server of {self.name} is gone") for call in gone]
+
+    def _send(self, now_s: float) -> None:
+        with self._lock:
+            if self._held and len(self._recent) >= _WINDOW:
+                self._recent = {sequence: until for sequence, until in self._recent.items() if until > now_s}
+            while self._held and len(self._recent) < _WINDOW:
+                call = next(iter(self._held))
+                sequence = self.handle.send_request(self._held.pop(call).request)
+                self._calls[sequence] = call
+                self._recent[sequence] = now_s + _WINDOW_S

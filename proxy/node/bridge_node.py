@@ -1,0 +1,152 @@
+"""A proxy in live graphs: the loop that drives the overlay's member, the endpoints and the bridge between them.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from pathlib import Path
+from typing import Final
+
+import typer
+
+from gdp.cli.node import emit, emit_wait
+from gdp.errors import LocalError
+from gdp.nodes.delegation_store import DelegationStore
+from proxy.bridge.bridge import Bridge
+from proxy.bridge.context import BridgeContext
+from proxy.bridge.topic_stats import percentile
+from proxy.config.config import ProxyConfig
+from proxy.endpoints.endpoint import proxy_node_name
+from proxy.endpoints.live import open_endpoints
+from proxy.node.node import GOODBYE_S, ProxyNode, run_node
+
+__all__ = ["run"]
+
+log = logging.getLogger(__name__)
+
+TICK_S: Final = 0.5
+_LOOK_S: Final = 2.0  # who begins sooner may not see yet that another proxy of its graph carries the same
+DRAIN_MAX_S: Final = 10.0  # a server that leaves gives up then what it has not answered
+_TURN_S: Final = 0.0002  # what an endpoint's thread may have to wait for the interpreter; Python's own is 5 ms
+
+
+def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
+    """Carry what the configuration names between its graphs and the overlay until stopped.
+
+    Args:
+        path: of the configuration, to read it again after a SIGHUP.
+
+    Raises:
+        LocalError: keys, delegations or the device are not as the configuration says, or an endpoint cannot be had.
+    """
+    sys.setswitchinterval(_TURN_S)
+    with run_node(settings, emit_wait if json else None) as node:
+        name = proxy_node_name(node.identity.name.to_text())
+        with open_endpoints(settings.ros, name) as endpoints:
+            held = DelegationStore(settings.delegations, node.identity)
+            look_s = 0.0 if all(end.exclusive for end in settings.ros) else _LOOK_S
+            bridge = Bridge(
+                BridgeContext(node.member, node.traffic, node.faults), settings, endpoints, held, look_s=look_s
+            )
+            node.drains = True
+            node.on_reload = lambda: _reload(path, settings, node, bridge)
+            for endpoint in endpoints:
+                node.runtime.watch(endpoint)
+            try:
+                _work(node, bridge, json=json)
+            finally:
+                for endpoint in endpoints:
+                    node.runtime.unwatch(endpoint)
+            bridge.close()
+            node.member.leave()
+            node.linger(GOODBYE_S)
+        if json:
+            emit("done", topics=[stats.to_fields() for stats in bridge.stats], faults=dict(node.faults.counts))
+        else:
+            for stats in bridge.stats:
+                median_ms = percentile(sorted(stats.latencies_ms), 0.5)
+                if median_ms is not None or stats.lost:
+                    median = "-" if median_ms is None else f"{median_ms:.1f} ms"
+                    lost = f", {stats.losses.words()}" if stats.losses.total else ""
+                    typer.echo(f"  {stats.topic}: {stats.received} received, median {median}{lost}")
+            carried = f"{node.traffic.messages_out} messages sent, {node.traffic.messages_in} received"
+            typer.echo(f"{carried}, {node.faults.total} faults")
+
+
+def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
+    """Carry until stopped, telling of progress."""
+    is_ready = False
+    tick_at_s = 0.0
+    leave_at_s: float | None = None
+    while not node.runtime.is_stopped:
+        due_s = bridge.get_timer()
+        node.runtime.step(tick_at_s if due_s is None else min(due_s, tick_at_s))
+        now_s = time.monotonic()
+        bridge.work(now_s)
+        node.member.flush(now_s)  # once for all that waited: small messages share a seal
+        if node.is_leaving:
+            if leave_at_s is None:
+                log.info("leaving; what is under way is answered")
+                leave_at_s = now_s + DRAIN_MAX_S
+            bridge.drain(now_s)  # again and again: a local server may appear meanwhile
+            node.has_drained = bridge.is_drained(now_s)
+            if now_s >= leave_at_s or node.has_drained:
+                return
+        if not is_ready and node.member.attachment.is_attached and bridge.is_settled:
+            is_ready = True
+            node.tell_refusals()
+            _tell_ready(node, bridge, json=json)
+        if now_s >= tick_at_s:
+            tick_at_s = now_s + TICK_S
+            if json and is_ready:
+                _tell_progress(node, bridge)
+
+
+def _tell_ready(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
+    if json:
+        emit("ready", name=node.member.name.to_text())
+        return
+    typer.echo(f"proxy {node.member.name.short} is attached, in {', '.join(bridge.labels)}; Ctrl-C ends it")
+    for flow_spec, _ in bridge.flows:
+        typer.echo(f"  {'expose' if flow_spec.is_exposed else 'import'} {flow_spec.local} [{flow_spec.type_name}]")
+
+
+def _tell_progress(node: ProxyNode, bridge: Bridge) -> None:
+    stats = bridge.stats
+    emit(
+        "progress",
+        sent=node.traffic.messages_out,
+        received=node.traffic.messages_in,
+        flows=len(bridge.flows),
+        faults=node.faults.total,
+        lost=sum(each.lost for each in stats),
+        topics=[
+            {
+                "topic": each.topic,
+                "received": each.received,
+                "lost": each.lost,
+                "latency_ms": each.latencies_ms[-1] if each.latencies_ms else None,
+            }
+            for each in stats
+            if each.latencies_ms or each.lost
+        ],
+    )
+
+
+def _reload(path: Path, first: ProxyConfig, node: ProxyNode, bridge: Bridge) -> None:
+    """Read the configuration and the delegations again; flows whose rule is the same go on.
+
+    Raises:
+        GdpError: the old configuration stays in use.
+    """
+    settings = ProxyConfig.load(path)
+    held = DelegationStore(settings.delegations, node.identity)
+    for key in ("identity", "domain", "iface", "ros", "metrics", "sandbox", "state", "control_socket"):
+        if getattr(settings, key) != getattr(first, key):
+            raise LocalError(f"{path}: {key} changed; restart the proxy to change it")
+    bridge.reload(settings, held)
+    log.info("configuration reloaded rules=%d", len(settings.expose) + len(settings.imports))

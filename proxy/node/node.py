@@ -1,0 +1,220 @@
+"""A proxy at work: a member of the overlay on one device, with what its configuration makes global.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import signal
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from types import FrameType
+from typing import Final
+
+from gdp.client.attachment import attachment_waits
+from gdp.client.participant import Participant, Topic
+from gdp.control.settings import NodeSettings
+from gdp.crypto.certificates import Role
+from gdp.crypto.identity import Identity
+from gdp.errors import GdpError, LocalError
+from gdp.message.loss import by_label
+from gdp.names import Name
+from gdp.nodes.control_client import control_path
+from gdp.nodes.control_socket import ControlHandlers
+from gdp.nodes.control_status import node_status
+from gdp.nodes.counts import count_list
+from gdp.nodes.credentials import Credentials, watched_folders
+from gdp.nodes.delegation_store import DelegationStore
+from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
+from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
+from gdp.nodes.revocation_upkeep import load_revocations
+from gdp.nodes.rights import confine_proxy
+from gdp.nodes.runtime import Runtime, now
+from gdp.nodes.single_instance import run_alone
+from gdp.nodes.uplink import open_uplink
+from gdp.ports.plane import Plane
+from gdp.telemetry.sources import Sources
+from proxy.bridge.counters import Traffic
+from proxy.bridge.faults import Faults
+from proxy.config.config import ProxyConfig, Record
+
+__all__ = ["GOODBYE_S", "ProxyNode", "open_topics", "run_node"]
+
+log = logging.getLogger(__name__)
+
+GOODBYE_S: Final = 0.2  # how long a node that leaves works on
+
+
+@dataclass(slots=True)
+class ProxyNode:
+    """What runs, for the command that drives it.
+
+    Attributes:
+        on_reload: reads the configuration again; raises ``GdpError`` where the old one stays. None: there is nothing.
+        is_leaving: a SIGUSR1 or a drain came: answer what is under way, then end.
+        has_drained: all that was under way was answered.
+        drains: whether the command looks at that; else a SIGUSR1 ends it at once.
+    """
+
+    identity: Identity
+    member: Participant
+    runtime: Runtime
+    plane: Plane
+    node_log: NodeLog
+    credentials: Credentials
+    on_reload: Callable[[], None] | None = None
+    is_leaving: bool = False
+    drains: bool = False
+    has_drained: bool = False
+    begun_s: float = field(default_factory=time.monotonic)
+    traffic: Traffic = field(default_factory=Traffic)
+    faults: Faults = field(default_factory=Faults)
+
+    def reload(self) -> None:
+        """Read again the certificates, the configuration and the delegations.
+
+        Raises:
+            GdpError: the old configuration stays in use; the text says why.
+        """
+        self.credentials.look(now())
+        if self.on_reload is not None:
+            self.on_reload()
+
+    def reload_on_signal(self) -> None:
+        """Reload after a SIGHUP; an error is logged."""
+        try:
+            self.reload()
+        except GdpError as error:
+            log.error("configuration not reloaded, the old one stays in use reason=%s", error)
+
+    def drain(self) -> None:
+        """Answer what is under way, then end; a command that does not look at ``is_leaving`` ends after this step."""
+        self.is_leaving = True
+        if not self.drains:
+            self.has_drained = True  # what arrived is written
+            self.runtime.stop()
+
+    def leave_soon(self, number: int, frame: FrameType | None) -> None:
+        """Take a SIGUSR1, which wakes the loop."""
+        del number, frame
+        self.drain()
+
+    def control_handlers(self) -> ControlHandlers:
+        """Return what the control socket does."""
+        sources = self.sources()
+
+        def status() -> dict[str, object]:
+            attached = self.member.attachment.is_attached
+            return node_status(self.identity, sources, uptime_s=time.monotonic() - self.begun_s, attached=attached)
+
+        return ControlHandlers(reload=self.reload, status=status, drain=self.drain, is_drained=lambda: self.has_drained)
+
+    def linger(self, duration_s: float) -> None:
+        """Work on for a while, so that a goodbye is heard."""
+        self.runtime.run(lambda: False, time.monotonic() + duration_s)
+
+    def tell_refusals(self) -> None:
+        """Warn of each claim that the overlay has refused."""
+        for each in self.member.attachment.advertisements:
+            if each.refused is not None:
+                name, right, reason = each.subject.name.short, each.right.value, each.refused.label
+                log.warning("claim refused name=%s right=%s reason=%s", name, right, reason)
+
+    def sources(self) -> Sources:
+        """Return what the metrics show."""
+        counters, member = self.plane.counters, self.member
+        return Sources(
+            frames=lambda: {"in": counters.frames_in, "out": counters.frames_out},
+            drops=[lambda: counters.drops, lambda: count_list(member.drops())],
+            messages=self.traffic.messages,
+            message_bytes=self.traffic.message_bytes,
+            repairs=lambda: {"sent": sum(publisher.repairs for publisher in member.publishers())},
+            lost=lambda: by_label(member.lost()),
+            unconfirmed=lambda: by_label(member.unconfirmed()),
+            faults=lambda: self.faults.counts,
+            calls=self.traffic.calls,
+            latency=lambda: self.traffic.latency,
+            waiting=self.node_log.metrics,
+            clashes=lambda: member.attachment.clashes + member.attachment.hello_protocol.clashes,
+        )
+
+
+@contextlib.contextmanager
+def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[ProxyNode]:
+    """Open everything that a proxy needs; close it on leaving.
+
+    Args:
+        on_wait: called with reason and text when the proxy reports what it waits for.
+
+    Raises:
+        LocalError: keys, delegations or the device are not as the configuration says, or this proxy already runs.
+    """
+    identity, policy = load_member(config.identity, config.domain, Role.PROXY)
+    settings = NodeSettings(incarnation(), wall_clock_ms(), fresh_bytes, lease_s=config.lease_s)
+    member = Participant(identity, policy, settings)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(run_alone("proxy", identity.name))
+        revocations = load_revocations(config.state, policy.revoked, stack)
+        plane = stack.enter_context(open_uplink(config.iface))
+        runtime = Runtime(member, plane, spin_s=config.busy_poll_us / 1e6)
+        node_log = NodeLog(
+            member.attachment.hello_protocol,
+            policy,
+            plane,
+            member.boundary,
+            lambda now_s: attachment_waits(member.attachment, now_s),
+            conflict=lambda: member.attachment.conflict_at,
+            local_name=_local_names(config),
+            on_wait=on_wait,
+        )
+        runtime.every(LOOK_S, node_log.look)
+        credentials = Credentials(config.identity, config.domain, identity, policy)
+        runtime.every(LOOK_S, credentials.look)
+        node = ProxyNode(identity, member, runtime, plane, node_log, credentials)
+        stack.callback(signal.signal, signal.SIGUSR1, signal.signal(signal.SIGUSR1, node.leave_soon))
+        stack.enter_context(runtime.signals(node.reload_on_signal))
+        control = config.control_socket or control_path(identity.name)
+        stack.enter_context(runtime.control(control, node.control_handlers()))
+        if config.sandbox:
+            again = watched_folders(config.identity, config.domain)
+            files = (each.path if isinstance(each, Record) else each for each in (config.record, config.control_socket))
+            kept = (*(None if each is None else each.parent for each in files), config.state)
+            written = [folder for folder in kept if folder is not None]
+            confine_proxy((*again, config.delegations), written, has_ros=bool(config.ros))
+        revocations.start(runtime)
+        if config.metrics is not None:
+            from gdp.telemetry.metrics import Metrics
+
+            metrics = Metrics(node.sources())
+            metrics.serve(config.metrics.port)
+            stack.callback(metrics.close)
+        log.info("proxy up name=%s iface=%s", identity.name.short, config.iface)
+        yield node
+
+
+def _local_names(config: ProxyConfig) -> Callable[[Name], str]:
+    """Return what the rules with a type call each overlay name; a pattern's names are shown short."""
+    rules = [rule for rule in (*config.expose, *config.imports) if rule.type_name and not rule.is_pattern]
+    names = {rule.overlay_name: rule.name for rule in rules}
+    return lambda name: names.get(name, name.short)
+
+
+def open_topics(config: ProxyConfig, held: DelegationStore) -> dict[Name, Topic]:
+    """Return, for every rule, what this node may do with its name and the topic's secrets.
+
+    Raises:
+        LocalError: a rule without a type, or without a delegation that holds.
+    """
+    topics: dict[Name, Topic] = {}
+    for rule in [*config.expose, *config.imports]:
+        topic = held.get(rule.overlay_name)
+        if topic is None:
+            raise LocalError(
+                f"{rule.name}: no delegation for {rule.overlay_name.to_text()} in {config.delegations};"
+                " the owner makes one with 'gdp delegate'"
+            )
+        topics[rule.overlay_name] = topic
+    return topics

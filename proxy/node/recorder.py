@@ -1,0 +1,105 @@
+"""A proxy without a live graph: the bridge records what is imported, or only counts it.
+
+Place: shell.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Sequence
+from typing import Final
+
+import typer
+
+from gdp.cli.node import emit, emit_wait
+from gdp.errors import LocalError
+from proxy.bridge.bridge import Bridge
+from proxy.bridge.topic_stats import TopicStats
+from proxy.config.config import ProxyConfig
+from proxy.config.recorded import RecordedRules
+from proxy.node.node import GOODBYE_S, ProxyNode, run_node
+from proxy.node.recording_bridge import open_recording_bridge, work
+from proxy.recordings.endpoint import RecordingEndpoint
+from proxy.recordings.writer import BagWriter
+
+__all__ = ["record", "refuse_existing_file"]
+
+TICK_S: Final = 0.5
+
+
+def record(settings: ProxyConfig, *, json: bool) -> None:
+    """Receive what the configuration imports until stopped.
+
+    Raises:
+        LocalError: keys, delegations, the device or the file are not as the configuration says.
+    """
+    refuse_existing_file(settings)
+    rules = RecordedRules.of(imports=settings.imports)
+    with run_node(settings, emit_wait if json else None) as node, contextlib.ExitStack() as stack:
+        writer = None
+        if settings.record is not None:
+            writer = BagWriter(settings.record.path, 1 if settings.record.format == "ros1" else 2)
+            stack.callback(writer.close)
+        endpoint = RecordingEndpoint(writer, rules.recorded_topics)
+        with open_recording_bridge(node, settings, rules, endpoint) as bridge:
+            _work(node, bridge, json=json)
+            stats = bridge.stats
+            bridge.close()
+            node.member.leave()
+            node.linger(GOODBYE_S)
+        stack.close()
+    _report(stats, json=json)
+
+
+def refuse_existing_file(settings: ProxyConfig) -> None:
+    """Refuse to record into a file that exists.
+
+    Raises:
+        LocalError: it does.
+    """
+    if settings.record is not None and settings.record.path.exists():
+        raise LocalError(f"{settings.record.path} exists already; move or delete it, or change record.path")
+
+
+def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
+    """Receive until stopped; report progress."""
+    is_ready = False
+    tick_at_s = 0.0
+    while not node.runtime.is_stopped:
+        due_s = bridge.get_timer()
+        node.runtime.step(max(tick_at_s if due_s is None else min(due_s, tick_at_s), time.monotonic()))
+        work(node, bridge)
+        if not is_ready and node.member.attachment.is_attached:
+            is_ready = True
+            node.tell_refusals()
+            if json:
+                emit("ready", name=node.member.name.to_text())
+            else:
+                typer.echo(f"proxy {node.member.name.short} is attached; Ctrl-C ends it")
+        if time.monotonic() >= tick_at_s:
+            tick_at_s = time.monotonic() + TICK_S
+            if json and is_ready:
+                _report_progress(bridge.stats)
+
+
+def _report_progress(stats: Sequence[TopicStats]) -> None:
+    latest = [each.latencies_ms[-1] for each in stats if each.latencies_ms]
+    emit(
+        "progress",
+        received=sum(each.received for each in stats),
+        lost=sum(each.lost for each in stats),
+        latency_ms=round(sum(latest) / len(latest), 3) if latest else None,
+    )
+
+
+def _report(topics: Sequence[TopicStats], *, json: bool) -> None:
+    if json:
+        emit("done", topics=[stats.to_fields() for stats in topics])
+        return
+    received, lost = sum(stats.received for stats in topics), sum(stats.lost for stats in topics)
+    typer.echo(f"{received} messages received, {lost} lost")
+    for stats in topics:
+        if stats.lost:
+            refused = f", {stats.refused} not handed over" if stats.refused else ""
+            typer.echo(f"  {stats.topic}: {stats.received} received, {stats.losses.words()}{refused}")

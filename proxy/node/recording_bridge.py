@@ -1,0 +1,71 @@
+"""Bridge between one recording and the overlay.
+
+Place: shell. ``gdp-replay`` and a ``gdp-proxy`` without a graph drive it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from collections.abc import Iterator
+
+from gdp.errors import GdpError
+from gdp.nodes.delegation_store import DelegationStore
+from proxy.bridge.bridge import Bridge
+from proxy.bridge.context import BridgeContext
+from proxy.config.config import ProxyConfig
+from proxy.config.recorded import RecordedRules
+from proxy.node.node import ProxyNode, open_topics
+from proxy.recordings.endpoint import RecordingEndpoint, ReplayEndpoint
+
+__all__ = ["open_recording_bridge", "work"]
+
+log = logging.getLogger(__name__)
+
+
+@contextlib.contextmanager
+def open_recording_bridge(
+    node: ProxyNode, settings: ProxyConfig, rules: RecordedRules, endpoint: ReplayEndpoint | RecordingEndpoint
+) -> Iterator[Bridge]:
+    """Begin every flow between a recording and the overlay; after a SIGHUP delegations are read again.
+
+    Args:
+        rules: those of ``settings`` that apply.
+
+    Raises:
+        LocalError: a rule of ``settings`` without a delegation that holds, or a topic that cannot be published.
+    """
+    held = DelegationStore(settings.delegations, node.identity)
+    open_topics(settings, held)
+    bridge = Bridge(BridgeContext(node.member, node.traffic, node.faults), rules, [endpoint], held)
+    node.on_reload = lambda: _renew(node, settings, rules, bridge)
+    node.runtime.watch(endpoint)
+    try:
+        while bridge.get_timer() is not None:  # the graph is read, then what it brings is described
+            work(node, bridge)
+        work(node, bridge)
+        yield bridge
+    finally:
+        node.on_reload = None
+        node.runtime.unwatch(endpoint)
+        endpoint.remove_entity()
+
+
+def work(node: ProxyNode, bridge: Bridge) -> None:
+    """Take what the recording and the overlay have, and hand on what results."""
+    now_s = time.monotonic()
+    bridge.work(now_s)
+    node.member.flush(now_s)
+
+
+def _renew(node: ProxyNode, settings: ProxyConfig, rules: RecordedRules, bridge: Bridge) -> None:
+    """Read the delegations again: new epochs and longer validity take effect without a message lost."""
+    try:
+        held = DelegationStore(settings.delegations, node.identity)
+        topics = open_topics(settings, held)
+    except GdpError as error:
+        log.error("delegations not renewed reason=%s", error)
+        return
+    bridge.reload(rules, held)
+    log.info("delegations renewed topics=%d", len(topics))

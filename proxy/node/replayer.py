@@ -1,0 +1,202 @@
+"""Replay of a recording over the bridge, with its own timing, and the figures of its end.
+
+Place: shell; drives the node's loop between messages.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from gdp.client.publisher import Publisher
+from gdp.message.loss import LossReason
+from proxy.bridge.bridge import Bridge
+from proxy.bridge.exposed_topic import ExposedTopic
+from proxy.node.node import ProxyNode
+from proxy.node.recording_bridge import work
+from proxy.recordings.endpoint import ReplayEndpoint
+
+__all__ = ["Replay", "ReplayedTopic", "Unconfirmed"]
+
+STALL_S: Final = 20.0  # without any acknowledgement, readers are given up
+TICK_S: Final = 0.5
+
+_WHY: Final = {
+    LossReason.NO_READER: "published while nobody read it",
+    LossReason.GIVEN_UP: "given up for a reader that fell silent or behind",
+    LossReason.WINDOW_OVERFLOW: "pushed out of the full window",
+    LossReason.TOO_LARGE: "above the rule's max_bytes",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Unconfirmed:
+    """A reliable topic of which some message was not confirmed by each of its readers.
+
+    Attributes:
+        messages: how many were published, those above the rule's limit included.
+        why: in words, as far as it is known.
+        reasons: messages by reason, a message once for each reader; what is still waited for has none.
+    """
+
+    topic: str
+    messages: int
+    confirmed: int
+    why: str
+    reasons: Mapping[str, int]
+
+    def words(self) -> str:
+        """Return it as one line."""
+        return f"{self.topic}: {self.confirmed} of {self.messages} confirmed: {self.why}"
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayedTopic:
+    """One topic of the recording that a rule exposes.
+
+    Attributes:
+        topic: as it was recorded.
+        indexes: of its channels in the recording.
+    """
+
+    topic: str
+    type_name: str
+    flow: ExposedTopic
+    publisher: Publisher
+    indexes: tuple[int, ...]
+
+
+class Replay:
+    """One recording on its way out.
+
+    Args:
+        bridge: its flows stand.
+        rate: 1: as recorded, 2: twice as fast, 0: as fast as readers confirm.
+        report: called about twice a second while replaying.
+    """
+
+    def __init__(
+        self, node: ProxyNode, bridge: Bridge, endpoint: ReplayEndpoint, rate: float, report: Callable[[], None]
+    ) -> None:
+        self._node = node
+        self._bridge = bridge
+        self._endpoint = endpoint
+        self._rate = rate
+        self._report = report
+        self._tick_at_s = 0.0
+        self.topics = [
+            ReplayedTopic(
+                flow_spec.local,
+                flow_spec.type_name,
+                flow,
+                flow.publisher,
+                tuple(endpoint.channels_of(flow_spec.local, flow_spec.type_name)),
+            )
+            for flow_spec, flow in bridge.flows
+            if isinstance(flow, ExposedTopic) and flow.publisher is not None
+        ]
+        self._flows = {each.flow.handle: each.flow for each in self.topics}
+
+    @property
+    def sent(self) -> int:
+        """Return how many messages were published, those that nobody read included."""
+        return sum(each.flow.published.total() for each in self.topics)
+
+    @property
+    def sent_bytes(self) -> int:
+        """Return their bytes, as recorded."""
+        return sum(each.flow.published_bytes.total() for each in self.topics)
+
+    @property
+    def confirmed(self) -> int:
+        """Return how many messages of reliable topics every reader has confirmed."""
+        return sum(each.publisher.acknowledged for each in self.topics if each.publisher.confirms)
+
+    @property
+    def sent_best_effort(self) -> int:
+        """Return how many messages of best-effort topics were sent: nobody confirms them."""
+        publishers = [each.publisher for each in self.topics if not each.publisher.confirms]
+        return sum(publisher.messages - publisher.losses.total for publisher in publishers)
+
+    @property
+    def too_large(self) -> int:
+        """Return how many messages were above a limit, and not sent."""
+        return sum(each.publisher.losses.counts.get(LossReason.TOO_LARGE, 0) for each in self.topics)
+
+    def unconfirmed(self) -> list[Unconfirmed]:
+        """Return the reliable topics of which something was not confirmed."""
+        publishers = [(each.topic, each.publisher) for each in self.topics]
+        return [
+            Unconfirmed(topic, each.messages, each.acknowledged, _why(each), each.losses.by_label())
+            for topic, each in publishers
+            if each.confirms and each.acknowledged < each.messages
+        ]
+
+    def wait_for_readers(self, timeout_s: float) -> list[str]:
+        """Wait until every topic has a reader; return the topics that have none after ``timeout_s`` seconds."""
+        deadline_s = time.monotonic() + timeout_s
+        self._node.runtime.run(lambda: all(each.publisher.readers for each in self.topics), deadline_s)
+        return [each.topic for each in self.topics if not each.publisher.readers]
+
+    def run(self) -> bool:
+        """Replay to the end; return False when the node was stopped before."""
+        runtime, begun_s = self._node.runtime, time.monotonic()
+        first_ns: int | None = None
+        for message in self._endpoint.messages(self._continue):
+            first_ns = message.stamp_ns if first_ns is None else first_ns
+            if self._rate > 0:
+                self._step_until(begun_s + (message.stamp_ns - first_ns) / 1e9 / self._rate)
+            flow = self._flows[message.handle]
+            while not flow.has_room() and not runtime.is_stopped:
+                self._step(None)
+            if runtime.is_stopped:
+                return False
+            self._endpoint.deliver(message)
+            work(self._node, self._bridge)
+            self._step(0.0)
+        return not runtime.is_stopped
+
+    def finish(self) -> bool:
+        """Wait until readers have confirmed what they may get; return False when they stop to, or when stopped."""
+        progress, stalled_s = self.confirmed, time.monotonic()
+        while any(each.publisher.is_wanted and not each.publisher.is_acknowledged() for each in self.topics):
+            if self._node.runtime.is_stopped:
+                return False
+            self._step(TICK_S)
+            if self.confirmed != progress:
+                progress, stalled_s = self.confirmed, time.monotonic()
+            elif time.monotonic() - stalled_s > STALL_S:
+                return False
+        return True
+
+    def _continue(self) -> bool:
+        """Let the node work while the recording is waited for; return whether it was not stopped."""
+        self._step(0.0)
+        return not self._node.runtime.is_stopped
+
+    def _step_until(self, due_s: float) -> None:
+        while time.monotonic() < due_s and not self._node.runtime.is_stopped:
+            self._step(due_s - time.monotonic())
+
+    def _step(self, at_most_s: float | None) -> None:
+        """Let the node and the bridge work once, for no longer than so many seconds."""
+        now_s = time.monotonic()
+        wait_s = TICK_S if at_most_s is None else min(max(at_most_s, 0.0), TICK_S)
+        self._node.runtime.step(now_s + wait_s)
+        self._bridge.work(now_s)
+        if now_s >= self._tick_at_s:
+            self._tick_at_s = now_s + TICK_S
+            self._report()
+
+
+def _why(publisher: Publisher) -> str:
+    """Return why not everything that a publisher has published was confirmed, as far as it is known."""
+    if not publisher.is_wanted and publisher.losses.counts.keys() <= {LossReason.NO_READER}:
+        return "nobody reads it"
+    known = [f"{count} {_WHY[reason]}" for reason, count in publisher.losses.counts.items() if reason in _WHY]
+    rest = publisher.messages - publisher.acknowledged - publisher.losses.total
+    if rest > 0:
+        known.append(f"{rest} not confirmed by a reader that {'lags' if publisher.readers else 'fell silent'}")
+    return ", ".join(known)

@@ -1,0 +1,133 @@
+"""A topic's messages in the other ROS: how it would describe them, and the bytes there for the bytes here.
+
+Place: pure. A message is read with the one definition and written with the other; no type is known beforehand.
+What may differ is in ``match``; the table for people is in ``docs/reference/serialisation.md``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from dataclasses import replace
+from typing import Final
+
+from gdp.errors import DropReason, RemoteError
+from proxy.serial.channel import Channel, Qos, RosVersion
+from proxy.serial.dialect import MisfitError
+from proxy.serial.native_dialect import NativeDialect
+from proxy.serial.schema import Array, DefinitionError, Record, Sequence, Text, Type, msg_name, parse
+from proxy.serial.serializer import Codec
+from proxy.serial.type_match import Amend, Side, match
+from proxy.serial.type_translation import bounds_of, md5_text, retyped, rihs01, text_of, types_of
+
+__all__ = ["MessageConverter", "translated_channel"]
+
+_NATIVE: Final = NativeDialect()
+_NEVER: Final = (9_223_372_036, 854_775_807)
+# What a ROS 1 publisher that latches promises: its last message, to whoever comes.
+_LATCHED: Final = Qos("keep_last", 1, "reliable", "transient_local", _NEVER, _NEVER, "automatic", _NEVER, False)
+
+
+def translated_channel(channel: Channel, ros: RosVersion) -> Channel:
+    """Return how the channel looks in ROS ``ros``: the same topic and type name, its own definition, hash and QoS.
+
+    Raises:
+        DefinitionError: there is no definition, or a field has no form there; the text names it.
+    """
+    if channel.ros == ros:
+        return channel
+    name = msg_name(channel.type_name, channel.definition_format)
+    record = _record(channel)
+    if ros == 1 and (path := _wide_in(record, "", set())):
+        raise DefinitionError(f"{path}: wstring has no form in ROS 1")
+    types = retyped(types_of(channel), ros)
+    if ros == 1:
+        digest = hashlib.md5(md5_text(name, types).encode(), usedforsecurity=False).hexdigest()
+    else:
+        digest = rihs01(channel.type_name, types | {channel.type_name: types[name]})
+    latched = channel.latched or any(profile.durability == "transient_local" for profile in channel.qos)
+    return replace(
+        channel,
+        ros=ros,
+        hash=digest,
+        definition=text_of(name, types, ros),
+        definition_format="msg",
+        qos=(_LATCHED,) if latched and ros == 2 else (),
+        latched=latched,
+        callerid=None,
+    )
+
+
+class MessageConverter:
+    """Messages of one channel as those of another, of either ROS.
+
+    Between channels of the same ROS and of equal definition every message is returned as it is, unread.
+
+    Raises:
+        DefinitionError: a definition is missing or cannot be read, or the two do not match field by field; the text
+            names the first difference, such as ``pose.position.x: float64 there, float32 here``.
+    """
+
+    __slots__ = ("_amend", "_read", "_write", "source", "target")
+
+    def __init__(self, source: Channel, target: Channel) -> None:
+        self.source = source
+        self.target = target
+        self._read: Codec | None = None
+        self._write: Codec | None = None
+        self._amend: Amend | None = None
+        if _same_hash(source, target):
+            return
+        pair = match(_side(source), _side(target))
+        self._amend = pair.amend
+        if source.ros == target.ros and pair.amend is None:
+            return
+        self._read = Codec(pair.read, source.ros, _NATIVE, None)
+        self._write = Codec(pair.write, target.ros, _NATIVE, None)
+
+    def convert(self, raw: bytes) -> bytes:
+        """Return the message in the target's wire form: ROS 1, or little-endian CDR with zero padding.
+
+        Raises:
+            RemoteError: the bytes are no message of the source, or hold a value that the target has no form for (a time
+                out of its range, a string or sequence beyond its bound).
+        """
+        if self._read is None or self._write is None:
+            return raw
+        try:
+            tree = self._read.to_tree(raw)
+            if tree is None:
+                raise MisfitError("not a message of this type")
+            if self._amend is not None:
+                self._amend(tree)
+            return self._write.to_raw(tree)
+        except (MisfitError, struct.error) as error:
+            raise RemoteError(DropReason.MALFORMED, f"{self.source.type_name}: {error}"[:200]) from error
+
+
+def _same_hash(source: Channel, target: Channel) -> bool:
+    """Whether two channels without a definition to compare are known to be of one type all the same."""
+    if source.definition_format and target.definition_format:
+        return False
+    return source.ros == target.ros and bool(source.hash) and source.hash == target.hash
+
+
+def _record(channel: Channel) -> Record:
+    return parse(channel.type_name, channel.definition, channel.definition_format, channel.ros)
+
+
+def _side(channel: Channel) -> Side:
+    return Side(_record(channel), channel.ros, bounds_of(types_of(channel)) if channel.ros == 2 else {})
+
+
+def _wide_in(kind: Type, path: str, seen: set[int]) -> str:
+    """Return where the first wide string is, empty for nowhere."""
+    if isinstance(kind, Array | Sequence):
+        return _wide_in(kind.item, f"{path}[]", seen)
+    if isinstance(kind, Text):
+        return path if kind.wide else ""
+    if not isinstance(kind, Record) or id(kind) in seen:
+        return ""
+    seen.add(id(kind))
+    fields = (_wide_in(field, f"{path}.{name}" if path else name, seen) for name, field in kind.fields)
+    return next(filter(None, fields), "")

@@ -1,0 +1,217 @@
+"""Whether two types say the same field by field, and how one tree of values serves both.
+
+Place: pure. What may differ between ROS 1 and ROS 2 without a difference in meaning is here and nowhere else:
+``Header.seq``, the signs in times and durations, ``byte``, the dummy of an empty type, upper case in field names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import zip_longest
+from typing import Final, TypeAlias
+
+from proxy.serial.channel import RosVersion
+from proxy.serial.dialect import MisfitError
+from proxy.serial.schema import Array, DefinitionError, Number, Record, Sequence, Text, Type
+from proxy.serial.type_translation import DUMMY, Bounds
+
+__all__ = ["Amend", "Pair", "Side", "match"]
+
+Amend: TypeAlias = "Callable[[object], None]"  # finish the tree of a value for the other side, or refuse it
+
+_WORDS: Final = {"?": "bool", "b": "int8", "B": "uint8", "h": "int16", "H": "uint16", "i": "int32", "I": "uint32"}
+_WORDS64: Final = {"q": "int64", "Q": "uint64", "f": "float32", "d": "float64"}
+_SEQ: Final = ("seq", Number("I"))
+_HEADER: Final = ("stamp", "frame_id")  # what a ROS 2 header has
+_ROS1_CLOCKS: Final = {"builtin_interfaces/msg/Time": ("I", "I"), "builtin_interfaces/msg/Duration": ("i", "i")}
+_ROS2_CLOCK: Final = (("sec", Number("i")), ("nanosec", Number("I")))
+
+
+@dataclass(frozen=True, slots=True)
+class Side:
+    """A type on one side, the ROS it belongs to, and its bounds."""
+
+    record: Record
+    ros: RosVersion
+    bounds: Bounds
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """What to read a message with, what to write its tree with, and what the tree needs in between (None: nothing)."""
+
+    read: Record
+    write: Record
+    amend: Amend | None
+
+
+def match(source: Side, target: Side) -> Pair:
+    """Return how messages of one type become those of the other. Names of types do not matter.
+
+    Raises:
+        DefinitionError: the types differ; the text names the first field that does, there (``source``) and here.
+    """
+    return _Matcher(source, target).record(source.record, target.record, "")
+
+
+class _Matcher:
+    def __init__(self, source: Side, target: Side) -> None:
+        self._source = source
+        self._target = target
+        self._crossing = source.ros != target.ros
+        self._done: dict[tuple[int, int], Pair] = {}
+
+    def record(self, there: Record, here: Record, path: str) -> Pair:
+        key = (id(there), id(here))
+        if key not in self._done:
+            self._done[key] = self._clocks(there, here, path) or self._fields(there, here, path)
+        return self._done[key]
+
+    def _clocks(self, there: Record, here: Record, path: str) -> Pair | None:
+        """Return the pair of a ROS 1 time or duration and its ROS 2 form; the writer refuses a number out of range."""
+        if not self._crossing:
+            return None
+        ros1, ros2 = (there, here) if self._source.ros == 1 else (here, there)
+        if _codes(ros1) != _ROS1_CLOCKS.get(ros1.name) or ros2.fields != _ROS2_CLOCK:
+            return None
+        if ros2.name in _ROS1_CLOCKS and ros2.name != ros1.name:
+            raise _difference(path, there, here)
+        return Pair(there, here, None)
+
+    def _fields(self, there: Record, here: Record, path: str) -> Pair:
+        unpaired = {DUMMY, "seq"} if self._crossing and _headers(there, here) else {DUMMY}
+        read: list[tuple[str, Type]] = [field for field in there.fields if field[0] in unpaired]  # both come first
+        write: list[tuple[str, Type]] = [field for field in here.fields if field[0] in unpaired]
+        filled = tuple(name for name, _ in write if name not in dict(read))
+        amends: list[tuple[str, Amend]] = []
+        theirs = [field for field in there.fields if field[0] not in unpaired]
+        ours = [field for field in here.fields if field[0] not in unpaired]
+        for one, other in zip_longest(theirs, ours):
+            if one is None or other is None:
+                name = (one or other)[0]
+                raise _difference(_join(path, name), one and one[1], other and other[1])
+            at = _join(path, other[0])
+            if one[0].lower() != other[0].lower():
+                raise DefinitionError(f"{at}: called {one[0]} there")
+            limits = self._limits((there.name, one[0]), (here.name, other[0]))
+            reading, writing, amend = self._type(one[1], other[1], at, limits)
+            read.append((other[0], reading))
+            write.append((other[0], writing))
+            if amend is not None:
+                amends.append((other[0], amend))
+        amend = _amend_record(filled, tuple(amends)) if filled or amends else None
+        return Pair(Record(there.name, tuple(read)), Record(here.name, tuple(write)), amend)
+
+    def _limits(self, there: tuple[str, str], here: tuple[str, str]) -> tuple[int, int]:
+        """Return the bounds here that are tighter than there, zero for none."""
+        wide = self._source.bounds.get(there, (0, 0))
+        text, count = (
+            tight if tight and not 0 < loose <= tight else 0
+            for loose, tight in zip(wide, self._target.bounds.get(here, (0, 0)), strict=True)
+        )
+        return text, count
+
+    def _type(self, there: Type, here: Type, path: str, limits: tuple[int, int]) -> tuple[Type, Type, Amend | None]:
+        if isinstance(there, Array) and isinstance(here, Array) and there.count == here.count:
+            read, write, amend = self._item(there.item, here.item, f"{path}[]", limits[0])
+            each = None if amend is None else _amend_items(amend)
+            return Array(read, there.count), Array(write, here.count), each
+        if isinstance(there, Sequence) and isinstance(here, Sequence):
+            read, write, amend = self._item(there.item, here.item, f"{path}[]", limits[0])
+            each = None if amend is None else _amend_items(amend)
+            if limits[1]:
+                each = _bound_items(path, limits[1], write.size if isinstance(write, Number) else 1, each)
+            return Sequence(read), Sequence(write), each
+        if isinstance(there, Array | Sequence) or isinstance(here, Array | Sequence):
+            raise _difference(path, there, here)
+        return self._item(there, here, path, limits[0])
+
+    def _item(
+        self, there: Number | Text | Record, here: Number | Text | Record, path: str, limit: int
+    ) -> tuple[Number | Text | Record, Number | Text | Record, Amend | None]:
+        if isinstance(there, Record) and isinstance(here, Record):
+            pair = self.record(there, here, path)
+            return pair.read, pair.write, pair.amend
+        if isinstance(there, Number) and isinstance(here, Number):
+            if there.code == here.code or (there.octet and here.octet):
+                return here, here, None  # a byte is eight bits, whatever its sign
+        elif there == here:
+            return there, here, _bound_text(path, limit) if limit else None
+        raise _difference(path, there, here)
+
+
+def _headers(there: Record, here: Record) -> bool:
+    names = [tuple(name.lower() for name, _ in record.fields) for record in (there, here)]
+    if _HEADER not in names or ("seq", *_HEADER) not in names:
+        return False
+    return _SEQ in (there.fields[0], here.fields[0])
+
+
+def _codes(record: Record) -> tuple[str, ...]:
+    return tuple(kind.code if isinstance(kind, Number) else "" for _, kind in record.fields)
+
+
+def _join(path: str, name: str) -> str:
+    return f"{path}.{name}" if path else name
+
+
+def _difference(path: str, there: Type | None, here: Type | None) -> DefinitionError:
+    return DefinitionError(f"{path or 'the type'}: {_said(there)} there, {_said(here)} here")
+
+
+def _said(kind: Type | None) -> str:
+    if kind is None:
+        return "nothing"
+    if isinstance(kind, Number):
+        return _WORDS.get(kind.code) or _WORDS64[kind.code]
+    if isinstance(kind, Text):
+        return "wstring" if kind.wide else "string"
+    if isinstance(kind, Record):
+        return kind.name
+    return f"{_said(kind.item)}[{kind.count if isinstance(kind, Array) else ''}]"
+
+
+def _amend_record(filled: tuple[str, ...], amends: tuple[tuple[str, Amend], ...]) -> Amend:
+    def amend(tree: object) -> None:
+        if not isinstance(tree, dict):
+            raise MisfitError("a record is a map")
+        for name in filled:
+            tree[name] = 0
+        for name, finish in amends:
+            finish(tree[name])
+
+    return amend
+
+
+def _amend_items(finish: Amend) -> Amend:
+    def amend(items: object) -> None:
+        if not isinstance(items, list):
+            raise MisfitError("an array is a list")
+        for item in items:
+            finish(item)
+
+    return amend
+
+
+def _bound_items(path: str, most: int, width: int, each: Amend | None) -> Amend:
+    def amend(items: object) -> None:
+        if not isinstance(items, list | memoryview):
+            raise MisfitError("an array is a list or bytes")
+        count = len(items) // width
+        if count > most:
+            raise MisfitError(f"{path}: {count} items, at most {most} here")
+        if each is not None:
+            each(items)
+
+    return amend
+
+
+def _bound_text(path: str, most: int) -> Amend:
+    def amend(text: object) -> None:
+        if not isinstance(text, memoryview):
+            raise MisfitError("a text is bytes")
+        if len(text) > most:
+            raise MisfitError(f"{path}: a string of {len(text)} bytes, at most {most} here")
+
+    return amend

@@ -1,0 +1,95 @@
+"""How words about a log travel between the proxies of a service that keeps state. Its entries travel as requests do.
+
+Place: pure. Wire form: version (1) | 0x40 in the place of a part (1) | deterministic CBOR.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from gdp.crypto.cbor import Value, decode, encode
+from gdp.errors import DropReason, RemoteError
+from gdp.limits import MESSAGE_MAX_BYTES
+from gdp.names import NAME_BYTES, Name
+from gdp.service.replication_messages import (
+    AttachReplica,
+    FollowerMessage,
+    LogId,
+    ReplicaProbe,
+    ReplicaStatus,
+    SequencerMessage,
+    Snapshot,
+    SnapshotRequest,
+)
+from proxy.wire.service import VERSION
+
+__all__ = ["STATE_MAX_BYTES", "follower_message", "is_word", "sequencer_message", "to_wire"]
+
+_WORDS: Final = 0x40  # in the place of a part
+_HEAD: Final = bytes([VERSION, _WORDS])
+STATE_MAX_BYTES: Final = MESSAGE_MAX_BYTES - 256
+
+
+def is_word(wire: bytes) -> bool:
+    """Return whether these bytes are meant as one, not as a request or an answer."""
+    return wire[: len(_HEAD)] == _HEAD
+
+
+def to_wire(word: SequencerMessage | FollowerMessage) -> bytes:
+    """Return the wire form."""
+    said: list[Value]
+    match word:
+        case ReplicaProbe(life):
+            said = ["keep", life]
+        case AttachReplica(log, at, log_before, at_before, state):
+            said = ["follow", *log, at, *log_before, at_before, state]
+        case SnapshotRequest(log):
+            said = ["tell", *log]
+        case ReplicaStatus(log, at, held, is_lost, tells, kept_by):
+            said = ["position", *log, at, held, is_lost, tells, None if kept_by is None else bytes(kept_by)]
+        case Snapshot(log, at, state):
+            said = ["state", *log, at, state]
+    return _HEAD + encode(said)
+
+
+def sequencer_message(wire: bytes) -> SequencerMessage:
+    """Read a keeper's word.
+
+    Raises:
+        RemoteError: MALFORMED, whatever else these bytes are.
+    """
+    match _read(wire):
+        case ["keep", int(life)]:
+            return ReplicaProbe(life)
+        case ["follow", int(g), int(life), int(at), int(g_before), int(life_before), int(at_before), state] if (
+            state is None or isinstance(state, bytes)
+        ):
+            return AttachReplica(LogId(g, life), at, LogId(g_before, life_before), at_before, state)
+        case ["tell", int(g), int(life)]:
+            return SnapshotRequest(LogId(g, life))
+    raise RemoteError(DropReason.MALFORMED, "a keeper's word")
+
+
+def follower_message(wire: bytes) -> FollowerMessage:
+    """Read a replica's word.
+
+    Raises:
+        RemoteError: MALFORMED, whatever else these bytes are.
+    """
+    match _read(wire):
+        case ["position", int(g), int(life), int(at), int(held), bool(is_lost), bool(tells), None]:
+            return ReplicaStatus(LogId(g, life), at, held, is_lost, tells)
+        case ["position", int(g), int(life), int(at), int(held), bool(is_lost), bool(tells), bytes(name)] if (
+            len(name) == NAME_BYTES
+        ):
+            return ReplicaStatus(LogId(g, life), at, held, is_lost, tells, Name(name))
+        case ["state", int(g), int(life), int(at), state] if state is None or isinstance(state, bytes):
+            return Snapshot(LogId(g, life), at, state)
+    raise RemoteError(DropReason.MALFORMED, "a replica's word")
+
+
+def _read(wire: bytes) -> list[Value]:
+    said = decode(wire[len(_HEAD) :], MESSAGE_MAX_BYTES)
+    if not isinstance(said, list) or any(isinstance(each, int) and each < 0 for each in said):
+        raise RemoteError(DropReason.MALFORMED, "a word about a log")
+    return said

@@ -1,0 +1,79 @@
+"""The next of many timers is known by looking at those that were touched, and is the one that asking all would give."""
+
+from __future__ import annotations
+
+from random import Random
+
+import pytest
+
+from gdp.client.timer_queue import TimerQueue
+
+
+class Clock:
+    """Something with a timer that counts how often it was asked."""
+
+    def __init__(self, due_s: float | None = None) -> None:
+        self.due_s = due_s
+        self.asked = 0
+
+    def get_timer(self) -> float | None:
+        self.asked += 1
+        return self.due_s
+
+
+def timers_of(*clocks: Clock) -> TimerQueue[Clock]:
+    timers = TimerQueue[Clock]()
+    for clock in clocks:
+        timers.reschedule(clock)
+    return timers
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_whatever_is_put_off_or_brought_forward_the_first_is_known_and_none_is_missed(seed: int) -> None:
+    chance, now_s = Random(seed), 0.0
+    clocks = [Clock() for _ in range(12)]
+    timers = timers_of(*clocks)
+    for _ in range(500):
+        clock = chance.choice(clocks)
+        clock.due_s = chance.choice((None, now_s + chance.random(), now_s + 10 * chance.random()))
+        timers.reschedule(clock)
+        assert timers.next_due() == min((each.due_s for each in clocks if each.due_s is not None), default=None)
+        if chance.random() < 0.2:
+            now_s += chance.random()
+            due = [each for each in clocks if each.due_s is not None and each.due_s <= now_s]
+            assert sorted(timers.poll_due(now_s), key=clocks.index) == due
+            for each in due:
+                each.due_s = None
+
+
+def test_those_that_were_not_touched_are_not_asked() -> None:
+    idle, busy = [Clock(50.0 + at) for at in range(100)], Clock(1.0)
+    timers = timers_of(*idle, busy)
+    timers.next_due()
+    for at in range(40):
+        busy.due_s = 1.0 + at
+        timers.reschedule(busy)
+        assert timers.next_due() == busy.due_s
+    assert [clock.asked for clock in idle] == [1] * 100
+
+
+def test_one_that_is_due_again_and_again_leaves_nothing_behind() -> None:
+    clock = Clock(0.0)
+    timers = timers_of(clock)
+    for at in range(1_000):
+        clock.due_s = 1_000.0 - at / 2  # always sooner than before
+        timers.reschedule(clock)
+        timers.next_due()
+    clock.due_s = float("inf")
+    timers.reschedule(clock)
+    assert timers.next_due() is None
+    assert [len(each) for each in (timers._heap, timers._due_s, timers._place_s, timers._touched)] == [0, 0, 0, 0]
+
+
+def test_one_that_was_taken_is_asked_anew() -> None:
+    clock = Clock(1.0)
+    timers = timers_of(clock)
+    assert timers.poll_due(0.5) == []
+    assert timers.poll_due(1.0) == [clock]
+    clock.due_s = 2.0
+    assert timers.next_due() == 2.0

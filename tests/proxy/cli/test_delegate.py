@@ -1,0 +1,121 @@
+"""``gdp-delegate``, as a person calls it."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from gdp.cli.gdp import main
+from gdp.stores.issue import delegate
+from gdp.stores.keyring import load_delegations, save_delegation
+from gdp.trust.right import Right
+from proxy.cli.delegate import app
+from proxy.cli.proxy import app as proxy_app
+from proxy.config.config import ProxyConfig
+
+_HEAD = """\
+identity: proxy
+domain: {root: proxy/root.crt}
+delegations: proxy/delegations
+iface: proxy0
+"""
+_MAP = "  - {name: /map, type: nav_msgs/msg/OccupancyGrid, owner: owner.pub}\n"
+_BOTH = ["--owner", "owner", "robot/proxy.yaml", "server/proxy.yaml"]
+
+
+@pytest.fixture(autouse=True)
+def _lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as leaving:
+        main(["lab", "robot", "server"])
+    assert not leaving.value.code
+    Path("robot/proxy.yaml").write_text(f"{_HEAD}expose:\n{_MAP}")
+    Path("server/proxy.yaml").write_text(f"{_HEAD}import:\n{_MAP}")
+
+
+def _run(*words: str) -> list[str]:
+    done = CliRunner().invoke(app, list(words))
+    assert done.exit_code == 0, done.output
+    return done.output.splitlines()
+
+
+def _rights(host: str) -> list[frozenset[Right]]:
+    return [each.rights for each in load_delegations(Path(host, "proxy/delegations"))]
+
+
+def test_each_proxy_may_then_do_what_its_file_says() -> None:
+    topic = "topic /map [nav_msgs/msg/OccupancyGrid]"
+    assert _run(*_BOTH) == [f"robot/proxy.yaml: + publish {topic}", f"server/proxy.yaml: + read {topic}"]
+    assert (_rights("robot"), _rights("server")) == ([frozenset({Right.PUBLISH})], [frozenset({Right.READ})])
+
+
+def test_a_second_time_changes_nothing_unless_it_is_to_renew() -> None:
+    _run(*_BOTH)
+    (file,) = Path("robot/proxy/delegations").iterdir()
+    before = file.read_bytes()
+    assert all(": = " in line for line in _run(*_BOTH))
+    assert file.read_bytes() == before
+    assert all(": + " in line for line in _run("--renew", *_BOTH))
+    assert file.read_bytes() != before
+
+
+def test_a_right_that_comes_later_leaves_rights_and_epochs_of_before() -> None:
+    rule = ProxyConfig.load(Path("robot/proxy.yaml")).expose[0]
+    given = delegate(Path("owner"), Path("robot/proxy/node.card"), rule.overlay_metadata, [Right.READ], [0, 1, 2])
+    save_delegation(Path("robot/proxy/delegations"), given)
+    _run(*_BOTH)
+    (now,) = load_delegations(Path("robot/proxy/delegations"))
+    assert (now.rights, sorted(now.grants)) == (frozenset({Right.READ, Right.PUBLISH}), [0, 1, 2])
+
+
+def test_one_that_has_run_out_is_made_anew() -> None:
+    rule = ProxyConfig.load(Path("robot/proxy.yaml")).expose[0]
+    metadata, card = rule.overlay_metadata, Path("robot/proxy/node.card")
+    old = delegate(Path("owner"), card, metadata, [Right.PUBLISH], days=1, unix_s=1e9)
+    save_delegation(Path("robot/proxy/delegations"), old)
+    assert "+ publish" in _run(*_BOTH)[0]
+
+
+def test_the_private_keys_of_a_proxy_need_not_be_at_hand() -> None:
+    Path("server/proxy/node.key").unlink()
+    Path("server/proxy/kem.key").unlink()
+    assert "+ read" in _run(*_BOTH)[1]
+
+
+def test_an_import_finds_what_another_machine_was_allowed_before() -> None:
+    _run(*_BOTH)
+    Path("robot/proxy.yaml").write_text(f"{_HEAD}expose:\n  - {{name: '/**', owner: owner.pub}}\n")
+    Path("server/proxy.yaml").write_text(f"{_HEAD}import:\n  - {{name: '/*', owner: owner.pub}}\n")
+    shutil.rmtree("server/proxy/delegations")
+    Path("server/proxy/delegations").mkdir()
+    assert "+ read topic /map" in _run(*_BOTH)[1]
+
+
+def test_a_rule_of_which_nothing_is_known_is_said() -> None:
+    Path("robot/proxy.yaml").write_text(f"{_HEAD}expose:\n  - {{name: '/**', owner: owner.pub}}\n")
+    assert "robot/proxy.yaml: /**: nothing is known yet that it means; try --live" in _run(*_BOTH)
+
+
+def test_an_owner_that_is_none_is_refused() -> None:
+    done = CliRunner().invoke(app, ["--owner", "lab", "robot/proxy.yaml"])
+    assert (done.exit_code, done.output.startswith("error: ")) == (2, True)
+
+
+def test_an_owner_whom_no_rule_names_is_refused_with_those_that_they_name() -> None:
+    with pytest.raises(SystemExit):
+        main(["keygen", "owner", "other"])
+    done = CliRunner().invoke(app, ["--owner", "other", "robot/proxy.yaml"])
+    assert done.exit_code == 2
+    assert "no rule of robot/proxy.yaml names this owner (other/owner.pub)" in done.output
+    assert "they name robot/owner.pub" in done.output
+
+
+def test_a_recording_that_exists_is_refused_by_the_check_too() -> None:
+    Path("there.mcap").touch()
+    Path("server/proxy.yaml").write_text(f"{_HEAD}import:\n{_MAP}record: {{path: ../there.mcap}}\n")
+    done = CliRunner().invoke(proxy_app, ["--config", "server/proxy.yaml", "--check"])
+    assert done.exit_code == 2
+    assert "there.mcap exists already; move or delete it, or change record.path" in done.output
