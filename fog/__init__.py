@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from gdp.extras import require_extra
-
 if TYPE_CHECKING:
     from fog.launch.description import DeclareLaunchArgument, LaunchConfiguration, LaunchDescription, Node
     from fog.launch.entity import FogCluster
@@ -24,10 +22,10 @@ __all__ = [
     "SpotMachine",
 ]
 
-require_extra("fog", ("numpy", "rich", "rosbags"), "fog")
-
 
 def __getattr__(name: str) -> object:
     from fog.launch.lazy_names import word
+    from gdp.extras import require_extra
 
+    require_extra("fog", ("numpy", "rich", "rosbags"), "fog")
     return word(name)

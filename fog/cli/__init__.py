@@ -1,0 +1,5 @@
+"""Commands of ``fog``."""
+
+from gdp.extras import require_extra
+
+require_extra("fog", ("numpy", "rich", "rosbags"), "fog")

@@ -55,8 +55,8 @@ def test_the_scapy_data_plane_names_its_extra_when_scapy_is_missing(monkeypatch:
         require_extra("scapy", ("scapy",), "data plane scapy")
 
 
-@pytest.mark.parametrize("package", ["proxy", "fog"])
-def test_a_package_names_its_extra_when_it_is_missing(package: str) -> None:
+@pytest.mark.parametrize(("package", "module"), [("proxy", "proxy"), ("fog", "fog.cli")])
+def test_a_package_names_its_extra_when_it_is_missing(package: str, module: str) -> None:
     code = "import importlib.util\nimportlib.util.find_spec = lambda name: None\n"
-    done = run_without_extras(code + f"import {package}")
+    done = run_without_extras(code + f"import {module}")
     assert f"pip install 'gdp-ros[{package}]'" in done.stderr
