@@ -1,6 +1,6 @@
 """Make the data of ``fog.catalog``: a digest of the spot advisor with list prices, and what the spot traces say.
 
-Place: command; reads ``../shared/data/spot``, writes ``fog/catalog/aws.json`` and ``traces.json``. One command:
+Command: reads ``../shared/data/spot``, writes ``fog/catalog/aws.json`` and ``traces.json``. One command:
 
     python scripts/make_catalog.py
 

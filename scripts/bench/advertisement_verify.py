@@ -1,6 +1,6 @@
 """How many claims one core verifies in a second.
 
-Place: benchmark; one process, no network.
+Benchmark in one process, without a network.
 Every claim is for another name, so that none of its own signatures was seen before. Four workloads::
 
     new        a new AdCert each, one owner: two signature checks       the wanted figure: at least 2,000/s

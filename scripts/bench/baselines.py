@@ -1,6 +1,6 @@
 """Who forwards in the middle of a chain: our planes, the Linux bridge, the kernel's IPv4.
 
-Place: I/O; sets namespaces of the bench up and back. Every baseline stands in the same chain, one at a time, and
+I/O. Sets namespaces of the bench up and back. Every baseline stands in the same chain, one at a time, and
 leaves it as it was.
 
 The others are set up as cheaply as they can be. The bridge learns both addresses from a round trip before it is

@@ -1,6 +1,6 @@
 """A chain of namespaces for the forwarding and scale benches: a source, some switches, a sink, each in its own.
 
-Place: I/O; ``gdp.simulation`` makes and removes the namespaces. What the switches are is ``baselines.py``'s.
+I/O. ``gdp.simulation`` makes and removes the namespaces. What the switches are is ``baselines.py``'s.
 ::
 
     s1 (source) -- s2 -- ... -- s(n+1) -- s(n+2) (sink)        devices are called like the neighbour they lead to

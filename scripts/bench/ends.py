@@ -1,6 +1,6 @@
 """What stands at the two ends of a chain: a source that sends or pings, a sink that counts or answers.
 
-Place: I/O; AF_PACKET sockets on one device. Frames come ready made, so an end costs the same whatever they hold.
+I/O. AF_PACKET sockets on one device. Frames come ready made, so an end costs the same whatever they hold.
 
 An end that *polls* asks its socket again and again and measures the path alone; one that *sleeps* waits in epoll, as a
 real node does, and measures the scheduler too. The sink looks for frames every half millisecond instead of being woken

@@ -1,6 +1,6 @@
 """What the three tasks of the FogROS papers send and get back, as data.
 
-Place: pure; read by the bench and by its nodes. The messages are those of the clients that the authors publish; what
+Sans-I/O. Read by the bench and by its nodes. The messages are those of the clients that the authors publish; what
 these leave open (how long a planned path is) is said where it stands. Types of packages that have no wheel are replaced
 by standard ones that carry the same numbers.
 

@@ -1,6 +1,6 @@
 """The frames that benches send, ready made: ours, and IPv4 of the same length.
 
-Place: pure. The source and the sink are names with entries at every switch; ``table_name`` counts through the names of
+Sans-I/O. The source and the sink are names with entries at every switch; ``table_name`` counts through the names of
 a large table.
 """
 

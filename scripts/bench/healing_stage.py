@@ -1,6 +1,6 @@
 """Cluster of ``recovery.py``: machines of the provider ``local``, a robot and its node that calls.
 
-Place: shell; what it makes is a run's, and what ``fog`` makes for it ends with ``fog down``, also after a crash.
+I/O. What it makes is a run's, and what ``fog`` makes for it ends with ``fog down``, also after a crash.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What a bench ran on: without it no figure means anything.
 
-Place: I/O; reads /proc and asks devices, by the old one-word ethtool requests, because the ``ethtool`` command and its
+I/O. Reads /proc and asks devices, by the old one-word ethtool requests, because the ``ethtool`` command and its
 netlink family are often absent. Whatever is about devices speaks of the namespace that the calling thread is in
 (``gdp.host.netns_files.inside`` enters another).
 Source: ``linux/ethtool.h``, ``linux/sockios.h``, netdevice(7).

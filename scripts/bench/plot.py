@@ -1,6 +1,6 @@
 """A picture of a bench: horizontal bars of medians, with a whisker up to the p99 or over the rounds' spread.
 
-Place: I/O; one file. Needs matplotlib, the extra ``bench`` of this package, and no display.
+I/O. One file. Needs matplotlib, the extra ``bench`` of this package, and no display.
 
     require_plot()                                       # at the start, so that a missing library is not found out last
     save_bars(path, "Forwarding", str(state), [

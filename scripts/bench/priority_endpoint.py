@@ -1,6 +1,6 @@
 """What runs at A, B and C in the bench of priorities: a member that ticks, floods, or reads.
 
-Place: process of its own, started by ``priority.py``. A tick is a small message that carries the moment at which it
+Process of its own, started by ``priority.py``. A tick is a small message that carries the moment at which it
 was due: a kernel timer wakes the process, as a robot's own loop would, and whatever keeps the tick from leaving counts.
 Source: timerfd_create(2); CLOCK_MONOTONIC is one clock for all namespaces of a machine.
 """

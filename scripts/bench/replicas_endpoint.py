@@ -1,6 +1,6 @@
 """The robot's client and the replicas of ``replicas.py``: ordinary rclpy nodes that know nothing of the overlay.
 
-Place: process of its own, started in a field (``scripts/experiments/field.py``) as ``serve``, ``straggle`` or ``ask``.
+Process of its own, started in a field (``scripts/experiments/field.py``) as ``serve``, ``straggle`` or ``ask``.
 
 The type is ``rcl_interfaces/srv/ListParameters``, because a request of it says something: its ``depth`` is the number
 of the request, its one prefix fills it up to 100 bytes of CDR. The answer names that number, the machine, and how many

@@ -1,6 +1,6 @@
 """What every bench says in the same way: figures over rounds, a table, ratios asked and got, JSON, a line about here.
 
-Place: pure, but for ``show`` (prints), ``progress`` (stderr) and ``write_json`` (one file). The machine is
+Sans-I/O, but for ``show`` (prints), ``progress`` (stderr) and ``write_json`` (one file). The machine is
 ``machine.py``'s, the picture ``plot.py``'s. Scripts of this folder import it by its bare name: ``from report import``.
 
     state = machine_state()                                          # machine.py, before anything else

@@ -1,6 +1,6 @@
 """The client and the server of ``services.py``: ordinary rclpy nodes and ``std_srvs/srv/SetBool``.
 
-Place: process of its own, started by ``ros_row.py`` as ``serve``, ``call`` (one call at a time) or ``load`` (many
+Process of its own, started by ``ros_row.py`` as ``serve``, ``call`` (one call at a time) or ``load`` (many
 clients, calls at a steady rate). The server answers with what it was asked, so that an answer to another call is seen.
 """
 

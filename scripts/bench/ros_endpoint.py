@@ -1,6 +1,6 @@
 """What the ROS nodes of the benches share: a node with an executor, and two signs for whoever started it.
 
-Place: process of its own, started by ``ros_row.py``; the only importer of rclpy beside the nodes themselves. They know
+Process of its own, started by ``ros_row.py``; the only importer of rclpy beside the nodes themselves. They know
 nothing of the overlay.
 
 The executor is rclpy's ``EventsExecutor`` where there is one: the ordinary one takes longer the more subscriptions a

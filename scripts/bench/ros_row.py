@@ -1,6 +1,6 @@
 """The row of the benches with real ROS nodes: A - s1 - s2 - s3 - B with a proxy at either end, and a cable from A to B.
 
-Place: shell; makes namespaces and keys, and starts the commands that robots run.
+I/O. Makes namespaces and keys, and starts the commands that robots run.
 ::
 
     a -- s1 -- s2 -- s3 -- b      overlay: all switches with the plane ``kernel``, the RIB beside s2

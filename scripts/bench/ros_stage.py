@@ -1,6 +1,6 @@
 """What the benches with real ROS nodes share: the command line, the rounds, and what is printed, written and drawn.
 
-Place: shell; lays a row for each MTU that is asked for, and takes them down. A bench is data: what the proxies carry,
+I/O. Lays a row for each MTU that is asked for, and takes them down. A bench is data: what the proxies carry,
 the turns of a round, and the figures that are wanted of them. A turn that fails has no figures in that round, and why
 is told with the results.
 """

@@ -1,6 +1,6 @@
 """The robot and the cloud of ``fogros.py``: the robot sends what a task needs, the cloud answers once it has all of it.
 
-Place: process of its own, started by ``ros_row.py`` as ``robot`` or ``cloud``. Nothing is computed: what takes time is
+Process of its own, started by ``ros_row.py`` as ``robot`` or ``cloud``. Nothing is computed: what takes time is
 the way there and back. Pixels and meshes are random bytes. Every message carries the number of its request, in its
 header's ``frame_id`` or its layout's ``data_offset``; requests numbered 0 are greetings.
 """

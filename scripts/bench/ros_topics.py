@@ -1,6 +1,6 @@
 """The talker and the listener of ``ros.py``: ordinary rclpy nodes that publish and hear typed messages.
 
-Place: process of its own, started by ``ros_row.py`` as ``talk`` or ``listen``. A message carries the wall clock at
+Process of its own, started by ``ros_row.py`` as ``talk`` or ``listen``. A message carries the wall clock at
 which it was published and its number, 1 and up. Until the talker is told to go it sends greetings, numbered 0: topics
 may not be joined yet. The listener ends when all came, or when nothing came for a while.
 """

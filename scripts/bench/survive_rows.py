@@ -1,6 +1,6 @@
 """The events of ``survive.py``: a small network for each, what fails in it, and how that is undone.
 
-Place: shell; through ``faults.overlay``. P publishes to R at an even rate; ``-`` is a link of cost 10, ``=`` one of
+I/O. Through ``faults.overlay``. P publishes to R at an even rate; ``-`` is a link of cost 10, ``=`` one of
 12, so that traffic takes the upper way::
 
     square      P - s1 - s2 - s4 - R            all of one domain; s1 has a loop-free alternate to s4 by s3 (RFC 5286),

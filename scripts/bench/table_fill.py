@@ -1,6 +1,6 @@
 """A large forwarding table, filled in bulk: how fast, and what it weighs.
 
-Place: I/O; asks the kernel about this process. What an eBPF map takes is no part of a process's resident memory; the
+I/O. Asks the kernel about this process. What an eBPF map takes is no part of a process's resident memory; the
 kernel tells it beside the map's file descriptor (``memlock``, proc(5)).
 """
 

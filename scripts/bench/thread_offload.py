@@ -2,7 +2,7 @@
 
     .venv/bin/python scripts/bench/thread_offload.py [--rounds 5] [--count 60] [--json FILE]
 
-Place: benchmark; one process, no network. An image of 921,600 bytes is sealed as parts for MTU 1500 and hashed as they
+Benchmark in one process, without a network.
 come, in place and by a thread beside; a small message is verified in place and by a thread beside. What a thread does
 must be handed over and waited for, and it helps only as far as the interpreter's lock is let go meanwhile: how far, is
 shown by what two threads take for twice the work (1: side by side, 2: one after the other).

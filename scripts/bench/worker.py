@@ -1,6 +1,6 @@
 """A process of a bench in a namespace of its own, asked by JSON lines; and how such a process reads and answers them.
 
-Place: I/O. The kernel kills it with the thread that started it, so that none outlives a bench, however that ends.
+I/O. The kernel kills it with the thread that started it, so that none outlives a bench, however that ends.
 """
 
 from __future__ import annotations

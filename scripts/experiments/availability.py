@@ -1,6 +1,6 @@
 """Availability of a pool of spot machines, by replaying recorded preemptions.
 
-Place: command; reads ``../shared/data/spot``, prints a table, writes ``docs/experiments/availability.{md,png,json}``.
+Command: reads ``../shared/data/spot``, prints a table, writes ``docs/experiments/availability.{md,png,json}``.
 
     python scripts/experiments/availability.py                      # everything, about 15 seconds
     python scripts/experiments/availability.py --recovery 20min --json --no-write

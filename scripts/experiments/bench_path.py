@@ -1,6 +1,6 @@
 """Where the benches lie: importing it lets the experiments import what they share with them.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What the experiments have in common: a field while it is needed, a table, a page, a file with every latency.
 
-Place: shell; prints, and writes ``figN.json`` and ``figN.md`` where it is told to.
+I/O. Prints, and writes ``figN.json`` and ``figN.md`` where it is told to.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Where the experiments take place: a robot, two switches, and as many machines as wanted, a namespace each.
 
-Place: shell; makes namespaces and keys, and starts the commands that robots and servers run.
+I/O. Makes namespaces and keys, and starts the commands that robots and servers run.
 ::
 
     robot -- s1 -- gate --+-- m1          switches s1 and gate with the RIB beside gate; a proxy at the robot and at

@@ -1,6 +1,6 @@
 """How a grey frame goes to a service and what was seen in it comes back, in a service type that every ROS 2 has.
 
-Place: pure.
+Sans-I/O.
 
 The installed packages have no service that takes an image, so ``rcl_interfaces/srv/
 SetParameters`` carries it: the request has one parameter, called like the frame's number, whose integer array holds the

@@ -1,6 +1,6 @@
 """The pictures of the experiments: histogram and CDF of latencies, and latencies along the time.
 
-Place: I/O; PNG files. Needs matplotlib, and no display.
+I/O. PNG files. Needs matplotlib, and no display.
 """
 
 from __future__ import annotations

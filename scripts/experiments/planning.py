@@ -1,6 +1,6 @@
 """Rigid bodies that look for a way: OMPL's planners on the meshes of OMPL.app, collisions by FCL.
 
-Place: pure, but for reading a problem's three files; a planner draws its own random numbers.
+Sans-I/O, but for reading a problem's three files; a planner draws its own random numbers.
 Source: the problem files of OMPL.app (``*.cfg``, ``*_robot.dae``, ``*_env.dae``). As there, the robot's mesh is moved
 so that the mean of its vertices is the origin of its poses, and COLLADA's up axis is turned from y to z.
 """

@@ -1,6 +1,6 @@
 """A link that takes time, in both directions: ``relay.py DEVICE DEVICE MILLISECONDS``.
 
-Place: process of its own, in the namespace between two machines. The relay is the one of the provider ``local``, which
+Process of its own, in the namespace between two machines. The relay is the one of the provider ``local``, which
 waits on its standard input for leave to begin; here it has that from the start.
 """
 

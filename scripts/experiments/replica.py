@@ -1,6 +1,6 @@
 """The service nodes of the experiments: ordinary rclpy nodes that know nothing of the overlay.
 
-Place: process of its own, started by ``field.py`` on a machine: ``replica.py ROLE SETTINGS``.
+Process of its own, started by ``field.py`` on a machine: ``replica.py ROLE SETTINGS``.
 
 ``plan`` and ``replay`` serve ``nav_msgs/srv/GetPlan``: the request's start names the problem in its ``frame_id`` (one
 that nobody knows is answered at once, without a way), its goal's stamp holds the number of the request in seconds; the

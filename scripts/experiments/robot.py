@@ -1,6 +1,6 @@
 """The clients of the experiments: ordinary rclpy nodes that know nothing of the overlay.
 
-Place: process of its own, started by ``field.py`` at the robot or beside a server: ``robot.py ROLE SETTINGS``.
+Process of its own, started by ``field.py`` at the robot or beside a server: ``robot.py ROLE SETTINGS``.
 
 ``ask`` does a series of calls, ``busy`` is the second client of figure 6; see ``series.py`` for their settings.
 """

@@ -1,6 +1,6 @@
 """What became of requests, and what may be said of it: mean, p99, gains, and the least of two that arithmetic promises.
 
-Place: pure.
+Sans-I/O.
 Source: FogROS2-FT (IROS 2024), whose figures compare mean and 99th percentile of one server and of two.
 """
 

@@ -1,6 +1,6 @@
 """What a client at the robot is to do: a series of calls, and what the second client of figure 6 does.
 
-Place: pure; it goes to the client's process as JSON.
+Sans-I/O. It goes to the client's process as JSON.
 """
 
 from __future__ import annotations

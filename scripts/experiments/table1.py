@@ -1,6 +1,6 @@
 """Table I: what one on-demand machine costs against two of them and against two spot machines.
 
-Place: command; reads the price list of this package, prints a table, writes ``docs/experiments/table1.{md,png,json}``.
+Command: reads the price list of this package, prints a table, writes ``docs/experiments/table1.{md,png,json}``.
 First come the paper's six applications in its two regions, then some machine types of one region.
 
     python scripts/experiments/table1.py                         # everything, under 5 seconds

@@ -1,6 +1,6 @@
 """A camera that sees an AprilTag: frames drawn for a known pose, and the pose found in them.
 
-Place: pure, but for the detector, a C library that keeps its own state.
+Sans-I/O, but for the detector, a C library that keeps its own state.
 
 ::
 

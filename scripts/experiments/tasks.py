@@ -1,6 +1,6 @@
 """What a client asks for, and how it tells a right answer from a wrong one: one class a kind of service.
 
-Place: pure; the frames are drawn once, when a task is made.
+Sans-I/O. The frames are drawn once, when a task is made.
 """
 
 from __future__ import annotations

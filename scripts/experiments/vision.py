@@ -1,6 +1,6 @@
 """Frames with something in them, and classical computer vision that finds it: the load of figures 6 and 7.
 
-Place: pure.
+Sans-I/O.
 
 Stand-ins, and no neural networks: object detection by correlation with a template (FFT), segmentation by smoothing,
 thresholds and connected components. Both are what a CPU does with an image, take as long whatever is in it, and their

@@ -1,6 +1,6 @@
 """The wall clock of a single process, stepped from outside.
 
-Place: I/O. The machine's clock is everybody's, and a time namespace shifts only the monotonic one. So a process that
+I/O. The machine's clock is everybody's, and a time namespace shifts only the monotonic one. So a process that
 may be stepped is started through this module, which replaces ``time.time`` and ``time.time_ns`` before anything else is
 loaded; the offset is eight bytes of a file that the bench writes. Nothing of the product knows of it, and what asks the
 kernel past the module ``time`` is not stepped.

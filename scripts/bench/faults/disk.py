@@ -1,6 +1,6 @@
 """The disk of a run: a small file system in memory that can be full, and what RIBs must say about it.
 
-Place: I/O; a tmpfs in the run's own folder, named in its record.
+I/O. A tmpfs in the run's own folder, named in its record.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A stranger on a link that floods it with hellos: a process of its own, started by ``security.py flood``.
 
-Place: shell; one packet socket. Its only argument is JSON: ``iface``; ``frames``, a file of frames from the header on,
+I/O. One packet socket. Its only argument is JSON: ``iface``; ``frames``, a file of frames from the header on,
 each behind its length (4 bytes); ``rate`` a second; ``seconds``; ``source``, an address, or nothing for many invented
 ones. It prints one line of JSON when it begins and one when it ends: how many frames left.
 """

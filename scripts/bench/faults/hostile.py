@@ -1,6 +1,6 @@
 """A member that turned hostile and floods: a process of its own, started by ``security.py flood``.
 
-Place: shell. It is a switch (``names``, ``joins``, ``revocations``) or a proxy that reads and publishes (``reports``,
+I/O. It is a switch (``names``, ``joins``, ``revocations``) or a proxy that reads and publishes (``reports``,
 ``parts``), as real as every other one, and goes on to be that while it floods: its frames leave from its own address,
 and its session stays up. Its only argument is JSON: ``what``; ``config``, its file; ``frames``, how many different
 ones; ``rate`` a second; ``seconds``; of a proxy ``reads`` and ``publishes``, topics. It prints a line of JSON when it

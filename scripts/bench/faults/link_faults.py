@@ -1,6 +1,6 @@
 """Frames lost, doubled and delayed on a link between two namespaces, while its carrier stays up.
 
-Place: I/O; needs root. Kernels without netem have no other way. A program stands at the ingress of the receiving
+I/O. Needs root. Kernels without netem have no other way. A program stands at the ingress of the receiving
 device, before the switch's own, and draws a number for each fault::
 
     frame -> lose it | double it | send it through the delay line | pass it on to the switch

@@ -1,6 +1,6 @@
 """A member at the end of a network under test: publishes, reads, serves, calls, and writes it all down.
 
-Place: process of its own, started by ``faults.overlay`` with one argument of JSON. What arrived is appended to a file
+Process of its own, started by ``faults.overlay`` with one argument of JSON. What arrived is appended to a file
 of records at once, so that nothing is lost when this process is killed. A message names its channel, its publisher and
 the publisher's life, so a message that reaches the wrong reader is seen as such.
 """

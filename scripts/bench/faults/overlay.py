@@ -1,6 +1,6 @@
 """The real processes and links of a plan, and every fault that can be made there.
 
-Place: shell; namespaces and processes through ``gdp.simulation``, the commands that robots run, and ``faults.member``
+I/O. Namespaces and processes through ``gdp.simulation``, the commands that robots run, and ``faults.member``
 at the ends. A process is called ``switch s1``, ``rib s1`` or ``member m1``. Each may be killed, restarted, frozen.
 """
 

@@ -1,6 +1,6 @@
 """What a member writes down, and how it is read back: records of fixed size, appended to a file.
 
-Place: I/O; one file. What was written stays when the writer is killed, for it is the kernel's from then on.
+I/O. One file. What was written stays when the writer is killed, for it is the kernel's from then on.
 """
 
 from __future__ import annotations

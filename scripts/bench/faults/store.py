@@ -1,6 +1,6 @@
 """A Valkey or Redis Cluster in a namespace of the run, which RIBs reach over a bridge; servers fail on demand.
 
-Place: I/O. ``scripts/start_cluster.sh`` starts three primaries with a replica each. The servers are daemons: they are
+I/O. ``scripts/start_cluster.sh`` starts three primaries with a replica each. The servers are daemons: they are
 in the run's record, and they live in a namespace of the run, whose end ends what is inside.
 """
 

@@ -1,6 +1,6 @@
 """What the bench asks of every baseline, and what it gets.
 
-Place: shell; starts processes on the row.
+I/O. Starts processes on the row.
 """
 
 from __future__ import annotations

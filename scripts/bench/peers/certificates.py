@@ -1,6 +1,6 @@
 """A certificate authority of one run, and a certificate for every machine of the row, for mutual TLS.
 
-Place: I/O; writes PEM files. Keys are ECDSA P-256 as in our own certificates, valid for a day.
+I/O. Writes PEM files. Keys are ECDSA P-256 as in our own certificates, valid for a day.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What runs of Cyclone DDS: the two ends.
 
-Place: process of its own, started by ``cyclone_net.py``.
+Process of its own, started by ``cyclone_net.py``.
 
 Messages go in and out as serialised bytes, which is what a ROS 2 node hands to the middleware; the binding's own
 serialiser, in Python, would cost an image 26 ms. To that end the type is one octet: of a longer message Cyclone takes

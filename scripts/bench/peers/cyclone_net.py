@@ -1,6 +1,6 @@
 """Cyclone DDS on the row, unsecured: peers known by address, no multicast, the kernel forwards IPv4.
 
-Place: shell; starts processes. Everything else is as Cyclone comes, also its packet sizes.
+I/O. Starts processes. Everything else is as Cyclone comes, also its packet sizes.
 """
 
 from __future__ import annotations

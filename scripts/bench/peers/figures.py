@@ -1,6 +1,6 @@
 """What the bench of messages was asked for: columns, cases, and the figures to reach.
 
-Place: pure; over the ``Rounds`` of ``acknack.py``. A ratio is of medians of one round in one case: same MTU, same state
+Sans-I/O. Over the ``Rounds`` of ``acknack.py``. A ratio is of medians of one round in one case: same MTU, same state
 of the devices.
 """
 

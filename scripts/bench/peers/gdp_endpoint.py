@@ -1,6 +1,6 @@
 """What runs of ours at A and B: a session of the library, or a member of the overlay without it.
 
-Place: process of its own, started by ``gdp_net.py``. Each message is written in the topic's encoding, encrypted,
+Process of its own, started by ``gdp_net.py``. Each message is written in the topic's encoding, encrypted,
 signed, verified, put in order and reported on, and read back from the encoding: all that a proxy does but for ROS.
 
 Each encoding has a topic of its own, ``/ping/json`` for one; answers come back on ``/pong``. ``bench/library.py`` runs

@@ -1,6 +1,6 @@
 """Ours on the row: a switch on each of the three in the middle, the RIB beside s2, a member at A and at B.
 
-Place: shell; starts the commands that robots run, and makes the keys of a run.
+I/O. Starts the commands that robots run, and makes the keys of a run.
 """
 
 from __future__ import annotations

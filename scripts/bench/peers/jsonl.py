@@ -1,6 +1,6 @@
 """How a process of a contender is told what to do, and how it answers: settings as one argument, lines of JSON back.
 
-Place: I/O; standard output.
+I/O. Standard output.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """One process of a contender: started on a machine of the row, heard, ended.
 
-Place: shell. What it prints on standard error goes to a file of the run, whose last line is the reason if it fails.
+I/O. What it prints on standard error goes to a file of the run, whose last line is the reason if it fails.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The turns of the bench of messages: in every round, on every row, each baseline once.
 
-Place: shell; lays the rows and takes them down.
+I/O. Lays the rows and takes them down.
 
 A baseline that fails the first time is not here, for the reason that it gives. One that fails later has no figures in
 that round, and the failure is told with the results.

@@ -1,6 +1,6 @@
 """What runs of Zenoh: the ends as a user would write them (a callback and an Event), and the router on each machine.
 
-Place: process of its own, started by ``zenoh_net.py``. Shared memory is off everywhere: it would cross namespaces of
+Process of its own, started by ``zenoh_net.py``. Shared memory is off everywhere: it would cross namespaces of
 one host, and its figures are not those of a network.
 """
 

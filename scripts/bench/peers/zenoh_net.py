@@ -1,6 +1,6 @@
 """Zenoh on the row: a router on each of the three in the middle, a client at either end; mutual TLS or plain TCP.
 
-Place: shell; starts processes. Every hop is a link of its own, so a message is encrypted and decrypted at each.
+I/O. Starts processes. Every hop is a link of its own, so a message is encrypted and decrypted at each.
 """
 
 from __future__ import annotations
