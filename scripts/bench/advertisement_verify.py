@@ -1,7 +1,7 @@
-"""How many claims one core verifies in a second.
+"""Bench of advertisement verification: advertisements that one core verifies in a second.
 
 Benchmark in one process, without a network.
-Every claim is for another name, so that none of its own signatures was seen before. Four workloads::
+Each advertisement is for another name, so the verifier has seen none of its own signatures. Four workloads::
 
     new        a new AdCert each, one owner: two signature checks       the wanted figure: at least 2,000/s
     owners     a new AdCert and another owner each: two checks and a key to decompress
@@ -47,7 +47,7 @@ PROXIES = 20
 
 
 class Field:
-    """A domain with a switch and some proxies, to make claims with."""
+    """A domain with a switch and some proxies that sign the advertisements."""
 
     def __init__(self, unix_s: float) -> None:
         self.unix_s = unix_s
@@ -58,14 +58,14 @@ class Field:
         self.rtcerts = [RtCert.make(proxy, self.switch.name, self.validity) for proxy in self.proxies]
 
     def verifier(self) -> AdvertisementVerifier:
-        """Return a verifier that has seen nothing yet, in a process that has decompressed no key yet."""
+        """Return a verifier with empty caches, in a process that has not yet decompressed a key."""
         PublicKey.from_compressed.cache_clear()
         return AdvertisementVerifier(Policy(self.authority.root))
 
     def advertisements(
         self, count: int, *, owners: bool = False, links: int = 1, sequences: int = 1
     ) -> list[list[bytes]]:
-        """Return ``sequences`` lists of claims on the same ``count`` names, each newer than the one before."""
+        """Return ``sequences`` lists of advertisements on the same ``count`` names, each newer than the list before."""
         owner = SigningKey.generate()
         gateway = self.proxies[0]
         rounds: list[list[bytes]] = [[] for _ in range(sequences)]
@@ -105,7 +105,7 @@ class Field:
 
 
 def rate(verifier: AdvertisementVerifier, wires: Sequence[bytes], unix_s: float) -> float:
-    """Return the claims verified in a second of CPU time."""
+    """Return the advertisements verified in a second of CPU time."""
     begin = time.process_time()
     for wire in wires:
         verifier.verify(wire, unix_s)
@@ -113,7 +113,7 @@ def rate(verifier: AdvertisementVerifier, wires: Sequence[bytes], unix_s: float)
 
 
 def fresh_rate(field: Field, wires: Sequence[bytes]) -> float:
-    """Return the rate of a verifier that has seen nothing yet."""
+    """Return the rate of a verifier with empty caches."""
     return rate(field.verifier(), wires, field.unix_s)
 
 

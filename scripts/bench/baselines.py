@@ -1,12 +1,12 @@
-"""Who forwards in the middle of a chain: our planes, the Linux bridge, the kernel's IPv4.
+"""Baselines of the forwarding bench: the planes of this project, the Linux bridge, the kernel's IPv4 forwarding.
 
-I/O. Sets namespaces of the bench up and back. Every baseline stands in the same chain, one at a time, and
-leaves it as it was.
+I/O. Each baseline sets up namespaces of the bench and restores them. All use the same chain, one at a time.
 
-The others are set up as cheaply as they can be. The bridge learns both addresses from a round trip before it is
-measured. IPv4 has its neighbours written down, so nobody asks by ARP; and the last of them is written down with an
-address that is not the end's own, so that the IP stack there lets go of a frame at once instead of routing it (the
-end's socket sees it all the same).
+The other systems are set up as cheaply as possible. The bridge learns both addresses from a round trip before it is
+measured. IPv4 has static neighbours, so no ARP request is sent. The last static neighbour has an address that is not
+the endpoint's own: the IP stack there discards a frame at once instead of routing it. The endpoint's packet socket
+receives the frame all the same.
+
 """
 
 from __future__ import annotations
@@ -48,18 +48,18 @@ class Baseline(Protocol):
         """Return frames of ``size`` bytes, Ethernet header included."""
 
     def stand(self, chain: Chain) -> ExitStack:
-        """Set it up in every middle of the chain; closing takes it down.
+        """Set it up in every middle of the chain; closing the returned stack removes it.
 
         Raises:
-            LocalError: it cannot be had here; says why.
+            LocalError: it is not available here; the text gives the reason.
         """
 
     def workers(self) -> list[Worker]:
-        """Return the processes that forward, while it stands."""
+        """Return the processes that forward while it is set up."""
 
 
 def _gdp_wire(chain: Chain, size: int, *, far: bool) -> Wire:
-    """Return our frames, addressed to the next node, or (``far``) to the other end as a bridge wants it."""
+    """Return GDP frames, addressed to the next node, or (``far``) to the other endpoint, as a bridge needs them."""
     nodes = chain.nodes
     source, sink = chain.mac(nodes[0], nodes[1]), chain.mac(nodes[-1], nodes[-2])
     first = sink if far else chain.mac(nodes[1], nodes[0])
@@ -69,28 +69,31 @@ def _gdp_wire(chain: Chain, size: int, *, far: bool) -> Wire:
 
 
 class Direct:
-    """Nobody: the ends side by side. What remains is what the ends cost."""
+    """No forwarder: the endpoints are joined directly. The figures are the cost of the endpoints."""
 
     name = "ends alone"
     processes = False
 
     def wire(self, chain: Chain, size: int) -> Wire:
+        """Return GDP frames of ``size`` bytes, Ethernet header included."""
         return _gdp_wire(chain, size, far=False)
 
     def stand(self, chain: Chain) -> ExitStack:  # noqa: ARG002
+        """Set up nothing."""
         return ExitStack()
 
     def workers(self) -> list[Worker]:
+        """Return no process."""
         return []
 
 
 class Plane:
-    """One of our planes, by the name that ``roles.py`` knows it by.
+    """A plane of this project, by its name in ``roles.py``.
 
     Args:
         name: the plane.
         processes: frames go through the process, not only through the kernel.
-        names: entries that each switch's table has room for, beside the two of the ends.
+        names: table entries that each switch can hold in addition to those of the two endpoints.
     """
 
     def __init__(self, name: str, *, processes: bool, names: int = 0) -> None:
@@ -100,9 +103,11 @@ class Plane:
         self._workers: list[Worker] = []
 
     def wire(self, chain: Chain, size: int) -> Wire:
+        """Return GDP frames of ``size`` bytes, Ethernet header included."""
         return _gdp_wire(chain, size, far=False)
 
     def stand(self, chain: Chain) -> ExitStack:
+        """Start a switch in every middle; closing the returned stack ends them."""
         with ExitStack() as undo:
             self._workers = []
             undo.callback(self._workers.clear)
@@ -119,6 +124,7 @@ class Plane:
             return undo.pop_all()
 
     def workers(self) -> list[Worker]:
+        """Return the switch processes."""
         return self._workers
 
 
@@ -129,9 +135,11 @@ class Bridge:
     processes = False
 
     def wire(self, chain: Chain, size: int) -> Wire:
+        """Return GDP frames addressed to the other endpoint."""
         return _gdp_wire(chain, size, far=True)
 
     def stand(self, chain: Chain) -> ExitStack:
+        """Make a bridge in every middle; closing the returned stack removes them."""
         with ExitStack() as undo:
             for node in chain.middles:
                 undo.callback(chain.inside, node, _remove_bridge)
@@ -140,16 +148,18 @@ class Bridge:
             return undo.pop_all()
 
     def workers(self) -> list[Worker]:
+        """Return no process: the kernel forwards."""
         return []
 
 
 class IPv4:
-    """The kernel's IPv4 forwarding, by routes and written-down neighbours. Link n is 10.99.n.0/24."""
+    """The kernel's IPv4 forwarding, with static routes and neighbours. Link n is 10.99.n.0/24."""
 
     name = "IPv4"
     processes = False
 
     def wire(self, chain: Chain, size: int) -> Wire:
+        """Return IPv4 frames of ``size`` bytes, Ethernet header included."""
         nodes, last = chain.nodes, len(chain.nodes) - 1
         source, sink = chain.mac(nodes[0], nodes[1]), chain.mac(nodes[-1], nodes[-2])
         far, near = f"10.99.{last}.2", "10.99.1.1"
@@ -160,6 +170,7 @@ class IPv4:
         )
 
     def stand(self, chain: Chain) -> ExitStack:
+        """Make every middle a router; closing the returned stack restores it."""
         with ExitStack() as undo:
             for at, node in enumerate(chain.middles, 1):
                 undo.callback(chain.inside, node, partial(_clear_addresses, chain.devices(node)))
@@ -167,6 +178,7 @@ class IPv4:
             return undo.pop_all()
 
     def workers(self) -> list[Worker]:
+        """Return no process: the kernel forwards."""
         return []
 
 
@@ -192,7 +204,7 @@ def _remove_bridge() -> None:
 
 
 def _route(chain: Chain, node: str, at: int) -> None:
-    """Make the ``at``-th middle a router: its left link is number ``at``, its right one the next."""
+    """Make the ``at``-th middle a router: its left link has number ``at``, its right one the next."""
     (_IP_SETTINGS / "ip_forward").write_text("1", encoding="ascii")
     for scope in ("all", "default", *chain.devices(node)):
         (_IP_SETTINGS / "conf" / scope / "rp_filter").write_text("0", encoding="ascii")
@@ -212,7 +224,7 @@ def _route(chain: Chain, node: str, at: int) -> None:
 
 
 def _clear_addresses(devices: list[str]) -> None:
-    """Take addresses, and with them routes, and neighbours away again."""
+    """Remove the addresses, and with them routes and neighbours."""
     (_IP_SETTINGS / "ip_forward").write_text("0", encoding="ascii")
     with _links() as (ipr, index):
         for neighbour in ipr.get_neighbours(family=AF_INET):

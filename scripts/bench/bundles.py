@@ -1,10 +1,10 @@
-"""Small messages on many topics, reliable, over three kernel switches: 100 bytes, 20 topics, one member at each end.
+"""Bench of bundles: reliable small messages over three kernel switches, 100 bytes, 20 topics, one member at each end.
 
     4,000/s      a steady rate, topics in turn: loss, latency, what each end costs
     overload     as many as come to be confirmed, at most 2,000 of a topic under way: messages/s
 
-each with bundles (what waits together goes under one seal) and with one seal a message, in turn, round by round. Asked:
-nothing lost at the steady rate; in overload at least three times what one seal a message carries.
+each with bundles (messages that wait together share one seal) and with one seal a message, in turn, round by round.
+Targets: no loss at the steady rate; in overload at least three times the rate of one seal a message.
 
     sudo .venv/bin/python scripts/bench/bundles.py                     # the whole; writes docs/benchmarks/bundles.*
     sudo .venv/bin/python scripts/bench/bundles.py --quick --no-save   # a few seconds: does it work?
@@ -45,7 +45,7 @@ QUICK_S: Final = 1.0
 
 
 def measure_once(members: MemberRow, settings: dict[str, str | float]) -> dict[str, float]:
-    """Return the figures of one try, by column.
+    """Return the figures of one trial, by column.
 
     Raises:
         FailedError: an end did not come up, or not everything was confirmed.
@@ -72,7 +72,7 @@ def measure_once(members: MemberRow, settings: dict[str, str | float]) -> dict[s
 
 
 def targets_of(over: Rounds) -> list[Target]:
-    """Return what was asked for."""
+    """Return the targets."""
     return [
         over.target(f"{STEADY}: {LOST}", BUNDLES, STEADY, LOST, 0.0, at_most=True),
         over.ratio(f"{OVERLOAD}: {BUNDLES} / {SINGLE}, {RATE}", BUNDLES, SINGLE, OVERLOAD, RATE, RATIO),

@@ -1,4 +1,4 @@
-"""What runs at A and B in the bench of bundles: a member that publishes small messages on many topics, or reads them.
+"""Endpoint process of the bundle bench: a member that publishes small messages on many topics, or reads them.
 
 Process of its own, started by ``bundles.py``. A message is 100 bytes and carries the moment at which it was
 due (``CLOCK_MONOTONIC``, one clock for all namespaces of a machine). At a steady rate a kernel timer makes them due,
@@ -38,7 +38,7 @@ Settings = Mapping[str, str | float]
 
 
 def topics(count: int) -> list[str]:
-    """Return their names."""
+    """Return the names of the topics."""
     return [f"/small{at}" for at in range(count)]
 
 
@@ -55,7 +55,7 @@ class _Sender:
         self._cpu_s = 0.0
 
     def publish(self, publisher: Publisher, due_ns: int) -> None:
-        """Let a message go."""
+        """Publish one message."""
         what = _WARM_UP if due_ns < self._measured_ns else _MEASURED
         if what == _MEASURED:
             self._cpu_s = self._cpu_s or time.process_time()
@@ -63,7 +63,7 @@ class _Sender:
         publisher.publish(_MESSAGE.pack(what, due_ns))
 
     def at_rate(self, rate: float) -> None:
-        """Publish so many messages a second until the end."""
+        """Publish at this rate, in messages a second, until the end."""
         gap_ns, due_ns = 1e9 / rate, float(time.monotonic_ns())
         timer = Timer(time.monotonic_ns(), _TICK_S)
 
@@ -82,7 +82,7 @@ class _Sender:
         timer.close()
 
     def in_overload(self) -> None:
-        """Publish until the end as much as is confirmed."""
+        """Publish until the end as fast as messages are confirmed."""
         while (now_ns := time.monotonic_ns()) < self.end_ns:
             free = {each: BACKLOG - each.messages + each.acknowledged for each in self.publishers}
             for publisher in islice(self._turns, _AT_ONCE):
@@ -93,7 +93,7 @@ class _Sender:
             self._end.runtime.step(time.monotonic() if max(free.values()) > 0 else time.monotonic() + 1.0)
 
     def finish(self) -> None:
-        """Say that this was all, see it confirmed, and report."""
+        """Announce the end, wait for the confirmation, and report."""
         cpu_s = time.process_time() - self._cpu_s
         for publisher in self.publishers:
             publisher.publish(_MESSAGE.pack(_LAST, time.monotonic_ns()))
@@ -106,7 +106,7 @@ class _Sender:
 
 
 def send(end: End, settings: Settings) -> None:
-    """Be A."""
+    """Run as A."""
     publishers = [end.advertise(topic, reliable=True) for topic in topics(int(settings["topics"]))]
     if not settings["bundles"]:
         for publisher in publishers:
@@ -124,7 +124,7 @@ def send(end: End, settings: Settings) -> None:
 
 
 def read(end: End, settings: Settings) -> None:
-    """Be B: read all, and report when every topic's last message is here."""
+    """Run as B: read all, and report when every topic's last message has arrived."""
     names = {end.subscribe(topic): topic for topic in topics(int(settings["topics"]))}
     latencies_s: list[float] = []
     seals: set[tuple[bytes, int]] = set()
@@ -159,7 +159,7 @@ def read(end: End, settings: Settings) -> None:
 
 
 def main() -> None:
-    """Be ``send`` or ``read``, as the first argument says."""
+    """Run ``send`` or ``read``, as the first argument states."""
     settings = json.loads(sys.argv[2])
     end = End(Path(settings["config"]), settings["spin_s"])
     {"send": send, "read": read}[sys.argv[1]](end, settings)

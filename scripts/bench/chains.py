@@ -1,9 +1,9 @@
-"""A chain of namespaces for the forwarding and scale benches: a source, some switches, a sink, each in its own.
+"""Chain of namespaces for the forwarding and scale benches: a source, some switches, a sink, each in its own.
 
-I/O. ``gdp.simulation`` makes and removes the namespaces. What the switches are is ``baselines.py``'s.
+I/O. ``gdp.simulation`` makes and removes the namespaces. ``baselines.py`` defines the switches.
 ::
 
-    s1 (source) -- s2 -- ... -- s(n+1) -- s(n+2) (sink)        devices are called like the neighbour they lead to
+    s1 (source) -- s2 -- ... -- s(n+1) -- s(n+2) (sink)        a device has the name of the neighbour it leads to
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ T = TypeVar("T")
 
 
 class Chain:
-    """A chain with so many ``switches``, none of which runs yet; a context manager that removes all of it.
+    """Chain with ``switches`` switches, none of which runs yet; a context manager that removes all of it.
 
     Args:
-        runs: where the record of what is made is kept.
+        runs: location of the record of what is made.
         switches: 0 joins the source and the sink directly.
         mtu: bytes after the Ethernet header.
         pin: the source on one core, the sink on another; without it the scheduler chooses.
@@ -83,11 +83,11 @@ class Chain:
         return self._macs[node][towards]
 
     def inside(self, node: str, work: Callable[[], T]) -> T:
-        """Do ``work`` in a node's namespace."""
+        """Call ``work`` in a node's namespace."""
         return netns_files.inside(self.spaces.path(node), work)
 
     def set_mtu(self, mtu: int) -> None:
-        """Give every device another MTU."""
+        """Set the MTU of every device, in bytes."""
         for node in self.nodes:
             self.inside(node, partial(_set_mtus, self.devices(node), mtu))
 

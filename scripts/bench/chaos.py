@@ -1,15 +1,15 @@
-"""Faults of every kind in a network of real processes, drawn from a seed; afterwards everything must be well again.
+"""Chaos bench: faults of every kind in a network of real processes, drawn from a seed; afterwards all flows must work.
 
 A random network of 12 to 20 switches, four domains, three tiers, several RIBs, two services with replicas, reliable
-and best-effort topics (``faults/network.py``) suffers overlapping faults (``faults/schedule.py``) for so long. What
-graph and policy leave connected (``faults/oracle.py``) must go on. Verdict:
+and best-effort topics (``faults/network.py``) gets overlapping faults (``faults/schedule.py``). Flows that
+graph and policy leave connected (``faults/oracle.py``) must continue. Promises:
 
     after the last fault    every flow that must be connected delivers again within a second, and stays so
     meanwhile               no silence above --limit-s where both ends were connected all the time
     nothing                 reaches a wrong reader, or comes twice; nothing of the revoked member after three seconds
-    reliable flows          are complete from the first message that came, or the reader was told exactly what it lacks
+    reliable flows          are complete from the first message that came, or the reader got a report of exactly what it lacks
     requests                each has one answer, or one error
-    snapshots               a RIB says once that its disk is full, and when it writes again; it starts all the same
+    snapshots               a RIB logs once that its disk is full, and when it writes again; it still starts
 
     sudo .venv/bin/python scripts/bench/chaos.py --seed 7                    # one minute
     sudo .venv/bin/python scripts/bench/chaos.py --seed 7 --seconds 300 --switches 20
@@ -52,12 +52,12 @@ from gdp.host.run_registry import RunRegistry
 
 SECONDS: Final = 60.0
 AFTER_S: Final = 8.0  # that everything is watched after the last fault
-WELL_S: Final = 1.0  # after the last fault, all is well again
+WELL_S: Final = 1.0  # after the last fault, all flows work again
 LIMIT_S: Final = 5.0
 REVOKED_S: Final = 3.0
 SETTLE_S: Final = 60.0
 LOOK_S: Final = 0.1
-TOLD_S: Final = 0.25  # shorter silences are not worth telling
+TOLD_S: Final = 0.25  # shorter silences are not reported
 CALL_S: Final = 5.0
 LOG_LINES: Final = 12
 _CLUSTER_EVERY: Final = 3  # seeds
@@ -72,7 +72,7 @@ SHORT: Final = {kind.name.lower().replace("_", "-"): kind for kind in FaultKind}
 
 
 class Chaos:
-    """One run: a network, its faults, and the books.
+    """One run: a network, its faults, and the records.
 
     Args:
         overlay: of the plan, started.
@@ -94,7 +94,7 @@ class Chaos:
         self.revoked_ns: int | None = None
 
     def settle(self) -> None:
-        """Return when every flow is delivered and every service answers.
+        """Return when every flow is delivered and every service responds.
 
         Raises:
             FailedError: not in time.
@@ -106,9 +106,9 @@ class Chaos:
             self._watch(time.monotonic() + LOOK_S)
 
     def run(self) -> None:
-        """Let the faults happen, each in its time, and watch for a while after the last.
+        """Apply the faults, each at its time, and observe for a while after the last.
 
-        What is late makes everything after it late, so that faults are as far apart as they were drawn.
+        A delay postpones all later faults, so that their distances stay as drawn.
         """
         begun_s, waited_s = time.monotonic(), _waited_s()
         self.begun_ns = time.monotonic_ns()
@@ -146,12 +146,12 @@ class Chaos:
         return [*found, *self._after_revocation(), *self._of_snapshots()]
 
     def noticed(self) -> int:
-        """Return how often a RIB said that its snapshot is not written."""
+        """Return how often a RIB logged that its snapshot is not written."""
         logs = (log for node in self._plan.ribs for _, log in self._overlay.logs(f"rib {node}"))
         return sum(log.count(NOT_WRITTEN) for log in logs)
 
     def silences(self) -> list[tuple[str, Silence]]:
-        """Return the silences of the run, each with the last thing that happened before it."""
+        """Return the silences of the run, each with the last event before it."""
         found = []
         for silence in self._all_silences(self.begun_ns, time.monotonic_ns(), TOLD_S):
             before = [each for each in self.moments if each[0] <= silence.begin_ns + round(1e9)]
@@ -161,7 +161,7 @@ class Chaos:
         return found
 
     def _is_last_life(self, member: str, life: int) -> bool:
-        """Return whether what this life of a member says and hears goes on to the end of the run."""
+        """Return whether what this incarnation of a member sends and receives continues to the end of the run."""
         is_revoked = member == VICTIM and self.revoked_ns is not None
         return life == self._overlay.life(f"member {member}") and not is_revoked
 
@@ -183,7 +183,7 @@ class Chaos:
             time.sleep(min(LOOK_S, left_s))
 
     def _note(self) -> None:
-        """Note what must be connected from now on."""
+        """Record what must be connected from now on."""
         at = {mover: self._overlay.at(mover) for mover in self._plan.homes}
         broken = broken_by(self._under_way, at)
         if self.revoked_ns is not None:
@@ -254,7 +254,7 @@ class Chaos:
             overlay.store.restart(str(fault))
 
     def _await(self, who: str) -> None:
-        """Go on reading records while a restarted process comes up: it is part of the network when it says so."""
+        """Continue to read records while a restarted process comes up; it joins the network when it reports ready."""
         while not self._overlay.is_ready(who):
             self._watch(time.monotonic() + LOOK_S)
 
@@ -278,7 +278,7 @@ class Chaos:
         return found
 
     def _of_snapshots(self) -> list[str]:
-        """Return what RIBs did wrong about their snapshots."""
+        """Return the errors of RIBs about their snapshots."""
         if self._overlay.disk is None:
             return []
         found = [f"{name}: a snapshot that its RIB could not make sense of" for name in self._overlay.disk.broken()]
@@ -342,7 +342,7 @@ def run_seed(runs: RunRegistry, seed: int, options: argparse.Namespace) -> list[
 
 
 def _waited_s() -> float:
-    """Return for how long, since boot, some process of the machine had to wait for a processor; 0 if that is not known.
+    """Return the seconds since boot in which some process waited for a processor; 0 if unknown.
 
     Source: Linux, Documentation/accounting/psi.rst.
     """
@@ -432,7 +432,7 @@ def arguments() -> argparse.ArgumentParser:
 
 
 def main() -> None:
-    """Run seeds; exit 1 when one broke."""
+    """Run seeds; exit 1 when one failed."""
     options = arguments().parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
     runs = RunRegistry()

@@ -1,10 +1,11 @@
-"""What stands at the two ends of a chain: a source that sends or pings, a sink that counts or answers.
+"""Endpoints of a chain: a source that sends or pings, a sink that counts or answers.
 
-I/O. AF_PACKET sockets on one device. Frames come ready made, so an end costs the same whatever they hold.
+I/O. AF_PACKET sockets on one device. Frames are prepared in advance, so the cost does not depend on their content.
 
-An end that *polls* asks its socket again and again and measures the path alone; one that *sleeps* waits in epoll, as a
-real node does, and measures the scheduler too. The sink looks for frames every half millisecond instead of being woken
-by each: the wake-up would be paid by the sender, whose time is what in-kernel forwarding lives on.
+An endpoint that *polls* queries its socket continuously and measures the path alone. One that *sleeps* waits in epoll,
+as a real node does, and measures the scheduler too. The sink checks for frames every half millisecond. A wake-up for
+each frame would be paid by the sender, and in-kernel forwarding runs in the sender's time.
+
 """
 
 from __future__ import annotations
@@ -33,14 +34,14 @@ _BUFFER_BYTES: Final = 64 << 20
 _SLOT_BYTES: Final = 64  # the sink reads no more of a frame
 _NAP_S: Final = 0.0005
 _PATIENCE_S: Final = 1.0
-_LOOKS: Final = 2_000_000  # empty looks of a polling end: about a second
+_LOOKS: Final = 2_000_000  # empty polls of a polling endpoint: about a second
 _FRAME_MAX: Final = 1 << 16
 _WARM: Final = 50  # pings that are not counted
 _DONTWAIT: Final = int(socket.MSG_DONTWAIT)
 
 
 class Sent(NamedTuple):
-    """What a source did; moments are monotonic seconds."""
+    """Result of a source; moments are monotonic seconds."""
 
     sent: int
     refused: int
@@ -50,7 +51,7 @@ class Sent(NamedTuple):
 
 
 class Counted(NamedTuple):
-    """What a sink saw; ``drops``: found its buffer full."""
+    """Frames that a sink received; ``drops``: frames that found its buffer full."""
 
     got: int
     drops: int
@@ -135,13 +136,13 @@ def _paced(sock: socket.socket, batches: list[MmsgPool], head: bytes, drops: lis
 
 
 def count_frames(ifname: str, ethertype: int, ready: Callable[[], None], asked: Callable[[], int | None]) -> Counted:
-    """Count frames until all expected ones are there or no more come.
+    """Count frames until all expected ones have arrived or no more come.
 
     Args:
         ifname: the device.
         ethertype: of the frames.
-        ready: called when frames are being counted.
-        asked: says how many are expected once the source is done, None before that; only called when nothing came.
+        ready: called when counting begins.
+        asked: returns the expected number once the source is done, None before that; only called when nothing came.
     """
     silence_s, expected, got, last_s = 0.2, None, 0, 0.0
     batch = make_batch(_SLOT_BYTES)
@@ -162,7 +163,7 @@ def count_frames(ifname: str, ethertype: int, ready: Callable[[], None], asked: 
 
 
 class _Ear:
-    """Takes one frame at a time, as cheaply as Python can: the C library's ``recv`` into fixed memory."""
+    """Receiver of one frame at a time, as cheap as Python allows: the C library's ``recv`` into fixed memory."""
 
     def __init__(self, sock: socket.socket) -> None:
         recv = ctypes.CDLL(None).recv
@@ -177,9 +178,9 @@ class _Ear:
         self._epoll.close()
 
     def poll(self) -> bool:
-        """Ask again and again; False when nothing came for about a second."""
+        """Query the socket continuously; False when nothing came for about a second."""
         recv, (fd, at, size, flags) = self._recv, self._arguments
-        for _ in repeat(None, _LOOKS):  # noqa: SIM110  (a generator would make every look dearer)
+        for _ in repeat(None, _LOOKS):  # noqa: SIM110  (a generator would make every poll more expensive)
             if recv(fd, at, size, flags) > 0:
                 return True
         return False
@@ -190,9 +191,9 @@ class _Ear:
 
 
 def ping(ifname: str, ethertype: int, frame: bytes, pings: int, *, poll: bool) -> list[float]:
-    """Return round-trip times in microseconds of a frame sent again when the last one is back; lost ones are left out.
+    """Return round-trip times in microseconds; a frame is sent again when the last one is back.
 
-    It gives up after three lost ones.
+    Lost frames are left out. The function gives up after three lost frames.
     """
     times, lost, now = [], 0, time.perf_counter
     with open_end(ifname, ethertype) as sock, closing(_Ear(sock)) as ear:
@@ -212,7 +213,7 @@ def ping(ifname: str, ethertype: int, frame: bytes, pings: int, *, poll: bool) -
 def answer_pings(
     ifname: str, ethertype: int, frame: bytes, pings: int, ready: Callable[[], None], *, poll: bool
 ) -> int:
-    """Answer as many pings as ``ping`` sends with ``frame``, or until none comes for a while; return how many came."""
+    """Answer as many pings as ``ping`` sends, with ``frame``, or until none comes for a while; return their number."""
     answered = 0
     with open_end(ifname, ethertype) as sock, closing(_Ear(sock)) as ear:
         send_frame, take = sock.send, ear.poll if poll else ear.sleep

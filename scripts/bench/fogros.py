@@ -1,4 +1,4 @@
-"""The tasks of FogROS G's Table I and Figure 5: how long a robot waits for the network when a cloud computes for it.
+"""Network time of the tasks of FogROS G's Table I and Figure 5: the wait of a robot when a cloud computes for it.
 
     vSLAM              two images of 640 x 480 there (1.5 MB), a pose back
     motion planning    two meshes and a request there (128 kB), a path back
@@ -6,7 +6,7 @@
 
 with ordinary rclpy nodes at both ends, over one cable (``direct``) and over proxies and three kernel switches, in turn,
 round by round; nothing is computed, so a time is the way there and back. ``fogros_tasks.py`` says where the sizes come
-from. ``scripts/experiments/offload.py`` computes the tasks, and puts the paper's figures beside ours.
+from. ``scripts/experiments/offload.py`` computes the tasks, and compares the paper's figures with ours.
 
     sudo .venv/bin/python scripts/bench/fogros.py                     # the whole; writes docs/benchmarks/fogros.*
     sudo .venv/bin/python scripts/bench/fogros.py --quick --no-save   # a few seconds: does it work?
@@ -55,7 +55,7 @@ class Trip:
         return DIRECT if self.encoding is None else f"overlay, {self.encoding}"
 
     def measure(self, row: Row, round_number: int) -> dict[str, float]:
-        """Return the figures of one try, by column.
+        """Return the figures of one trial, by column.
 
         Raises:
             FailedError: a node did not come up, or nothing was answered.
@@ -79,7 +79,7 @@ class Trip:
 
 
 def prefix_of(task: Task, encoding: Encoding) -> str:
-    """Return what the names of a task's topics begin with, where proxies carry it so."""
+    """Return the prefix of the names of a task's topics, where proxies carry it so."""
     return f"/{task.name.replace(' ', '_').lower()}_{encoding}/"
 
 
@@ -89,7 +89,7 @@ def case_of(task: Task, mtu: int) -> str:
 
 
 def carried_of(task: Task, encoding: Encoding) -> Iterator[Carried]:
-    """Return what the proxies carry of a task."""
+    """Return the topics of a task that the proxies carry."""
     prefix = prefix_of(task, encoding)
     for part in task.parts:
         yield Carried(prefix + part.topic, part.type_name, encoding)
@@ -107,7 +107,7 @@ def turns_of(options: Options) -> Iterator[Turn]:
 
 
 def targets_of(over: Rounds, mtu: int) -> list[Target]:
-    """Return what the overlay adds, task by task; no bound is asked for."""
+    """Return what the overlay adds, by task; there is no bound."""
     targets = []
     for task in TASKS:
         case = case_of(task, mtu)

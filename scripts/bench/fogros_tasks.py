@@ -1,7 +1,7 @@
-"""What the three tasks of the FogROS papers send and get back, as data.
+"""Messages that the three tasks of the FogROS papers send and get back, as data.
 
 Sans-I/O. Read by the bench and by its nodes. The messages are those of the clients that the authors publish; what
-these leave open (how long a planned path is) is said where it stands. Types of packages that have no wheel are replaced
+these leave open (the length of a planned path) has a comment. Types of packages that have no wheel are replaced
 by standard ones that carry the same numbers.
 
 Source: github.com/BerkeleyAutomation: ``fogros2-examples`` (``vslam/TUTORIAL.md``: the TUM dataset freiburg1;
@@ -43,7 +43,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What a robot sends, and what the cloud answers when it has all of it."""
+    """Messages that a robot sends, and the answer of the cloud to all of them."""
 
     name: str
     parts: tuple[Part, ...]

@@ -1,22 +1,22 @@
-"""How many frames a second one and three switches carry, how long a round trip takes, what a frame costs.
+"""Forwarding bench: frames a second through one and three switches, round-trip time, and cost of a frame.
 
     sudo .venv/bin/python scripts/bench/forwarding.py                      minutes; JSON and plot to docs/benchmarks
     sudo .venv/bin/python scripts/bench/forwarding.py --quick --no-save    a few seconds, to see that all works
     sudo .venv/bin/python scripts/bench/forwarding.py --only kernel --only bridge --rounds 5
 
-Our planes (scapy, raw, kernel with and without redirect_peer), the Linux bridge and the kernel's IPv4 forwarding stand
-in the same chain of namespaces, one after the other, and so again each round. Per size of frame and length of chain:
+Our planes (scapy, raw, kernel with and without redirect_peer), the Linux bridge and the kernel's IPv4 forwarding run
+in the same chain of namespaces, one after the other, in each round. Per size of frame and length of chain:
 
 frames/s            highest rate at which less than 0.1 % is lost and the last frame comes at once (``rate_search.py``)
-RTT, polling ends   of single frames, by ends that ask their socket again and again: the path alone; not measured for
-                    planes that are processes where these would share the ends' cores
-RTT, sleeping ends  by ends that wait in epoll, as nodes do
+RTT, polling ends   of single frames, by endpoints that query their socket continuously: the path alone; not measured for
+                    planes that are processes where these would share the endpoints' cores
+RTT, sleeping ends  by endpoints that wait in epoll, as nodes do
 CPU µs/frame        at that rate: the source, soft interrupts (forwarding in the kernel is done by the sender's own, so
                     it shows as the source's time) and switch processes; the sink is left out
-forwarding's part, forwarding's share: round trip and CPU, less what the ends side by side take in the same round
+forwarding's part, forwarding's share: round trip and CPU, less the cost of directly joined endpoints in the same round
 
 All frames leave through AF_PACKET, IPv4 ones too, so that the source costs the same for all, and no offload takes part.
-Everything made is removed, whatever happens.
+Everything made is removed, also after an error.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ SLEPT, SLEPT_P99 = "RTT µs, sleeping ends: median", "p99, sleeping"
 
 
 class Bench:
-    """The rounds of one run: what is known so far, and how to measure one baseline in one chain."""
+    """Rounds of one run: the figures so far, and the measurement of one baseline in one chain."""
 
     def __init__(self, seconds: float, pings: int) -> None:
         self.over = Rounds()
@@ -63,13 +63,13 @@ class Bench:
         self._ends_trip: dict[int, float] = {}
 
     def measure(self, baseline: Baseline, chain: Chain, sizes: Sequence[int], lengths: Sequence[int]) -> None:
-        """Set a baseline up, measure each size, take it down; say why if it cannot be had.
+        """Set a baseline up, measure each size, take it down; report the reason if it is not available.
 
         Args:
-            baseline: who.
-            chain: where.
+            baseline: what to measure.
+            chain: the chain of namespaces.
             sizes: of frames, bytes.
-            lengths: the chains whose tables the figures stand in.
+            lengths: chains in whose tables the figures appear.
         """
         if baseline.name in self.over.reasons:
             return
@@ -119,19 +119,19 @@ class Bench:
 
 
 def case_of(size: int, switches: int) -> str:
-    """Return what a table is headed with."""
+    """Return the heading of a table."""
     return f"{size:,} B, {switches} switch{'es' if switches > 1 else ''}"
 
 
 def baselines_of(only: Sequence[str]) -> list[Baseline]:
-    """Return the baselines asked for, all without a wish; those that are compared follow each other closely."""
+    """Return the selected baselines, by default all; those to compare are adjacent."""
     quick: list[Baseline] = [*(Plane(name, processes=False) for name in OURS if name not in GUESSES), Bridge(), IPv4()]
     known = [*quick, *(Plane(name, processes=True) for name in OURS if name in GUESSES)]
     return [each for each in known if not only or each.name in only]
 
 
 def targets_of(over: Rounds) -> list[Target]:
-    """Return the figures that the kernel plane is to reach, all in the longer chain."""
+    """Return the targets of the kernel plane, all in the longer chain."""
     case, plain = case_of(1_400, 3), "kernel, redirect"
     return [
         over.ratio(f"{case}: kernel by plain redirect / bridge, frames/s", plain, "bridge", case, RATE, 1.3),

@@ -1,4 +1,4 @@
-"""The frames that benches send, ready made: ours, and IPv4 of the same length.
+"""Prepared frames of the benches: GDP frames, and IPv4 frames of the same length.
 
 Sans-I/O. The source and the sink are names with entries at every switch; ``table_name`` counts through the names of
 a large table.
@@ -29,7 +29,7 @@ _TTL, _UDP, _PORT = 64, 17, 7
 
 @dataclass(frozen=True, slots=True)
 class Wire:
-    """What travels for one contender: its EtherType, a frame from source to sink, and one back."""
+    """Frames of one baseline: its EtherType, a frame from source to sink, and one back."""
 
     ethertype: int
     out: bytes
@@ -52,7 +52,7 @@ def gdp_frame(macs: bytes, size: int, destination: bytes, source: bytes) -> byte
 
 
 def ip_frame(macs: bytes, size: int, destination: str, source: str) -> bytes:
-    """Return a whole Ethernet, IPv4 and UDP frame of ``size`` bytes, with a right header checksum."""
+    """Return a whole Ethernet, IPv4 and UDP frame of ``size`` bytes, with a correct header checksum."""
     length = size - ETHER_BYTES
     ends = (ipaddress.IPv4Address(source).packed, ipaddress.IPv4Address(destination).packed)
     header = _IP_HEADER.pack(0x45, 0, length, 0, _DONT_FRAGMENT, _TTL, _UDP, 0, *ends)
@@ -71,12 +71,12 @@ def ip_checksum(header: bytes) -> int:
 
 
 def table_name(number: int) -> bytes:
-    """Return the name of one entry of a large table: nothing about its neighbours shows in it, as with real names."""
+    """Return the name of one entry of a large table; like a real name it does not resemble its neighbours."""
     return hashlib.sha256(number.to_bytes(8, "big")).digest()
 
 
 def table_key(number: int) -> bytes:
-    """Return the key of one entry: a destination, or every other time destination and source."""
+    """Return the key of one entry: alternately a destination, or destination and source."""
     return table_name(number) + (SOURCE if number % 2 else b"")
 
 

@@ -1,6 +1,6 @@
-"""Cluster of ``recovery.py``: machines of the provider ``local``, a robot and its node that calls.
+"""Cluster of ``recovery.py``: machines of the provider ``local``, a robot, and a calling node.
 
-I/O. What it makes is a run's, and what ``fog`` makes for it ends with ``fog down``, also after a crash.
+I/O. A run owns what this module makes; ``fog down`` ends what ``fog`` makes for it, also after a crash.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ T = TypeVar("T")
 
 
 class Cluster:
-    """Replicas that serve, and a robot that calls; a context manager that takes everything down.
+    """Replicas that serve, and a robot that calls; a context manager that removes everything.
 
     Args:
         rate_hz: requests a second.
@@ -109,15 +109,15 @@ class Cluster:
                 return longest_ms / 1e3
 
     def freeze(self, machine: Record) -> None:
-        """Stop all of a machine where it is."""
+        """Stop all processes of a machine (SIGSTOP)."""
         fault_injection.freeze(self._runs, machine.id)
 
     def notice(self, machine: Record, seconds: float) -> None:
-        """Give a machine notice."""
+        """Send a machine its preemption notice."""
         fault_injection.notice(self._runs, machine.id, seconds)
 
     def kill(self, machine: Record) -> None:
-        """Kill all of a machine, and unplug it."""
+        """Kill all processes of a machine, and unplug it."""
         fault_injection.kill(self._runs, machine.id)
 
     def kill_supervisor(self) -> None:
@@ -129,14 +129,14 @@ class Cluster:
         self._until(lambda: pid_of(self._site) is None or None, "the supervisor's end")
 
     def start_supervisor(self) -> float:
-        """Start one; return when that was, in seconds since 1970."""
+        """Start a supervisor; return the time, in seconds since 1970."""
         self._supervisors.close()
         at_s = time.time()
         self._supervisors.enter_context(self._start("supervisor", fog_command(self._run, ["supervise"])))
         return at_s
 
     def await_replacement(self, after_s: float) -> Record:
-        """Return the first machine that was asked for after this moment, when it serves."""
+        """Return the first machine that was requested after this moment, when it serves."""
 
         def served() -> Record | None:
             later = (each for each in self._machines() if each.asked_unix_s >= after_s and each.is_serving)
@@ -145,7 +145,7 @@ class Cluster:
         return self._until(served, "a replacement that serves")
 
     def await_event(self, machine: str | None, what: set[str], after_s: float) -> float:
-        """Return when one of these events was written of a machine, or of any, in seconds since 1970."""
+        """Return when one of these events was recorded of a machine, or of any, in seconds since 1970."""
 
         def written() -> float | None:
             found = (e for e in self._journal.events() if machine in (None, e.machine) and e.what in what)
@@ -154,7 +154,7 @@ class Cluster:
         return self._until(written, f"{machine or 'any machine'}: {' or '.join(sorted(what))}")
 
     def await_whole(self, victim: Record) -> None:
-        """Return when this machine is gone and all others are as many as are wanted, and serve."""
+        """Return when this machine is gone and the wanted number of other machines serve."""
 
         def is_whole() -> bool | None:
             there = [each for each in self._machines() if not each.is_gone]
@@ -195,7 +195,7 @@ class Cluster:
         return self._spaces.command(_ROBOT, ["env", *told, *argv])
 
     def _until(self, found: Callable[[], T | None], what: str) -> T:
-        """Look until something is there that tells nobody when it comes."""
+        """Poll until a state is reached that sends no event."""
         end_s = time.monotonic() + _PATIENCE_S
         while (value := found()) is None:
             if time.monotonic() > end_s:

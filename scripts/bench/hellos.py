@@ -1,4 +1,4 @@
-"""What it costs a switch to hear at once that a neighbour is gone: processor time with twenty neighbours, no traffic.
+"""Cost of immediate loss detection: processor time of a switch with twenty neighbours and no traffic.
 
 One switch, joined to twenty others by a link each; every switch is a process in a namespace of its own. After all are
 up, the processor time of the one in the middle is taken over each round, with keepalives as shipped, and without.
@@ -35,7 +35,7 @@ _CASES: Final[dict[str, int | None]] = {"keepalives as shipped": None, "no keepa
 
 
 def plan(neighbours: int) -> Plan:
-    """Return a star, and nobody who speaks."""
+    """Return a star without traffic."""
     leaves = [f"s{number}" for number in range(1, neighbours + 1)]
     topology, members = make_topology({"home": ("s0", *leaves)}, {}, [f"s0-{leaf}" for leaf in leaves], ("s0",), {})
     return Plan(topology, members)

@@ -1,7 +1,7 @@
-"""What a bench ran on: without it no figure means anything.
+"""State of the machine that a bench ran on; figures mean nothing without it.
 
-I/O. Reads /proc and asks devices, by the old one-word ethtool requests, because the ``ethtool`` command and its
-netlink family are often absent. Whatever is about devices speaks of the namespace that the calling thread is in
+I/O. Reads /proc and queries devices, by the old one-word ethtool requests, because the ``ethtool`` command and its
+netlink family are often absent. Functions on devices apply to the namespace of the calling thread
 (``gdp.host.netns_files.inside`` enters another).
 Source: ``linux/ethtool.h``, ``linux/sockios.h``, netdevice(7).
 
@@ -42,7 +42,7 @@ _NEEDS: Final = ("tx-checksum", "tso")  # segmentation cannot be on without chec
 
 @dataclass(frozen=True, slots=True)
 class MachineState:
-    """The machine as a bench found it. ``load_before``: runnable processes, mean over the last minute."""
+    """State of the machine before a bench. ``load_before``: runnable processes, mean over the last minute."""
 
     kernel: str
     processor: str
@@ -58,7 +58,7 @@ class MachineState:
 
 
 def machine_state() -> MachineState:
-    """Look at the machine; only the cores that this process may use are counted."""
+    """Read the state of the machine; only the cores that this process may use are counted."""
     return MachineState(
         platform.release(),
         _processor(),
@@ -116,7 +116,7 @@ def _ask(ifname: str, command: int, value: int) -> int:
 
 
 def thread_s(pid: int) -> float:
-    """Return the processor time of a process of one thread, what its soft interrupts took included (schedstat).
+    """Return the processor time of a process of one thread, including its soft interrupts (schedstat).
 
     Raises:
         OSError: no such process.
@@ -125,7 +125,7 @@ def thread_s(pid: int) -> float:
 
 
 def soft_interrupts_s() -> float:
-    """Return the processor time of the kernel's soft interrupt threads, which take over when there is much to do."""
+    """Return the processor time of the kernel's soft interrupt threads, which take over under load."""
     return sum(map(thread_s, _soft_interrupt_threads()))
 
 

@@ -1,4 +1,4 @@
-"""How long a message takes over three machines, and a small answer back: ours beside what people would use instead.
+"""Message bench: time of a message over three machines and a small answer back, compared with Zenoh and Cyclone DDS.
 
 Five machines in namespaces, A - s1 - s2 - s3 - B, and in turn on them, round by round:
 
@@ -45,7 +45,7 @@ QUICK_COUNT: Final = 10
 
 
 def baselines_of(only: Sequence[str], encodings: tuple[str, ...], spin_s: float) -> tuple[Baseline, ...]:
-    """Return the baselines called so; all, if none is named."""
+    """Return the baselines with these names; all, if none is named."""
     every: tuple[Baseline, ...] = (
         GdpNet("kernel", encodings, spin_s),
         GdpNet("raw", encodings, spin_s),
@@ -91,7 +91,7 @@ def positive(text: str) -> int:
     """Return a whole number above 0.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is not.
     """
     number = int(text)
     if number < 1:
@@ -103,7 +103,7 @@ def size_of(text: str) -> int:
     """Return the bytes of a message.
 
     Raises:
-        argparse.ArgumentTypeError: too few, or not a multiple of four, to which Cyclone DDS fills up.
+        argparse.ArgumentTypeError: too few, or not a multiple of four, to which Cyclone DDS pads.
     """
     size = int(text)
     if size < SIZE_MIN or size % 4:
@@ -112,7 +112,7 @@ def size_of(text: str) -> int:
 
 
 def plan_of(options: argparse.Namespace) -> Plan:
-    """Return what the command line asks for."""
+    """Return the plan that the command line states."""
     return Plan(
         tuple(options.mtu or MTUS),
         {"off": (False,), "on": (True,), "both": (False, True)}[options.offloads],
@@ -150,7 +150,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
 
 
 def is_whole(options: Options) -> bool:
-    """Return whether all cases are measured, so that the figures belong into ``docs/benchmarks``."""
+    """Return whether all cases are measured, so that the figures are written to ``docs/benchmarks``."""
     return not (options.quick or options.only or options.mtu or options.size or options.offloads != "both")
 
 

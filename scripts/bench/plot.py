@@ -1,8 +1,8 @@
-"""A picture of a bench: horizontal bars of medians, with a whisker up to the p99 or over the rounds' spread.
+"""Picture of a bench: horizontal bars of medians, with a whisker up to the p99 or over the spread of the rounds.
 
 I/O. One file. Needs matplotlib, the extra ``bench`` of this package, and no display.
 
-    require_plot()                                       # at the start, so that a missing library is not found out last
+    require_plot()                                       # at the start, so that a missing library is reported first
     save_bars(path, "Forwarding", str(state), [
         Panel("1400 B, 3 switches", "frames/s", [Bar("kernel", 450e3, 440e3, 460e3), Bar("bridge", 244e3)]),
         Panel("100 B", "round trip, µs: median, whisker to p99", [Bar("kernel", 4.7, None, 12.0)], log=True),
@@ -10,7 +10,7 @@ I/O. One file. Needs matplotlib, the extra ``bench`` of this package, and no dis
     panel_of(over, case, column, contenders)             # whiskers: lowest to highest round
     panel_of(over, case, median_column, contenders, p99=p99_column)   # whiskers: median to p99
 
-Several bars of one contender (sizes, encodings) are bars with a label each, in one panel or in panels side by side.
+Several bars of one baseline (sizes, encodings) are bars with a label each, in one panel or in panels side by side.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """Bars on one axis. ``unit`` stands under the axis, and says what the whiskers are."""
+    """Bars on one axis. ``unit`` is the label of the axis, and explains the whiskers."""
 
     title: str
     unit: str
@@ -62,11 +62,11 @@ def panel_of(
     ours: Sequence[str] = (),
     log: bool = False,
 ) -> Panel:
-    """Return the panel of one column of one case; contenders without a figure are left out.
+    """Return the panel of one column of one case; baselines without a figure are left out.
 
     Args:
         p99: the column that whiskers lead to; without it they span the rounds.
-        ours: contenders to colour as ours.
+        ours: baselines to colour as ours.
     """
     bars = []
     for contender in contenders:
@@ -81,7 +81,7 @@ def panel_of(
 
 
 def require_plot() -> None:
-    """Leave with a clear word if there is no matplotlib."""
+    """Exit with a clear message if matplotlib is missing."""
     if importlib.util.find_spec("matplotlib") is None:
         sys.exit("no matplotlib for the plot: pip install 'gdp-ros[bench]' (or go without: --no-plot)")
 

@@ -1,6 +1,6 @@
-"""How late a small urgent message is while images fill the path: a tick of 100 bytes at 100 Hz over three switches.
+"""Priority bench: lateness of an urgent message while images fill the path; 100 bytes at 100 Hz over three switches.
 
-One member at A ticks; what floods the same path is, in turn:
+One member at A ticks; the floods on the same path are, in turn:
 
     idle                        nothing
     own images                  the same member's images of 921,600 bytes, reliable, as fast as they are confirmed
@@ -8,8 +8,8 @@ One member at A ticks; what floods the same path is, in turn:
     another's images            those of another member at the same switch, reliable
 
 over three switches with the data plane ``kernel``, then ``raw``; on links as fast as the machine, where both its cores
-are busy, and with 100 Mbit/s between the first two switches, where a queue is what is full. Latency is one way, from
-when a tick was due to when B's program has it. Asked: p99 of no flood above twice the idle p99 and one frame's time.
+are busy, and with 100 Mbit/s between the first two switches, where a queue is full. Latency is one way, from the time
+a tick was due to its delivery to B's program. Target: p99 of no flood above twice the idle p99 and one frame's time.
 
     sudo .venv/bin/python scripts/bench/priority.py                     # the whole; writes docs/benchmarks/priority.*
     sudo .venv/bin/python scripts/bench/priority.py --quick --no-save   # a few seconds: does it work?
@@ -126,7 +126,7 @@ def _shape(device: str) -> None:
 
 
 def targets_of(over: Rounds, cases: Sequence[str]) -> list[Target]:
-    """Return what was asked for: no flood passes the bound, which idle itself makes in each round."""
+    """Return the targets: no flood exceeds the bound, which the idle case sets in each round."""
     floods = [flood for flood in FLOODS if flood != IDLE]
     targets = [over.target(f"{case}: {flood}, {OF_BOUND}", flood, case, OF_BOUND, 1.0, at_most=True)
              for case in cases for flood in floods]  # fmt: skip

@@ -1,7 +1,7 @@
-"""What runs at A, B and C in the bench of priorities: a member that ticks, floods, or reads.
+"""Endpoint process of the priority bench at A, B and C: a member that ticks, floods, or reads.
 
 Process of its own, started by ``priority.py``. A tick is a small message that carries the moment at which it
-was due: a kernel timer wakes the process, as a robot's own loop would, and whatever keeps the tick from leaving counts.
+was due: a kernel timer wakes the process, as a robot's own loop would, and every delay before the tick leaves counts.
 Source: timerfd_create(2); CLOCK_MONOTONIC is one clock for all namespaces of a machine.
 """
 
@@ -57,7 +57,7 @@ def _checked(result: int) -> int:
 
 
 class Timer:
-    """Becomes readable at every tick.
+    """Timer whose descriptor becomes readable at every tick.
 
     Raises:
         OSError: the kernel refuses.
@@ -73,7 +73,7 @@ class Timer:
         return self._fd
 
     def passed(self) -> int:
-        """Return how many ticks were due since last asked."""
+        """Return how many ticks were due since the last call."""
         return int.from_bytes(os.read(self._fd, 8), sys.byteorder)
 
     def close(self) -> None:
@@ -82,10 +82,10 @@ class Timer:
 
 
 class End:
-    """A member on its plane."""
+    """Member on its plane."""
 
     def __init__(self, config: Path, spin_s: float) -> None:
-        settings = RibConfig.load(config)  # identity, domain and iface are all that an end needs
+        settings = RibConfig.load(config)  # identity, domain and iface are all that an endpoint needs
         identity, policy = load_member(settings.identity, settings.domain, Role.PROXY)
         self.member = Participant(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes))
         self.plane = RawPlane([settings.iface])
@@ -113,14 +113,14 @@ class End:
         return {label: count for label, count in found.items() if count}
 
     def leave(self) -> None:
-        """Say goodbye."""
+        """Withdraw and close."""
         self.member.leave()
         while self.runtime.send():
             continue
 
 
 class Ticks:
-    """Publishes a tick whenever one is due, from within the loop of the node."""
+    """Publisher of a tick whenever one is due, from within the loop of the node."""
 
     def __init__(self, end: End, publisher: Publisher, count: int) -> None:
         self._publisher = publisher
@@ -152,7 +152,7 @@ class Ticks:
 
 
 class Flood:
-    """Publishes images as fast as the path takes them.
+    """Publisher of images at the rate of the path.
 
     Args:
         kind: ``reliable`` or ``best-effort``; else nothing is published.
@@ -165,11 +165,11 @@ class Flood:
 
     @property
     def is_ready(self) -> bool:
-        """Return whether somebody reads, or nothing is to be read."""
+        """Return whether there is a reader, or nothing to read."""
         return self.publisher is None or self.publisher.readers > 0
 
     def go_on(self) -> None:
-        """See that there is always something to send."""
+        """Keep something to send in the queue."""
         if self.publisher is None:
             return
         if self.publisher.has_room() if self._is_reliable else self.publisher.is_acknowledged():
@@ -180,7 +180,7 @@ _FLOODS: Final = ("reliable", "best-effort")
 
 
 def tick(end: End, settings: Mapping[str, str | float]) -> None:
-    """Be A: tick, and flood if asked to."""
+    """Run as A: tick, and flood if configured."""
     control = end.advertise(CONTROL, reliable=True, urgent=True)
     flood = Flood(end, str(settings["flood"]))
     tune_memory()
@@ -200,7 +200,7 @@ def tick(end: End, settings: Mapping[str, str | float]) -> None:
 
 
 def flood(end: End, settings: Mapping[str, str | float]) -> None:
-    """Be C: flood until ended."""
+    """Run as C: flood until ended."""
     images = Flood(end, str(settings["flood"]))
     with end.runtime.signals():
         if not end.runtime.run(lambda: images.is_ready, time.monotonic() + _PATIENCE_S):
@@ -213,7 +213,7 @@ def flood(end: End, settings: Mapping[str, str | float]) -> None:
 
 
 def read(end: End) -> None:
-    """Be B: read both, and say at each last tick what came since the first measured one."""
+    """Run as B: read both, and report at each last tick what arrived since the first measured one."""
     control = end.subscribe(CONTROL)
     end.subscribe(IMAGES)
     latencies_s: list[float] = []
@@ -237,7 +237,7 @@ def read(end: End) -> None:
 
 
 def main() -> None:
-    """Be ``tick``, ``flood`` or ``read``, as the first argument says."""
+    """Run ``tick``, ``flood`` or ``read``, as the first argument states."""
     settings = json.loads(sys.argv[2])
     end = End(Path(settings["config"]), settings["spin_s"])
     if sys.argv[1] == "tick":

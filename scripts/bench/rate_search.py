@@ -1,9 +1,10 @@
-"""The highest rate that holds: pure, asked about one rate at a time.
+"""Search for the highest rate that holds, one rate at a time.
 
-A try holds when it loses less than ``LOSS_MAX`` of its frames, the last of them comes soon after the last sending (a
-rate that only fills queues does not count), and the source kept the rate. What is carried in the sender's own time
-shows flat out, the best of three tries; else the rate is bracketed and bisected. A rate that fails is tried once more,
-for whatever else a machine does can spoil a single try.
+Sans-I/O. A try holds when it loses less than ``LOSS_MAX`` of its frames, the last of them arrives soon after the last
+sending (a rate that only fills queues does not count), and the source kept the rate. Where frames are forwarded in the
+sender's own time, the best of three tries at full speed shows the rate; else the rate is bracketed and bisected. A rate
+that fails is tried once more, because other load of the machine can spoil a single try.
+
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ _TRIES_MAX: Final = 14
 
 @dataclass(frozen=True, slots=True)
 class Try:
-    """What came of sending for a while.
+    """Result of sending for a while.
 
     Attributes:
-        asked: frames/s wanted; None for flat out.
+        asked: frames/s requested; None for full speed.
         sent: frames that left the source.
         got: frames that the sink counted.
-        sink_drops: frames that came as far as the sink and found its buffer full; lost like the others.
+        sink_drops: frames that reached the sink and found its buffer full; lost like the others.
         send_s: from the first sending to the last.
         late_s: from the last sending to the last arrival.
         cpu_s: processor time of the source, of the kernel's soft interrupt threads and of the switches.
@@ -56,7 +57,7 @@ class Try:
 
     @property
     def holds(self) -> bool:
-        """Tell whether the path carries this rate."""
+        """Return whether the path carries this rate."""
         kept = self.asked is None or self.sent >= 0.95 * self.asked * self.send_s
         return kept and self.loss < LOSS_MAX and self.late_s < LATE_MAX_S
 
@@ -65,8 +66,8 @@ def highest(attempt: Callable[[float | None], Try], guess: float | None) -> Try 
     """Return the try with the highest rate that held; None if none did.
 
     Args:
-        attempt: sends at a rate (None: flat out).
-        guess: a rate near the answer, where one is known; else it begins flat out.
+        attempt: sends at a rate (None: full speed).
+        guess: an approximate rate, where one is known; else the search begins at full speed.
     """
     low: Try | None = None
     high = float("inf")
@@ -88,13 +89,13 @@ def highest(attempt: Callable[[float | None], Try], guess: float | None) -> Try 
         floor = low.asked if low and low.asked else 0.0
         if high <= floor * _CLOSE:
             break
-        step *= _STEP  # longer and longer strides, for the guess may be far off
+        step *= _STEP  # growing strides, because the guess may be far off
         rate = _next(floor, high, step)
     return low
 
 
 def _next(floor: float, high: float, step: float) -> float:
-    """Return the next rate to try: outside a bracket that is open, else in its middle."""
+    """Return the next rate to try: outside an open bracket, else in its middle."""
     if not floor:
         return high / step
     return floor * step if high == float("inf") else (floor + high) / 2

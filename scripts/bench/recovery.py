@@ -1,16 +1,16 @@
-"""How soon a cluster is whole again: machines of the provider ``local`` are preempted and killed while a robot calls.
+"""Recovery bench: time until a cluster is complete after machines of the provider ``local`` are preempted or killed.
 
-    preempted      a machine is given notice: until that is seen, and until a replacement serves. Asked: at most 5 s
-    killed         all its processes at once, its link gone: until that is seen, and until a replacement serves. Asked
+    preempted      a machine gets a notice: until that is seen, and until a replacement serves. Target: at most 5 s
+    killed         all its processes at once, its link gone: until that is seen, and until a replacement serves. Target
                    of the first: at most 1 s
     frozen         all its processes stop and its link stays up; with --gateway replica only
-    supervisor     the supervisor is killed (SIGKILL), and while nobody looks a machine as well; then it is started
-                   again: until the journal is right and the replacement asked for. Asked: at most 2 s
+    supervisor     the supervisor is killed (SIGKILL), and a machine while it is down; then the supervisor starts
+                   again: until the journal is right and the replacement requested. Target: at most 2 s
 
-With --gateway replica one of the machines is the gateway to the others, and it is always this machine that is taken.
-Then there are two figures more: until another machine has the role, and the longest time without an answer.
+With --gateway replica one of the machines is the gateway to the others, and the event always hits this machine.
+Then there are two further figures: until another machine has the role, and the longest time without an answer.
 
-A real ROS node calls ``/echo`` at the robot all the while. Asked: not one request fails. Every machine has a switch, a
+A real ROS node calls ``/echo`` at the robot all the while. Target: no request fails. Every machine has a switch, a
 proxy and a real ROS node of its own; they, the robot and the supervisor share this machine's cores.
 
     sudo .venv/bin/python scripts/bench/recovery.py                     # the whole; writes docs/benchmarks/healing.*
@@ -60,7 +60,7 @@ RATE: Final = 50.0
 
 
 def measure_case(cluster: Cluster, case: str) -> dict[str, float | None]:
-    """Let it happen once; return the figures by column, when all is whole again.
+    """Make the event happen once; return the figures by column, when the cluster is complete again.
 
     Raises:
         FailedError: it is not in time.
@@ -94,7 +94,7 @@ def measure_case(cluster: Cluster, case: str) -> dict[str, float | None]:
 
 
 def targets_of(over: Rounds) -> list[Target]:
-    """Return what was asked for of what was measured."""
+    """Return the targets of the measured cases."""
     found = []
     for case, columns in COLUMNS.items():
         for column in columns:

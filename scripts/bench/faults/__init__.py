@@ -1,8 +1,9 @@
-"""Faults in an overlay of real processes and namespaces: what ``survive.py``, ``chaos.py`` and ``soak.py`` share.
+"""Faults in an overlay of real processes and namespaces, shared by ``survive.py``, ``chaos.py`` and ``soak.py``.
 
-Sans-I/O: ``plan`` (who there is), ``network`` (a random one), ``schedule`` (what fails when), ``oracle`` (what must
-stay connected), ``accounts`` (what the records come to), ``slope`` (what grows).
+Sans-I/O: ``plan`` (the nodes), ``network`` (a random one), ``schedule`` (which fault happens when), ``oracle`` (what
+must stay connected), ``accounts`` (evaluation of the records), ``slope`` (growth).
 
 I/O: ``overlay`` (processes and links), ``link_faults`` (frames), ``clock`` (wall clocks), ``disk``, ``store``
-(servers that RIBs share), ``member`` (the process at the ends), ``records`` (what it writes down).
+(servers that RIBs share), ``member`` (the endpoint process), ``records`` (its record files).
+
 """

@@ -1,10 +1,11 @@
-"""What the records of a run come to: silences, what is missing, what came twice, what reached the wrong one.
+"""Evaluation of the records of a run: silences, missing and duplicate messages, messages at a wrong reader.
 
-Sans-I/O; moments are monotonic nanoseconds, as the members wrote them down.
+Sans-I/O. Moments are monotonic nanoseconds, as the members recorded them.
 
-A reader's life and a publisher's life make one account: numbers rise by one within it. From the first message that
-came on, each number is to come once, or its loss is to be told; what a killed publisher had not delivered nobody can
-tell.
+One incarnation of a reader and one of a publisher make one account: numbers rise by one within it. From the first
+message that arrived, each number must arrive once, or its loss must be reported. What a killed publisher had not
+delivered cannot be reported.
+
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ from gdp.message.loss import LossReason
 
 __all__ = ["Account", "Books", "Silence", "Timeline"]
 
-UNCONFIRMED_S: Final = 2.0  # what came so shortly before a reader's death its publisher may take for lost
+UNCONFIRMED_S: Final = 2.0  # the publisher may count a message as lost that came so shortly before a reader's death
 _SECOND_NS: Final = 1_000_000_000
 
 
 class Silence(NamedTuple):
-    """A time without a message at a reader, while it had to be reached."""
+    """Interval without a message at a reader, while it had to be reached."""
 
     channel: int
     reader: str
@@ -36,13 +37,13 @@ class Silence(NamedTuple):
 
     @property
     def seconds(self) -> float:
-        """Return its length."""
+        """Return its length in seconds."""
         return (self.end_ns - self.begin_ns) / _SECOND_NS
 
 
 @dataclass(slots=True)
 class Account:
-    """What one life of a reader had of one life of a publisher; ``counts``: by number, how often it came, to 255."""
+    """Messages of one incarnation of a publisher at one of a reader; ``counts``: deliveries by number, up to 255."""
 
     counts: bytearray = field(default_factory=bytearray)
     first: int = 0
@@ -50,7 +51,7 @@ class Account:
     doubled: int = 0
 
     def add(self, number: int) -> None:
-        """Take a message."""
+        """Record a message."""
         self.first = self.first or number
         if number >= len(self.counts):
             self.counts.extend(bytes(number + 1 - len(self.counts) + 4_096))
@@ -60,25 +61,25 @@ class Account:
         self.last = max(self.last, number)
 
     def missing(self, until: int) -> int:
-        """Return how many numbers did not come, from the first that did up to one."""
+        """Return how many numbers did not arrive, from the first that did up to one."""
         if not self.first:
             return 0
         return max(until + 1 - self.first, 0) - sum(map(bool, self.counts[self.first : until + 1]))
 
 
 class Timeline:
-    """When something had to be connected: changes in the order of time."""
+    """Intervals in which something had to be connected: changes in the order of time."""
 
     def __init__(self) -> None:
         self._changes: list[tuple[int, bool]] = []
 
     def note(self, at_ns: int, *, connected: bool) -> None:
-        """Note how it is from now on."""
+        """Record the state from now on."""
         if not self._changes or self._changes[-1][1] != connected:
             self._changes.append((at_ns, connected))
 
     def stretches(self, begin_ns: int, end_ns: int) -> Iterator[tuple[int, int]]:
-        """Yield the parts of a time in which it had to be connected throughout."""
+        """Yield the parts of an interval in which it had to be connected throughout."""
         marks = [*self._changes, (end_ns, False)]
         for (from_ns, is_connected), (to_ns, _) in pairwise(marks):
             if is_connected and max(from_ns, begin_ns) < min(to_ns, end_ns):
@@ -86,7 +87,7 @@ class Timeline:
 
 
 class Books:
-    """The accounts of all readers, callers and publishers of a run.
+    """Accounts of all readers, callers and publishers of a run.
 
     Args:
         plan: the network.
@@ -94,10 +95,12 @@ class Books:
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
-        # by channel, reader, the reader's life, the publisher's life
+        # by channel, reader, the reader's incarnation, the publisher's incarnation
         self.accounts: defaultdict[tuple[int, str, int, int], Account] = defaultdict(Account)
         self.told: defaultdict[tuple[int, str, int], int] = defaultdict(int)  # by channel, reader, its life
-        self.told_between: defaultdict[tuple[int, str, int], int] = defaultdict(int)  # the same, of before that life
+        self.told_between: defaultdict[tuple[int, str, int], int] = defaultdict(
+            int
+        )  # the same, of before that incarnation
         self.published: defaultdict[tuple[int, int], list[int]] = defaultdict(list)  # channel, life -> moments
         self.arrivals_ns: defaultdict[tuple[int, str], list[int]] = defaultdict(list)
         self.wrong: list[str] = []
@@ -108,7 +111,7 @@ class Books:
         self.failed: list[tuple[int, int]] = []
 
     def take(self, member: str, life: int, records: Iterator[Record]) -> None:
-        """Take what a life of a member wrote down."""
+        """Read the records of one incarnation of a member."""
         for each in records:
             if each.kind == Kind.DELIVERED:
                 self.accounts[each.channel, member, life, each.life].add(each.number)
@@ -149,11 +152,11 @@ class Books:
                         yield Silence(channel, reader, *part)
 
     def incomplete(self, is_last_life: Callable[[str, int], bool], until_ns: int) -> list[str]:
-        """Return what reliable flows lack that no reader was told, in words; and what came twice, of any flow.
+        """Return unreported losses of reliable flows, in words, and duplicates of any flow.
 
         Args:
-            is_last_life: whether a life of a member goes on to the end of the run.
-            until_ns: what was published later may still be under way.
+            is_last_life: whether an incarnation of a member continues to the end of the run.
+            until_ns: messages that were published later may still be in flight.
         """
         found = []
         of_reader: defaultdict[tuple[int, str, int], list[tuple[int, Account]]] = defaultdict(list)
@@ -170,7 +173,7 @@ class Books:
             for at, (source_life, account) in enumerate(accounts):
                 sent = sum(at_ns <= until_ns for at_ns in self.published[channel, source_life])
                 is_last = is_last_life(flow.publisher, source_life) and is_last_life(reader, life)
-                # a later life is missed from its beginning on, also if only a reader's former life knew an earlier one
+                # losses of a later incarnation count from its start, also if only a former reader's incarnation knew an earlier one
                 is_later = at or self._known_before(channel, reader, life, source_life)
                 head = account.first - 1 if is_later else 0
                 least += account.missing(sent if is_last else account.last)
@@ -187,7 +190,7 @@ class Books:
         return found
 
     def _gap(self, channel: int, reader: str, life: int, source_life: int) -> int:
-        """Return how many messages came to neither this life of a reader nor to an earlier one, in between."""
+        """Return how many messages in between reached neither this incarnation of a reader nor an earlier one."""
         before = [
             account.last
             for (of, who, earlier, source), account in self.accounts.items()
@@ -197,7 +200,7 @@ class Books:
         return max(account.first - 1 - max(before), 0) if before else 0
 
     def _known_before(self, channel: int, reader: str, life: int, source_life: int) -> dict[int, int]:
-        """Return the last number by earlier lives of a publisher that earlier lives of a reader had messages of."""
+        """Return the last number of earlier publisher incarnations that earlier incarnations of a reader received."""
         known: dict[int, int] = {}
         for (of, who, earlier, source), account in self.accounts.items():
             if (of, who) == (channel, reader) and earlier < life and source < source_life:
@@ -205,18 +208,18 @@ class Books:
         return known
 
     def _tail(self, channel: int, reader: str, life: int) -> int:
-        """Return what lives of a publisher said after a reader's former lives had last heard them, and died."""
+        """Return what publisher incarnations sent after a reader's former ones last received from them, and died."""
         own = {source for of, who, its, source in self.accounts if (of, who, its) == (channel, reader, life)}
         known = self._known_before(channel, reader, life, max(own))
         lost = (len(self.published[channel, source]) - last for source, last in known.items() if source not in own)
         return sum(max(each, 0) for each in lost)
 
     def miscalled(self, until_ns: int, is_over: Callable[[str, int], bool]) -> list[str]:
-        """Return the calls without an end, or with more than one.
+        """Return the calls without a result, or with more than one.
 
         Args:
-            until_ns: what was called later may still be under way.
-            is_over: whether a life of a member ended before its calls did.
+            until_ns: calls that began later may still be in progress.
+            is_over: whether an incarnation of a member ended before its calls did.
         """
         found = []
         for (channel, client, life, number), (since_ns, ends) in self._calls.items():

@@ -1,11 +1,12 @@
-"""The wall clock of a single process, stepped from outside.
+"""Wall clock of a single process, stepped from outside.
 
-I/O. The machine's clock is everybody's, and a time namespace shifts only the monotonic one. So a process that
-may be stepped is started through this module, which replaces ``time.time`` and ``time.time_ns`` before anything else is
-loaded; the offset is eight bytes of a file that the bench writes. Nothing of the product knows of it, and what asks the
-kernel past the module ``time`` is not stepped.
+I/O. All processes share the machine's clock, and a time namespace shifts only the monotonic one. So a process that may
+be stepped starts through this module, which replaces ``time.time`` and ``time.time_ns`` before it loads anything else.
+The offset is eight bytes of a file that the bench writes. The product does not know of it. Calls to the kernel that
+bypass the module ``time`` are not stepped.
 
     python -m faults.clock OFFSET_FILE gdp.cli.switch --config switch.yaml
+
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _OFFSET: Final = struct.Struct("=q")  # nanoseconds
 
 
 class Clock:
-    """The offset of one process, as the bench sets it; it outlives the process.
+    """Offset of the clock of one process, as the bench sets it; it outlives the process.
 
     Args:
         path: a file to create.
@@ -35,13 +36,13 @@ class Clock:
         path.write_bytes(_OFFSET.pack(0))
 
     def step(self, seconds: float) -> None:
-        """Let the clock be so far ahead of the machine's (behind, if negative) from now on."""
+        """Set the clock ahead of the machine's by so many seconds (behind, if negative) from now on."""
         with self.path.open("r+b") as file:
             file.write(_OFFSET.pack(round(seconds * 1e9)))
 
 
 def follow(path: Path) -> None:
-    """Let this process's wall clock be off by what the file says, whenever it is asked."""
+    """Shift this process's wall clock by the offset in the file; each query reads it."""
     with path.open("r+b") as file:
         offset = mmap.mmap(file.fileno(), _OFFSET.size)
     machine_ns = time.time_ns

@@ -1,6 +1,7 @@
-"""The disk of a run: a small file system in memory that can be full, and what RIBs must say about it.
+"""Disk of a run: a small file system in memory that can be full, and the log lines that RIBs must write about it.
 
-I/O. A tmpfs in the run's own folder, named in its record.
+I/O. A tmpfs in the folder of the run; the record of the run names it.
+
 """
 
 from __future__ import annotations
@@ -27,10 +28,10 @@ _BLOCKS_BYTES: Final = (1 << 20, 1 << 12)
 
 
 class Disk:
-    """A small file system.
+    """Small file system.
 
     Args:
-        run: in whose folder it is mounted, and whose end unmounts it.
+        run: run whose folder holds the mount, and whose end unmounts it.
 
     Raises:
         LocalError: the kernel refuses.
@@ -46,11 +47,11 @@ class Disk:
         return self._path / "ballast"
 
     def snapshot(self, node: str) -> Path:
-        """Return where the RIB of a switch keeps its snapshot."""
+        """Return the path of the snapshot of the RIB at a switch."""
         return self._path / f"rib-{node}.sqlite"
 
     def fill(self) -> None:
-        """Leave no block free."""
+        """Fill every block."""
         with self._ballast.open("wb", buffering=0) as file:
             for size in _BLOCKS_BYTES:
                 try:
@@ -61,20 +62,20 @@ class Disk:
                         raise
 
     def free(self) -> None:
-        """Give the blocks back."""
+        """Free the blocks."""
         self._ballast.unlink(missing_ok=True)
 
     def broken(self) -> list[str]:
-        """Return the snapshots that a RIB could not make sense of."""
+        """Return the snapshots that a RIB could not read."""
         return sorted(name for name in os.listdir(self._path) if name.endswith(BROKEN))
 
 
 def snapshot_faults(who: str, log: str, *, is_alive: bool) -> Iterator[str]:
-    """Yield, in words, what a life of a RIB said wrongly about its snapshot.
+    """Yield, in words, what an incarnation of a RIB logged wrongly about its snapshot.
 
     Args:
-        log: all that it logged.
-        is_alive: it runs, the disk has space, and time enough has passed to write.
+        log: its whole log.
+        is_alive: it runs, the disk has free space, and it had enough time to write.
     """
     is_failing = has_started = False
     for line in log.splitlines():

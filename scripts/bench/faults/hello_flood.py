@@ -1,8 +1,9 @@
-"""A stranger on a link that floods it with hellos: a process of its own, started by ``security.py flood``.
+"""Stranger on a link that floods it with hellos: a process of its own, started by ``security.py flood``.
 
-I/O. One packet socket. Its only argument is JSON: ``iface``; ``frames``, a file of frames from the header on,
-each behind its length (4 bytes); ``rate`` a second; ``seconds``; ``source``, an address, or nothing for many invented
-ones. It prints one line of JSON when it begins and one when it ends: how many frames left.
+I/O. One packet socket. Its only argument is JSON: ``iface``; ``frames``, a file of frames from the header on, each
+after its length (4 bytes); ``rate`` a second; ``seconds``; ``source``, an address, or nothing for many invented ones.
+It prints one line of JSON at its begin and one at its end: the number of frames sent.
+
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def main() -> None:
             sent += batch.send(sink, chosen, _BROADCAST + sources[(at // _BATCH) % len(sources)], drops)
             at += _BATCH
         if due > told["rate"] / 100:
-            begun_s += (due - _BATCH) / told["rate"]  # what could not be sent in time is not caught up with
+            begun_s += (due - _BATCH) / told["rate"]  # frames that could not be sent in time are skipped
     say(sent=sent, seconds=time.monotonic() - begun_s)
 
 

@@ -1,10 +1,11 @@
-"""A member that turned hostile and floods: a process of its own, started by ``security.py flood``.
+"""Member that turned hostile and floods: a process of its own, started by ``security.py flood``.
 
 I/O. It is a switch (``names``, ``joins``, ``revocations``) or a proxy that reads and publishes (``reports``,
-``parts``), as real as every other one, and goes on to be that while it floods: its frames leave from its own address,
-and its session stays up. Its only argument is JSON: ``what``; ``config``, its file; ``frames``, how many different
-ones; ``rate`` a second; ``seconds``; of a proxy ``reads`` and ``publishes``, topics. It prints a line of JSON when it
-takes part, begins to flood at SIGUSR1, and prints another line when it has ended.
+``parts``). It is as real as every other node and continues to work while it floods: its frames leave from its own
+address, and its session stays up. Its only argument is JSON: ``what``; ``config``, its file; ``frames``, how many
+different ones; ``rate`` a second; ``seconds``; for a proxy ``reads`` and ``publishes``, topics. It prints a line of
+JSON when it takes part, begins to flood at SIGUSR1, and prints another line at the end.
+
 """
 
 from __future__ import annotations
@@ -77,7 +78,7 @@ class HostileSwitch:
         return next(each.mac for each in port.neighbours.values())
 
     def names(self) -> _Frames:
-        """Yield frames to names that nobody has."""
+        """Yield frames to names that no node advertises."""
         for number in count():
             header = Header(
                 Kind.DATA, Flag.LAST, HOPS_MAX, 1, 100, number, 0, 1, 77, secrets.token_bytes(32), self._identity.name
@@ -85,7 +86,7 @@ class HostileSwitch:
             yield encode(header) + bytes(100)
 
     def joins(self) -> _Frames:
-        """Yield joins of a tree that it is part of, each a new one that holds."""
+        """Yield joins of a tree that it is part of, each new and valid."""
         multicast = self._switch.multicast
         tree = next(each for each in multicast.trees.all() if each.above is not None)
         while tree.above is not None and tree.above_name is not None:
@@ -112,7 +113,7 @@ class HostileProxy:
         self._publisher = self._end.advertise(told["publishes"], reliable=True)
 
     def is_ready(self) -> bool:
-        """Return whether it reads, and is read."""
+        """Return whether it reads a topic and has a reader."""
         writer_proxies = self._end.member.writer_proxies_of(self._topic)
         return any(feed.state is WriterProxyState.LIVE for feed in writer_proxies) and self._publisher.readers > 0
 
@@ -121,7 +122,7 @@ class HostileProxy:
         return self._end.member.attachment.hello_protocol.all_up()[0].mac
 
     def reports(self) -> _Frames:
-        """Yield reports of a reader that lacks everything, under the key that it has agreed with the publisher."""
+        """Yield AckNacks of a reader that lacks everything, under the key that it has agreed with the publisher."""
         feed = next(
             each for each in self._end.member.writer_proxies_of(self._topic) if each.state is WriterProxyState.LIVE
         )
@@ -143,7 +144,7 @@ class HostileProxy:
 
 
 def _flood(node: HostileSwitch | HostileProxy, frames: list[bytes], rate: float, seconds: float) -> tuple[int, float]:
-    """Send frames over and over, beside what the node itself does; return how many left, and the time that took."""
+    """Send frames repeatedly while the node itself continues to work; return how many left, and the time taken."""
     port = next(iter(node.plane.ports.values()))
     macs = node.neighbour() + port.mac
     sink, drops, batch = open_port(port.ifname), [0] * DROP_COUNTERS, make_batch(2_000)
@@ -160,7 +161,7 @@ def _flood(node: HostileSwitch | HostileProxy, frames: list[bytes], rate: float,
         chosen = [frames[(at + each) % len(frames)] for each in range(_BATCH)]
         sent += batch.send(sink, chosen, macs, drops)
         at += _BATCH
-        due_s = max(due_s + _BATCH / rate, now_s - 0.01)  # what could not be sent in time is not caught up with
+        due_s = max(due_s + _BATCH / rate, now_s - 0.01)  # frames that could not be sent in time are skipped
     return sent, time.monotonic() - begun_s
 
 

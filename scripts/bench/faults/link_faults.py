@@ -1,13 +1,13 @@
-"""Frames lost, doubled and delayed on a link between two namespaces, while its carrier stays up.
+"""Link faults: frames lost, doubled and delayed between two namespaces, while the carrier of the link stays up.
 
-I/O. Needs root. Kernels without netem have no other way. A program stands at the ingress of the receiving
-device, before the switch's own, and draws a number for each fault::
+I/O. Needs root. This also works on kernels without netem. A program at the ingress of the receiving
+device, before the switch's own, draws a number for each fault::
 
     frame -> lose it | double it | send it through the delay line | pass it on to the switch
 
-The delay line is a veth pair in the same namespace, whose other end a thread of this process reads: it gives each frame
-back after a random time, so frames overtake each other. A frame that comes back carries a mark and is passed on.
-Everything hangs on descriptors of this process and ends with it.
+The delay line is a veth pair in the same namespace, whose other end a thread of this process reads. It returns each
+frame after a random time, so frames overtake each other. A returned frame carries a mark and is passed on.
+All of it depends on descriptors of this process and ends with them.
 Source: Linux, include/uapi/linux/bpf.h (``BPF_TCX_INGRESS``, ``BPF_F_BEFORE``, ``bpf_clone_redirect``).
 """
 
@@ -54,7 +54,7 @@ _BATCH: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class FrameFaults:
-    """Chances, 0 to 1, of each frame that comes in; ``delay_s``: a delayed frame waits a random time up to this."""
+    """Chances, 0 to 1, of each received frame; ``delay_s``: upper bound of the random delay of a delayed frame."""
 
     lost: float = 0.0
     doubled: float = 0.0
@@ -77,7 +77,7 @@ class LinkFaults:
         self.close()
 
     def set(self, namespace: Path, ifname: str, faults: FrameFaults) -> None:
-        """Let frames that come in at a device suffer from now on.
+        """Apply faults to frames that a device receives, from now on.
 
         Raises:
             LocalError: the kernel refuses.
@@ -95,13 +95,13 @@ class LinkFaults:
         end.write(faults, line)
 
     def clear(self, namespace: Path, ifname: str) -> None:
-        """Let frames pass again; harmless where they do."""
+        """Remove the faults of a device; harmless where it has none."""
         end = self._ends.pop((namespace, ifname), None)
         if end is not None:
             self._close(namespace, end)
 
     def close(self) -> None:
-        """Let all frames pass again."""
+        """Remove all faults."""
         while self._ends:
             (namespace, _), end = self._ends.popitem()
             with contextlib.suppress(OSError):  # the namespace went first, and its devices with it
@@ -116,7 +116,7 @@ class LinkFaults:
 
 
 class _End:
-    """The program at one device; made and closed inside its namespace."""
+    """Program at one device; made and closed inside its namespace."""
 
     def __init__(self, ifname: str, number: int) -> None:
         self._names = f"late{number}a", f"late{number}b"
@@ -130,7 +130,7 @@ class _End:
         self._far: socket.socket | None = None
 
     def write(self, faults: FrameFaults, line: int) -> None:
-        """Take these chances from the next frame on."""
+        """Apply these chances from the next frame on."""
         chances = (round(share * _WHOLE) for share in (faults.lost, faults.doubled, faults.delayed))
         self._settings.put(_FIRST, _SETTINGS.pack(*chances, line))
 
@@ -165,7 +165,7 @@ class _End:
 
 
 class _DelayLine:
-    """The thread that gives frames back late."""
+    """Thread that returns frames late."""
 
     def __init__(self) -> None:
         self._epoll = select.epoll()
@@ -178,14 +178,14 @@ class _DelayLine:
         self._thread.start()
 
     def add(self, far: socket.socket, delay_s: float) -> None:
-        """Carry what comes at this socket."""
+        """Delay the frames of this socket."""
         with self._lock:
             if far.fileno() not in self._sockets:
                 self._epoll.register(far.fileno(), select.EPOLLIN)
             self._sockets[far.fileno()] = far, delay_s
 
     def remove(self, far: socket.socket) -> None:
-        """Carry nothing more; what waits is lost."""
+        """Stop; pending frames are lost."""
         with self._lock:
             if self._sockets.pop(far.fileno(), None) is not None:
                 self._epoll.unregister(far.fileno())
@@ -267,7 +267,7 @@ def _faulty(settings: int) -> bytes:
 
 
 def _returning(ifindex: int) -> bytes:
-    """Return the program at the near end of a delay line: what comes back comes in at the device once more."""
+    """Return the program at the near end of a delay line: a returned frame arrives at the device once more."""
     code = Assembler()
     code.move(Reg.R6, Reg.R1)
     _mark(code, _MARK)

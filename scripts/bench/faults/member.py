@@ -1,8 +1,9 @@
-"""A member at the end of a network under test: publishes, reads, serves, calls, and writes it all down.
+"""Member at the end of a network under test: publishes, reads, serves, calls, and records all of it.
 
-Process of its own, started by ``faults.overlay`` with one argument of JSON. What arrived is appended to a file
-of records at once, so that nothing is lost when this process is killed. A message names its channel, its publisher and
-the publisher's life, so a message that reaches the wrong reader is seen as such.
+Process of its own, started by ``faults.overlay`` with one argument of JSON. Each arrival is appended to a file of
+records at once, so that nothing is lost when this process is killed. A message names its channel, its publisher and
+the publisher's incarnation, so a message at a wrong reader is detected.
+
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ from gdp.service.dispatch import Ask, Dispatch, Failure
 
 __all__: list[str] = []
 
-_HEAD: Final = struct.Struct("!8sHHIQ")  # token of the channel, channel, publisher, life, number
+_HEAD: Final = struct.Struct("!8sHHIQ")  # token of the channel, channel, publisher, incarnation, number
 _REQUEST: Final = struct.Struct("!8sQ")  # token, number of the call
-_BEHIND_S: Final = 0.5  # what was not published for so long is not caught up with
-_LOOK_S: Final = 0.25  # between two looks at what was lost
+_BEHIND_S: Final = 0.5  # messages that are overdue for so long are skipped
+_LOOK_S: Final = 0.25  # between two checks for losses
 
 
 class Station(End):
@@ -49,11 +50,11 @@ class Station(End):
         return self._topics[name].name
 
     def call(self, name: str) -> Publisher:
-        """Call a name from now on; return the stream that all its servers hear."""
+        """Call a name from now on; return the stream that all its servers receive."""
         return self.member.call(self._topics[name], b"bench")
 
     def name_of(self, name: str) -> Name:
-        """Return what a topic or service is called in the overlay."""
+        """Return the overlay name of a topic or service."""
         return self._topics[name].name
 
 
@@ -73,7 +74,7 @@ class Source:
         self._readers = -1
 
     def go_on(self, now_s: float) -> None:
-        """Publish what is due."""
+        """Publish all messages that are due."""
         readers = self._publisher.readers
         if readers != self._readers:
             self._readers = readers
@@ -89,7 +90,7 @@ class Source:
 
 
 class Caller:
-    """Calls one service at an even rate: all replicas are asked, the first answer counts."""
+    """Caller of one service at an even rate: all replicas receive the request, the first response counts."""
 
     def __init__(self, station: Station, told: dict[str, Any], token: bytes, life: int, out: RecordWriter) -> None:
         self._station, self._token, self._out, self._life = station, token, out, life
@@ -101,12 +102,12 @@ class Caller:
         self._count = 0
 
     def next_s(self) -> float:
-        """Return the monotonic second of what is due next."""
+        """Return the next deadline, in monotonic seconds."""
         timer_s = self._dispatch.get_timer()
         return self.due_s if timer_s is None else min(self.due_s, timer_s)
 
     def go_on(self, now_s: float) -> None:
-        """Learn of servers, call what is due, end what took too long."""
+        """Discover servers, make the calls that are due, end those that time out."""
         peers = set(self._station.member.peers(self._name)) or set(self._station.member.heard(self._name))
         for server in set(self._dispatch.servers) - peers:
             self._dispatch.gone(server, now_s, "gone")
@@ -119,7 +120,7 @@ class Caller:
         self._send(now_s)
 
     def take(self, message: Message, now_s: float) -> None:
-        """Take a server's answer."""
+        """Handle a server's response."""
         if not message.private:
             return
         token, number = _REQUEST.unpack_from(message.delivered.message)
@@ -141,7 +142,7 @@ class Caller:
                 lambda _: self._note(Kind.ANSWERED, call),
                 partial(self._failed, call),
             )
-        except LocalError:  # no server is there: the caller hears so at once
+        except LocalError:  # no server is there: the caller is notified at once
             self._note(Kind.FAILED, call)
 
     def _failed(self, call: int, failure: Failure, reason: str) -> None:
@@ -165,7 +166,7 @@ class Caller:
 
 
 class Reading:
-    """What came on one topic."""
+    """Messages received on one topic."""
 
     def __init__(self, channel: int, token: bytes, out: RecordWriter) -> None:
         self._channel, self._token, self._out = channel, token, out
@@ -173,7 +174,7 @@ class Reading:
         self._look_at_s = 0.0
 
     def look(self, station: Station, name: Name, now_s: float) -> None:
-        """Write down what the member says was lost, now and then."""
+        """Record reported losses, at intervals."""
         if now_s < self._look_at_s:
             return
         self._look_at_s = now_s + _LOOK_S
@@ -183,7 +184,7 @@ class Reading:
         self._told = told
 
     def take(self, message: Message, now_s: float) -> None:
-        """Write a message down; one that is not of this channel is a wrong one."""
+        """Record a message; one of another channel counts as wrong."""
         del now_s
         token, channel, publisher, life, number = _HEAD.unpack_from(message.delivered.message)
         at_ns = time.monotonic_ns()
@@ -194,13 +195,13 @@ class Reading:
 
 
 class Serving:
-    """Answers each request with itself."""
+    """Server that echoes each request."""
 
     def __init__(self, station: Station, name: Name, token: bytes) -> None:
         self._station, self._name, self._token = station, name, token
 
     def take(self, message: Message, now_s: float) -> None:
-        """Answer a client; one that has gone meanwhile gets nothing."""
+        """Answer a client; a client that has gone meanwhile gets nothing."""
         del now_s
         body = message.delivered.message
         if body[: len(self._token)] == self._token:
@@ -211,7 +212,7 @@ class Serving:
 
 
 class Churning:
-    """Takes a topic up and leaves it, over and over."""
+    """Topic that is subscribed or published, and left, repeatedly."""
 
     def __init__(self, station: Station, told: dict[str, Any], begin: Callable[[dict[str, Any]], None]) -> None:
         self._station, self._told, self._begin = station, told, begin
@@ -221,7 +222,7 @@ class Churning:
         self._is_taken_up = False
 
     def go_on(self, now_s: float) -> None:
-        """Change what is due."""
+        """Apply the changes that are due."""
         if now_s < self.due_s:
             return
         self.due_s = max(self.due_s + self._every_s, now_s)
@@ -235,7 +236,7 @@ class Churning:
 
 
 def main() -> None:
-    """Be a member until ended."""
+    """Run as a member until ended."""
     told: dict[str, Any] = json.loads(sys.argv[1])
     out, life = RecordWriter(Path(told["records"])), told["life"]
     tokens = {int(channel): bytes.fromhex(token) for channel, token in told["tokens"].items()}
@@ -263,7 +264,7 @@ def main() -> None:
     churn = [Churning(station, each, begin_churn) for each in told["churn"]]
 
     def begin_spare(*_: object) -> None:
-        """Take up the next spare flow."""
+        """Start the next spare flow."""
         each = next(spare)
         token = tokens[each["channel"]]
         if each["publishes"]:

@@ -1,4 +1,4 @@
-"""A random network for a chaos run, the same for the same seed.
+"""Random network for a chaos run, the same for the same seed.
 
 Sans-I/O. Four domains in three tiers (``top`` over ``middle``, that over ``left`` and ``right``), each a ring of
 switches with some chords; domains of neighbouring tiers are joined at two pairs of borders, so any single switch or
@@ -25,7 +25,7 @@ _READERS: Final = ("read1", "read2", "read3")
 
 
 def random_network(seed: int, switches: int = 14, *, rate: float = 1.0, one_rib: bool = False) -> Plan:
-    """Return a network of so many switches, with its members, flows and services.
+    """Return a network with so many switches, and its members, flows and services.
 
     Args:
         switches: at least 12.

@@ -1,8 +1,8 @@
-"""Which ends must be able to talk, by graph and policy, while some things are broken.
+"""Oracle of connectivity: which endpoints must be able to communicate, by graph and policy, during faults.
 
-Sans-I/O. All domains of a plan trust each other and let each other's traffic pass, so policy allows every way and what
-must be connected is what the graph connects: both members live, each at a live switch, and a way of live switches and
-links between these. A RIB is not needed for what is known already, and is reached the same way.
+Sans-I/O. All domains of a plan trust each other and let each other's traffic pass, so policy allows every path.
+The graph decides what must be connected: both members run, each at a running switch, with a path of working switches
+and links between these. Known names need no RIB, and a RIB is reached the same way.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ __all__ = ["Broken", "Oracle"]
 
 @dataclass(slots=True)
 class Broken:
-    """What does not work now: switches, links (both ends), members; and where moved members are."""
+    """State of the faults: switches, links (both ends) and members that do not work; locations of moved members."""
 
     switches: set[str] = field(default_factory=set)
     links: set[frozenset[str]] = field(default_factory=set)
@@ -26,10 +26,10 @@ class Broken:
 
 
 class Oracle:
-    """Says what must be connected.
+    """Oracle of the pairs that must be connected.
 
     Args:
-        plan: the network when all is well.
+        plan: the network without faults.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -63,7 +63,7 @@ class Oracle:
         return bool(live) and self.part_of(min(live), broken) == live
 
     def must_talk(self, a: str, b: str, broken: Broken) -> bool:
-        """Return whether two members must be able to talk."""
+        """Return whether two members must be able to communicate."""
         homes = [broken.at.get(member, self._plan.home(member)) for member in (a, b)]
         if {a, b} & broken.members or set(homes) & broken.switches:
             return False

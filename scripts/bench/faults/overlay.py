@@ -1,7 +1,8 @@
-"""The real processes and links of a plan, and every fault that can be made there.
+"""Overlay of a plan: its real processes and links, and every fault that can be made there.
 
-I/O. Namespaces and processes through ``gdp.simulation``, the commands that robots run, and ``faults.member``
-at the ends. A process is called ``switch s1``, ``rib s1`` or ``member m1``. Each may be killed, restarted, frozen.
+I/O. Namespaces and processes through ``gdp.simulation``, the commands that robots run, and ``faults.member`` at the
+ends. A process is called ``switch s1``, ``rib s1`` or ``member m1``. Each may be killed, restarted, frozen.
+
 """
 
 from __future__ import annotations
@@ -45,15 +46,15 @@ _OWNER: Final = "owner"
 
 
 class Overlay:
-    """The network of a plan; a context manager that takes everything down.
+    """Network of a plan; a context manager that removes everything.
 
     Args:
-        run: of which the namespaces and processes are.
-        plan: who there is.
+        run: run that owns the namespaces and processes.
+        plan: the nodes.
         plane: as ``gdp-switch --data-plane``.
         has_clocks: processes may have their wall clock stepped.
-        churn_hz: how often members take up or leave what they churn, a second.
-        more: further keys of every switch's, RIB's file, by role.
+        churn_hz: how often members start or leave a churning topic, a second.
+        more: further keys of the file of every switch and RIB, by role.
         has_disk: RIBs keep snapshots on a small disk.
         in_store: switches whose RIBs share a cluster of servers; they keep no snapshots.
 
@@ -126,7 +127,7 @@ class Overlay:
     # processes
 
     def start_all(self) -> None:
-        """Start switches, RIBs, members; return when each says that it is ready."""
+        """Start switches, RIBs, members; return when each reports that it is ready."""
         for role in ("switch", "rib", "member"):
             names = [who for who in self.everybody() if who.startswith(role)]
             for who in names:
@@ -135,7 +136,7 @@ class Overlay:
                 self._processes[who].read(READY_S)
 
     def start(self, who: str) -> None:
-        """Start a process, in a life of its own."""
+        """Start a process, with a new incarnation."""
         role, _, node = who.partition(" ")
         life = self._lives[who] = self._lives.get(who, 0) + 1
         if role == "switch":
@@ -149,10 +150,10 @@ class Overlay:
         self._processes[who] = Started(self._run, f"{who} {life}", partial(self.spaces.command, node), argv)
 
     def await_ready(self, who: str) -> None:
-        """Return when a process that was started says that it is ready.
+        """Return when a started process reports that it is ready.
 
         Raises:
-            FailedError: it ended, or said nothing in time.
+            FailedError: it ended, or reported nothing in time.
         """
         self._processes[who].read(READY_S)
 
@@ -168,11 +169,11 @@ class Overlay:
         process.__exit__(None, None, None)
 
     def restart(self, who: str) -> None:
-        """Start a killed process again; not waited for."""
+        """Start a killed process again, without waiting for it."""
         self.start(who)
 
     def is_running(self, who: str) -> bool:
-        """Return whether a process was started and not killed, whatever became of it."""
+        """Return whether a process was started and not killed; it may have ended by itself."""
         return who in self._processes
 
     def died(self) -> list[str]:
@@ -188,34 +189,37 @@ class Overlay:
         return self._processes[who].pid
 
     def freeze(self, who: str) -> None:
-        """Give a process no more time."""
+        """Stop a process (SIGSTOP)."""
         self._frozen.add(who)
         os.kill(self._processes[who].pid, signal.SIGSTOP)
 
     def thaw(self, who: str) -> None:
-        """Let a frozen process go on; harmless when it is none."""
+        """Continue a frozen process; harmless when it is not frozen."""
         if who in self._frozen and who in self._processes:
             self._frozen.discard(who)
             with suppress(ProcessLookupError):
                 os.kill(self._processes[who].pid, signal.SIGCONT)
 
     def step_clock(self, who: str, seconds: float) -> None:
-        """Let a process's wall clock be so far off the machine's."""
+        """Set a process's wall clock off the machine's by so many seconds."""
         self._clocks[who].step(seconds)
 
     def read(self, member: str) -> Iterator[tuple[int, Iterator[Record]]]:
-        """Yield, by life, what a member wrote down since the last call."""
+        """Yield, by incarnation, what a member recorded since the last call."""
         for life in range(1, self._lives.get(f"member {member}", 0) + 1):
             if (member, life) not in self._records:
                 self._records[member, life] = RecordReader(self._record_file(member, life))
             yield life, self._records[member, life].read()
 
     def signal(self, who: str, number: signal.Signals) -> None:
-        """Send a signal: SIGHUP lets a switch read its revocations, SIGUSR1 a member begin its next spare flow."""
+        """Send a signal.
+
+        SIGHUP makes a switch read its revocations, SIGUSR1 makes a member start its next spare flow.
+        """
         os.kill(self._processes[who].pid, number)
 
     def log_tail(self, who: str, lines: int = 15) -> str:
-        """Return the end of a process's log, of its latest life."""
+        """Return the end of a process's log, of its latest incarnation."""
         path = self.directory / f"{who} {self._lives.get(who, 0)}".replace(" ", "-")
         with suppress(FileNotFoundError):
             text = path.with_name(path.name + ".log").read_text(encoding="utf-8", errors="replace")
@@ -227,7 +231,7 @@ class Overlay:
         return self.disk is not None and node not in self._in_store
 
     def logs(self, who: str) -> Iterator[tuple[int, str]]:
-        """Yield each life of a process, and all that it logged."""
+        """Yield each incarnation of a process, and its whole log."""
         for life in range(1, self._lives.get(who, 0) + 1):
             path = self.directory / f"{who} {life}.log".replace(" ", "-")
             yield life, path.read_text(encoding="utf-8", errors="replace")
@@ -239,7 +243,7 @@ class Overlay:
         self.spaces.cut(a, b)
 
     def revoke(self, member: str) -> None:
-        """Take a member's membership back: each switch is given the statement."""
+        """Revoke a member's membership: each switch receives the statement."""
         label = self.plan.topology.domain_of(member).label
         authority = load_domain(self.directory / "domains" / label)
         identity = load_identity(self.directory / "nodes" / f"proxy-{member}", time.time())
@@ -251,16 +255,16 @@ class Overlay:
                 self.signal(f"switch {node}", signal.SIGHUP)
 
     def mend(self, a: str, b: str) -> None:
-        """Bring a link back."""
+        """Restore a link."""
         self.spaces.mend(a, b)
 
     def disturb(self, a: str, b: str, faults: FrameFaults) -> None:
-        """Let the frames of a link suffer, both ways."""
+        """Apply faults to the frames of a link, both ways."""
         for own, other in ((a, b), (b, a)):
             self._links.set(self.spaces.path(own), other, faults)
 
     def calm(self, a: str, b: str) -> None:
-        """Let the frames of a link pass again."""
+        """Remove the faults of a link."""
         for own, other in ((a, b), (b, a)):
             self._links.clear(self.spaces.path(own), other)
 
@@ -269,11 +273,11 @@ class Overlay:
         return netns_files.inside(self.spaces.path(node), partial(_received, neighbours))
 
     def at(self, mover: str) -> str:
-        """Return where a member is plugged in."""
+        """Return the switch that a member is plugged into."""
         return self._at[mover]
 
     def move(self, mover: str, to: str) -> None:
-        """Pull the cable of a mover at its switch and put it in at another one: the mover keeps its device."""
+        """Pull the cable of a mover at its switch and plug it into another one; the mover keeps its device."""
         there = os.open(self.spaces.path(to), os.O_RDONLY | os.O_CLOEXEC)
         try:
             netns_files.inside(self.spaces.path(self._at[mover]), partial(_hand_over, mover, there))
@@ -320,7 +324,7 @@ class Overlay:
         return path
 
     def _told(self, member: str, life: int) -> dict[str, object]:
-        """Return what a member process is told: who it is, what it takes part in."""
+        """Return the settings of a member process: its identity, and its flows and services."""
         parts = ("publish", "read", "serve", "call", "spare", "churn")
         told: dict[str, list[dict[str, object]]] = {part: [] for part in parts}
         for channel, what in self.plan.channels(member):
@@ -350,11 +354,11 @@ class Overlay:
         return [*self.plan.channels(member), *self.plan.spares(member), *self.plan.churns(member)]
 
     def _token(self, channel: int) -> bytes:
-        """Return what every message of a channel begins with, and of no other."""
+        """Return the prefix of every message of a channel, which no other channel has."""
         return struct.pack("!I", int(self._run.id, 16)) + struct.pack("!I", channel)
 
     def _admit(self, member: str) -> None:
-        """Let a member do what it takes part in, and write its configuration."""
+        """Give a member its delegations, and write its configuration."""
         identity = self.directory / "nodes" / f"proxy-{member}"
         owner = self.directory / _OWNER
         for _, what in self._parts(member):
@@ -372,7 +376,7 @@ class Overlay:
         content = {
             "identity": str(identity),
             "domain": {"root": roots.pop(own), "trusts": list(roots.values())},
-            "iface": self.plan.home(member),  # a device is called like the neighbour it first leads to
+            "iface": self.plan.home(member),  # a device has the name of the neighbour it first leads to
         }
         self._write(self.directory / f"end-{member}.yaml", content)
 

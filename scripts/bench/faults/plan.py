@@ -1,7 +1,8 @@
-"""A network under test as data: switches, RIBs, members, what they say to each other.
+"""Plan of a network under test, as data: switches, RIBs, members, and their flows and services.
 
-Sans-I/O. A member is a node of the topology without a switch of its own, joined to its home switch by one link; that
+Sans-I/O. A member is a node of the topology without a switch of its own, joined to its home switch by one link. That
 link may be moved to the other switches it lists.
+
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ RIB_IFNAME = "rib"
 
 @dataclass(frozen=True, slots=True)
 class Flow:
-    """A topic with one publisher; ``size``: bytes of each message."""
+    """Topic with one publisher; ``size``: bytes of each message."""
 
     topic: str
     publisher: str
@@ -30,7 +31,7 @@ class Flow:
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """A service with its replicas and its clients."""
+    """Service with its replicas and its clients."""
 
     name: str
     servers: tuple[str, ...]
@@ -41,7 +42,7 @@ class Service:
 
 @dataclass(frozen=True, slots=True)
 class Churn:
-    """A topic that a member reads (or publishes) now and then: it begins and ends over and over."""
+    """Topic that a member reads (or publishes) at intervals: it starts and ends repeatedly."""
 
     topic: str
     member: str
@@ -50,15 +51,15 @@ class Churn:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Everything of one run but its faults.
+    """One run without its faults.
 
     Args:
         topology: members are nodes of it, too.
         members: those nodes that run no switch.
-        homes: of members (and switches) whose link moves: where it may go, the first at the start.
-        flows, services: who talks to whom; their place in the tuple is their channel.
-        spare: flows that begin one by one, when publisher and readers are told to; their channels come after those.
-        churn: what comes and goes; a channel for each topic, that of its flow where it has one.
+        homes: of members (and switches) whose link moves: the possible switches, the first at the start.
+        flows, services: traffic between members; the index in the tuple is the channel.
+        spare: flows that begin one by one, when publisher and readers get a signal; their channels come after those.
+        churn: topics that come and go; a channel for each topic, that of its flow where it has one.
     """
 
     topology: Topology
@@ -80,7 +81,7 @@ class Plan:
         return tuple(at.switch for at in self.topology.attached("rib"))
 
     def home(self, mover: str) -> str:
-        """Return where a member, or a switch that moves, is plugged in at the start."""
+        """Return the switch into which a member, or a switch that moves, is plugged at the start."""
         homes = self.homes.get(mover)
         return homes[0] if homes else next(self.topology.links_of(mover)).other(mover)
 
@@ -100,7 +101,7 @@ class Plan:
                 yield channel, flow
 
     def churns(self, member: str) -> Iterable[tuple[int, Churn]]:
-        """Yield what a member takes up and leaves over and over, with its channel."""
+        """Yield the churning topics of a member, with their channels."""
         topics = [flow.topic for flow in self.flows]
         after = len(self.flows) + len(self.services) + len(self.spare)
         topics += [""] * (after - len(topics))

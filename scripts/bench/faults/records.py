@@ -1,6 +1,7 @@
-"""What a member writes down, and how it is read back: records of fixed size, appended to a file.
+"""Records of a member: fixed size, appended to a file, and their reader.
 
-I/O. One file. What was written stays when the writer is killed, for it is the kernel's from then on.
+I/O. One file. Written records remain when the writer is killed, because the kernel holds them from then on.
+
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ _FORM: Final = struct.Struct("=BBHIQQ")
 
 
 class Kind(IntEnum):
-    """What happened, and what ``other`` and ``number`` say of it."""
+    """Kind of a record, and the meaning of its ``other`` and ``number``."""
 
     PUBLISHED = 1  # number: of the message
-    DELIVERED = 2  # other: the publisher; life: the publisher's
-    LOST = 3  # number: how many more messages the reader was told it missed; other: the reason, a ``LossReason``
+    DELIVERED = 2  # other: the publisher; life: its incarnation
+    LOST = 3  # number: how many more messages were reported lost to the reader; other: the reason, a ``LossReason``
     WRONG = 4  # other: the channel that the message was meant for
     CALLED = 5  # number: of the request
     ANSWERED = 6
@@ -42,25 +43,25 @@ class Record(NamedTuple):
 
 
 class RecordWriter:
-    """Appends records; ``flush`` hands them to the kernel."""
+    """Writer of records; ``flush`` passes them to the kernel."""
 
     def __init__(self, path: Path) -> None:
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
         self._waiting: list[bytes] = []
 
     def add(self, kind: Kind, channel: int, life: int, other: int, number: int, at_ns: int) -> None:
-        """Note one thing."""
+        """Add one record."""
         self._waiting.append(_FORM.pack(kind, channel, life, other, number, at_ns))
 
     def flush(self) -> None:
-        """Hand over what was noted."""
+        """Write the pending records."""
         if self._waiting:
             os.write(self._file, b"".join(self._waiting))
             self._waiting.clear()
 
 
 class RecordReader:
-    """Reads a file that still grows."""
+    """Reader of a file that still grows."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -1,8 +1,9 @@
-"""Which faults happen when: drawn from a seed, overlapping, and never parting what is to stay connected.
+"""Schedule of faults: drawn from a seed, overlapping, without parting what must stay connected.
 
-Sans-I/O. Faults of the kinds in ``STRUCTURAL`` take a switch or a link away; one is drawn only if the rest stays whole
+Sans-I/O. Faults of the kinds in ``STRUCTURAL`` remove a switch or a link. One is drawn only if the rest stays whole
 with everything that is broken at that moment, by the oracle. A partition is the exception: it parts a domain on
-purpose, alone.
+purpose, while no other fault is active.
+
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ __all__ = ["DISK", "STORE", "STRUCTURAL", "Fault", "FaultKind", "broken_by", "ma
 
 
 class FaultKind(Enum):
-    """What may happen."""
+    """Kind of a fault."""
 
     CUT = "link cut"
     SILENT = "link silent"
@@ -62,11 +63,11 @@ _TRIES: Final = 40
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault: ``targets`` are a process (``switch s1``), the two ends of a link, or a mover and where it goes.
+    """One fault: ``targets`` are a process (``switch s1``), the two ends of a link, or a mover and its new switch.
 
     Attributes:
-        start_s, end_s: from the start of the run; what has no end of its own ends where it starts.
-        amount: seconds of a clock step; which server of the store, of those in the role.
+        start_s, end_s: from the start of the run; a fault without an end of its own ends at its start.
+        amount: seconds of a clock step; the index of the server of the store, among those of the role.
     """
 
     kind: FaultKind
@@ -81,7 +82,7 @@ class Fault:
 
 
 def broken_by(faults: Sequence[Fault], at: dict[str, str]) -> Broken:
-    """Return what does not work while these faults are there."""
+    """Return what does not work while these faults are active."""
     broken = Broken(at=dict(at))
     for fault in faults:
         if fault.kind in (FaultKind.CUT, FaultKind.SILENT):
@@ -189,7 +190,7 @@ def _one(
 
 
 def _is_fit(fault: Fault, under_way: Sequence[Fault], oracle: Oracle, at: dict[str, str]) -> bool:
-    """Return whether a fault may come on top of those under way."""
+    """Return whether a fault may be added to those in progress."""
     busy = {target for each in under_way for target in _touched(each)}
     if busy & _touched(fault):
         return False

@@ -1,7 +1,8 @@
-"""Whether something grows: the slope of samples by least squares.
+"""Growth of a figure: the slope of samples by least squares.
 
-Sans-I/O. A figure that is bounded rises while it warms up and is flat after that, so the samples of the warm-up are
-left out. A slope is told as growth over the rest of the run, beside the spread of the samples around their line.
+Sans-I/O. A bounded figure rises while it warms up and is flat after that, so the samples of the warm-up are left out.
+A slope is reported as growth over the rest of the run, with the spread of the samples around their line.
+
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ _WARM_UP: Final = 0.4  # of the samples
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """What a figure did after the warm-up.
+    """Growth of a figure after the warm-up.
 
     Attributes:
         mean: of the samples.
-        rise: by how much the line rises from its first sample to its last; negative where it falls.
+        rise: rise of the line from its first sample to its last; negative where it falls.
         scatter: standard deviation of the samples from the line.
     """
 
@@ -31,12 +32,12 @@ class Growth:
     scatter: float
 
     def is_flat(self, share: float, least: float) -> bool:
-        """Return whether the rise is below a share of the mean, or below ``least``, or drowns in the scatter."""
+        """Return whether the rise is below a share of the mean, below ``least``, or below the scatter."""
         return self.rise <= max(share * abs(self.mean), least, 2 * self.scatter)
 
 
 def growth_of(samples: Sequence[float]) -> Growth:
-    """Return what the samples did after the warm-up; they were taken at even distances.
+    """Return the growth of the samples after the warm-up; they were taken at even distances.
 
     Raises:
         ValueError: too few samples.

@@ -1,7 +1,8 @@
-"""A Valkey or Redis Cluster in a namespace of the run, which RIBs reach over a bridge; servers fail on demand.
+"""Valkey or Redis Cluster in a namespace of the run, which RIBs reach over a bridge; servers fail on demand.
 
-I/O. ``scripts/start_cluster.sh`` starts three primaries with a replica each. The servers are daemons: they are
-in the run's record, and they live in a namespace of the run, whose end ends what is inside.
+I/O. ``scripts/start_cluster.sh`` starts three primaries with a replica each. The servers are daemons. They are in the
+run's record, and they run in a namespace of the run; its end ends all processes inside.
+
 """
 
 from __future__ import annotations
@@ -49,10 +50,10 @@ def has_server() -> bool:
 
 
 class StoreCluster:
-    """Six servers.
+    """Cluster of six servers.
 
     Args:
-        run: whose folder holds the data.
+        run: run whose folder holds the data.
         spaces: of the network.
         ribs: switches in whose namespaces the RIBs run that use the cluster.
 
@@ -88,19 +89,19 @@ class StoreCluster:
 
     @property
     def config(self) -> Mapping[str, object]:
-        """Return the keys of a RIB's file that let it use the cluster."""
+        """Return the keys of a RIB's file that make it use the cluster."""
         return dict(self._config)
 
     def kill(self, fault: str, *, is_primary: bool, choice: int) -> str:
-        """Kill a primary that has a replica in step, or a replica (SIGKILL); return which."""
+        """Kill (SIGKILL) a replica, or a primary that has a replica in step; return which."""
         return self._take(fault, signal.SIGKILL, is_primary=is_primary, choice=choice)
 
     def freeze(self, fault: str, *, choice: int) -> str:
-        """Give a primary that has a replica in step no more time; return which."""
+        """Stop a primary that has a replica in step (SIGSTOP); return which."""
         return self._take(fault, signal.SIGSTOP, is_primary=True, choice=choice)
 
     def restart(self, fault: str) -> None:
-        """Start again what a fault killed.
+        """Restart a killed server.
 
         Raises:
             FailedError: it does not start.
@@ -119,12 +120,12 @@ class StoreCluster:
         self._run.note_process(self._pid(number))
 
     def thaw(self, fault: str) -> None:
-        """Let go on what a fault froze."""
+        """Continue a frozen server."""
         with suppress(ProcessLookupError):
             os.kill(self._pid(self._away.pop(fault)), signal.SIGCONT)
 
     def close(self) -> None:
-        """End the servers; their data go with the run."""
+        """End the servers; the run removes their data."""
         for number in self._servers:
             with suppress(FileNotFoundError, ProcessLookupError):
                 os.kill(self._pid(number), signal.SIGKILL)
@@ -140,14 +141,14 @@ class StoreCluster:
         return f"server {server}"
 
     def _fit(self, *, is_primary: bool) -> list[int]:
-        """Return the servers of this role; those alone that another one could replace, or that replace none yet."""
+        """Return the servers of this role; only those that another server could replace, or that replace none yet."""
         roles = {number: self._role(number) for number in sorted(self._servers)}
         if any(role is None for role in roles.values()) or list(roles.values()).count((True, True)) != len(roles) // 2:
             return []
         return [number for number, role in roles.items() if role is not None and role[0] is is_primary]
 
     def _role(self, number: int) -> tuple[bool, bool] | None:
-        """Return whether a server is a primary, and whether its other half is in step; None: it does not answer."""
+        """Return whether a server is a primary, and whether its counterpart is in step; None: it does not answer."""
         return netns_files.inside(self._path, partial(_role_of, self._servers[number], self._password, self._folder))
 
     def _pid(self, number: int) -> int:
@@ -166,7 +167,7 @@ class StoreCluster:
 
 
 def _program() -> str | None:
-    """Return the server that ``start_cluster.sh`` starts, too, or None."""
+    """Return the server program that ``start_cluster.sh`` also starts, or None."""
     kinds = (kind for kind in _KINDS if shutil.which(f"{kind}-cli"))
     return next((program for kind in kinds if (program := shutil.which(f"{kind}-server"))), None)
 

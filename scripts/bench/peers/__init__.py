@@ -1,5 +1,6 @@
-"""The contenders of ``messages.py``: what carries a message from A to B over three machines in a row.
+"""Baselines of ``messages.py``: systems that carry a message from A to B over three machines in a row.
 
-``chain.py`` lays the machines, ``exchange.py`` is the one measurement that all ends run, and of every contender there
-is a ``*_net.py`` (which processes stand where) and a ``*_endpoint.py`` (what runs at A and at B).
+``chain.py`` makes the machines, ``exchange.py`` is the measurement that all endpoints run. Each baseline has a
+``*_net.py`` (its processes by machine) and a ``*_endpoint.py`` (the processes at A and at B).
+
 """

@@ -1,4 +1,4 @@
-"""What the bench asks of every baseline, and what it gets.
+"""Interface of the baselines of the message bench.
 
 I/O. Starts processes on the row.
 """
@@ -24,10 +24,10 @@ _MEASURED_S = 180.0
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """One size by one baseline: seconds of every message, CPU seconds a message by place.
+    """One size by one baseline: seconds of every message, CPU seconds a message by machine.
 
     Attributes:
-        resent: parts that had to be sent again, over all sizes; known of ours only.
+        resent: retransmitted parts, over all sizes; known of GDP only.
     """
 
     label: str
@@ -42,7 +42,7 @@ class Baseline(Protocol):
 
     @property
     def name(self) -> str:
-        """What ``--only`` calls it."""
+        """Name in ``--only``."""
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -52,14 +52,14 @@ class Baseline(Protocol):
         """Start its processes, measure, end them.
 
         Raises:
-            FailedError: it is not here, or did not come up, or lost a message.
+            FailedError: it is not installed, or did not come up, or lost a message.
         """
 
 
 def start_end(
     chain: Lab, module: str, node: str, load: Load, own: Mapping[str, str], pids: Mapping[str, Sequence[int]]
 ) -> Started:
-    """Start an end, ``ping`` at A or ``pong`` at B."""
+    """Start an endpoint, ``ping`` at A or ``pong`` at B."""
     settings = EndSettings(
         "ping" if node == LEFT else "pong", load, {place: list(each) for place, each in pids.items()}, dict(own)
     )
@@ -67,10 +67,10 @@ def start_end(
 
 
 def ask_end(ping: Started, labels: Mapping[str, str], patience_s: float = _MEASURED_S) -> list[Measured]:
-    """Return what A measured.
+    """Return the figures of A.
 
     Args:
-        labels: row by what the end calls it.
+        labels: row by the name that the endpoint uses.
 
     Raises:
         FailedError: it failed.

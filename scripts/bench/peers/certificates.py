@@ -1,4 +1,4 @@
-"""A certificate authority of one run, and a certificate for every machine of the row, for mutual TLS.
+"""Certificate authority of one run, and a certificate for every machine of the row, for mutual TLS.
 
 I/O. Writes PEM files. Keys are ECDSA P-256 as in our own certificates, valid for a day.
 """

@@ -1,4 +1,4 @@
-"""Five machines in a row, A - s1 - s2 - s3 - B, that all contenders use in turn: by names, by routers, by IPv4.
+"""Five machines in a row, A - s1 - s2 - s3 - B, shared by all baselines: by names, by routers, by IPv4.
 
 I/O; namespaces through ``gdp.simulation``. Link ``n`` (from 0) has the network 10.99.n.0/24, its left end .1, its
 right end .2; the three in the middle forward IPv4::
@@ -56,7 +56,7 @@ class Chain(Lab):
             self.inside(node, partial(_number, node))
 
     def set_offloads(self, *, on: bool) -> str:
-        """Switch the offloads of every device of the row, and return how they are then, as the devices say."""
+        """Switch the offloads of every device of the row; return the states that the devices report."""
         found = [self.inside(node, partial(_switch_offloads, _neighbours(node), on=on)) for node in NODES]
         return offload_text([one for each in found for one in each])
 

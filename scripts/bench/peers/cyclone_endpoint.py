@@ -1,10 +1,12 @@
-"""What runs of Cyclone DDS: the two ends.
+"""Endpoint process of Cyclone DDS.
 
 Process of its own, started by ``cyclone_net.py``.
 
-Messages go in and out as serialised bytes, which is what a ROS 2 node hands to the middleware; the binding's own
-serialiser, in Python, would cost an image 26 ms. To that end the type is one octet: of a longer message Cyclone takes
-the rest along. Each end waits in the thread that works on, by a WaitSet: a listener would add a change of threads.
+Messages go in and out as serialised bytes, which is what a ROS 2 node passes to the middleware; the binding's own
+serialiser, in Python, would cost 26 ms for an image. For that the type is one octet: Cyclone carries the rest of a
+longer message along. Each endpoint waits by a WaitSet in the thread that continues the work. A listener would add a
+change of threads.
+
 """
 
 from __future__ import annotations
@@ -44,7 +46,7 @@ class Opaque(IdlStruct, typename="bench::Opaque"):
 
 
 class CycloneWay:
-    """One end: writes one topic, reads the other."""
+    """One endpoint: writes one topic, reads the other."""
 
     def __init__(self, writes: str, reads: str) -> None:
         qos = Qos(
@@ -60,13 +62,13 @@ class CycloneWay:
         self._arrived = deque[bytes]()
 
     def send(self, message: bytes) -> None:
-        """Let a message go."""
+        """Send a message."""
         result = ddspy_write(self._writer._ref, message)
         if result < 0:
             raise OSError(f"Cyclone DDS does not write: {result}")
 
     def receive(self, deadline_s: float) -> bytes | None:
-        """Return the next message; None when the monotonic second passed."""
+        """Return the next message; None when the monotonic second has passed."""
         while not self._arrived:
             rest_s = deadline_s - time.monotonic()
             if rest_s <= 0:
@@ -76,7 +78,7 @@ class CycloneWay:
         return self._arrived.popleft()
 
     def wait(self, deadline_s: float) -> bytes | None:
-        """Return the next answer without its prefix; None when the monotonic second passed."""
+        """Return the next answer without its prefix; None when the monotonic second has passed."""
         message = self.receive(deadline_s)
         return None if message is None else message[len(_PREFIX) : len(_PREFIX) + ANSWER.size]
 
@@ -88,7 +90,7 @@ class CycloneWay:
 
 
 def main() -> None:
-    """Be ``ping`` or ``pong``."""
+    """Run ``ping`` or ``pong``."""
     settings = EndSettings.from_argument()
     os.environ["CYCLONEDDS_URI"] = settings.own["xml"]  # read when the participant is made
     if settings.role == "ping":

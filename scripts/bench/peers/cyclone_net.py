@@ -1,6 +1,7 @@
-"""Cyclone DDS on the row, unsecured: peers known by address, no multicast, the kernel forwards IPv4.
+"""Cyclone DDS on the row, unsecured: peers by address, no multicast, the kernel forwards IPv4.
 
-I/O. Starts processes. Everything else is as Cyclone comes, also its packet sizes.
+I/O. Starts processes. All other settings are the defaults of Cyclone, including its packet sizes.
+
 """
 
 from __future__ import annotations

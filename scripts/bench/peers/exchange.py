@@ -1,13 +1,14 @@
-"""The one measurement: a message goes from A to B, a small answer comes back, the next one goes.
+"""Measurement of the message bench: a message goes from A to B, a small answer comes back, the next one goes.
 
-Place: of A's and B's processes; reads clocks, the way there is the contender's (``Path``).
+Runs in A's and B's processes. It reads clocks; the baseline carries the messages (``Way``).
 
-The message is a ``sensor_msgs/msg/Image`` in CDR of exactly so many bytes, its last eight a number. The answer has 16
-bytes: the number, how many bytes came, and, where the number asks for it, their CRC (once for every size).
+The message is a ``sensor_msgs/msg/Image`` in CDR of exactly the stated size, its last eight bytes a number. The answer
+has 16 bytes: the number, the bytes that arrived, and, where the number requests it, their CRC (once for every size).
 
-CPU is what the processes' own clocks say over the measured messages: A's, B's, and that of all in between. What the
-kernel forwards on the way runs in whichever process was interrupted, mostly the one that sent.
+CPU is the reading of the processes' own clocks over the measured messages: A's, B's, and that of all in between.
+Kernel forwarding on the way runs in the process that was interrupted, mostly the one that sent.
 Source of the clocks: clock_getcpuclockid(3).
+
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ SIZE_MIN: Final = _IMAGE_HEAD.size + _NUMBER.size
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """How many messages of which sizes. ``count`` is for messages above 100 kB; of smaller ones four times as many."""
+    """Numbers and sizes of messages. ``count`` is for messages above 100 kB; of smaller ones four times as many."""
 
     sizes: tuple[int, ...]
     count: int
@@ -51,20 +52,20 @@ class Load:
 
 
 class Way(Protocol):
-    """A contender as seen from A."""
+    """A baseline from A's side."""
 
     def send(self, message: bytes) -> None:
-        """Let a message go."""
+        """Send a message."""
 
     def wait(self, deadline_s: float) -> bytes | None:
-        """Return the next answer; None when the monotonic second passed."""
+        """Return the next answer; None when the monotonic second has passed."""
 
 
 def image(size: int) -> bytearray:
     """Return a serialised image of exactly ``size`` bytes, with random pixels.
 
     Raises:
-        ValueError: no room for the number.
+        ValueError: too small for the number.
     """
     pixels = size - _IMAGE_HEAD.size
     if pixels < _NUMBER.size:
@@ -80,14 +81,14 @@ def answer_to(message: bytes) -> bytes:
 
 
 def exchange(way: Way, load: Load, pids: Mapping[str, Sequence[int]]) -> list[dict[str, object]]:
-    """Measure every size; return for each its ``size``, ``rtt_s`` of every message, and ``cpu_s`` a message by place.
+    """Measure every size; return for each its ``size``, ``rtt_s`` of every message, and ``cpu_s`` a message by machine.
 
     Args:
-        pids: of the processes at each place.
+        pids: of the processes at each machine.
 
     Raises:
         TimeoutError: an answer did not come.
-        ValueError: what B got is not what was sent.
+        ValueError: B received other bytes than were sent.
     """
     clocks = {place: [_clock(pid) for pid in each] for place, each in pids.items()}
     numbers = iter(range(1, _CHECKED))
@@ -108,7 +109,7 @@ def exchange(way: Way, load: Load, pids: Mapping[str, Sequence[int]]) -> list[di
 
 
 def _greet(way: Way) -> None:
-    """Send small messages, all numbered 0, until one is answered: the way may not stand yet."""
+    """Send small messages, all numbered 0, until one is answered: the path may not be ready yet."""
     message = bytes(image(SIZE_MIN)[: -_NUMBER.size]) + bytes(_NUMBER.size)
     deadline_s = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline_s:

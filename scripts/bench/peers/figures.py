@@ -1,7 +1,8 @@
-"""What the bench of messages was asked for: columns, cases, and the figures to reach.
+"""Columns, cases and targets of the message bench.
 
-Sans-I/O. Over the ``Rounds`` of ``acknack.py``. A ratio is of medians of one round in one case: same MTU, same state
-of the devices.
+Sans-I/O. Works on the ``Rounds`` of ``report.py``. A ratio is of medians of one round in one case: same MTU, same
+state of the devices.
+
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def case_of(size: int, mtu: int, *, offloads: bool) -> str:
 
 
 def targets_of(over: Rounds, ours: Iterable[str], cases: Sequence[tuple[int, int, bool]]) -> list[Target]:
-    """Return what was asked for, of each of our rows, in the cases that were run.
+    """Return the targets of each of our rows, in the cases that were run.
 
     Args:
         cases: bytes, MTU, offloads.

@@ -1,7 +1,7 @@
-"""What runs of ours at A and B: a session of the library, or a member of the overlay without it.
+"""Endpoint process of GDP at A and B: a session of the library, or a member of the overlay without it.
 
 Process of its own, started by ``gdp_net.py``. Each message is written in the topic's encoding, encrypted,
-signed, verified, put in order and reported on, and read back from the encoding: all that a proxy does but for ROS.
+signed, verified, put in order and reported on, and decoded: all that a proxy does except for ROS.
 
 Each encoding has a topic of its own, ``/ping/json`` for one; answers come back on ``/pong``. ``bench/library.py`` runs
 the same with the internal path in place of the library, to measure what that costs.
@@ -67,7 +67,7 @@ class Endpoint(Protocol):
 
 
 class LibraryEndpoint:
-    """A session of the library."""
+    """Session of the library."""
 
     def __init__(self, config: Path, spin_s: float) -> None:
         self.session = gdp.open(config, busy_poll_us=round(spin_s * 1e6), timeout_s=PATIENCE_S)
@@ -105,10 +105,10 @@ class LibraryEndpoint:
 
 
 class InternalEndpoint:
-    """A member on its plane, as the library has one inside."""
+    """Member on its plane, as the library contains one."""
 
     def __init__(self, config: Path, spin_s: float) -> None:
-        settings = RibConfig.load(config)  # identity, domain and iface are all that an end needs
+        settings = RibConfig.load(config)  # identity, domain and iface are all that an endpoint needs
         identity, policy = load_member(settings.identity, settings.domain, Role.PROXY)
         self._member = Participant(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes))
         self._runtime = Runtime(self._member, RawPlane([settings.iface]), spin_s=spin_s)
@@ -200,7 +200,7 @@ def _pong(end: Endpoint, encodings: list[Encoding]) -> None:
     for topic in serializers:
         end.subscribe(topic)
     tune_memory()
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # the bench ends it so; there is nothing to give back
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # the bench ends it so; there is nothing to release
     say(event="ready")
     while True:
         arrived = end.receive(time.monotonic() + _FOREVER_S)
@@ -210,7 +210,7 @@ def _pong(end: Endpoint, encodings: list[Encoding]) -> None:
 
 
 def main() -> None:
-    """Be ``ping`` or ``pong``."""
+    """Run ``ping`` or ``pong``."""
     settings = EndSettings.from_argument()
     wanted = settings.own["encodings"].split()
     encodings: list[Encoding] = [each for each in get_args(Encoding) if each in wanted]

@@ -1,4 +1,4 @@
-"""Ours on the row: a switch on each of the three in the middle, the RIB beside s2, a member at A and at B.
+"""GDP on the row: a switch on each of the three in the middle, the RIB at s2, a member at A and at B.
 
 I/O. Starts the commands that robots run, and makes the keys of a run.
 """
@@ -29,8 +29,8 @@ class GdpNet:
     Args:
         plane: as ``gdp-switch --data-plane``.
         encodings: measured one after the other, by the same processes.
-        spin_s: how long ends look for frames before they sleep.
-        path: what the ends are: ``library`` or ``internal``.
+        spin_s: seconds for which endpoints poll for frames before they sleep.
+        path: kind of endpoint, ``library`` or ``internal``.
     """
 
     def __init__(self, plane: str, encodings: tuple[str, ...], spin_s: float, path: str = "library") -> None:

@@ -1,6 +1,7 @@
-"""How a process of a contender is told what to do, and how it answers: settings as one argument, lines of JSON back.
+"""Settings of a baseline process as one argument, and its replies as lines of JSON.
 
 I/O. Standard output.
+
 """
 
 from __future__ import annotations
@@ -16,13 +17,13 @@ __all__ = ["EndSettings", "say"]
 
 @dataclass(frozen=True, slots=True)
 class EndSettings:
-    """What an end is told, whoever the contender.
+    """Settings of an endpoint, the same for every baseline.
 
     Attributes:
         role: ``ping`` (A) or ``pong`` (B).
         load: what to measure.
-        pids: processes whose CPU counts, by place; A adds itself.
-        own: what only this contender's end needs.
+        pids: processes whose CPU counts, by machine; A adds itself.
+        own: further settings of this baseline's endpoint.
     """
 
     role: str
@@ -43,5 +44,5 @@ class EndSettings:
 
 
 def say(**values: object) -> None:
-    """Print one line of JSON for whoever started this process."""
+    """Print one line of JSON for the parent process."""
     print(json.dumps(values), flush=True)

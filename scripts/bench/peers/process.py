@@ -1,6 +1,7 @@
-"""One process of a contender: started on a machine of the row, heard, ended.
+"""Process of a baseline: started on a machine of the row, read, ended.
 
-I/O. What it prints on standard error goes to a file of the run, whose last line is the reason if it fails.
+I/O. Its standard error goes to a file of the run, whose last line is the reason if it fails.
+
 """
 
 from __future__ import annotations
@@ -27,11 +28,11 @@ _REASON_CHARS: Final = 200
 
 
 class FailedError(Exception):
-    """A process of a contender ended, was silent for too long, or said that it cannot."""
+    """A process of a baseline ended, was silent for too long, or reported a failure."""
 
 
 class Started:
-    """A running process; a context manager that ends it, and its group with it.
+    """Running process; a context manager that ends it, and its group with it.
 
     Args:
         command: from the command line to the one that enters the machine.
@@ -85,7 +86,7 @@ class Started:
         return said
 
     def has_line(self, patience_s: float) -> bool:
-        """Return whether a line waits to be read, or comes in time; raises as ``read`` where none can come."""
+        """Return whether a line is ready, or arrives in time; raises as ``read`` where none can arrive."""
         assert self._process.stdout is not None
         if b"\n" not in self._unread and select.select([self._process.stdout], [], [], patience_s)[0]:
             part = os.read(self._process.stdout.fileno(), 1 << 16)
@@ -95,7 +96,7 @@ class Started:
         return b"\n" in self._unread
 
     def read_line(self, patience_s: float) -> bytes:
-        """Return the next line that it prints, whatever it is; raises as ``read``."""
+        """Return the next line that it prints, of any content; raises as ``read``."""
         assert self._process.stdout is not None
         deadline_s = time.monotonic() + patience_s
         while b"\n" not in self._unread:

@@ -1,9 +1,10 @@
-"""The turns of the bench of messages: in every round, on every row, each baseline once.
+"""Schedule of the message bench: in every round, on every row, each baseline once.
 
-I/O. Lays the rows and takes them down.
+I/O. Makes the rows and removes them.
 
-A baseline that fails the first time is not here, for the reason that it gives. One that fails later has no figures in
-that round, and the failure is told with the results.
+A baseline that fails the first time is reported as absent, with its reason. One that fails later has no figures in
+that round, and the results list the failure.
+
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ __all__ = ["Plan", "Turns"]
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is measured: every combination of these, in every round."""
+    """Combinations to measure in every round."""
 
     mtus: tuple[int, ...]
     offloads: tuple[bool, ...]
@@ -47,12 +48,12 @@ class Plan:
 
 
 class Turns:
-    """The rounds under way.
+    """Rounds in progress.
 
     Attributes:
         over: the figures.
-        notes: what went wrong, or was sent twice.
-        offload_states: of the devices, as they say themselves, by what was asked for.
+        notes: failures, and retransmissions.
+        offload_states: states that the devices report, by the requested setting.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -64,7 +65,7 @@ class Turns:
         self._absent: set[str] = set()
 
     def run(self, runs: RunRegistry) -> None:
-        """Lay a row for each MTU, run all rounds, take the rows down."""
+        """Make a row for each MTU, run all rounds, remove the rows."""
         with ExitStack() as stack:
             chains = []
             for mtu in self.plan.mtus:
@@ -106,7 +107,7 @@ class Turns:
                     self.over.add(each.label, case, column, 1e3 * each.cpu_s[place])
 
     def _miss(self, baseline: Baseline, mtu: int, on: bool, where: str, reason: str) -> None:
-        """Take note of a failure: who never came up is not here, whoever did has no figures in this round."""
+        """Record a failure: a baseline that never came up is absent, any other has no figures in this round."""
         if baseline.name not in self._seen:
             self._absent.add(baseline.name)
             for label in baseline.labels:

@@ -1,4 +1,4 @@
-"""What runs of Zenoh: the ends as a user would write them (a callback and an Event), and the router on each machine.
+"""Endpoint and router processes of Zenoh; the endpoints are as a user would write them (a callback and an Event).
 
 Process of its own, started by ``zenoh_net.py``. Shared memory is off everywhere: it would cross namespaces of
 one host, and its figures are not those of a network.
@@ -26,7 +26,7 @@ _PONG: Final = "bench/pong"
 
 
 class ZenohWay:
-    """A's side: publishes on one key, hears the answers on another."""
+    """A's side: publishes on one key, subscribes to the answers on another."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._answers = deque[bytes]()
@@ -35,11 +35,11 @@ class ZenohWay:
         self._subscriber = session.declare_subscriber(_PONG, self._take)
 
     def send(self, message: bytes) -> None:
-        """Let a message go."""
+        """Send a message."""
         self._publisher.put(message)
 
     def wait(self, deadline_s: float) -> bytes | None:
-        """Return the next answer; None when the monotonic second passed."""
+        """Return the next answer; None when the monotonic second has passed."""
         while not self._answers:
             if not self._arrived.wait(max(deadline_s - time.monotonic(), 0.0)):
                 return None
@@ -52,7 +52,7 @@ class ZenohWay:
 
 
 def main() -> None:
-    """Be one of ``ping``, ``pong`` and ``router``."""
+    """Run ``ping``, ``pong`` or ``router``."""
     settings = EndSettings.from_argument()
     with zenoh.open(_config(settings)) as session:
         if settings.role == "ping":
@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def _serve() -> None:
-    """Stay until told to end; Zenoh works in threads of its own."""
+    """Wait for the signal to end; Zenoh works in threads of its own."""
     say(event="ready")
     signal.sigwait({signal.SIGTERM, signal.SIGINT})
 
