@@ -8,8 +8,8 @@ Our planes (scapy, raw, kernel with and without redirect_peer), the Linux bridge
 in the same chain of namespaces, one after the other, in each round. Per size of frame and length of chain:
 
 frames/s            highest rate at which less than 0.1 % is lost and the last frame comes at once (``rate_search.py``)
-RTT, polling ends   of single frames, by endpoints that query their socket continuously: the path alone; not measured for
-                    planes that are processes where these would share the endpoints' cores
+RTT, polling ends   of single frames, by endpoints that query their socket continuously: the path alone; not measured
+                    for planes that are processes where these would share the endpoints' cores
 RTT, sleeping ends  by endpoints that wait in epoll, as nodes do
 CPU µs/frame        at that rate: the source, soft interrupts (forwarding in the kernel is done by the sender's own, so
                     it shows as the source's time) and switch processes; the sink is left out

@@ -1,12 +1,12 @@
-"""What replicas give a service, and what they cost: real ROS nodes, a proxy at the robot, one at each machine.
+"""Bench of replicas: benefit and cost for a service; real ROS nodes, a proxy at the robot, one at each machine.
 
     killed    10^5 requests while any two of three replicas are killed (SIGKILL) at random moments and come back; one
-              that serves stays, another one each time. Asked: none fails, each is answered once
+              that serves stays, another one each time. Target: none fails, each is answered once
     added     calls of 100 bytes, one at a time, to one server and to two replicas in turn: what replication adds.
-              Asked: at most 0.2 ms at the median
-    hedged    a server that is slow (+200 ms) once in 100 requests: one such server, two of which both are asked, and
-              two of which the second is asked only when the first is late. Asked of the last: at most 2 % more
-              requests, and a p99.9 five times better
+              Target: at most 0.2 ms at the median
+    hedged    a server that is slow (+200 ms) once in 100 requests: one such server, two that both get each request,
+              and two of which the second is called only when the first is late. Target of the last: at most 2 %
+              more requests, and a p99.9 five times better
 
 The fourth figure, two replicas against the least of two of the same samples, is ``scripts/experiments/fig5.py``'s.
 
@@ -48,7 +48,7 @@ THREE: Final = "three replicas"
 REQUESTS: Final = {KILLED: 100_000, ADDED: 1_200, HEDGED: 9_000}  # of a round
 QUICK: Final = {KILLED: 1_000, ADDED: 60, HEDGED: 300}
 ROUNDS: Final = {KILLED: 1, ADDED: 7, HEDGED: 3}
-RATE: Final = 300  # what two cores carry with three replicas, and one of them starting
+RATE: Final = 300  # the load that two cores carry with three replicas, one of them starting
 MEDIAN, P99, P999 = "p50, ms", "p99, ms", "p99.9, ms"
 COUNT: Final = "requests"
 COUNTS: Final = {"failed": "failed", "answered wrongly": "wrong", "answers": "heard", "answers too many": "twice"}
@@ -75,7 +75,7 @@ Said = Mapping[str, object]
 
 
 class Kills:
-    """Kills all replicas but one at random moments, starts them again, and then another one stays. A context manager.
+    """Kills of all replicas but one at random moments, and their restart; then another one stays. A context manager.
 
     Attributes:
         count: deaths.
@@ -122,7 +122,7 @@ class Kills:
         self._all_serve(others)
 
     def _all_serve(self, servers: Sequence[Server]) -> None:
-        """Wait until a request has come to each, as its node says, or until no more are sent."""
+        """Wait until each node reports a request, or until no more are sent."""
         for server in servers:
             late_s = time.monotonic() + READY_S
             while not self._over.is_set():
@@ -135,7 +135,7 @@ class Kills:
 
 
 class Bench:
-    """The rounds under way.
+    """Rounds in progress.
 
     Attributes:
         over: the figures.
@@ -148,7 +148,7 @@ class Bench:
         self.over = Rounds()
 
     def killed(self, count: int) -> None:
-        """Ask three replicas while two of them are killed again and again."""
+        """Call three replicas while two of them are killed repeatedly."""
         served = [Served("/number", TYPE, _MACHINES, imports={"timeout_s": _CALL_S})]
         with self._field(served) as here, Kills(here, self._draw) as kills:
             told = {"lanes": _LANES, "rate": self._rate, "counts_answers": True}
@@ -158,7 +158,7 @@ class Bench:
         self._add(KILLED, THREE, figures)
 
     def added(self, count: int) -> None:
-        """Ask one server and two replicas in turn; between two calls all have come to rest."""
+        """Call one server and two replicas in turn; all are idle between two calls."""
         names = {ONE: "/one", TWO: "/two"}
         with self._field([Served("/one", TYPE, _MACHINES[:1]), Served("/two", TYPE, _MACHINES[:2])]) as here:
             said = _ask(here, list(names.values()), count, {"lanes": 1, "rate": _RESTFUL})
@@ -166,7 +166,7 @@ class Bench:
             self._add(ADDED, who, _latencies(_times(said, name)))
 
     def hedged(self, count: int) -> None:
-        """Ask a server that is slow now and then, two of them, and the second one only if the first is late."""
+        """Call a server that is slow sometimes, two of them, and the second one only if the first is late."""
         names = {ONE: ("/one/m1", "/one/m2"), BOTH: ("/both",), LATE: ("/late",)}
         served = [
             Served("/one/m1", TYPE, _MACHINES[:1]),
@@ -196,7 +196,7 @@ class Bench:
 
 
 def targets_of(over: Rounds) -> list[Target]:
-    """Return what was asked for of what was measured."""
+    """Return the targets of the measured cases."""
     killed, added, hedged = CASES.values()
     targets = []
     if killed in over.cases():
@@ -249,7 +249,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
 
 
 def _ask(here: Field, services: Sequence[str], count: int, told: Mapping[str, object]) -> Said:
-    """Return what the robot's client has to say in the end."""
+    """Return the final report of the robot's client."""
     own = {"services": " ".join(services), "count": count, "patience_s": _CALL_S, **told}
     with here.client(ROBOT, "ask", _END, **own) as client:
         client.read(READY_S)
@@ -272,7 +272,7 @@ def _times(said: Said, name: str) -> list[float]:
 
 
 def _counted(said: Said, key: str, name: str) -> int:
-    """Return how often the client asked a service, or how often its machines were."""
+    """Return how often the client called a service, or how many calls its machines received."""
     by_name = said[key]
     found = by_name[name] if isinstance(by_name, dict) else 0
     return sum(found.values()) if isinstance(found, dict) else int(found)

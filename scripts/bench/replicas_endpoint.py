@@ -1,9 +1,9 @@
-"""The robot's client and the replicas of ``replicas.py``: ordinary rclpy nodes that know nothing of the overlay.
+"""Client of the robot and replicas of ``replicas.py``: ordinary rclpy nodes without knowledge of the overlay.
 
 Process of its own, started in a field (``scripts/experiments/field.py``) as ``serve``, ``straggle`` or ``ask``.
 
-The type is ``rcl_interfaces/srv/ListParameters``, because a request of it says something: its ``depth`` is the number
-of the request, its one prefix fills it up to 100 bytes of CDR. The answer names that number, the machine, and how many
+The type is ``rcl_interfaces/srv/ListParameters``, because its request has content: ``depth`` is the number
+of the request, one prefix fills it up to 100 bytes of CDR. The answer names that number, the machine, and how many
 requests to this service the machine has had.
 """
 
@@ -50,7 +50,7 @@ def serve(end: End, settings: Settings) -> None:
 
 
 def straggle(settings: Settings) -> None:
-    """Answer until killed; one in ``slow_in`` requests takes ``slow_s`` more, and holds up no other."""
+    """Answer until killed; one in ``slow_in`` requests takes ``slow_s`` more, and delays no other."""
     slow_in, slow_s = int(str(settings["slow_in"])), float(str(settings["slow_s"]))
 
     def pause() -> None:
@@ -87,7 +87,7 @@ def _offer(node: Node, settings: Settings, pause: Callable[[], None] = lambda: N
 
 
 class _Asking:
-    """Requests under way, and what became of them."""
+    """Requests in progress, and their results."""
 
     def __init__(self, clients: dict[str, Client]) -> None:
         self._clients = clients
@@ -101,7 +101,7 @@ class _Asking:
         return len(self._under_way)
 
     def begin(self, name: str, then: Callable[[], None]) -> None:
-        """Ask; ``then`` when it is answered."""
+        """Send a request; ``then`` is called when it is answered."""
         number, begun_s = self.sent, time.perf_counter()
         self.sent += 1
         self._under_way[number] = name, begun_s
@@ -121,7 +121,7 @@ class _Asking:
         self._clients[name].call_async(request).add_done_callback(take)
 
     def give_up(self, patience_s: float) -> None:
-        """Count as failed what has been under way for longer."""
+        """Count requests as failed that have been in progress for longer."""
         now_s = time.perf_counter()
         for number, (_, begun_s) in list(self._under_way.items()):
             if now_s - begun_s < patience_s:
@@ -132,7 +132,7 @@ class _Asking:
 
 
 def ask(end: End, settings: Settings) -> None:
-    """Ask the services in turn, ``count`` requests in all, ``lanes`` at most at a time, so many a second."""
+    """Call the services in turn, ``count`` requests in all, ``lanes`` at most at a time, at a steady rate."""
     names = str(settings["services"]).split()
     count, lanes, gap_s = int(str(settings["count"])), int(str(settings["lanes"])), 1 / float(str(settings["rate"]))
     patience_s = float(str(settings["patience_s"]))
@@ -164,7 +164,7 @@ def ask(end: End, settings: Settings) -> None:
     timer.cancel()
     took_s = time.monotonic() - begun_s
     if heard is not None:
-        _linger(end)  # for answers too many
+        _linger(end)  # for surplus answers
     say(
         event="asked all",
         failed=asking.failed,
@@ -200,7 +200,7 @@ def _linger(end: End) -> None:
 
 
 def _count_answers(end: End, clients: dict[str, Client]) -> Counter[tuple[bytes, int]]:
-    """Return what counts the answers that reach each call of this node, by ROS 2's service introspection."""
+    """Return a counter of the answers that reach each call of this node, by ROS 2's service introspection."""
     answers: Counter[tuple[bytes, int]] = Counter()
 
     def take(event: ListParameters.Event) -> None:
@@ -214,7 +214,7 @@ def _count_answers(end: End, clients: dict[str, Client]) -> Counter[tuple[bytes,
 
 
 def _nothing() -> None:
-    """Do nothing more."""
+    """Do nothing."""
 
 
 if __name__ == "__main__":

@@ -1,14 +1,15 @@
-"""What every bench says in the same way: figures over rounds, a table, ratios asked and got, JSON, a line about here.
+"""Common report of the benches: figures over rounds, tables, ratios with targets, JSON, and a line on the machine.
 
-Sans-I/O, but for ``show`` (prints), ``progress`` (stderr) and ``write_json`` (one file). The machine is
-``machine.py``'s, the picture ``plot.py``'s. Scripts of this folder import it by its bare name: ``from report import``.
+Sans-I/O, but for ``show`` (prints), ``progress`` (stderr) and ``write_json`` (one file). ``machine.py``
+describes the machine, ``plot.py`` draws the picture. Scripts of this folder import it by its bare name: ``from report
+import``.
 
     state = machine_state()                                          # machine.py, before anything else
     over = Rounds()                                                  # figures, by what and by whom
-    for number in range(rounds):                                     # contenders interleaved: A B C, A B C ...
-        for contender in contenders:
-            progress(f"round {number + 1}/{rounds}: {contender}")
-            over.add(contender, "1400 B, 3 switches", "frames/s", 450_000.0)      # None: it could not be measured
+    for number in range(rounds):                                     # baselines interleaved: A B C, A B C ...
+        for baseline in baselines:
+            progress(f"round {number + 1}/{rounds}: {baseline}")
+            over.add(baseline, "1400 B, 3 switches", "frames/s", 450_000.0)      # None: it could not be measured
     over.absent("kernel", "no CAP_BPF")                              # is shown as "not here: no CAP_BPF"
     over.spread("kernel", "1400 B, 3 switches", "frames/s")          # Spread(median, low, high) | None
     target = over.ratio("kernel / bridge, frames/s", "kernel", "bridge", "1400 B, 3 switches", "frames/s", 1.3)
@@ -17,7 +18,7 @@ Sans-I/O, but for ``show`` (prints), ``progress`` (stderr) and ``write_json`` (o
     save_bars(path, ...)                                             # plot.py
 
 A ratio is taken in each round and then medianed, so that what slows a whole round slows both of its sides. A figure of
-one round is itself a median (or p99) over many frames; whoever adds it says so in its column's name.
+one round is itself a median (or p99) over many frames; the name of its column states that.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ class Spread:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A figure that was asked for, and what came of it.
+    """Figure with a bound, and its measured values.
 
     Attributes:
         what: the figure in words, with its unit unless it is a ratio.
@@ -83,7 +84,7 @@ class Target:
 
     @property
     def met(self) -> bool | None:
-        """Tell whether the median keeps the bound; None when there is none, or nothing was measured."""
+        """Return whether the median keeps the bound; None when there is none, or nothing was measured."""
         if self.measured is None or self.target is None:
             return None
         return self.measured.median <= self.target if self.at_most else self.measured.median >= self.target
@@ -100,7 +101,7 @@ class Target:
 
 @dataclass(slots=True)
 class Rounds:
-    """All figures of a bench: contender, case (what was done), column (figure and unit), one value a round."""
+    """Figures of a bench: baseline, case, column (figure and unit), one value a round."""
 
     values: dict[str, dict[str, dict[str, list[float | None]]]] = field(default_factory=dict)
     reasons: dict[str, str] = field(default_factory=dict)
@@ -110,7 +111,7 @@ class Rounds:
         self.values.setdefault(contender, {}).setdefault(case, {}).setdefault(column, []).append(value)
 
     def absent(self, contender: str, reason: str) -> None:
-        """Say why a contender does not take part."""
+        """Record why a baseline does not take part."""
         self.reasons[contender] = reason
 
     def column(self, contender: str, case: str, column: str) -> list[float | None]:
@@ -123,17 +124,17 @@ class Rounds:
         return Spread.of(known) if known else None
 
     def cases(self) -> list[str]:
-        """Return the cases in the order in which they came."""
+        """Return the cases in their first order."""
         return list(dict.fromkeys(case for cases in self.values.values() for case in cases))
 
     def columns(self, case: str) -> list[str]:
-        """Return the columns that any contender has in a case."""
+        """Return the columns that any baseline has in a case."""
         return list(dict.fromkeys(column for cases in self.values.values() for column in cases.get(case, {})))
 
     def target(
         self, what: str, contender: str, case: str, column: str, asked: float | None, *, at_most: bool = False
     ) -> Target:
-        """Return a bound on one contender's figure."""
+        """Return a bound on one baseline's figure."""
         return _target(what, asked, at_most, self.column(contender, case, column), self._why_not(contender, case))
 
     def ratio(
@@ -190,7 +191,7 @@ def _target(what: str, asked: float | None, at_most: bool, values: Iterable[floa
 
 
 def percentile(values: Iterable[float], share: float) -> float:
-    """Return the smallest value that at least ``share`` (0 to 1) of the values do not pass.
+    """Return the smallest value that at least ``share`` (0 to 1) of the values do not exceed.
 
     Raises:
         ValueError: no values.
@@ -202,7 +203,7 @@ def percentile(values: Iterable[float], share: float) -> float:
 
 
 def number_text(value: float) -> str:
-    """Return a figure with about three digits that mean something."""
+    """Return a figure with about three significant digits."""
     size = abs(value)
     if size >= 1_000:
         return f"{value:,.0f}"
@@ -214,12 +215,12 @@ def number_text(value: float) -> str:
 
 
 def progress(text: str) -> None:
-    """Say on stderr what is being done, so that stdout holds results alone."""
+    """Report progress on stderr, so that stdout holds results alone."""
     print(text, file=sys.stderr, flush=True)
 
 
 def show(title: str, state: MachineState, settings: Settings, over: Rounds, targets: Sequence[Target] = ()) -> None:
-    """Print the machine, a table a case, and a line for each figure that was asked for."""
+    """Print the machine, a table a case, and a line for each figure with a target."""
     console = Console() if sys.stdout.isatty() else Console(width=_CONSOLE_COLUMNS)
     console.print(f"[bold]{title}[/bold]\n{state}", highlight=False)
     console.print(
@@ -249,7 +250,7 @@ def _setting_text(value: str | float | Sequence[int] | Sequence[str]) -> str:
 def write_json(
     path: Path, bench: str, state: MachineState, settings: Settings, over: Rounds, targets: Sequence[Target] = ()
 ) -> None:
-    """Write all values of all rounds, and the targets with what came of them."""
+    """Write all values of all rounds, and the targets with their results."""
     answer = {
         "bench": bench,
         "machine": asdict(state),

@@ -1,9 +1,9 @@
-"""What a name costs in a cluster that RIBs share: bytes, the time to look it up, and how long a dead primary is missed.
+"""Cost of a name in a cluster that RIBs share: bytes, lookup time, and the gap after the death of a primary.
 
 The cluster is ``scripts/start_cluster.sh``'s: three primaries with a replica each, TLS, on this machine. Every name has
-an AdCert and a claim of its own, as a RIB would have taken them. A lookup is what a RIB does for a name that is not in
-its memory: one round trip, and every signature verified. Then primaries are killed, one after the other; each row of
-``gap`` is the time from the kill until a name of that primary can be read and written again.
+an AdCert and an advertisement of its own, as a RIB would have accepted them. A lookup is the work of a RIB for a name
+that is not in its memory: one round trip, and every signature verified. Then primaries are killed, one after the other;
+each row of ``gap`` is the time from the kill until a name of that primary can be read and written again.
 
     .venv/bin/python scripts/bench/rib_cluster.py                        # 1,000,000 names; about a quarter of an hour
     .venv/bin/python scripts/bench/rib_cluster.py --names 50000 --no-save
@@ -67,10 +67,10 @@ BYTES_GOAL, LOOKUP_GOAL_MS, GAP_GOAL_S = 1_000, 2.0, 2.0
 
 @dataclass
 class Measured:
-    """What came of a run.
+    """Result of a run.
 
     Attributes:
-        bytes_a_name: what the primaries' memory grew by.
+        bytes_a_name: growth of the primaries' memory.
         lookup_ms: one figure a lookup.
         warm_ms: the same for a name that is in the RIB's memory.
         gap_s: one figure a killed primary.
@@ -100,15 +100,19 @@ class Field:
         return NodeKeys.generate(role, label).join(self.authority, self.validity)
 
     def verifier(self) -> AdvertisementVerifier:
+        """Return a new verifier that trusts the domain."""
         return AdvertisementVerifier(Policy(self.authority.root))
 
     def about(self, number: int) -> Subject:
+        """Return the subject of the name with this number."""
         return Subject.of(Metadata({"kind": "topic", "name": f"/topic/{number}"}), self.owner.public.compressed)
 
     def name(self, number: int) -> Name:
+        """Return the name with this number."""
         return self.about(number).name
 
     def advertisement(self, number: int, sequence: int = 1) -> bytes:
+        """Return a signed advertisement of the name with this number."""
         about = self.about(number)
         adcert = AdCert.make(
             self.owner, about.name, about, self.proxy.subject, {Right.PUBLISH}, self.validity, may_delegate=False
@@ -119,6 +123,7 @@ class Field:
         )  # fmt: skip
 
     def route(self, advertisement: Advertisement, now: Timestamps) -> Route:
+        """Return the route that a RIB makes of an advertisement."""
         domain = self.authority.root.domain
         expires_s = now.mono_s + LEASE_S
         return Route.of(
@@ -127,14 +132,15 @@ class Field:
 
 
 def now() -> Timestamps:
+    """Return this process's monotonic and wall-clock time."""
     return Timestamps(time.monotonic(), time.time())
 
 
 def put(store: ClusterStore, field_: Field, numbers: range, sequence: int = 1) -> None:
-    """Write names as a RIB does that has verified them.
+    """Write names as a RIB does after verification.
 
     Raises:
-        LocalError: the cluster did not take some.
+        LocalError: the cluster rejected some.
     """
     verifier, at = field_.verifier(), now()
     store.prefetch([field_.name(number) for number in numbers], at)
@@ -154,7 +160,7 @@ def fill(config: ClusterConfig, field_: Field, numbers: range) -> None:
 
 
 def used_bytes(folder: Path, config: ClusterConfig) -> int:
-    """Return what the primaries hold in memory; only the operator may ask."""
+    """Return the memory that the primaries use, in bytes; only the operator may query it."""
     asking = config.model_copy(update={"username": "admin", "password_file": folder / "admin.password"})
     link = ClusterLink(asking.address())
     used = sum(client.info("memory")["used_memory"] for client in link.primaries())
@@ -166,7 +172,7 @@ def look_up(store: ClusterStore, name: Name) -> float:
     """Return the seconds that a lookup takes.
 
     Raises:
-        LocalError: the name is not there.
+        LocalError: the name is missing.
     """
     begun_s = time.perf_counter()
     store.prefetch([name], now())
@@ -200,7 +206,7 @@ def one_of_each_shard(config: ClusterConfig, field_: Field, names: int, dice: ra
 
 
 def gap_after_death(folder: Path, config: ClusterConfig, field_: Field, number: int) -> float:
-    """Kill the primary of a name and return the seconds until that is read and written again."""
+    """Kill the primary of a name and return the seconds until the name is read and written again."""
     link = ClusterLink(config.address())
     victim = link.primary_of(field_.name(number))
     kill(folder, victim[1])
@@ -269,7 +275,7 @@ def measure(folder: Path, names: int, lookups: int, kills: int) -> Measured:
 
 
 def summary(measured: Measured) -> dict[str, object]:
-    """Return what is written to disk: percentiles in place of thousands of figures."""
+    """Return the record for the disk: percentiles in place of thousands of figures."""
     figures = {"lookup_ms": measured.lookup_ms, "warm_ms": measured.warm_ms}
     shares = {"p50": 0.5, "p99": 0.99, "max": 1.0}
     of = {key: {label: percentile(each, share) for label, share in shares.items()} for key, each in figures.items()}
@@ -277,7 +283,7 @@ def summary(measured: Measured) -> dict[str, object]:
 
 
 def table(measured: Measured) -> Table:
-    """Return what is printed."""
+    """Return the table to print."""
     shown = Table("what", "to reach", "got")
     shown.add_row(f"bytes a name, of {measured.names:,}", f"≤ {BYTES_GOAL:,}", f"{measured.bytes_a_name:,.0f}")
     for label, figures in (("lookup", measured.lookup_ms), ("lookup, in the RIB's memory", measured.warm_ms)):
@@ -291,6 +297,7 @@ def table(measured: Measured) -> Table:
 
 
 def main() -> int:
+    """Run the bench; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--names", type=int, default=NAMES)
     parser.add_argument("--lookups", type=int, default=LOOKUPS)

@@ -1,9 +1,9 @@
-"""How many advertisements one RIB takes in a second, whole: relay, claim, delegation, route, verdict; and queries.
+"""Load test of one RIB: whole advertisements a second (relay, advertisement, delegation, route, ack), and queries.
 
     .venv/bin/python scripts/bench/rib_load.py [NAMES]      one line of JSON; scale.py runs it, a process a round
 
 One process, no network. Each advertisement is a new name under an AdCert of its own, signed by its proxy and relayed by
-its switch: three signatures to check, and one to make for the verdict.
+its switch: three signatures to verify, and one to make for the AdvertiseAck.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ QUERIES = 1_000
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """What one RIB did in processor time, and what it grew by."""
+    """Processor time and growth of one RIB."""
 
     advertisements_per_s: float
     queries_per_s: float
@@ -48,7 +48,7 @@ class Load:
 
 
 def advertisements(count: int, validity: Validity, proxy: Identity, switch: Identity, owner: SigningKey) -> list[bytes]:
-    """Return relayed claims on so many names."""
+    """Return relayed advertisements of so many names."""
     rtcert = RtCert.make(proxy, switch.name, validity)
     made = []
     for number in range(count):
@@ -70,12 +70,12 @@ def advertisements(count: int, validity: Validity, proxy: Identity, switch: Iden
 
 
 def topic(number: int) -> Metadata:
-    """Return what the so manieth name stands for."""
+    """Return the subject of the topic with this number."""
     return Metadata({"kind": "topic", "name": f"/topic/{number}"})
 
 
 def measure(names: int) -> Load:
-    """Let a new RIB take ``names`` advertisements, then answer ``QUERIES`` questions.
+    """Let a new RIB accept ``names`` advertisements, then answer ``QUERIES`` queries.
 
     Raises:
         LocalError: it refused some.

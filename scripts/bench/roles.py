@@ -1,6 +1,7 @@
-"""The processes of the forwarding and scale benches, each in a namespace of its own: ``switch`` and ``end``.
+"""Processes of the forwarding and scale benches, each in a namespace of its own: ``switch`` and ``end``.
 
 Started by ``worker.py``. Each reads commands as JSON lines on stdin and answers every one with a JSON line.
+
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ def make_plane(kind: str, ifnames: list[str], table: Table, entries_max: int) ->
     """Return a plane by its name in the benches.
 
     Raises:
-        LocalError: it is not to be had here; says why.
+        LocalError: it is not available here; the text gives the reason.
     """
     if kind == "scapy":
         from gdp.ports.scapy_plane import ScapyPlane
@@ -47,7 +48,7 @@ def switch(plane: str, ways: dict[str, str], names: int = 0, **_: Any) -> None:
     Args:
         plane: which one.
         ways: the devices towards the source ("left") and the sink ("right"), each "device neighbour's-MAC" in hex.
-        names: entries beside those two; all lead to the right.
+        names: entries in addition to those two; all lead to the right.
     """
     left, right = (ways[side].split() for side in ("left", "right"))
     entries_max = max(names + 2, 1_024)
@@ -90,7 +91,7 @@ def switch(plane: str, ways: dict[str, str], names: int = 0, **_: Any) -> None:
 
 
 def end(ifname: str, **_: Any) -> None:
-    """Send, count, ping or answer on one device, as told."""
+    """Send, count, ping or answer on one device, as commanded."""
     answer({"event": "ready"})
     gc.freeze()
     gc.disable()
@@ -112,11 +113,12 @@ def end(ifname: str, **_: Any) -> None:
 
 
 def expected() -> int | None:
-    """Return how many frames the source has sent, once that has been told."""
+    """Return how many frames the source has sent, once the bench has reported it."""
     return integer(command()["expected"]) if command_waits() else None
 
 
 def ready() -> None:
+    """Report that the process is ready."""
     answer({"event": "ready"})
 
 

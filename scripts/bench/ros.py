@@ -1,13 +1,13 @@
-"""Real ROS 2 nodes over three machines: an rclpy talker, a proxy, three kernel switches, a proxy, an rclpy listener.
+"""Bench of real ROS 2 nodes over three machines: an rclpy talker, a proxy, three kernel switches, a proxy, a listener.
 
-    text         100 bytes in CDR, 100 a second: who handles it has gone to sleep in between
+    text         100 bytes in CDR, 100 a second: each process sleeps in between
     quick text   the same, 500 a second
     image        640 x 480, rgb8: 921,600 bytes, 30 a second
     small        text on 20 topics, in bursts of 20 every 5 ms: 4,000 a second
 
-each beside the same two nodes joined by one cable (``direct``), in turn, round by round; latencies are one way, by the
-wall clock of the one machine. Asked: of text at most 1 ms more than direct, of images at most 3 ms, both proxies
-together on at most one core, and nothing lost; ``image`` and ``small`` run for a minute in the first round.
+each compared with the same two nodes joined by one cable (``direct``), in turn, round by round; latencies are one way,
+by the wall clock of the one machine. Targets: text at most 1 ms more than direct, images at most 3 ms, both proxies
+together on at most one core, and no loss; ``image`` and ``small`` run for a minute in the first round.
 
     sudo .venv/bin/python scripts/bench/ros.py                     # the whole; writes docs/benchmarks/ros.*
     sudo .venv/bin/python scripts/bench/ros.py --quick --no-save   # a few seconds each: does it work?
@@ -63,7 +63,7 @@ _DONE_S: Final = 30.0
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """What a talker sends to a listener. ``encoding``: how proxies carry it; None: it goes directly."""
+    """Messages from a talker to a listener. ``encoding``: how proxies carry them; None: they go directly."""
 
     kind: str
     encoding: Encoding | None
@@ -76,7 +76,7 @@ class Stream:
         return DIRECT if self.encoding is None else f"overlay, {self.encoding}"
 
     def measure(self, row: Row, round_number: int) -> dict[str, float]:
-        """Return the figures of one try, by column.
+        """Return the figures of one trial, by column.
 
         Raises:
             FailedError: a node did not come up, or nothing came.
@@ -132,12 +132,12 @@ def bench_of(options: Options) -> Bench:
 
 
 def first_s(options: Options) -> float:
-    """Return how long images and small messages run in the first round."""
+    """Return the seconds for which images and small messages run in the first round."""
     return float(options.seconds) if options.quick else max(float(options.seconds), LONG_S)
 
 
 def kinds_of(options: Options, mtu: int) -> tuple[str, ...]:
-    """Return what is measured at an MTU: small messages, which fit any, only at the first."""
+    """Return the kinds to measure at an MTU: small messages, which fit any, only at the first."""
     return (TEXT, QUICK, IMAGE, SMALL) if mtu == options.mtus[0] else (IMAGE,)
 
 
@@ -152,7 +152,7 @@ def turns_of(options: Options, mtu: int) -> Iterator[Turn]:
 
 
 def targets_of(over: Rounds, mtu: int) -> list[Target]:
-    """Return what was asked for at one MTU."""
+    """Return the targets at one MTU."""
     targets = []
     for kind, added_ms in ((TEXT, 1.0), (QUICK, 1.0), (IMAGE, 3.0), (SMALL, None)):
         case = case_of(kind, mtu)

@@ -1,7 +1,7 @@
-"""The client and the server of ``services.py``: ordinary rclpy nodes and ``std_srvs/srv/SetBool``.
+"""Client and server of ``services.py``: ordinary rclpy nodes and ``std_srvs/srv/SetBool``.
 
 Process of its own, started by ``ros_row.py`` as ``serve``, ``call`` (one call at a time) or ``load`` (many
-clients, calls at a steady rate). The server answers with what it was asked, so that an answer to another call is seen.
+clients, calls at a steady rate). The server echoes the request, so that an answer to another call is detected.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from std_srvs.srv import SetBool
 _WARM_UP: Final = 100
 _TICK_S: Final = 0.001
 _PATIENCE_S: Final = 10.0
-_DEPTH: Final = 1_000  # every client hears the answers to all clients; ten places are soon taken
+_DEPTH: Final = 1_000  # every client receives the answers to all clients; a queue of ten fills soon
 
 
 def serve(end: End, settings: Settings) -> None:
@@ -37,7 +37,7 @@ def serve(end: End, settings: Settings) -> None:
 
 
 class _Calls:
-    """Calls under way, and what came of them."""
+    """Calls in progress, and their results."""
 
     def __init__(self) -> None:
         self.sent = 0
@@ -46,7 +46,7 @@ class _Calls:
         self.times_s: list[float] = []
 
     def begin(self, client: Client, then: Callable[[], None]) -> None:
-        """Call; ``then`` when it is answered."""
+        """Call; ``then`` is called when the answer is there."""
         data, begun_s = random.random() < 0.5, time.perf_counter()
 
         def take(future: Future[SetBool.Response]) -> None:

@@ -1,10 +1,11 @@
-"""What the ROS nodes of the benches share: a node with an executor, and two signs for whoever started it.
+"""Common parts of the ROS nodes of the benches: a node with an executor, and two signals for the parent process.
 
-Process of its own, started by ``ros_row.py``; the only importer of rclpy beside the nodes themselves. They know
-nothing of the overlay.
+Process of its own, started by ``ros_row.py``; only it and the nodes themselves import rclpy. The nodes have
+no knowledge of the overlay.
 
-The executor is rclpy's ``EventsExecutor`` where there is one: the ordinary one takes longer the more subscriptions a
-node has, and would be what is measured.
+The executor is rclpy's ``EventsExecutor`` where it exists. The ordinary one takes longer the more subscriptions a node
+has, and would distort the measurement.
+
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ except ImportError:  # before Kilted and late Jazzy
 
 __all__ = ["End", "Settings", "reliable", "run_role"]
 
-_STEP_S: Final = 60.0  # without a timeout, rclpy 7.1's EventsExecutor never looks at the future
+_STEP_S: Final = 60.0  # without a timeout, rclpy 7.1's EventsExecutor never checks the future
 
 Settings = Mapping[str, object]
 
 
 class End:
-    """A node at A or B."""
+    """Node at A or B."""
 
     def __init__(self, name: str) -> None:
         self.node = Node(name)
@@ -47,11 +48,11 @@ class End:
 
     @property
     def is_told_to_go(self) -> bool:
-        """Return whether a SIGUSR1 came: the other end hears, the measurement may begin."""
+        """Return whether a SIGUSR1 came: the other endpoint receives, the measurement may begin."""
         return self._is_told_to_go
 
     def finish(self) -> None:
-        """End ``run``; called within it."""
+        """End ``run``; call it from within ``run``."""
         if not self._done.done():
             self._done.set_result(None)
 
@@ -62,7 +63,7 @@ class End:
         self._done = Future()
 
     def every(self, seconds: float, work: Callable[[], None]) -> None:
-        """Do something at a steady rate; within ``run``."""
+        """Call a function at a steady rate; within ``run``."""
         self.node.create_timer(seconds, work)
 
     def _go(self, number: int, frame: FrameType | None) -> None:
@@ -71,15 +72,15 @@ class End:
 
 
 def reliable(depth: int = 10) -> QoSProfile:
-    """Return the profile of all topics here: reliable, volatile, so many messages deep."""
+    """Return the profile of all topics here: reliable, volatile, with this depth in messages."""
     return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE)
 
 
 def run_role(roles: Mapping[str, Callable[[End, Settings], None]]) -> None:
-    """Be what the first argument says, with the settings of the second, until killed."""
+    """Run the role of the first argument, with the settings of the second, until killed."""
     role, settings = sys.argv[1], json.loads(sys.argv[2])
     rclpy.init()
     end = End(f"bench_{role}")
     roles[role](end, settings)
     say(event="over")
-    end.run()  # a reliable writer must stay to repair what was lost
+    end.run()  # a reliable writer must stay to retransmit losses

@@ -1,9 +1,9 @@
-"""The row of the benches with real ROS nodes: A - s1 - s2 - s3 - B with a proxy at either end, and a cable from A to B.
+"""Row of the benches with real ROS nodes: A - s1 - s2 - s3 - B, a proxy at either end, and a cable from A to B.
 
 I/O. Makes namespaces and keys, and starts the commands that robots run.
 ::
 
-    a -- s1 -- s2 -- s3 -- b      overlay: all switches with the plane ``kernel``, the RIB beside s2
+    a -- s1 -- s2 -- s3 -- b      overlay: all switches with the plane ``kernel``, the RIB at s2
     |______________________|      direct: one veth pair with IPv4, which only nodes of the direct case use
 
 With ``bridged`` the direct path is as long as the other one: three more namespaces, each with a Linux bridge::
@@ -11,11 +11,11 @@ With ``bridged`` the direct path is as long as the other one: three more namespa
     a -- p1 -- p2 -- p3 -- b      direct
 
 A node is started ``direct`` or not. Direct nodes meet over the cable, in a ROS domain of their own. The others have a
-domain for each end, so that nothing but the proxies joins them, and speak with their proxy inside their namespace.
-Everyone uses UDP over IPv4, because the shared memory of Fast DDS crosses the namespaces of one host (the discovery
-range ``LOCALHOST`` brings it in again, so the range is ``SUBNET``, and the namespaces are what confines), with socket
-buffers of 4 MiB (as far as ``net.core.rmem_max`` allows): the default ones do not hold a camera image, and what takes
-time is then how the middleware repairs it. ROS 2's guide to tuning says the same.
+domain for each end, so that nothing but the proxies joins them, and reach their proxy inside their namespace.
+All nodes use UDP over IPv4, because the shared memory of Fast DDS crosses the namespaces of one host. The discovery
+range ``LOCALHOST`` would enable it again, so the range is ``SUBNET``, and the namespaces confine. Socket buffers have
+4 MiB (as far as ``net.core.rmem_max`` allows). The default ones do not hold a camera image, and the middleware's
+retransmissions would then dominate the time. ROS 2's guide to tuning recommends the same.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK")
 
 @dataclass(frozen=True, slots=True)
 class Carried:
-    """A topic or a service that the proxies carry. ``source``: where its publishers, or its server, are."""
+    """Topic or service that the proxies carry. ``source``: location of its publishers, or its server."""
 
     name: str
     type_name: str
@@ -64,7 +64,7 @@ class Carried:
 
     @property
     def metadata(self) -> Metadata:
-        """Return what its name in the overlay digests."""
+        """Return the metadata of its name in the overlay."""
         return Metadata({"kind": self.kind, "name": self.name, "type": self.type_name})
 
     def rule(self, owner: Path) -> dict[str, object]:
@@ -119,7 +119,7 @@ class Row:
         return self.process(node, role, ["-m", module, role, json.dumps(settings)], direct=direct)
 
     def process(self, node: str, what: str, arguments: Sequence[str], *, direct: bool) -> Started:
-        """Start a Python process that is a ROS node at A or B."""
+        """Start a Python process with a ROS node at A or B."""
         environment = self._nodes.ros_environment(DIRECT_DOMAIN if direct else _DOMAINS[node])
         return self._lab.start(node, what, arguments, [*environment, f"CYCLONEDDS_URI={_cyclone(node)}"])
 
@@ -128,7 +128,7 @@ class Row:
         return sum(_cpu_s(pid) for pid in self.proxies)
 
     def _admit(self, node: str, carried: Sequence[Carried]) -> str:
-        """Let a proxy carry its side of everything, and write its configuration; return the file."""
+        """Give a proxy the delegations of its side, and write its configuration; return the file."""
         sides: dict[str, list[dict[str, object]]] = {"expose": [], "import": []}
         for each in carried:
             is_source = each.source == node

@@ -1,8 +1,8 @@
-"""What the benches with real ROS nodes share: the command line, the rounds, and what is printed, written and drawn.
+"""Common parts of the benches with real ROS nodes: the command line, the rounds, and the output.
 
-I/O. Lays a row for each MTU that is asked for, and takes them down. A bench is data: what the proxies carry,
-the turns of a round, and the figures that are wanted of them. A turn that fails has no figures in that round, and why
-is told with the results.
+I/O. Makes a row for each selected MTU, and removes them. A bench is data: what the proxies carry,
+the turns of a round, and their figures. A turn that fails has no figures in that round, and the results list the
+reason.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ _RMEM_MAX: Final = Path("/proc/sys/net/core/rmem_max")
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """One thing to measure in every round. ``columns`` are what ``measure`` returns when it succeeds.
+    """One measurement of every round. ``columns`` are the keys that ``measure`` returns when it succeeds.
 
-    ``measure`` is told the row and the number of the round, from 1, and may raise ``FailedError``.
+    ``measure`` gets the row and the number of the round, from 1, and may raise ``FailedError``.
     """
 
     case: str
@@ -56,7 +56,7 @@ class Bench:
 
 
 def parse(description: str, *, rounds: int, seconds: float, mtus: Sequence[int], quick_s: float) -> Options:
-    """Read the command line; ``seconds`` and ``rounds`` are final, and ``mtus`` those that are asked for."""
+    """Read the command line; ``seconds`` and ``rounds`` are final, and ``mtus`` the selected ones."""
     quick = {"rounds": 1, "seconds": quick_s}
     parser = skeleton.command_line(
         description, rounds=rounds, seconds=seconds, quick=quick, has_record=True, has_plot=True

@@ -1,8 +1,8 @@
-"""The robot and the cloud of ``fogros.py``: the robot sends what a task needs, the cloud answers once it has all of it.
+"""Robot and cloud of ``fogros.py``: the robot sends the messages of a task, the cloud answers once it has all of them.
 
-Process of its own, started by ``ros_row.py`` as ``robot`` or ``cloud``. Nothing is computed: what takes time is
-the way there and back. Pixels and meshes are random bytes. Every message carries the number of its request, in its
-header's ``frame_id`` or its layout's ``data_offset``; requests numbered 0 are greetings.
+Process of its own, started by ``ros_row.py`` as ``robot`` or ``cloud``. Nothing is computed: the time is
+that of the network, both ways. Pixels and meshes are random bytes. Every message carries the number of its request, in
+its header's ``frame_id`` or its layout's ``data_offset``; requests numbered 0 are greetings.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def message_of(part: Part) -> Message:
 
 
 def set_number(message: Message, number: int) -> None:
-    """Say which request a message is of."""
+    """Write the number of its request into a message."""
     if isinstance(message, Float64MultiArray | UInt8MultiArray):
         message.layout.data_offset = number
     else:
@@ -60,14 +60,14 @@ def set_number(message: Message, number: int) -> None:
 
 
 def number_of(message: Message) -> int:
-    """Return which request a message is of."""
+    """Return the number of the request of a message."""
     if isinstance(message, Float64MultiArray | UInt8MultiArray):
         return int(message.layout.data_offset)
     return int(message.header.frame_id)
 
 
 class _Robot:
-    """Asks, and asks again when the answer is here."""
+    """Client that sends the next request when the answer has arrived."""
 
     def __init__(self, end: End, task: Task, prefix: str, seconds: float) -> None:
         self._end = end
@@ -112,7 +112,7 @@ class _Robot:
 
 
 def robot(end: End, settings: Settings) -> None:
-    """Ask for so many seconds, one request after the other; report how long each took."""
+    """Send requests for so many seconds, one after the other; report how long each took."""
     asking = _Robot(end, _task_of(settings), str(settings["prefix"]), float(str(settings["seconds"])))
     end.run()
     figures = {f"p{at}_s": percentile(asking.times_s, at / 100) for at in (50, 99) if asking.times_s}

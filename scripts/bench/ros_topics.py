@@ -1,8 +1,8 @@
-"""The talker and the listener of ``ros.py``: ordinary rclpy nodes that publish and hear typed messages.
+"""Talker and listener of ``ros.py``: ordinary rclpy nodes that publish and receive typed messages.
 
 Process of its own, started by ``ros_row.py`` as ``talk`` or ``listen``. A message carries the wall clock at
-which it was published and its number, 1 and up. Until the talker is told to go it sends greetings, numbered 0: topics
-may not be joined yet. The listener ends when all came, or when nothing came for a while.
+which it was published and its number, 1 and up. Until the talker gets the signal to start it sends greetings, numbered
+0: topics may not be joined yet. The listener ends when all came, or when nothing came for a while.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ _TEXT_CHARS: Final = TEXT_BYTES - 9
 _WIDTH, _HEIGHT, _PIXEL = 640, 480, 3
 _DEPTHS: Final = {"text": 10, "quick": 10, "image": 10, "small": 1_000}  # ten of 200/s would be 50 ms
 _GREETING_S: Final = 0.05
-_QUIET_S: Final = 8.0  # Fast DDS asks for what it lost after 3 s
+_QUIET_S: Final = 8.0  # Fast DDS requests losses after 3 s
 
 
 class _Texts:
-    """100 bytes: the time in ns, the number, and blanks."""
+    """Texts of 100 bytes: the time in ns, the number, and blanks."""
 
     kind = String
 
@@ -47,7 +47,7 @@ class _Texts:
 
 
 class _Images:
-    """A camera's: the time in the header, the number in the frame's name."""
+    """Camera images: the time in the header, the number in the frame's name."""
 
     kind = Image
 
@@ -64,7 +64,7 @@ class _Images:
 
     @staticmethod
     def read(message: Image) -> tuple[int, int]:
-        """Return when it was published, and its number; 0 for one that is not whole."""
+        """Return when it was published, and its number; 0 for an incomplete one."""
         stamp = message.header.stamp
         number = int(message.header.frame_id) if len(message.data) == IMAGE_BYTES else 0
         return stamp.sec * 1_000_000_000 + stamp.nanosec, number
@@ -106,7 +106,7 @@ def talk(end: End, settings: Settings) -> None:
 
 
 class _Listener:
-    """Hears all topics and takes note."""
+    """Subscriber of all topics that records arrivals."""
 
     def __init__(self, end: End, settings: Settings) -> None:
         self._end = end
@@ -145,13 +145,13 @@ class _Listener:
                 self._end.finish()
 
     def look(self) -> None:
-        """Give up what does not come."""
+        """Give up messages that do not arrive."""
         if time.monotonic() > self._last_s + _QUIET_S:
             self._end.finish()
 
 
 def listen(end: End, settings: Settings) -> None:
-    """Say when every topic was heard, and report when all messages came."""
+    """Report when every topic was received, and the results when all messages have arrived."""
     listener = _Listener(end, settings)
     end.run()
     say(event="hears")

@@ -1,14 +1,14 @@
-"""What a large forwarding table costs, and how much a RIB takes.
+"""Scale bench: cost of a large forwarding table, and load of a RIB.
 
     sudo .venv/bin/python scripts/bench/scale.py                      minutes; JSON and plot to docs/benchmarks
     sudo .venv/bin/python scripts/bench/scale.py --quick --no-save    a small table, to see that all works
 
-Tables of 1,000, 100,000 and 1,000,000 names, in the raw and the kernel plane. Each stands in a chain of its own with
-one switch, all at the same time, so that frames are tried on all of them in turn:
+Tables of 1,000, 100,000 and 1,000,000 names, in the raw and the kernel plane. Each has a chain of its own with
+one switch, all at the same time, so that frames are sent on all of them in turn:
 
 installs/s     new entries put into the table and, where there is one, the kernel's map: 100,000 a call
 renewals/s     the same entries again, under a new lease
-table B/entry  what the process grew by; "map" all that the kernel's maps hold beside that (memlock)
+table B/entry  growth of the process; "map": memory of the kernel's maps in addition (memlock)
 frames/s       of 128 bytes, spread over 1,024 names of the table (--spread), under 0.1 % loss, through one switch
 CPU µs/frame   then: of source, soft interrupts and switch; the sink is left out
 
@@ -103,12 +103,12 @@ def measure_rib(names: int, over: Rounds) -> None:
 
 
 def case_of(names: int) -> str:
-    """Return what a table is headed with."""
+    """Return the heading of a table."""
     return f"{names:,} names"
 
 
 def targets_of(over: Rounds, sizes: Sequence[int], rib_names: int) -> list[Target]:
-    """Return the figures that are to be reached."""
+    """Return the targets."""
     small, large = case_of(min(sizes)), case_of(max(sizes))
     return [
         *(

@@ -1,14 +1,14 @@
-"""What security costs, and what it withstands: one subcommand for each question.
+"""Security bench: cost of security and resistance to attacks, one subcommand for each question.
 
     sudo .venv/bin/python scripts/bench/security.py revocation            # the whole; docs/benchmarks/security.json
     .venv/bin/python scripts/bench/security.py revocation --part kept     # 10^5 revocations in one process; no root
     sudo .venv/bin/python scripts/bench/security.py revocation --part closed --rounds 3 --no-save
     .venv/bin/python scripts/bench/security.py rotation                   # messages lost while epochs change; no root
-    sudo .venv/bin/python scripts/bench/security.py cost                  # beside the commit before; minutes
+    sudo .venv/bin/python scripts/bench/security.py cost                  # compared with an earlier commit
     sudo .venv/bin/python scripts/bench/security.py flood                 # by strangers and by members; an hour
 
-Each subcommand is a module beside this one that has ``add_arguments(parser)`` and ``run(options)``; ``run`` returns its
-figures, which go under the subcommand's name into the file, and whether every target was met.
+Each subcommand is a module in this folder with ``add_arguments(parser)`` and ``run(options)``. ``run`` returns its
+figures, which are stored under the subcommand's name, and whether every target was met.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def arguments() -> argparse.ArgumentParser:
 
 
 def save(path: Path, command: str, figures: Mapping[str, object], state: MachineState) -> None:
-    """Write what one subcommand measured; figures of others, and parts that were not measured now, are kept."""
+    """Write the figures of one subcommand; figures of others, and parts that were not measured now, are kept."""
     held = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"bench": "security"}
     before = held.get(command, {})
     held[command] = {**before, **figures, "machine": asdict(state)}

@@ -1,21 +1,25 @@
-"""How many bytes does the network send because of what one member, or a stranger on a link, says?
+"""Amplification: bytes that the network sends because of the bytes of one member, or of a stranger on a link.
 
-One process for each row: the stage of the insiders (``tests/insiders/stage.py``) on the in-memory network, its clock
-virtual, honest-looking statements and frames of every kind, signed by real keys. A row is spoken not at all, at the
-rate that the speaker's grants pay, at five and ten times that rate. *In* are the bytes said; *out* are the bytes that
-all other machines send more than they do without it, answers, copies on the way and later repetitions included (not
-counted: frames that a data plane forwards by its table). *Plain* is out by in at the first rate; *beyond* is the
-difference of out by that of in between the last two: what is drawn by what no grant pays. (Many words are refused for
-what they say, so the grants are not used up at the first rate; at five times it they are.) Of a stranger everything
-counts, and *towards* are the bytes sent into its link.
+One process for each row: the stage of the insiders (``tests/insiders/stage.py``) on the in-memory network with a
+virtual clock. Statements and frames of every kind look honest and are signed by real keys. The speaker of a row sends
+nothing, sends at the rate that its grants pay, and at five and ten times that rate.
 
-Rates and bursts of the grants are made smaller for this (``GRANTS``), so that the first rate is as much for every kind;
-what a byte beyond them draws does not depend on how many they pay.
+- *In* are the speaker's bytes. *Out* are the additional bytes of all other machines, compared with a run without the
+  speaker. They include answers, copies on the way and later repetitions. Frames that a data plane forwards by its
+  table do not count.
+- *Plain* is out by in at the first rate.
+- *Beyond* is the difference of out by that of in between the last two rates: bytes that no grant pays. Many statements
+  are refused for their content, so the grants are not used up at the first rate; at five times it they are.
+- For a stranger everything counts, and *towards* are the bytes sent into its link.
+
+Rates and bursts of the grants are made smaller for this (``GRANTS``), so that the first rate is the same for every
+kind. The response to a byte beyond them does not depend on their size.
 
 Rows of earlier runs stay in the file until they are measured again.
 
     .venv/bin/python scripts/bench/security.py amplification
     .venv/bin/python scripts/bench/security.py amplification --speakers proxy --kinds withdraw query --no-save
+
 """
 
 from __future__ import annotations
@@ -101,7 +105,7 @@ class Meter:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """What one speaker drew by one kind of word; ratios, None where too little was said."""
+    """Amplification of one speaker by one kind of statement; ratios are None where too little was sent."""
 
     speaker: str
     kind: str
@@ -112,7 +116,7 @@ class Row:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what this subcommand takes."""
+    """Add the options of this subcommand."""
     parser.add_argument("--speakers", nargs="+", choices=list(SPEAKERS), default=list(SPEAKERS))
     parser.add_argument("--kinds", nargs="+", choices=KINDS_OF_WORDS, default=list(KINDS_OF_WORDS))
     parser.add_argument("--seconds", type=float, default=4.0, help="of virtual time, spoken (default: %(default)s)")
@@ -146,7 +150,7 @@ def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
 
 
 def _held(path: Path) -> list[Row]:
-    """Return the rows that earlier runs measured."""
+    """Return the rows of earlier runs."""
     saved = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     return [Row(**row) for row in saved.get("amplification", {}).get("rows", [])]
 
@@ -212,7 +216,7 @@ _record: list[bytes]
 
 
 def _recorded(stage: Stage) -> list[bytes]:
-    """Return what was said on the links of nuc2 for ten seconds."""
+    """Return what the links of nuc2 carried in ten seconds."""
     frames: list[bytes] = []
     network = stage.world.network
 
@@ -229,7 +233,7 @@ def _recorded(stage: Stage) -> list[bytes]:
 
 
 def _spoken(speaker: str, kind: str, times: int, seconds: float) -> Meter:
-    """Let one speaker say words of a kind, in a copy of the stage; count what is sent."""
+    """Send statements of a kind from one speaker, in a copy of the stage; count the bytes sent."""
     stage, network = _stage, _stage.world.network
     assert isinstance(network, TracingNetwork)
     persona = next(each for each in PERSONAS if each.node == SPEAKERS[speaker])
@@ -254,7 +258,7 @@ def _spoken(speaker: str, kind: str, times: int, seconds: float) -> Meter:
 
 
 def _say(stage: Stage, forge: Forge, rng: random.Random, persona: Persona, kind: str) -> int:
-    """Say one word; return its bytes."""
+    """Send one statement; return its bytes."""
     is_stranger = persona.node == SPEAKERS["stranger"]
     places = [each for each in stage.places(persona.node) if stage.believes(persona, each) is not is_stranger]
     place = rng.choice(places)

@@ -1,16 +1,16 @@
-"""What security costs: this tree beside an earlier commit, in turn, round by round.
+"""Cost of security: this tree compared with an earlier commit, in turn, round by round.
 
 ends         processor time to seal and sign a message, to open and verify it, in 100 and 10,000 bytes; advertisements
              that one RIB takes in a second (``security_cost_endpoint.py``): the best of many short blocks, in turn
 forwarding   one switch in namespaces: frames a second of the plane ``kernel``, flat out, and processor time of a frame
              at the plane ``raw``, at a steady rate
-messages     ``bundles.py`` as each tree has it: real processes over three switches, 20 reliable topics, 100 bytes, with
-             as many messages as come to be confirmed; with bundles, and with one seal a message
-trips        ``messages.py`` as each tree has it, on the plane ``raw``: a message there and a small answer back
+messages     ``bundles.py`` of each tree: real processes over three switches, 20 reliable topics, 100 bytes, with
+             as many messages as are confirmed; with bundles, and with one seal a message
+trips        ``messages.py`` of each tree, on the plane ``raw``: a message there and a small answer back
 
 The other commit is checked out in a ``git worktree``, and removed after. Its packages run under scripts of the commit
 ``SCRIPTS``, the last one whose scripts use the names of that time, so that renames in this tree do not disturb it.
-Asked is that no median is worse by more than 5 %. A ratio is taken in each round, since what slows a round slows both.
+Target: no median is worse by more than 5 %. A ratio is taken in each round, since what slows a round slows both.
 
     sudo .venv/bin/python scripts/bench/security.py cost
     .venv/bin/python scripts/bench/security.py cost --part ends --rounds 9      # no root
@@ -87,7 +87,7 @@ Part = Callable[[Trees, argparse.Namespace], dict[str, Figures]]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """State the subcommand's options."""
+    """Add the options of this subcommand."""
     parser.add_argument("--part", action="append", choices=list(PARTS), help="this part only; may be repeated")
     parser.add_argument("--base", default=BASE, help="the commit to compare with (default: %(default)s)")
     parser.add_argument("--rounds", type=int, default=5)
@@ -95,7 +95,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
-    """Measure; return the figures, and whether nothing is dearer than was asked."""
+    """Measure; return the figures, and whether all costs are within the target."""
     figures: dict[str, object] = {}
     has_met = True
     state = machine_state()
@@ -138,7 +138,7 @@ def _targets(over: Rounds) -> list[Target]:
 
 @contextmanager
 def _checked_out(commit: str) -> Iterator[Path]:
-    """Check a commit out beside this tree while within."""
+    """Check a commit out into a temporary work tree; remove it at the end."""
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder) / "tree"
         git = ["git", "-C", str(_TREE), "worktree"]
@@ -199,7 +199,7 @@ def _ends(trees: Trees, _: argparse.Namespace) -> dict[str, Figures]:
 
 
 def _line(end: subprocess.Popen[str], asked: str | None = None) -> str:
-    """Return the next line of a process, which may be asked for something first.
+    """Return the next line of a process, after an optional command.
 
     Raises:
         FailedError: it ended.
@@ -243,7 +243,7 @@ def _forwarding(tree: Tree, _: argparse.Namespace) -> Figures:
 
 @contextmanager
 def _packages_of(tree: Tree) -> Iterator[None]:
-    """Have processes that are started meanwhile use the packages of a tree."""
+    """Make processes that start meanwhile use the packages of a tree."""
     before, roles = os.environ.get("PYTHONPATH"), Worker.roles
     os.environ["PYTHONPATH"], Worker.roles = str(tree.path), tree.roles
     try:
@@ -257,7 +257,7 @@ def _packages_of(tree: Tree) -> Iterator[None]:
 
 
 def _own_bench(tree: Path, name: str, *argv: str) -> Mapping[str, Mapping[str, Mapping[str, list[float | None]]]]:
-    """Run a bench of a tree for one round; return its figures by contender, case and column."""
+    """Run a bench of a tree for one round; return its figures by baseline, case and column."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "figures.json"
         _output(tree, str(tree / "scripts" / "bench" / name), "--rounds", "1", "--json", str(out), *argv)

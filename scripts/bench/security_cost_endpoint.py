@@ -1,8 +1,9 @@
-"""What one tree takes for a message and for an advertisement: a process of ``security_cost.py``.
+"""Cost of a message and of an advertisement in one tree: a process of ``security_cost.py``.
 
-The tree is the one that ``PYTHONPATH`` names, this one or an earlier commit. Its first line says, in JSON, what it can
-measure. Each such name on its standard input is measured once, and the figure printed: processor time of this process.
-A message is sealed in parts for an MTU of 1,500 bytes and signed; opened, part by part, and a signature verified.
+The tree is the one that ``PYTHONPATH`` names, this one or an earlier commit. Its first line lists, in JSON, the names
+of its measurements. For each name on standard input it measures once and prints the figure: processor time of this
+process. A message is sealed in parts for an MTU of 1,500 bytes and signed; opened, part by part, and a signature
+verified.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def mean_us(work: Callable[[int], object], numbers: Iterable[int]) -> float:
 
 
 def of_messages(size: int) -> dict[str, Callable[[], float]]:
-    """Return what measures sealing and opening."""
+    """Return the measurements of sealing and opening."""
     secret, source, topic, key = secrets.token_bytes(32), bytes(32), bytes(range(32)), SigningKey.generate()
     is_salted = "random_bytes" in inspect.signature(Sealer).parameters  # not before messages had salts
     salts = (membership.fresh_bytes,) if is_salted else ()
@@ -68,7 +69,7 @@ def of_messages(size: int) -> dict[str, Callable[[], float]]:
 
 
 def main() -> None:
-    """Measure what is asked for."""
+    """Measure the requested figures."""
     measures = {name: measure for size in SIZES for name, measure in of_messages(size).items()}
     measures["advertisements/s"] = lambda: rib_load.measure(_ADVERTISEMENTS).advertisements_per_s
     print(json.dumps(list(measures)), flush=True)

@@ -1,20 +1,19 @@
-"""Does a flood by a stranger on a link, or by a member, disturb real nodes? Neighbours lost, memory, goodput, cores.
+"""Flood bench: effect of a flood by a stranger on a link, or by a member, on real nodes.
 
 Three switches in a row, each a process in a namespace of its own; a topic goes from a member at the first to a member
-at the last one. A stranger on the link between the first and the middle one plays hellos to the middle one, from
+at the last one. A stranger on the link between the first and the middle one replays hellos to the middle one, from
 10,000 invented addresses: with certificates of its own (``fresh``), recorded ones of members (``recorded``), and with a
 member's certificate and a wrong signature (``wrong``). Broadcast data, which no switch reads, is the control
-(``noise``): what it disturbs is the machine, on which the flood takes a core.
+(``noise``): it disturbs only the machine, on which the flood takes a core.
 
-A fourth switch at the middle one is hostile (``faults.hostile``): it sends frames to ``names`` that nobody has,
-``joins`` that hold, ``revocations`` of its own. A proxy at the middle one, which reads the topic and publishes another,
-is so in its turn: it sends ``reports`` that everything lacks, and first ``parts`` of large messages, one after the
-other.
+A fourth switch at the middle one is hostile (``faults.hostile``): it sends frames to unknown ``names``, valid
+``joins``, ``revocations`` of its own. A proxy at the middle one, which reads the topic and publishes another, is
+hostile in turn: it sends ``reports`` that everything lacks, and first ``parts`` of large messages, one after the other.
 
 The rate is ten times what this machine verifies in a second; that of parts, which are a member's right to send, ten
 times that of the good topic's frames.
-A calm phase before each flood is what it is compared with. At the end of each phase the first switch is killed and
-started again: how long until the middle one has it for a neighbour? Memory is that of the node which the flood aims at:
+Each flood is compared with a calm phase before it. At the end of each phase the first switch is killed and started
+again; the figure is the time until it is a neighbour of the middle one. Memory is that of the target of the flood:
 the middle switch, the publisher (``reports``), the reader (``parts``).
 
     sudo .venv/bin/python scripts/bench/security.py flood                        # an hour
@@ -182,7 +181,7 @@ def backlog_drops() -> int:
 
 
 def lost(overlay: Overlay) -> int:
-    """Return how often any switch has lost a neighbour so far, those that may be hostile apart."""
+    """Return how often any switch has lost a neighbour so far, except those that may be hostile."""
     texts = [text for node in overlay.plan.switches if node != "h" for _, text in overlay.logs(f"switch {node}")]
     return sum(len(_LOST.findall(text)) for text in texts)
 
@@ -199,7 +198,7 @@ def counted(overlay: Overlay) -> tuple[int, int]:
 
 
 def restart_s(overlay: Overlay) -> float:
-    """Return how long a neighbour on the flooded link takes to come back; a switch logs what is up each half second."""
+    """Return the seconds until a neighbour on the flooded link is back; a switch logs what is up each half second."""
 
     def ups() -> int:
         return sum(text.count(f"neighbour up port={_NEAR}") for _, text in overlay.logs(f"switch {_VICTIM}"))
@@ -217,7 +216,7 @@ def restart_s(overlay: Overlay) -> float:
 
 
 def phase(overlay: Overlay, kind: str, seconds: float) -> Phase:
-    """Let time go on, with a flood or without."""
+    """Run one phase, with a flood or without."""
     pid = overlay.pid(f"switch {_VICTIM}")
     aimed_at, link = _AIMED_AT.get(kind, (f"switch {_VICTIM}", "h" if kind in OF_SWITCH else _NEAR))
     node = aimed_at.split()[1]
@@ -242,7 +241,7 @@ def phase(overlay: Overlay, kind: str, seconds: float) -> Phase:
 def measure(
     runs: RunRegistry, plane: str, kinds: Sequence[str], seconds: float, rate: float, rounds: int, *, spoof: bool
 ) -> dict[str, list[dict[str, Phase]]]:
-    """Return for each kind of flood what each round showed, calm and flooded."""
+    """Return the phases of each round by kind of flood, calm and flooded."""
     run = runs.start()
     try:
         with Overlay(run, plan(), plane=plane) as overlay:
@@ -268,7 +267,7 @@ def measure(
 
 @contextmanager
 def _flooding(run: Run, overlay: Overlay, kind: str, rate: float, seconds: float, *, spoof: bool) -> Iterator[Started]:
-    """Let a flood begin; a hostile member takes the place of the honest one of its name, which comes back."""
+    """Run a flood; a hostile member replaces the honest one of its name, which then returns."""
     if kind not in _HOSTILE:
         path = run.directory / f"{kind}.frames"
         path.write_bytes(b"".join(struct.pack("!I", len(frame)) + frame for frame in hellos(kind, overlay)))
@@ -313,7 +312,7 @@ def _own_address() -> bytes:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """State the subcommand's options."""
+    """Add the options of this subcommand."""
     parser.add_argument("--planes", nargs="+", default=["raw", "kernel"])
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--seconds", type=float, default=10.0, help="of each phase (default: %(default)s)")

@@ -1,15 +1,16 @@
-"""How many hostile statements of real members were tried, and how many of them ended a process?
+"""Insider bench: hostile statements of real members, and how many of them ended a process.
 
-Whole networks in memory (``tests/insiders``), each in a state that a random journey has reached, hear statements of
-every type, signed with the keys of eleven hostile members. An error that leaves a machine would end its process; with
-the boundary that a node has around each frame, it would be counted. Both count here, and so do invariants that break:
-bytes drawn by who is not believed, bounds of tables, the flow that no insider has a right on.
+Whole networks in memory (``tests/insiders``), each in a state that a random journey has reached, receive statements of
+every type, signed with the keys of eleven hostile members. An error that leaves a machine would end its process; the
+boundary that a node has around each frame counts it. Both count here. Broken invariants count too: bytes drawn by an
+untrusted sender, bounds of tables, the flow on which no insider has a right.
 
-Runs add up in the file; each begins at the seed after the last one. ``scripts/fuzz.py insiders --shrink`` cuts down
-what was found.
+Runs add up in the file; each begins at the seed after the last one. ``scripts/fuzz.py insiders --shrink`` reduces the
+findings.
 
     .venv/bin/python scripts/bench/security.py insiders --seconds 400 --processes 2
     .venv/bin/python scripts/bench/security.py insiders --statements 20000 --seed 7 --no-save
+
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ GOAL_STATEMENTS: Final = 10_000_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what this subcommand takes."""
+    """Add the options of this subcommand."""
     parser.add_argument("--statements", type=int, default=GOAL_STATEMENTS, help="in this run (default: %(default)s)")
     parser.add_argument("--seconds", type=float, help="end after so long in any case")
     parser.add_argument("--processes", type=int, default=1, help="side by side (default: 1)")
@@ -41,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
-    """Try statements, and add what came of it to what is in the file."""
+    """Try statements, and add the results to the file."""
     logging.disable(logging.CRITICAL)
     held = json.loads(options.json.read_text(encoding="utf-8")) if options.json.exists() else {}
     before: dict[str, Any] = held.get("insiders", {})

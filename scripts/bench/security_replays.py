@@ -1,29 +1,33 @@
-"""How many recorded frames are accepted after a restart, of so many that are played back? None should be.
+"""Replay bench: recorded frames that are accepted after a restart, of all that are played back. The target is none.
 
-One process: two domains with a RIB each, a publisher and its reader, a client and a server, a node that has moved, one
-that has withdrawn its topic, and one that is revoked, on the in-memory network, its clock virtual. Every frame on every
-link is recorded: while all come up, at work, while a link is cut, a RIB restarts, a node moves, withdraws or is
-revoked. Then nothing, one process or all of them restart, after seconds or, all being off, after hours or days, with
-their clocks right, or nearly an hour behind or ahead. RIBs begin with their snapshot and switches with the revocations
-that they kept. Right from the start of each recordings are played back: single frames, all parts of a statement, and
-stretches of a link in their order, at the port where they came in or at any other one, under the address of the
-neighbour there, their own, or a stranger's. Where a reader or a server has restarted, whom it hears is silent
-meanwhile, and every second recording is of what it heard of it.
+One process with the in-memory network and its virtual clock. There are two domains with a RIB each, a publisher and
+its reader, a client and a server. One node has moved, one has withdrawn its topic, and one is revoked. Every frame on
+every link is recorded: while all come up, at work, while a link is cut, a RIB restarts, a node moves, withdraws or is
+revoked.
+
+Then nothing, one process or all of them restart: after seconds or, all being off, after hours or days. Their clocks
+are right, or nearly an hour behind or ahead. RIBs begin with their snapshot and switches with the revocations that
+they kept. From the start, recordings of each kind are played back: single frames, all parts of a statement, and
+stretches of a link in their order. They arrive at their original port or at any other one, under the address of the
+neighbour there, their own, or a stranger's. Where a reader or a server has restarted, its peers are silent meanwhile,
+and every second recording is of what it received from them.
 
 *Accepted* is what the oracle (``Domain.found``) sees after that and ``QUIET_S`` more:
 
-- a message or request that an application was given and nobody sent in this batch, or was given twice or out of order;
+- a message or request that no member sent in this batch, or that an application got twice or out of order;
 - one that was sent when all had settled, and was not delivered or answered within ``PROMISE_S``: a flow was cut;
-- a neighbour, an attached claim, a place, a route of a RIB, or a branch of a tree, that is not of who is there, or that
-  is gone although it is: of the moved node the former place, of the withdrawn topic and the revoked node anything;
-- a link state that its origin did not say last.
+- a neighbour, an attached advertisement, a location, a route of a RIB, or a branch of a tree of an absent node; or one
+  that is gone although its node is there. Of the moved node the former location counts, of the withdrawn topic and the
+  revoked node anything;
+- a link state that its origin did not send last.
 
-What a frame warrants by itself is none of these: a keepalive of now keeps a neighbour up that is there.
+What a frame warrants by itself is none of these: a current keepalive keeps a present neighbour up.
 
-``--control`` takes one check of freshness away and must find something; it shows that the oracle can.
+``--control`` removes one check of freshness and must find something; it shows that the oracle can.
 
     .venv/bin/python scripts/bench/security.py replays
     .venv/bin/python scripts/bench/security.py replays --tries 2000 --control window --no-save
+
 """
 
 from __future__ import annotations
@@ -102,7 +106,7 @@ _TOPOLOGY: Final = Topology(
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """A frame, from its header on, as it came in somewhere."""
+    """Frame, from its header on, as it arrived somewhere."""
 
     node: str
     port: int
@@ -113,7 +117,7 @@ class Recorded:
 
 
 class _Stepped:
-    """A machine whose wall clock is off."""
+    """Machine whose wall clock is off."""
 
     def __init__(self, machine: ProtocolCore, ahead_s: float) -> None:
         self._machine = machine
@@ -145,11 +149,11 @@ class _Stepped:
 
 
 class RecordingNetwork(SimNetwork):
-    """Records what comes in where, and lets clocks jump and be off.
+    """Network that records arrivals, and lets clocks jump and be off.
 
     Attributes:
         records: None: nothing is recorded.
-        ahead_s: of the clock of what starts now.
+        ahead_s: offset of the clock of machines that start now.
     """
 
     records: list[Recorded] | None = None
@@ -157,13 +161,15 @@ class RecordingNetwork(SimNetwork):
 
     @property
     def now(self) -> Timestamps:
+        """Return the virtual time, with the clock offset of machines that start now."""
         return Timestamps(self._now_s, EPOCH_UNIX_S + self._now_s + self.ahead_s)
 
     def jump(self, gap_s: float) -> None:
-        """Let time go by in which nobody is alive."""
+        """Advance the time while every machine is off."""
         self._now_s += gap_s
 
     def replace(self, name: str, machine: ProtocolCore, table: ForwardingTable | None = None) -> None:
+        """Replace a machine; its wall clock keeps the present offset."""
         stepped = _Stepped(machine, self.ahead_s) if self.ahead_s else machine
         ahead_s, self.ahead_s = self.ahead_s, 0.0
         super().replace(name, stepped, table)  # type: ignore[arg-type]
@@ -180,7 +186,7 @@ class RecordingNetwork(SimNetwork):
 
 @dataclass(slots=True)
 class Domain:
-    """The network of one episode, and what must be true of it."""
+    """Network of one episode, and its invariants."""
 
     seed: int
     rng: random.Random = field(init=False)
@@ -223,7 +229,7 @@ class Domain:
         assert self._is_settled(SETTLE_S)
 
     def _live_through(self) -> None:
-        """Let happen what is recorded."""
+        """Run the events that are recorded."""
         world, network = self.world, self.network
         ghost = advertise(world, "/ghost", GHOST)
         ghost.read_by(READER)
@@ -259,7 +265,7 @@ class Domain:
         self.forget()
 
     def record_more(self) -> None:
-        """Record how a reader and a server of the present lives begin and work."""
+        """Record how a reader and a server of the present incarnations begin and work."""
         first, self.network.records = len(self.records), self.records
         for what in (READER, SERVER):
             self.restart(what)
@@ -280,7 +286,7 @@ class Domain:
     # -- what happens
 
     def say(self) -> None:
-        """Publish a message and ask a question."""
+        """Publish a message and send a request."""
         self.sent += 1
         message = b"message %d" % self.sent
         self.expected.append(message)
@@ -289,7 +295,7 @@ class Domain:
         self.client.publish(message)
 
     def restart(self, what: str, ahead_s: float = 0.0) -> None:
-        """Start a process again, with what it had on disk, and have it do what it did."""
+        """Restart a process with its files, and start its flows again."""
         world, network = self.world, self.network
         network.ahead_s = ahead_s
         if what.startswith("switch "):
@@ -330,7 +336,7 @@ class Domain:
         return [entry for key in store.known() if (entry := host.rib.entry_of(key, now_s))]  # type: ignore[attr-defined]
 
     def restart_all(self, gap_s: float, aheads: Callable[[], float]) -> None:
-        """End every process, let time go by, and start them all."""
+        """End every process, advance the time, and start them all."""
         world, network = self.world, self.network
         names = [*(f"switch {each}" for each in world.switches), *(f"rib {each}" for each in world.ribs)]
         nodes = [*world.switches, *map(world.rib_node, world.ribs), *world.members]
@@ -359,7 +365,7 @@ class Domain:
             self._take_part(label)
 
     def play(self, tries: int, counts: Counter[str], *, is_live: bool, to: str | None = None) -> Iterator[None]:
-        """Play back so many frames; yield now and then. ``to``: half of them are of what that member heard."""
+        """Play back so many frames; yield at intervals. ``to``: half of them are frames that this member received."""
         done = 0
         heard = [each for each in self.records if each.node == to and each.kind in (Kind.HEARTBEAT, Kind.DATA)]
         while done < tries:
@@ -398,7 +404,7 @@ class Domain:
     # -- what must be true
 
     def _is_settled(self, within_s: float) -> bool:
-        """Wait until all flows are there; return whether that came true."""
+        """Wait until all flows work; return whether they do in time."""
 
         def are_there() -> bool:
             server, client = self.server.member, self.client.member
@@ -410,7 +416,7 @@ class Domain:
         return self.network.run(within_s, are_there)
 
     def forget(self) -> None:
-        """Take everything that was delivered, and begin anew to count."""
+        """Take everything that was delivered, and restart the count."""
         self.collect()
         self.network.run(0.5)  # for answers to what the server has just taken
         self.collect()
@@ -421,19 +427,19 @@ class Domain:
         self.asked.clear()
 
     def collect(self) -> None:
-        """Take what was delivered."""
+        """Take the deliveries."""
         self.flow.got[READER] += [each.delivered for each in self.world.members[READER].poll_messages()]
         self.server.collect()
         self.client.collect()
 
     def settle(self) -> list[str]:
-        """Wait until all that restarted work again; return what was delivered meanwhile, or what does not work."""
+        """Wait until all restarted processes work again; return the deliveries meanwhile, or what does not work."""
         found = [] if self._is_settled(SETTLE_S) else ["a flow does not come back"]
         self.network.run(QUIET_S)
         return [*found, *self.delivered()]
 
     def delivered(self) -> list[str]:
-        """Return what applications were given that they should not have been, or were not given in time."""
+        """Return wrong deliveries to applications, and deliveries that are overdue."""
         self.network.run(PROMISE_S, self._has_all)
         tail = b" by " + SERVER.encode()
         found = []
@@ -457,7 +463,7 @@ class Domain:
         )  # fmt: skip
 
     def found(self) -> list[str]:
-        """Return what was accepted, by ``before`` and by what is true now."""
+        """Return what was accepted, compared with ``before`` and with the true state."""
         found = self.delivered()
         state, true = self.state(), self._truth()
         for what, values in state.items():
@@ -470,7 +476,7 @@ class Domain:
         return found
 
     def _truth(self) -> dict[str, set[Any]]:
-        """Return where everybody is, whoever says what."""
+        """Return the true location of every node, independent of all statements."""
         world = self.world
         at = {label: label.split("/")[0] for label in world.members} | {ROAMER: "b"}
         advertisements = {
@@ -486,7 +492,7 @@ class Domain:
         return {"attached": advertisements, "places": advertisements, "routes": advertisements, "link states": last}
 
     def state(self) -> dict[str, set[Any]]:
-        """Return what nodes believe."""
+        """Return the state that nodes believe."""
         world = self.world
         hosts = {world.rib_node(label): host.attachment.hello_protocol for label, host in world.ribs.items()}
         members = {
@@ -533,7 +539,7 @@ def _always(value: Any) -> Callable[..., Any]:
 
 
 def _any_start(self: WriterProxy, joined: Any, epoch: int, now_s: float) -> None:
-    """Take a start that is of another life of this reader."""
+    """Accept a start of another incarnation of this reader."""
     status = Heartbeat.from_wire(joined.message)
     start = status.starts.get(self._reader.name)
     if start is not None:
@@ -555,7 +561,7 @@ CONTROLS: Final[dict[str, tuple[tuple[object, str, Any], ...]]] = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what this subcommand takes."""
+    """Add the options of this subcommand."""
     parser.add_argument("--tries", type=int, default=100_000, help="frames played back (default: %(default)s)")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="end after so long in any case")
     parser.add_argument("--seed", type=int, default=1, help="of the first network")

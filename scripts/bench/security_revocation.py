@@ -1,11 +1,11 @@
-"""Revocations: what 10^5 of them cost a node, and how soon one closes a flow.
+"""Revocation bench: cost of 10^5 revocations for a node, and time until one closes a flow.
 
 kept      One process. A domain's root revokes 100,000 memberships: memory, time to take one, to look one up, to read
           all back from disk, and to bring a neighbour that knows none to the same state.
 closed    Real processes in namespaces, three tiers of RIBs. A member publishes on many topics, or many members publish
           on one topic each; one after the other loses its delegation (``gdp delegate revoke``) or its membership
           (``gdp cert revoke``). The file is handed to one switch, of neither end's domain, by SIGHUP. Measured is the
-          time from the signal, and from the start of the command, to the last message that a reader was given.
+          time from the signal, and from the start of the command, to the last message that a reader got.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ _YEAR_S: Final = 365 * 86_400
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """State the subcommand's options."""
+    """Add the options of this subcommand."""
     parser.add_argument("--part", action="append", choices=["kept", "closed"], help="this part only; may be repeated")
     parser.add_argument("--count", type=int, default=COUNT, help="revocations kept (default: %(default)s)")
     parser.add_argument("--rounds", type=int, default=3, help="networks built for closed (default: %(default)s)")
@@ -150,7 +150,7 @@ def _each_us(call: Any, wires: list[bytes]) -> float:
 
 
 def _unconcerned_us(revoked: Revocations, unix_s: float) -> float:
-    """Return what a junk revocation costs, its parsing included."""
+    """Return the cost of a junk revocation in microseconds, its parsing included."""
     stranger = CertificateAuthority.create("none", SigningKey.generate(), Validity.lasting(unix_s, _YEAR_S))
     wires = list(_statements(stranger, 5_000, unix_s))
 
@@ -190,7 +190,7 @@ def _on_disk(revoked: Revocations, authority: CertificateAuthority, unix_s: floa
 
 
 def _newcomer(count: int) -> dict[str, float]:
-    """Return what it takes until a neighbour that comes up and knows none keeps all, and again ten more."""
+    """Return the cost until a neighbour that comes up and knows none keeps all, and again ten more."""
     topology = Topology((Link("s1", "s2"),), (DomainPlan("lab", ("s1", "s2")),), ())
     world = Simulation(topology, keepalive_ms=1_000, dead_s=10.0, hello_s=1.0)
     first, second = world.topology.nodes
@@ -294,10 +294,10 @@ class _Closing:
 
     def __init__(self, overlay: Overlay) -> None:
         self._overlay = overlay
-        self._last_ns: dict[int, int] = {}  # by channel: when R was given the last message
+        self._last_ns: dict[int, int] = {}  # by channel: when R got the last message
 
     def measure(self, found: dict[str, list[float]]) -> int:
-        """Add what was measured; return how many flows were not closed.
+        """Add the measurements; return how many flows were not closed.
 
         Raises:
             FailedError: the flows did not come up, or a process ended by itself.
@@ -325,7 +325,7 @@ class _Closing:
         return late
 
     def _revoke(self, channel: int) -> tuple[int, int]:
-        """Take back by the command, hand the file in; return when each began, monotonic nanoseconds."""
+        """Revoke by the command, and hand the file in; return when each began, in monotonic nanoseconds."""
         flow, folder = self._overlay.plan.flows[channel], self._overlay.directory
         node = folder / "nodes" / f"proxy-{flow.publisher}"
         out = folder / "revocations" / f"{channel}.revoke"

@@ -1,4 +1,4 @@
-"""How many messages are lost while the secrets of their topics change every few seconds.
+"""Rotation bench: messages lost while the secrets of their topics change every few seconds.
 
 One process: the ring of five switches on the in-memory network, its clock virtual. The robot publishes one reliable and
 one best-effort topic to two readers. Every ``--rotate-s`` each member is granted the next epoch: the readers first, the
@@ -39,7 +39,7 @@ DRAIN_S: Final = 30.0
 
 @dataclass(slots=True)
 class Stream:
-    """One topic, and what of it came to whom."""
+    """Topic, and its deliveries by reader."""
 
     name: str
     reliable: bool
@@ -48,7 +48,7 @@ class Stream:
 
 
 class Rotation:
-    """The ring, its topics, and the epochs that have begun."""
+    """Ring, its topics, and the epochs that have begun."""
 
     def __init__(self, loss: float) -> None:
         self.world = Simulation(ring5(), seed=5)
@@ -105,7 +105,7 @@ class Rotation:
         self.world.network.touch(ROBOT)
 
     def collect(self) -> None:
-        """Take what came."""
+        """Take the deliveries."""
         by_name = {stream.publisher.topic: stream for stream in self.streams if stream.publisher is not None}
         for label in READERS:
             for message in self.world.members[label].poll_messages():
@@ -138,12 +138,12 @@ class Rotation:
         }
 
     def refused(self) -> Counter[str]:
-        """Return what the publisher refused, by reason."""
+        """Return the refusals of the publisher, by reason."""
         return Counter({reason.label: count for reason, count in self.world.members[ROBOT].drops().items()})
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """State the subcommand's options."""
+    """Add the options of this subcommand."""
     parser.add_argument("--messages", type=int, default=100_000, help="on both topics together, to each reader")
     parser.add_argument("--rate", type=float, default=2_000.0, help="messages a second of virtual time")
     parser.add_argument("--rotate-s", type=float, default=5.0, help="seconds of an epoch")
@@ -151,7 +151,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
-    """Print the table; return the figures, and whether nothing was lost that may not be."""
+    """Publish so many messages on all topics together; return the account of each."""
     rotation = Rotation(options.loss)
     accounts = rotation.run(options.messages, options.rate, options.rotate_s)
     table = Table(title=f"{rotation.epoch} epochs of {options.rotate_s:g} s")

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""CPU per message at each end, for the three encodings: a camera image, a laser scan, an IMU reading."""
+"""CPU time per message at each endpoint, for the three encodings: a camera image, a laser scan, an IMU reading."""
 
 from __future__ import annotations
 
@@ -86,6 +86,7 @@ def measure(repeat: int) -> list[dict[str, object]]:
 
 
 def show(rows: list[dict[str, object]]) -> None:
+    """Print the table."""
     table = Table(
         "topic",
         "encoding",
@@ -106,6 +107,7 @@ def _ends(row: dict[str, object]) -> list[dict[str, float]]:
 
 
 def main() -> int:
+    """Run the bench; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, epilog="example: scripts/bench/serial.py --repeat 500")
     parser.add_argument("--repeat", type=int, default=300, help="calls per figure (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")

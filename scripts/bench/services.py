@@ -1,10 +1,10 @@
-"""Calls of a real ROS 2 service over three machines: rclpy client, proxy, three kernel switches, proxy, rclpy server.
+"""Service bench: calls over three machines; rclpy client, proxy, three kernel switches, proxy, rclpy server.
 
     one at a time    a client calls, waits for the answer, calls again: how long a call takes
-    1,000/s          50 clients in one node call in turn, nobody waits for the others: whether all are answered
+    1,000/s          50 clients in one node call in turn, none waits for the others: whether all are answered
 
-each beside the same two nodes joined by one cable (``direct``), in turn, round by round. Asked: at most 1.5 ms more a
-call than direct; of 1,000 calls a second every one answered.
+each compared with the same two nodes joined by one cable (``direct``), in turn, round by round. Targets: at most
+1.5 ms more a call than direct; every one of 1,000 calls a second answered.
 
     sudo .venv/bin/python scripts/bench/services.py                     # the whole; writes docs/benchmarks/services.*
     sudo .venv/bin/python scripts/bench/services.py --quick --no-save   # a few seconds: does it work?
@@ -58,7 +58,7 @@ class Series:
         return DIRECT if self.encoding is None else f"overlay, {self.encoding}"
 
     def measure(self, row: Row, round_number: int) -> dict[str, float]:
-        """Return the figures of one try, by column.
+        """Return the figures of one trial, by column.
 
         Raises:
             FailedError: a node did not come up, or nothing was answered.
@@ -104,7 +104,7 @@ def case_of(case: str, mtu: int) -> str:
 
 
 def targets_of(over: Rounds, mtu: int) -> list[Target]:
-    """Return what was asked for."""
+    """Return the targets."""
     one, load = case_of(ONE, mtu), case_of(LOAD, mtu)
     targets = []
     for encoding in ENCODINGS[ONE]:

@@ -1,6 +1,6 @@
 """Bench skeleton: command line, rounds, interruption, machine facts, table, JSON record and picture of every bench.
 
-I/O. Figures, their spread and targets are ``acknack.py``'s. A bench states its options and measures::
+I/O. ``report.py`` defines figures, their spread and targets. A bench states its options and measures::
 
     def measure(options: Options, runs: Runs) -> Outcome: ...
 
@@ -35,7 +35,7 @@ Options = argparse.Namespace
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a bench measured.
+    """Result of a bench.
 
     Attributes:
         name: of the record, and of its files below ``docs/benchmarks``.
@@ -150,7 +150,7 @@ def clean_exit() -> Iterator[None]:
 
 @contextmanager
 def new_run(runs: RunRegistry | None = None) -> Iterator[Run]:
-    """Have a run of the test bed; without ``runs``, what an earlier killed run left is removed first."""
+    """Create a run of the test bed; without ``runs``, remains of an earlier killed run are removed first."""
     if runs is None:
         runs = RunRegistry()
         runs.sweep()

@@ -1,14 +1,14 @@
-"""Whether anything grows in nodes that live long: subscriptions and publishers that come and go.
+"""Soak bench: growth of long-lived nodes while subscriptions and publishers come and go.
 
-In memory (virtual time, one process): a reader subscribes and unsubscribes over and over; then publishers of names that
-were never heard of come, are read, and go. Samples: objects that Python's collector tracks, and resident memory.
+In memory (virtual time, one process): a reader subscribes and unsubscribes over and over; then publishers of unknown
+names come, are read, and go. Samples: objects that Python's collector tracks, and resident memory.
 
 On real processes in namespaces: the same for a while, at an even rate. Samples of every switch, RIB and member: open
 descriptors, threads, bytes of BPF maps (which hold an entry only while it is there), resident memory.
 
-The samples after the warm-up must be flat (``faults/slope.py``). What went is remembered up to a bound: 16,384 verified
-delegations a node, 4,096 ended feeds, withdrawals for the hour of an RtCert. A run of more publishers takes its samples
-after that is full; a shorter one may grow by ``FILL_KB`` for each, and counts no objects.
+The samples after the warm-up must be flat (``faults/slope.py``). Nodes remember ended peers up to a bound: 16,384
+verified delegations a node, 4,096 ended writer proxies, withdrawals for the hour of an RtCert. A run of more publishers
+takes its samples after that is full; a shorter one may grow by ``FILL_KB`` for each, and counts no objects.
 
     .venv/bin/python scripts/bench/soak.py --only memory                                    # a minute
     .venv/bin/python scripts/bench/soak.py --only memory --cycles 30000 --publishers 25000         # 20 minutes
@@ -90,7 +90,7 @@ class Memory:
         world.network.touch(LEFT)
 
     def publish(self, publishers: int, samples: Samples) -> None:
-        """Let so many publishers come, each of a name of its own, be read once, and go."""
+        """Start so many publishers in turn, each of a name of its own; each is read once and goes."""
         world, left, right = self._world, self._world.members[LEFT], self._world.members[RIGHT]
 
         def once() -> None:
@@ -124,7 +124,7 @@ class Memory:
 
 
 def _repeat(label: str, once: Callable[[], None], times: int, samples: Samples | None = None) -> None:
-    """Do something so often, and take samples; where bounded memories still fill up, objects are not counted."""
+    """Repeat an action, and take samples; where bounded memories still fill up, objects are not counted."""
     begun_s = time.monotonic()
     for at in range(times):
         once()
@@ -140,7 +140,7 @@ def soak_memory(options: argparse.Namespace, samples: Samples) -> None:
     """Soak in memory.
 
     Raises:
-        FailedError: something did not come about.
+        FailedError: an expected event did not occur.
     """
     memory = Memory()
     memory.subscribe(options.cycles, samples)
@@ -195,7 +195,7 @@ def _resident_bytes(pid: int) -> int:
 
 
 def _map_bytes(folder: Path) -> Iterator[int]:
-    """Yield what each BPF map of a process takes. Source: Linux, kernel/bpf/syscall.c, ``bpf_map_show_fdinfo``."""
+    """Yield the bytes of each BPF map of a process. Source: Linux, kernel/bpf/syscall.c, ``bpf_map_show_fdinfo``."""
     for each in (folder / "fdinfo").iterdir():
         facts = dict(line.split(":", 1) for line in each.read_text(encoding="ascii").splitlines() if ":" in line)
         if "map_type" in facts:
@@ -203,7 +203,7 @@ def _map_bytes(folder: Path) -> Iterator[int]:
 
 
 def show(samples: Samples, publishers: int) -> bool:
-    """Print what every figure did; return whether all are flat, or grew as memories do that fill."""
+    """Print every figure; return whether all are flat, or grew as filling memories do."""
     table = Table(title="After the warm-up", title_justify="left")
     for heading in ("who", "figure", "mean", "rise", "scatter", "flat"):
         table.add_column(heading, justify="left" if heading in ("who", "figure") else "right")
@@ -220,7 +220,7 @@ def show(samples: Samples, publishers: int) -> bool:
 
 
 def main() -> None:
-    """Soak; exit 1 when something grows."""
+    """Run the soak; exit 1 when something grows."""
     parser = command_line(__doc__, seconds=SECONDS, seconds_of="on real processes")
     parser.add_argument("--only", choices=("memory", "real"), help="this part")
     parser.add_argument("--cycles", type=int, default=CYCLES, help="subscriptions in memory (default: %(default)s)")

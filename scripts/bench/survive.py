@@ -1,4 +1,4 @@
-"""How long a steady reliable flow is silent when something fails or moves, and whether it loses anything.
+"""Survival bench: silence of a steady reliable flow when something fails or moves, and its losses.
 
 Each row has a small network of real processes in namespaces (``survive_rows.py``). P publishes numbered messages of 100
 bytes; R writes down when each came. The silence of an event is the longest time between two consecutive messages at R,
@@ -54,13 +54,13 @@ COLUMNS: Final = 170
 
 @dataclass(slots=True)
 class Measured:
-    """What came of a row: seconds, one figure an event.
+    """Result of a row: seconds, one figure an event.
 
     Attributes:
         silence_s: from the event on.
-        return_s: when it was taken back.
+        return_s: the same after the event is undone.
         new_name_s: until a name that is new after the event was read.
-        told_lost: what R was told that it missed of the steady flow.
+        told_lost: losses of the steady flow that R got a report of.
         never: events after which the flow did not come back in time; their silence is at least the patience.
     """
 
@@ -75,18 +75,18 @@ class Measured:
 
 
 class Flowing:
-    """R's side of the flow while it runs: arrivals as they are written down."""
+    """R's side of the flow while it runs: arrivals as they are recorded."""
 
     def __init__(self, overlay: Overlay) -> None:
         self._overlay = overlay
         self.arrivals_ns: list[int] = []
-        self.numbers: Counter[tuple[int, int]] = Counter()  # (life, number) of the steady flow
+        self.numbers: Counter[tuple[int, int]] = Counter()  # (incarnation, number) of the steady flow
         self.published: set[tuple[int, int]] = set()
         self.told_lost = 0
         self.first_of: dict[int, int] = {}  # channel -> when its first message came
 
     def look(self) -> None:
-        """Take what is new; end with an error if a process ended by itself.
+        """Read new records; end with an error if a process ended by itself.
 
         Raises:
             FailedError: one did.
@@ -137,14 +137,14 @@ class Flowing:
         return max((b - a for a, b in pairwise(marks)), default=0) / 1e9
 
     def count(self, sent: set[tuple[int, int]]) -> tuple[int, int]:
-        """Return how many of these are missing, from the first that came on, and how many of any came twice."""
+        """Return how many of these are missing, from the first that arrived on, and the surplus deliveries of any."""
         first = min(self.numbers, default=(0, 0))
         missing = {each for each in sent if each >= first} - self.numbers.keys()
         return len(missing), sum(number - 1 for number in self.numbers.values())
 
 
 def measure(runs: RunRegistry, row: Row, rounds: int, options: argparse.Namespace) -> Measured:
-    """Let the event of a row happen so often.
+    """Make the event of a row happen so often.
 
     Raises:
         FailedError: the network did not come up, or a process ended by itself.
@@ -159,7 +159,7 @@ def measure(runs: RunRegistry, row: Row, rounds: int, options: argparse.Namespac
         flow = Flowing(overlay)
         if not flow.await_steady(time.monotonic_ns()):
             raise FailedError(f"{row.what}: no steady flow before any event")
-        _watch(flow, options.settle_s)  # paths wait longer in a network that has just begun (RFC 8405)
+        _watch(flow, options.settle_s)  # path computation waits longer in a network that has just started (RFC 8405)
         for at in range(rounds):
             _once(overlay, flow, row, at, found, options)
         flow.look()
@@ -198,7 +198,7 @@ def _watch(flow: Flowing, seconds: float) -> None:
 
 
 def _new_name_s(overlay: Overlay, flow: Flowing, at: int) -> float:
-    """Let P publish, and R read, a name that nobody knew; return how long until the first message of it."""
+    """Make P publish, and R read, an unknown name; return the seconds until its first message."""
     channel = len(overlay.plan.flows) + len(overlay.plan.services) + at
     begun_ns = time.monotonic_ns()
     for who in ("member P", "member R"):

@@ -1,4 +1,4 @@
-"""The events of ``survive.py``: a small network for each, what fails in it, and how that is undone.
+"""Events of ``survive.py``: a small network for each, what fails in it, and how that is undone.
 
 I/O. Through ``faults.overlay``. P publishes to R at an even rate; ``-`` is a link of cost 10, ``=`` one of
 12, so that traffic takes the upper way::
@@ -38,11 +38,11 @@ class Row:
 
     Args:
         what: in words.
-        target_s: most seconds of silence at the 99th percentile; None: only told.
+        target_s: most seconds of silence at the 99th percentile; None: reported without a target.
         plan: the network, for a rate of messages a second.
-        fail: makes the event happen; given the overlay and the number of the round, from 0.
-        undo: takes it back; None where the next event is as good from here.
-        new_name_s: most seconds until a name that is new then is read; None: not asked.
+        fail: makes the event happen; gets the overlay and the number of the round, from 0.
+        undo: undoes it; None where the next event may start from this state.
+        new_name_s: most seconds until a new name is read; None: not measured.
         holds: the event lasts for the bench's ``--dead-s``.
     """
 
@@ -114,14 +114,14 @@ def _move(*movers: str) -> Callable[[Overlay, int], None]:
 
 
 class _OnPath:
-    """Faults at the switch, or the link to or from it, that the flow takes at that moment.
+    """Faults at the switch, or the link to or from it, that the flow uses at that moment.
 
     A link that came back may be left out of routes for seconds (damping), so the path is not always the cheaper one.
-    The busier of the last switch's two devices tells.
+    The busier of the last switch's two devices shows the path.
 
     Args:
-        last: where both ways meet again.
-        ways: the switch before it, by which the flow comes, and what fails then.
+        last: the switch where both paths meet again.
+        ways: the switch before it on the flow's path, and what fails then.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
-"""A large forwarding table, filled in bulk: how fast, and what it weighs.
+"""Bulk fill of a large forwarding table: speed and memory.
 
-I/O. Asks the kernel about this process. What an eBPF map takes is no part of a process's resident memory; the
-kernel tells it beside the map's file descriptor (``memlock``, proc(5)).
+I/O. Queries the kernel about this process. Memory of an eBPF map is no part of a process's resident memory; the
+kernel reports it with the map's file descriptor (``memlock``, proc(5)).
 """
 
 from __future__ import annotations
@@ -25,7 +25,10 @@ _CHUNK: Final = 100_000  # entries a call; made outside the measured time
 
 
 def resident_bytes() -> int:
-    """Return what this process holds now; its recorded maximum would include the parent's, from before exec."""
+    """Return the present resident memory of this process.
+
+    Its recorded maximum would include the parent's, from before exec.
+    """
     return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * resource.getpagesize()
 
 

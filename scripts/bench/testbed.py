@@ -161,7 +161,7 @@ class OverlayNodes:
         install_delegation(identity, delegate(self.files / "owner", identity / CARD, metadata, [right]))
 
     def admit_member(self, node: str, topics: Mapping[Right, Iterable[str]]) -> Path:
-        """Let a member without ROS use topics; return its configuration file."""
+        """Delegate topics to a member without ROS; return its configuration file."""
         for right, names in topics.items():
             for name in names:
                 self.admit(node, Metadata({"kind": "topic", "name": name}), right)

@@ -1,11 +1,12 @@
-"""Whether hashing or verifying in a thread of its own pays: both ways side by side, in one process and run.
+"""Thread offload bench: benefit of a separate thread for hashing or verification, both ways in one process and run.
 
     .venv/bin/python scripts/bench/thread_offload.py [--rounds 5] [--count 60] [--json FILE]
 
-Benchmark in one process, without a network.
-come, in place and by a thread beside; a small message is verified in place and by a thread beside. What a thread does
-must be handed over and waited for, and it helps only as far as the interpreter's lock is let go meanwhile: how far, is
-shown by what two threads take for twice the work (1: side by side, 2: one after the other).
+One process, without a network. An image of 921,600 bytes is sealed as parts for MTU 1500 and hashed as they come, in
+place and by a second thread; a small message is verified in place and by a second thread. Work of a thread must be
+handed over and awaited, and a thread helps only while the interpreter's lock is released. The time that two threads
+take for twice the work shows how far: 1 for parallel, 2 for one after the other.
+
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ Hash = Callable[[list[bytes]], None]
 
 
 def seal(aead: AESGCM, image: memoryview, take: Hash) -> None:
-    """Encrypt part by part, giving each chunk of parts to ``take``."""
+    """Encrypt part by part, passing each chunk of parts to ``take``."""
     chunk: list[bytes] = []
     for number, begin in enumerate(range(0, len(image), ROOM_BYTES)):
         part = aead.encrypt(number.to_bytes(12, "big"), image[begin : begin + ROOM_BYTES], ADDITIONAL)
@@ -49,6 +50,7 @@ def seal(aead: AESGCM, image: memoryview, take: Hash) -> None:
 
 
 def in_place(aead: AESGCM, image: memoryview) -> None:
+    """Seal and hash an image in this thread."""
     update = hashlib.sha256().update
 
     def take(chunk: list[bytes]) -> None:
@@ -59,6 +61,7 @@ def in_place(aead: AESGCM, image: memoryview) -> None:
 
 
 def beside(worker: ThreadPoolExecutor, aead: AESGCM, image: memoryview) -> None:
+    """Seal an image in this thread and hash it in another."""
     running = hashlib.sha256()
     under_way: list[Future[None]] = []
 
@@ -72,6 +75,7 @@ def beside(worker: ThreadPoolExecutor, aead: AESGCM, image: memoryview) -> None:
 
 
 def by_two(work: Callable[[], object]) -> None:
+    """Run the same work in two threads at the same time."""
     threads = [threading.Thread(target=work) for _ in range(2)]
     for thread in threads:
         thread.start()
@@ -80,6 +84,7 @@ def by_two(work: Callable[[], object]) -> None:
 
 
 def median_ms(work: Callable[[], object], count: int) -> float:
+    """Return the median time of a call, in milliseconds."""
     times = []
     for _ in range(count):
         begun_s = time.perf_counter()
@@ -89,6 +94,7 @@ def median_ms(work: Callable[[], object], count: int) -> float:
 
 
 def main() -> None:
+    """Run the bench."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--count", type=int, default=60, help="images in a round; small messages: ten times that")

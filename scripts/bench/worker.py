@@ -1,6 +1,7 @@
-"""A process of a bench in a namespace of its own, asked by JSON lines; and how such a process reads and answers them.
+"""Process of a bench in a namespace of its own, controlled by JSON lines; and the reader and writer in that process.
 
-I/O. The kernel kills it with the thread that started it, so that none outlives a bench, however that ends.
+I/O. The kernel kills it with the thread that started it, so that no worker outlives a bench, however that ends.
+
 """
 
 from __future__ import annotations
@@ -25,17 +26,17 @@ _PATIENCE_S: Final = 5.0
 
 
 class Worker:
-    """One running role of ``roles.py``; a context manager that ends it.
+    """Running role of ``roles.py``; a context manager that ends it.
 
     Args:
-        spaces: where its namespace is.
-        node: that namespace.
-        role: what it is to be.
+        spaces: the namespaces.
+        node: the namespace of the worker.
+        role: its role.
         cpu: the core to run on; None leaves that to the scheduler.
-        settings: what the role is told at its start.
+        settings: settings of the role at its start.
 
     Raises:
-        LocalError: it ended before it was ready; ``refused`` in its only line says why, or stderr does.
+        LocalError: it ended before it was ready; ``refused`` in its only line gives the reason, or stderr does.
     """
 
     roles = Path(__file__).with_name("roles.py")  # another commit's while its packages are measured
@@ -54,6 +55,7 @@ class Worker:
 
     @property
     def pid(self) -> int:
+        """Process id of the worker."""
         return self._process.pid
 
     def __enter__(self) -> Worker:
@@ -75,7 +77,7 @@ class Worker:
         """Return its next line.
 
         Raises:
-            LocalError: it ended, or could not do what it was asked.
+            LocalError: it ended, or could not do the command.
         """
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
@@ -87,13 +89,13 @@ class Worker:
         return said
 
     def tell(self, **values: Value) -> None:
-        """Say something to it, without waiting for an answer."""
+        """Send a command, without waiting for an answer."""
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps(values) + "\n")
         self._process.stdin.flush()
 
     def ask(self, **values: Value) -> Answer:
-        """Say something and return the answer.
+        """Send a command and return the answer.
 
         Raises:
             LocalError: as ``read``.
@@ -126,7 +128,7 @@ def floats(value: Value) -> list[float]:
 
 
 def answer(values: Mapping[str, Value]) -> None:
-    """Say something to the bench."""
+    """Send an answer to the bench."""
     print(json.dumps(values), flush=True)
 
 
@@ -140,5 +142,5 @@ def command() -> Answer:
 
 
 def command_waits() -> bool:
-    """Tell whether ``command`` would return at once. (One line is asked for at a time, so none hides in a buffer.)"""
+    """Return whether ``command`` would return at once. One line is requested at a time, so none is in a buffer."""
     return bool(select.select([sys.stdin], [], [], 0)[0])

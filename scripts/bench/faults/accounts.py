@@ -173,7 +173,7 @@ class Books:
             for at, (source_life, account) in enumerate(accounts):
                 sent = sum(at_ns <= until_ns for at_ns in self.published[channel, source_life])
                 is_last = is_last_life(flow.publisher, source_life) and is_last_life(reader, life)
-                # losses of a later incarnation count from its start, also if only a former reader's incarnation knew an earlier one
+                # losses of a later incarnation count from its start, also if only an earlier reader knew an older one
                 is_later = at or self._known_before(channel, reader, life, source_life)
                 head = account.first - 1 if is_later else 0
                 least += account.missing(sent if is_last else account.last)
