@@ -25,7 +25,7 @@ _FENCE: Final = re.compile(r"(^```.*?^```$)", re.MULTILINE | re.DOTALL)
 
 
 def _origin(src_uri: str) -> Path:
-    """Return the file of which a page of the site is made."""
+    """Return the source file of a page of the site."""
     return ROOT / src_uri.removeprefix(_PREFIX) if src_uri.startswith(_PREFIX) else _DOCS / src_uri
 
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Give every decoder mutated inputs; each must return or raise one of its own errors, in time and within its memory.
+"""Fuzzing: every decoder gets mutated inputs and must return or raise one of its own errors, in time and memory.
 
 Examples:
   scripts/fuzz.py --list                             the decoders, and what they may raise
@@ -83,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _engine(options: argparse.Namespace) -> tuple[Sequence[Decoder], _Fuzz]:
-    """Return the decoders, and what fuzzes one of them: libFuzzer where that is asked for and installed."""
+    """Return the decoders, and the engine that fuzzes one of them: libFuzzer where requested and installed."""
     if options.guided:
         from tests.fuzzing.guided import guided, instrumented_decoders
 
@@ -155,7 +155,7 @@ def _findings(outcomes: Sequence[Outcome], *, has_limits: bool) -> int:
 
 
 def _insiders(arguments: Sequence[str]) -> int:
-    """Let hostile members speak to networks in memory."""
+    """Send statements of hostile members to networks in memory."""
     parser = argparse.ArgumentParser(prog="scripts/fuzz.py insiders", description=_insiders.__doc__)
     parser.add_argument("--statements", type=int, default=10_000, metavar="N", help="to try (default: 10000)")
     parser.add_argument("--seconds", type=float, help="end after so long in any case")
@@ -194,7 +194,7 @@ def _insiders(arguments: Sequence[str]) -> int:
 
 
 def _breaks(place: str, plan: Plan) -> bool:
-    """Return whether a plan breaks at this place."""
+    """Return whether a plan fails at this location."""
     from tests.insiders.search import run_plan
 
     _, found = run_plan(plan)

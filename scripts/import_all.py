@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Import test: imports every module of the packages named.
+"""Import test of every module of the named packages.
 
     scripts/import_all.py gdp                 base installation; skips modules that need an extra
     scripts/import_all.py gdp proxy fog       with all extras
@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-EXTRAS = frozenset({"pkcs11", "redis", "scapy"})  # what modules of gdp import and no base installation has
+EXTRAS = frozenset({"pkcs11", "redis", "scapy"})  # packages that modules of gdp import and a base installation lacks
 
 
 def module_names(package: str) -> Iterator[str]:

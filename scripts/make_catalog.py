@@ -1,4 +1,4 @@
-"""Make the data of ``fog.catalog``: a digest of the spot advisor with list prices, and what the spot traces say.
+"""Generator of the data of ``fog.catalog``: a digest of the spot advisor with list prices, and spot trace statistics.
 
 Command: reads ``../shared/data/spot``, writes ``fog/catalog/aws.json`` and ``traces.json``. One command:
 
@@ -95,7 +95,7 @@ def prices() -> dict[str, object]:
 
 
 def traces() -> dict[str, object]:
-    """Return what the traces say of uptime and of failing together."""
+    """Return statistics of the traces: uptime, and simultaneous failures."""
     zones = [
         Trace.from_document(path.stem.rsplit("_", 1)[1], json.loads(path.read_text()))
         for path in sorted(SPOT.glob("aws_*.json"))

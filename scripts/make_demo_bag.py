@@ -1,5 +1,8 @@
 #!/usr/bin/env python3
-"""Make the demonstration recording: a small robot drives a circle in a room. The same arguments give the same bytes."""
+"""Generator of the demonstration recording: a small robot drives a circle indoors.
+
+The same arguments give the same bytes.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,7 @@ TYPES: Final = {  # topic: type, messages a second (0: one, latched)
 
 
 def scene() -> NDArray[np.uint8]:
-    """Return the floor that the camera passes over: uint8 [TEXTURE, TEXTURE, 3], RGB; integers only, so exact."""
+    """Return the ground that the camera passes over: uint8 [TEXTURE, TEXTURE, 3], RGB; integers only, so exact."""
     random = np.random.default_rng(7)
     total = np.zeros((TEXTURE, TEXTURE, 3), np.int64)
     for cells, weight in ((8, 4), (32, 2), (128, 1)):
@@ -68,7 +71,7 @@ def scene() -> NDArray[np.uint8]:
 
 
 class Drive:
-    """The robot and its messages, for either ROS."""
+    """Robot and its messages, for either ROS."""
 
     def __init__(self, ros: RosVersion) -> None:
         self.ros = ros
@@ -80,7 +83,7 @@ class Drive:
         self.seq = 0
 
     def make(self, type_name: str, **fields: object) -> object:
-        """Return a message."""
+        """Return a message of a type with these fields."""
         return self.store.types[type_name](**fields)  # type: ignore[arg-type]
 
     def channel(self, topic: str) -> Channel:
@@ -97,7 +100,7 @@ class Drive:
         return Channel(topic, type_name, 2, digest, definition, "msg", qos=(qos,), latched=latched)
 
     def raw(self, topic: str, at_ns: int) -> bytes:
-        """Return a topic's message of a moment, in wire form."""
+        """Return the message of a topic at a moment, in wire form."""
         type_name = TYPES[topic][0]
         message = {
             "/tf_static": self.static_transforms,
@@ -113,6 +116,7 @@ class Drive:
         return bytes(self.store.serialize_cdr(message, type_name, little_endian=True))
 
     def header(self, at_ns: int, frame: str) -> object:
+        """Return a header; ``at_ns`` counts from the start."""
         seconds, nanoseconds = divmod(START_NS + at_ns, 1_000_000_000)
         stamp = self.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
         if self.ros == 2:
@@ -127,13 +131,16 @@ class Drive:
         return round(x, 9), round(y, 9), round(turned, 9)
 
     def vector(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> object:
+        """Return a vector."""
         return self.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
     def quaternion(self, heading: float) -> object:
+        """Return the rotation about z; ``heading`` in radians."""
         z, w = round(math.sin(heading / 2), 9), round(math.cos(heading / 2), 9)
         return self.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=z, w=w)
 
     def transform(self, at_ns: int, frames: tuple[str, str], at: tuple[float, float, float], heading: float) -> object:
+        """Return the transform between two frames; metres, ``heading`` in radians."""
         return self.make(
             "geometry_msgs/msg/TransformStamped",
             header=self.header(at_ns, frames[0]),
@@ -144,11 +151,13 @@ class Drive:
         )
 
     def static_transforms(self, at_ns: int) -> object:
+        """Return the mounts of camera and laser."""
         camera = self.transform(at_ns, ("base_link", "camera"), (0.2, 0.0, 0.3), 0.0)
         laser = self.transform(at_ns, ("base_link", "laser"), (0.1, 0.0, 0.2), 0.0)
         return self.make("tf2_msgs/msg/TFMessage", transforms=[camera, laser])
 
     def transforms(self, at_ns: int) -> object:
+        """Return the pose of the base in the odometry frame."""
         x, y, heading = self.pose_at(at_ns)
         return self.make(
             "tf2_msgs/msg/TFMessage",
@@ -156,6 +165,7 @@ class Drive:
         )
 
     def map(self, at_ns: int) -> object:
+        """Return the occupancy grid of the walls."""
         columns, rows = (round(side / MAP_CELL_M) for side in ROOM_M)
         cells = np.zeros((rows, columns), np.int8)
         cells[0] = cells[-1] = cells[:, 0] = cells[:, -1] = 100
@@ -177,6 +187,7 @@ class Drive:
         return self.make("nav_msgs/msg/OccupancyGrid", header=header, info=info, data=cells.reshape(-1))
 
     def image(self, at_ns: int) -> object:
+        """Return the image of the camera: RGB, ``HEIGHT`` x ``WIDTH`` pixels."""
         x, y, _ = self.pose_at(at_ns)
         left, top = (round(256 * value) % TEXTURE for value in (x, y))
         view = self.floor[top : top + HEIGHT, left : left + WIDTH]
@@ -192,6 +203,7 @@ class Drive:
         )
 
     def scan(self, at_ns: int) -> object:
+        """Return the laser scan: ``BEAMS`` ranges in metres."""
         x, y, heading = self.pose_at(at_ns)
         angles = -math.pi + np.arange(BEAMS) * (2 * math.pi / BEAMS)
         ahead, aside = np.cos(angles + heading), np.sin(angles + heading)
@@ -218,6 +230,7 @@ class Drive:
         )
 
     def imu(self, at_ns: int) -> object:
+        """Return the reading of the IMU."""
         _, _, heading = self.pose_at(at_ns)
         shake = round(0.05 * math.sin(at_ns / 1e9 * 40), 9)
         unknown = np.zeros(9)
@@ -234,6 +247,7 @@ class Drive:
         )
 
     def odometry(self, at_ns: int) -> object:
+        """Return pose and speed of the base."""
         x, y, heading = self.pose_at(at_ns)
         spread = np.diag([1e-4] * 6).reshape(-1)
         pose = self.make(
@@ -267,6 +281,7 @@ def moments(seconds: float) -> Iterator[tuple[int, str]]:
 
 
 def main() -> int:
+    """Write the recording; return the exit status."""
     parser = argparse.ArgumentParser(
         description=__doc__,
         epilog="example: scripts/make_demo_bag.py --seconds 10 -o drive.mcap",

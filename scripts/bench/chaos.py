@@ -7,9 +7,9 @@ graph and policy leave connected (``faults/oracle.py``) must continue. Promises:
     after the last fault    every flow that must be connected delivers again within a second, and stays so
     meanwhile               no silence above --limit-s where both ends were connected all the time
     nothing                 reaches a wrong reader, or comes twice; nothing of the revoked member after three seconds
-    reliable flows          are complete from the first message that came, or the reader got a report of exactly what it
-    lacks requests                each has one answer, or one error snapshots               a RIB logs once that its
-    disk is full, and when it writes again; it still starts
+    reliable flows          are complete from the first message that came, or the reader got a report of each loss
+    requests                each has one answer, or one error
+    snapshots               a RIB logs once that its disk is full, and when it writes again; it still starts
 
     sudo .venv/bin/python scripts/bench/chaos.py --seed 7                    # one minute
     sudo .venv/bin/python scripts/bench/chaos.py --seed 7 --seconds 300 --switches 20

@@ -43,12 +43,12 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A pool replayed.
+    """Replay of one pool.
 
     Args:
         way: of ``WAYS``.
         none_up: share of time.
-        independent: what the product of the single replicas' shares says; None where they have no share each.
+        independent: product of the single replicas' shares; None where they have no share each.
     """
 
     way: str
@@ -66,7 +66,7 @@ def availability(
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
     write: Annotated[bool, typer.Option("--write/--no-write", help="the page, the picture and the JSON")] = True,
 ) -> None:
-    """Say for what share of time no replica would have been up."""
+    """Compute the share of time in which no replica would have been up."""
     with failing_clearly():
         traces = recorded()
         chance = np.random.default_rng(seed)
@@ -87,7 +87,7 @@ def recorded() -> list[Trace]:
     """Read the traces.
 
     Raises:
-        LocalError: they are not there.
+        LocalError: they are missing.
     """
     paths = sorted(SPOT.glob("aws_*.json"))
     if not paths:
@@ -96,7 +96,7 @@ def recorded() -> list[Trace]:
 
 
 def replay(traces: Sequence[Trace], recovery_s: float, chance: np.random.Generator) -> Iterator[Case]:
-    """Give every pool with that recovery: which zones, how many replicas, by which way."""
+    """Yield every pool with that recovery: zones, replicas, way."""
     block = int(BLOCK_S / traces[0].step_s)
     for way, down in (("stays", replica_down), ("elsewhere", outages)):
         each = {trace.zone: down(trace, recovery_s) for trace in traces}

@@ -1,6 +1,7 @@
-"""Where the benches lie: importing it lets the experiments import what they share with them.
+"""Import path of the benches: importing this module lets the experiments import what they share with them.
 
 I/O.
+
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""What the experiments have in common: a field while it is needed, a table, a page, a file with every latency.
+"""Common parts of the experiments: a field, a table, a page, and a file with every latency.
 
-I/O. Prints, and writes ``figN.json`` and ``figN.md`` where it is told to.
+I/O. Prints, and writes ``figN.json`` and ``figN.md`` into the folder of the command line.
+
 """
 
 from __future__ import annotations
@@ -49,10 +50,10 @@ OutOption = Annotated[Path | None, typer.Option("--out", help="Folder for JSON, 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A figure, beside what was asked for and what the paper has.
+    """Figure, with its target and the figure of the paper.
 
     Args:
-        target: the least that it is to be; None: there is no target.
+        target: the least accepted value; None: there is no target.
         at_most: ``target`` is the most instead.
         paper: in words; empty: not known for sure.
     """
@@ -78,13 +79,13 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """An experiment's outcome.
+    """Outcome of an experiment.
 
     Args:
         name: of its files, such as ``fig5``.
-        setting: what was done, in sentences for the page.
-        groups: samples by what they are called in the table.
-        notes: where it differs from the paper, in sentences.
+        setting: the method, in sentences for the page.
+        groups: samples by their label in the table.
+        notes: differences from the paper, in sentences.
     """
 
     name: str
@@ -106,7 +107,7 @@ class Report:
         return rows
 
     def to_dict(self, state: MachineState) -> dict[str, object]:
-        """Return all of it, every latency included."""
+        """Return the whole report, every latency included."""
         return {
             "experiment": self.name,
             "machine": asdict(state),
@@ -130,16 +131,16 @@ class Report:
 def field_of(
     served: Sequence[Served], work: Mapping[str, Work], delays: Mapping[str, float] | None = None
 ) -> Iterator[Field]:
-    """Have a field for a while; leaves with a clear word if there can be none."""
+    """Yield a field; exit with a clear message if there can be none."""
     with clean_exit(), new_run() as run, Field(run, served, work, delays=delays) as place:
         yield place
 
 
 class Asking:
-    """A series under way, heard a sample at a time; a context manager that ends its client.
+    """Series in progress, read a sample at a time; a context manager that ends its client.
 
     Attributes:
-        twice: answers too many that reached a call; None until the end, or where they were not counted.
+        twice: surplus answers that reached a call; None until the end, or where they were not counted.
         heard: answers in all; the same.
     """
 
@@ -166,7 +167,7 @@ class Asking:
         self.twice, self.heard = (each if isinstance(each, int) else None for each in (twice, heard))
 
     def by_service(self, what: str) -> dict[str, list[Sample]]:
-        """Return all samples of each service, and say now and then how many there are."""
+        """Return all samples of each service, and report progress at intervals."""
         found: dict[str, list[Sample]] = {}
         for number, sample in enumerate(self, 1):
             found.setdefault(sample.service, []).append(sample)
@@ -176,7 +177,7 @@ class Asking:
 
 
 def place_of(out: Path | None, *, quick: bool) -> Path | None:
-    """Return where to write, or None: nowhere."""
+    """Return the output folder, or None."""
     return out or (None if quick else _OUTPUT)
 
 
@@ -214,5 +215,5 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _short(sample: Sample) -> list[object]:
-    """Return latency and server's time in ms, who answered, and whether it was right."""
+    """Return latency and server's time in ms, the machine that answered, and whether the answer was right."""
     return [round(1e3 * sample.latency_s, 2), round(1e3 * sample.worked_s, 2), sample.machine, sample.is_right]

@@ -1,14 +1,14 @@
-"""Where the experiments take place: a robot, two switches, and as many machines as wanted, a namespace each.
+"""Field of the experiments: a robot, two switches, and any number of machines, a namespace each.
 
 I/O. Makes namespaces and keys, and starts the commands that robots and servers run.
 ::
 
-    robot -- s1 -- gate --+-- m1          switches s1 and gate with the RIB beside gate; a proxy at the robot and at
+    robot -- s1 -- gate --+-- m1          switches s1 and gate with the RIB at gate; a proxy at the robot and at
                           +-- m2          every machine; the machines' proxies expose, the robot's imports
-                          +-- (x3) -- m3  x: a relay where the link takes time
+                          +-- (x3) -- m3  x: a relay that adds the link's delay
 
-Every namespace has a ROS domain of its own, so nothing but the proxies joins the nodes. Why Fast DDS is set as it is:
-``scripts/bench/ros_row.py``.
+Every namespace has a ROS domain of its own, so nothing but the proxies joins the nodes. The reason for the settings of
+Fast DDS is in ``scripts/bench/ros_row.py``.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ _DOMAIN: Final = 150  # of the robot; the machines' follow
 
 @dataclass(frozen=True, slots=True)
 class Served:
-    """A service.
+    """Service of the field.
 
     Args:
-        machines: which expose it.
+        machines: the machines that expose it.
         expose: further keys of their rules.
         imports: further keys of the robot's rule.
     """
@@ -58,18 +58,18 @@ class Served:
 
     @property
     def metadata(self) -> Metadata:
-        """Return what its name in the overlay digests."""
+        """Return the metadata of its name in the overlay."""
         return Metadata({"kind": "service", "name": self.name, "type": self.type_name})
 
     def rule(self, owner: Path, further: Mapping[str, object]) -> dict[str, object]:
-        """Return a rule about it."""
+        """Return a rule for it."""
         told = {"name": self.name, "kind": "service", "type": self.type_name, "encoding": "cdr"}
         return {**told, "owner": str(owner), **further}
 
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """What a machine's node does: a role of ``program`` and its settings."""
+    """Work of a machine's node: a role of ``program`` and its settings."""
 
     role: str
     settings: Mapping[str, object] = field(default_factory=dict)
@@ -77,7 +77,7 @@ class Work:
 
 
 class Server:
-    """A machine's proxy and node; both can be killed, and come back as they were."""
+    """A machine's proxy and node; both can be killed and started again with the same settings."""
 
     def __init__(self, place: Field, label: str, config: str, work: Work) -> None:
         self.label = label
@@ -95,7 +95,7 @@ class Server:
         ]
 
     def wait(self) -> None:
-        """Wait until both are ready. They say so before the robot's proxy knows of them.
+        """Wait until both are ready. They report it before the robot's proxy knows of them.
 
         Raises:
             FailedError: one did not come up.
@@ -104,24 +104,24 @@ class Server:
             each.read_line(READY_S)
 
     def hear(self, patience_s: float) -> dict[str, object]:
-        """Return the next that its node says; raises as ``wait``."""
+        """Return the next line of its node; raises as ``wait``."""
         return self._running[-1].read(patience_s)
 
     def kill(self) -> None:
-        """Kill both at once: SIGKILL, nobody is told."""
+        """Kill both at once with SIGKILL, without any notice."""
         self._signal(signal.SIGKILL)
         self.end()
 
     def freeze(self) -> None:
-        """Stop both; what is sent to them waits."""
+        """Stop both; data sent to them waits."""
         self._signal(signal.SIGSTOP)
 
     def thaw(self) -> None:
-        """Let both go on."""
+        """Continue both."""
         self._signal(signal.SIGCONT)
 
     def end(self) -> None:
-        """End both; what is gone already is fine."""
+        """End both; harmless where one is gone already."""
         for each in self._running:
             each.__exit__(None, None, None)
         self._running = []
@@ -133,13 +133,13 @@ class Server:
 
 
 class Field:
-    """The field with switches, RIB, proxies and servers running; a context manager that ends them.
+    """Field with switches, RIB, proxies and servers running; a context manager that ends them.
 
     Args:
-        run: of which the namespaces are.
-        served: the services; those that any of them names are the machines.
-        work: what every machine's node does.
-        delays: seconds that a machine's link takes, each way.
+        run: run that owns the namespaces.
+        served: the services; all machines that any of them names exist.
+        work: work of every machine's node.
+        delays: one-way delay of a machine's link, in seconds.
         mtu: of every link.
 
     Raises:
@@ -184,12 +184,12 @@ class Field:
         self._undo.close()
 
     def client(self, place: str, role: str, program: Path = _HERE / "robot.py", **settings: object) -> Started:
-        """Start a client at the robot, or beside a server: a role of ``program`` and its settings."""
+        """Start a client at the robot, or at a server: a role of ``program`` and its settings."""
         return self.process(place, role, [str(program), role, json.dumps(settings)])
 
     def process(self, node: str, what: str, arguments: Sequence[str]) -> Started:
         """Start a Python process in a namespace, in its ROS domain, with one thread for linear algebra."""
-        threads = ["OPENBLAS_NUM_THREADS=1", "OMP_NUM_THREADS=1"]  # a machine here is one core's worth
+        threads = ["OPENBLAS_NUM_THREADS=1", "OMP_NUM_THREADS=1"]  # a machine here has one core
         environment = [*self._nodes.ros_environment(self._domain(node)), *threads]
         return self._lab.start(node, what, arguments, environment)
 
@@ -197,7 +197,7 @@ class Field:
         return _DOMAIN + 1 + self._machines.index(node) if node in self._machines else _DOMAIN
 
     def _admit(self, node: str, served: Sequence[Served]) -> str:
-        """Let a proxy carry its side of everything, and write its configuration; return the file."""
+        """Give a proxy the delegations of its side, and write its configuration; return the file."""
         side, right = ("import", Right.CALL) if node == ROBOT else ("expose", Right.SERVE)
         rules = []
         for each in served:

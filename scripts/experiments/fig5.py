@@ -6,8 +6,8 @@
     sudo .venv/bin/python scripts/experiments/fig5.py --trials 100 --timeout 100    # computed as in the paper: hours
     sudo .venv/bin/python scripts/experiments/fig5.py --problem Cubicles --planner RRT --out /tmp/fig5
 
-Two planners that share a machine's cores do not show what two machines would. So there are also servers that wait as
-long as a recorded run took, and compute nothing. How long each request takes is then known before, and the result can
+Two planners that share a machine's cores do not show the effect of two machines. So there are also servers that wait
+as long as a recorded run took, and compute nothing. The time of each request is then known before, and the result can
 be compared with arithmetic. With these servers the number of trials is the paper's.
 """
 
@@ -144,7 +144,7 @@ def main(
 
 
 def _check(problems: Collection[str], planner: str, meshes: Path) -> None:
-    """Leave with a clear word where the planner or a problem is not to be had."""
+    """Exit with a clear message where the planner or a problem is not available."""
     try:
         from planning import PROBLEMS, planners
     except ImportError as error:

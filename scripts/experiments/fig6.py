@@ -40,7 +40,7 @@ COMPUTED: Final = 100
 QUICK: Final = 5
 ON_S: Final = 1.1
 OFF_S: Final = 1.0
-_GAP_S: Final = 0.27  # longer than a wait, so that the slower replica is done; shares no beat with the second client
+_GAP_S: Final = 0.27  # longer than a wait, so that the slower replica is done; not in step with the second client
 _PATIENCE_S: Final = 10.0
 _MACHINES: Final = ("m1", "m2")
 _ONE, _TWO = "/segment/m1", "/segment"
@@ -52,7 +52,7 @@ _SEED: Final = 6
 
 @dataclass(frozen=True, slots=True)
 class _Setting:
-    """What the servers do, whether the second client is there, and the paper's gains of mean and p99."""
+    """Work of the servers, presence of the second client, and the paper's gains of mean and p99."""
 
     role: str
     is_contended: bool
@@ -142,7 +142,7 @@ def main(
 
 
 def _times() -> dict[str, list[float]]:
-    """Return the seconds that each machine's requests take, one after the other."""
+    """Return the seconds of each machine's requests, one after the other."""
     chance = random.Random(_SEED)
     middle = math.log(_MEAN_S) - _SIGMA**2 / 2
     return {each: [chance.lognormvariate(middle, _SIGMA) for _ in range(REQUESTS)] for each in _MACHINES}

@@ -1,4 +1,4 @@
-"""Figure 9: where is the tag, ten times a second, while the replicas are killed one after the other and come back.
+"""Figure 9: pose of a tag, ten times a second, while the replicas are killed one after the other and come back.
 
 sudo .venv/bin/python scripts/experiments/fig9.py                  # writes docs/experiments/fig9.*
 sudo .venv/bin/python scripts/experiments/fig9.py --quick          # a few seconds: does it work?
@@ -52,7 +52,7 @@ _NOTES: Final = (
 
 
 class _Phase(Enum):
-    """What the machine whose turn it is does."""
+    """Phase of the machine whose turn it is."""
 
     SERVING = auto()
     DEAD = auto()
@@ -60,7 +60,7 @@ class _Phase(Enum):
 
 
 class _FaultInjector:
-    """Kills one machine after the other, driven by the answers as they come."""
+    """Kills one machine after the other, driven by the answers as they arrive."""
 
     def __init__(self, place: Field, steady_s: float) -> None:
         self._servers = list(place.servers.values())
@@ -72,7 +72,7 @@ class _FaultInjector:
         self.spans: list[tuple[str, float, float]] = []
 
     def see(self, sample: Sample) -> None:
-        """Look at an answer, and kill or start a machine if it is time."""
+        """Handle an answer, and kill or start a machine if it is time."""
         server, now_s = self._servers[self._turn], time.monotonic()
         since_s = self._since_s = now_s if self._since_s is None else self._since_s
         passed_s = now_s - since_s

@@ -31,7 +31,7 @@ _BATCH: Final = 20_000
 
 @dataclass(frozen=True, slots=True)
 class Grasp:
-    """A parallel-jaw grasp: where, how wide, how good.
+    """Parallel-jaw grasp: position, width, quality.
 
     Args:
         row: of the middle between the jaws, in pixels.

@@ -1,9 +1,9 @@
-"""How a grey frame goes to a service and what was seen in it comes back, in a service type that every ROS 2 has.
+"""Service messages that carry a grey frame and its result, in a service type that every ROS 2 has.
 
 Sans-I/O.
 
 The installed packages have no service that takes an image, so ``rcl_interfaces/srv/
-SetParameters`` carries it: the request has one parameter, called like the frame's number, whose integer array holds the
+SetParameters`` carries it: the request has one parameter, named by the frame's number, whose integer array holds the
 640 x 480 bytes of the frame, eight to an integer; the answer's ``reason`` is JSON.
 """
 
@@ -43,11 +43,11 @@ def number_of(request: SetParameters.Request) -> int:
 
 
 def answer_of(said: Mapping[str, object]) -> SetParameters.Response:
-    """Return the response that says something."""
+    """Return the response with this content."""
     return SetParameters.Response(results=[SetParametersResult(successful=True, reason=json.dumps(said))])
 
 
 def said_in(response: SetParameters.Response) -> dict[str, object]:
-    """Return what a response says."""
+    """Return the content of a response."""
     said = json.loads(response.results[0].reason)
     return said if isinstance(said, dict) else {}

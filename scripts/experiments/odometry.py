@@ -28,12 +28,12 @@ _REPROJECTION_PIXELS: Final = 3.0
 _CONFIDENCE: Final = 0.9999
 _LEAST_POINTS: Final = 6
 
-cv2.setNumThreads(1)  # a machine here is one core's worth
+cv2.setNumThreads(1)  # a machine here has one core
 
 
 @dataclass(frozen=True, slots=True)
 class Features:
-    """What is kept of a frame: pixels and descriptors of its features, and its depth."""
+    """Features of a frame: pixels and descriptors, and its depth."""
 
     pixels: NDArray[np.float64]
     descriptors: NDArray[np.uint8]

@@ -1,4 +1,4 @@
-"""FogROS G, Table I and Figure 5: what a robot gains by computing elsewhere, and what the overlay adds to ROS 2.
+"""FogROS G, Table I and Figure 5: the gain of a robot that computes elsewhere, and the time that the overlay adds.
 
     sudo .venv/bin/python scripts/experiments/offload.py               # all; writes docs/experiments/offload.*
     sudo .venv/bin/python scripts/experiments/offload.py --quick       # a few seconds: does it work?
@@ -59,7 +59,7 @@ Part: TypeAlias = Literal["network", "alone", "both"]
 
 @dataclass(slots=True)
 class Measured:
-    """What one baseline took, in seconds, a value a request. ``failed``: answers that were wrong."""
+    """Times of one baseline, in seconds, a value a request. ``failed``: answers that were wrong."""
 
     there_s: list[float] = field(default_factory=list)
     back_s: list[float] = field(default_factory=list)
@@ -138,7 +138,7 @@ def _network(name: str, rounds: int, *, quick: bool) -> dict[str, object]:
 
 
 def _trip(row: Row, found: Measured, told: Mapping[str, object], at_once: int, *, direct: bool) -> int:
-    """Let a robot and a server do one series; return the size of a request, in bytes."""
+    """Run one series between a robot and a server; return the size of a request, in bytes."""
     there_s = []
     with row.process(RIGHT, "cloud", [_END, "cloud", json.dumps(told)], direct=direct) as cloud:
         cloud.read(READY_S)
@@ -166,7 +166,7 @@ def _trip(row: Row, found: Measured, told: Mapping[str, object], at_once: int, *
 
 
 def _alone(name: str, *, quick: bool) -> dict[str, object]:
-    """Let robots compute by themselves, each in a control group that is as much slower than a core as the paper's."""
+    """Let robots compute by themselves, each in a control group that is slower than a core by the paper's ratio."""
     count, robots = (1, 1) if quick else ALONE[name]
     cores = 1 / SLOWER[name] if SLOWER[name] > 1 and not quick else 1.0
     times, failed = [], 0

@@ -1,4 +1,4 @@
-"""The processes of ``offload.py``: a robot that asks, a server that computes, and a robot that computes by itself.
+"""Processes of ``offload.py``: a robot that calls, a server that computes, and a robot that computes by itself.
 
 Process of its own: ``offload_endpoint.py robot|cloud|alone SETTINGS``. Both are nodes of ROS 2, by one of two
 middlewares: ``rclpy`` with Fast DDS, or Cyclone DDS. Of the latter there is no wheel for rclpy, so the messages are
@@ -34,10 +34,10 @@ Settings: TypeAlias = "Mapping[str, object]"
 
 
 class _End(Protocol):
-    """A node of ROS 2."""
+    """Node of ROS 2."""
 
     def publisher(self, topic: str, type_name: str) -> Callable[[Message], None]:
-        """Return what publishes on a topic."""
+        """Return a publisher of a topic."""
         ...
 
     def subscribe(self, topic: str, type_name: str, take: Callable[[Message], None]) -> None:
@@ -45,12 +45,12 @@ class _End(Protocol):
         ...
 
     def run(self, look: Callable[[], bool], every_s: float) -> None:
-        """Work until ``look``, called at least so often, returns that it is over."""
+        """Work until ``look``, called at least so often, returns that the series is over."""
         ...
 
 
 class _FastEnd:
-    """A node of rclpy, with Fast DDS."""
+    """Node of rclpy, with Fast DDS."""
 
     def __init__(self, domain: int) -> None:
         del domain  # ROS_DOMAIN_ID
@@ -61,7 +61,7 @@ class _FastEnd:
         self._end = End("offload")
 
     def publisher(self, topic: str, type_name: str) -> Callable[[Message], None]:
-        """Return what publishes on a topic."""
+        """Return a publisher of a topic."""
         from ros_endpoint import reliable
 
         publish: Callable[[Message], None] = self._end.node.create_publisher(
@@ -76,7 +76,7 @@ class _FastEnd:
         self._end.node.create_subscription(TYPES[type_name], topic, take, reliable())
 
     def run(self, look: Callable[[], bool], every_s: float) -> None:
-        """Work until ``look`` returns that it is over."""
+        """Work until ``look`` returns that the series is over."""
         is_over = False
 
         def tick() -> None:
@@ -90,7 +90,7 @@ class _FastEnd:
 
 
 class _CycloneEnd:
-    """A node of ROS 2 on Cyclone DDS."""
+    """Node of ROS 2 on Cyclone DDS."""
 
     def __init__(self, domain: int) -> None:
         from proxy.endpoints.dds.endpoint import DdsEndpoint
@@ -99,7 +99,7 @@ class _CycloneEnd:
         self._heard: dict[int, Callable[[bytes], None]] = {}
 
     def publisher(self, topic: str, type_name: str) -> Callable[[Message], None]:
-        """Return what publishes on a topic."""
+        """Return a publisher of a topic."""
         handle = self._endpoint.advertise(self._endpoint.channel(topic, type_name))
         return lambda message: self._endpoint.publish(handle, serialize_message(message))
 
@@ -109,7 +109,7 @@ class _CycloneEnd:
         self._heard[handle] = lambda raw: take(deserialize_message(raw, TYPES[type_name]))
 
     def run(self, look: Callable[[], bool], every_s: float) -> None:
-        """Work until ``look`` returns that it is over."""
+        """Work until ``look`` returns that the series is over."""
         from proxy.endpoints.endpoint import MessageReceived
 
         while not look():
@@ -123,7 +123,7 @@ _ENDS: Final[Mapping[str, Callable[[int], _End]]] = {"fast": _FastEnd, "cyclone"
 
 
 def robot(settings: Settings) -> None:
-    """Ask one request after the other; print of each when it was asked and answered."""
+    """Send one request after the other; print when each was sent and answered."""
     task, end, prefix = TASKS[str(settings["task"])](), _end(settings), str(settings["prefix"])
     at_once, count = int(str(settings["at_once"])), int(str(settings["count"]))
     publish = [end.publisher(prefix + topic, type_name) for topic, type_name in task.parts]
@@ -163,11 +163,11 @@ def robot(settings: Settings) -> None:
     say(event="ready", request_bytes=sum(len(serialize_message(each)) for each in task.request(0)))
     end.run(look, _GREETING_S)
     say(event="over")
-    end.run(lambda: False, _LONG_S)  # a reliable writer must stay to repair what was lost
+    end.run(lambda: False, _LONG_S)  # a reliable writer must stay to retransmit losses
 
 
 def cloud(settings: Settings) -> None:
-    """Answer until killed; print of each request when all of it was there and when the answer was ready."""
+    """Answer until killed; print when all of each request had arrived and when the answer was ready."""
     task, end, prefix = TASKS[str(settings["task"])](), _end(settings), str(settings["prefix"])
     at_once = int(str(settings["at_once"]))
     answer_topic, answer_type = task.answer
@@ -201,7 +201,7 @@ def cloud(settings: Settings) -> None:
 
 
 def alone(settings: Settings) -> None:
-    """Compute by oneself; print how long each request took."""
+    """Compute without a server; print how long each request took."""
     task = TASKS[str(settings["task"])]()
     task.warm_up()
     is_limited = threading.Event()

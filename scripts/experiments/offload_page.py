@@ -1,4 +1,4 @@
-"""The page and the picture of ``offload.py``: FogROS G's Table I and Figure 5, ours below the paper's.
+"""Page and picture of ``offload.py``: FogROS G's Table I and Figure 5, ours below the paper's.
 
 Sans-I/O, but for the picture's file.
 """
@@ -29,7 +29,7 @@ COMPUTES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class PaperRow:
-    """A row of the paper's Table I, in seconds."""
+    """Row of the paper's Table I, in seconds."""
 
     alone_s: float
     ros_network_s: float
@@ -48,14 +48,14 @@ Document = Mapping[str, Any]  # JSON
 
 
 def added_s(network: Document, other: str) -> tuple[float, float, float]:
-    """Return what the overlay adds to the network time of another contender: median, least and most of the rounds."""
+    """Return the network time that the overlay adds to another baseline: median, least and most of the rounds."""
     ours, theirs = (network["contenders"][who]["rounds_there_s"] for who in (OVERLAY, other))
     gaps = [a - b for a, b in zip(ours, theirs, strict=True)]
     return statistics.median(gaps), min(gaps), max(gaps)
 
 
 def page_of(document: Document) -> str:
-    """Return the page, in Markdown, of those tasks that were measured."""
+    """Return the page, in Markdown, of the measured tasks."""
     tasks: Document = document["tasks"]
     networks = {name: task["network"] for name, task in tasks.items() if "network" in task}
     parts = [
@@ -83,7 +83,7 @@ def page_of(document: Document) -> str:
 
 
 def save_picture(path: Path, document: Document) -> None:
-    """Draw network time by contender and task, and beside it what the overlay adds."""
+    """Draw network time by baseline and task, and next to it the time that the overlay adds."""
     import matplotlib as mpl
 
     mpl.use("Agg")

@@ -1,4 +1,4 @@
-"""The three tasks of FogROS G's Table I: what a robot sends, what the server computes from it, and whether it is right.
+"""Tasks of FogROS G's Table I: the robot's request, the server's computation, and the check of the answer.
 
 Reads recorded frames and meshes when a task is made; otherwise sans-I/O. The sizes of images and the types are those of
 the clients that the authors publish (``scripts/bench/fogros_tasks.py`` names the files); types of packages without a
@@ -43,7 +43,7 @@ _PLANNING_LIMIT_S: Final = 1_000.0
 
 
 class OffloadTask(Protocol):
-    """A task.
+    """Task of the experiment.
 
     Attributes:
         parts: topic and type of each message that the robot sends.
@@ -71,7 +71,7 @@ class OffloadTask(Protocol):
 
 
 class Vslam:
-    """The camera's motion since the frame before. The camera goes through the recorded frames, back and forth."""
+    """Motion of the camera since the frame before. The camera passes through the recorded frames, back and forth."""
 
     parts = (("color", IMAGE), ("depth", IMAGE))
     answer = ("pose", POSE)
@@ -125,7 +125,7 @@ class Vslam:
 
 
 class MotionPlanning:
-    """A path of a rigid body through OMPL's Home. Every request carries both meshes."""
+    """Path of a rigid body through OMPL's Home. Every request carries both meshes."""
 
     parts = (("environment_mesh", OCTETS), ("robot_mesh", OCTETS), ("motion_plan_request", NUMBERS))
     answer = ("motion_plan", NUMBERS)
@@ -173,7 +173,7 @@ class MotionPlanning:
 
 
 class GraspPlanning:
-    """A grasp of an armchair, in three of the recorded frames in turn."""
+    """Grasp of an armchair, in three of the recorded frames in turn."""
 
     parts = (("camera_info", CAMERA), ("image_raw", IMAGE), ("mask_raw", IMAGE))
     answer = ("grasp", POSE)
@@ -236,7 +236,7 @@ _KINDS: Final = {"rgb8": (np.uint8, 3), "16UC1": (np.uint16, 1), "32FC1": (np.fl
 
 
 def _frame(number: int) -> int:
-    """Return which frame a request shows: 2 (request 0), 3, 4, 5, 4, 3, 2, ..."""
+    """Return the frame of a request: 2 (request 0), 3, 4, 5, 4, 3, 2, ..."""
     last = len(_FRAMES) - 1
     at = number % (2 * last)
     return _FRAMES[min(at, 2 * last - at)]

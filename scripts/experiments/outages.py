@@ -1,11 +1,12 @@
-"""Availability, measured: machines that stop and come back at random, a service on one of them and on both.
+"""Measured availability: machines that stop and come back at random, a service on one of them and on both.
 
     sudo .venv/bin/python scripts/experiments/outages.py                # 4 minutes; writes docs/experiments/outages.*
     sudo .venv/bin/python scripts/experiments/outages.py --quick        # a few seconds: does it work?
 
-FogROS2-FT reckons that two spot machines, each up for 15 h and down for 20 min, are down together less than 0.05 % of
-the time, because shares of independent machines multiply. Nobody can wait for that. Here the times are seconds, and the
-machines are down for a quarter of the time, so that both are down together often enough to be measured.
+FogROS2-FT computes that two spot machines, each up for 15 h and down for 20 min, are down together less than 0.05 % of
+the time, because shares of independent machines multiply. Such times are too long for an experiment. Here the times are
+seconds, and the machines are down for a quarter of the time, so that both are down together often enough to be
+measured.
 """
 
 from __future__ import annotations
@@ -66,14 +67,14 @@ _NOTES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Outage:
-    """A time for which a machine is down, in seconds from the beginning."""
+    """Interval in which a machine is down, in seconds from the beginning."""
 
     from_s: float
     to_s: float
 
 
 class _Stopper:
-    """Stops machines and lets them go on, as drawn; driven by the samples as they come."""
+    """Stops and continues machines on schedule; driven by the samples as they arrive."""
 
     def __init__(self, place: Field, drawn: Mapping[str, Sequence[Outage]]) -> None:
         self._servers = place.servers
@@ -83,7 +84,7 @@ class _Stopper:
         self._down_from_s: dict[str, float] = {}
 
     def see(self, since_s: float) -> None:
-        """Do what is due ``since_s`` seconds after the beginning."""
+        """Apply what is due ``since_s`` seconds after the beginning."""
         for label, outages in self._drawn.items():
             wanted = any(each.from_s <= since_s < each.to_s for each in outages)
             if wanted and not self._is_down[label]:
@@ -95,7 +96,7 @@ class _Stopper:
             self._is_down[label] = wanted
 
     def end(self, since_s: float) -> None:
-        """Let every machine go on."""
+        """Continue every machine."""
         for label, is_down in self._is_down.items():
             if is_down:
                 self._servers[label].thaw()
@@ -109,7 +110,7 @@ def main(
     as_json: JsonOption = False,
     out: OutOption = None,
 ) -> None:
-    """Ask a service on one machine and one on two, while machines stop and go on."""
+    """Call a service on one machine and one on two, while machines stop and continue."""
     state, place = machine_state(), place_of(out, quick=quick)
     seconds = QUICK_S if quick else seconds
     drawn = {each: draw_outages(random.Random(f"{_SEED} {each}"), seconds) for each in _MACHINES}
@@ -150,7 +151,7 @@ _CASES: Final = {"one machine": _ONE, "two machines": _TWO}
 
 
 def draw_outages(chance: random.Random, seconds: float) -> list[Outage]:
-    """Return when a machine is down within ``seconds``; times up and down are exponential."""
+    """Return the outages of a machine within ``seconds``; times up and down are exponential."""
     outages, now_s = [], 0.0
     while (now_s := now_s + chance.expovariate(1 / UP_S)) < seconds:
         outage = Outage(now_s, now_s + chance.expovariate(1 / DOWN_S))
@@ -160,7 +161,7 @@ def draw_outages(chance: random.Random, seconds: float) -> list[Outage]:
 
 
 def share_unanswered(machines: Sequence[Sequence[Outage]], seconds: float, patience_s: float) -> float:
-    """Return the share of moments from which on all machines stay down for ``patience_s``."""
+    """Return the share of moments from which all machines stay down for ``patience_s``."""
     moments = [at * _STEP_S for at in range(round(seconds / _STEP_S))]
     lost = sum(
         all(any(each.from_s <= now_s and now_s + patience_s < each.to_s for each in outages) for outages in machines)

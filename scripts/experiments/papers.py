@@ -1,4 +1,4 @@
-"""All experiments of both papers, and one table of theirs and ours.
+"""Experiments of both papers, and one table of their figures and ours.
 
     sudo .venv/bin/python scripts/experiments/papers.py              # everything: about half an hour
     sudo .venv/bin/python scripts/experiments/papers.py --only fig7  # one of them, and the table

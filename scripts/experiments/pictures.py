@@ -1,4 +1,4 @@
-"""The pictures of the experiments: histogram and CDF of latencies, and latencies along the time.
+"""Pictures of the experiments: histogram and CDF of latencies, and latencies over time.
 
 I/O. PNG files. Needs matplotlib, and no display.
 """
@@ -28,7 +28,7 @@ _BINS: Final = 30
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A time during which a machine was away, in seconds of the timeline."""
+    """Interval in which a machine was away, in seconds of the timeline."""
 
     machine: str
     from_s: float
@@ -55,7 +55,7 @@ def save_distributions(path: Path, title: str, panels: Mapping[str, Mapping[str,
 
 
 def save_timeline(path: Path, title: str, samples: Sequence[Sample], spans: Sequence[Span], from_s: float) -> None:
-    """Draw each request as a point, coloured by who answered; grey: a machine was away; red: failed."""
+    """Draw each request as a point, coloured by the machine that answered; grey: a machine was away; red: failed."""
     figure, axis = plt.subplots(figsize=(11, 3.6), layout="constrained")
     machines = sorted({each.machine for each in samples if each.is_right} | {span.machine for span in spans})
     colours = dict(zip(machines, _COLOURS[1:], strict=False))

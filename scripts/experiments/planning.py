@@ -1,8 +1,8 @@
-"""Rigid bodies that look for a way: OMPL's planners on the meshes of OMPL.app, collisions by FCL.
+"""Motion planning for rigid bodies: OMPL's planners on the meshes of OMPL.app, collisions by FCL.
 
 Sans-I/O, but for reading a problem's three files; a planner draws its own random numbers.
 Source: the problem files of OMPL.app (``*.cfg``, ``*_robot.dae``, ``*_env.dae``). As there, the robot's mesh is moved
-so that the mean of its vertices is the origin of its poses, and COLLADA's up axis is turned from y to z.
+so that the mean of its vertices is the origin of its poses, and COLLADA's up axis is rotated from y to z.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ Way: TypeAlias = "list[Place]"
 
 
 class Solved(NamedTuple):
-    """The outcome of one run.
+    """Outcome of one run.
 
     Args:
-        way: places, each with a position and a quaternion (w last); None: not found in time.
-        checks: states whose validity was checked, a measure of the work that no other load of the machine changes.
+        way: poses, each with a position and a quaternion (w last); None: not found in time.
+        checks: states whose validity was checked; this measure of work does not depend on other load of the machine.
     """
 
     way: Way | None
@@ -45,7 +45,7 @@ class Solved(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """A robot, a world, a start and a goal, in the units of the meshes. Start and goal are not turned."""
+    """Robot, world, start and goal, in the units of the meshes. Start and goal are not rotated."""
 
     robot: Mesh
     world: Mesh
@@ -73,12 +73,12 @@ class Problem:
         return cls((vertices - vertices.mean(axis=0), faces), _mesh(world), start, goal, low, high)
 
     def solve(self, planner: str, patience_s: float, is_over: Callable[[], bool]) -> Solved:
-        """Look for a way.
+        """Search for a path.
 
         Args:
             planner: its class in ``ompl.geometric``, such as ``RRTConnect``.
-            patience_s: after which nobody looks any more.
-            is_over: asked all the time; whether the way is wanted no longer.
+            patience_s: limit of the search, in seconds.
+            is_over: polled during the search; whether the path is no longer wanted.
         """
         space = base.SE3StateSpace()
         bounds = base.RealVectorBounds(3)
@@ -139,13 +139,13 @@ def limits(folder: Path, name: str) -> tuple[Place, Place, Place, Place]:
 
 
 def planners() -> list[str]:
-    """Return the names of all planners that there are."""
+    """Return the names of all available planners."""
     kinds = {name: getattr(geometric, name) for name in dir(geometric)}
     return [name for name, kind in kinds.items() if isinstance(kind, type) and issubclass(kind, base.Planner)]
 
 
 def be_quiet() -> None:
-    """Let OMPL print nothing."""
+    """Switch off the log of OMPL."""
     util.setLogLevel(util.LogLevel.LOG_NONE)
 
 

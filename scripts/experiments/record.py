@@ -2,7 +2,7 @@
 
 I/O: reads the problems, appends to one JSON file. A run's work is the number of states that the planner checked. That
 number does not depend on what else the machine does, so the recording can run in the background. The processor time
-stands beside it.
+is recorded too.
 
     nice .venv/bin/python scripts/experiments/record.py --problem Home --runs 60       # about 5 minutes of one core
 """

@@ -24,11 +24,11 @@ LIMIT_S: Final = 100.0  # the paper's timeout
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """How the runs of a problem are used.
+    """Use of the runs of a problem.
 
     Args:
-        mean_s: of the computed trials of figure 5 on a quiet machine; the recorded runs are scaled to it.
-        faster: times that the waits are shorter than the runs, so that a hundred trials take minutes.
+        mean_s: of the computed trials of figure 5 on an idle machine; the recorded runs are scaled to it.
+        faster: factor by which the waits are shorter than the runs, so that a hundred trials take minutes.
     """
 
     mean_s: float
@@ -43,7 +43,7 @@ RECORDED: Final[Mapping[str, Recorded]] = {
 
 
 def load(path: Path = RECORDING) -> dict[str, list[float]]:
-    """Return the recorded runs by problem, in seconds, as on a quiet machine; at most ``LIMIT_S`` each."""
+    """Return the recorded runs by problem, in seconds, as on an idle machine; at most ``LIMIT_S`` each."""
     recording: dict[str, list[list[float]]] = json.loads(path.read_text(encoding="utf-8"))
     found = {}
     for name, runs in recording.items():

@@ -1,7 +1,8 @@
-"""A link that takes time, in both directions: ``relay.py DEVICE DEVICE MILLISECONDS``.
+"""Relay with a delay in both directions: ``relay.py DEVICE DEVICE MILLISECONDS``.
 
-Process of its own, in the namespace between two machines. The relay is the one of the provider ``local``, which
-waits on its standard input for leave to begin; here it has that from the start.
+Process of its own, in the namespace between two machines. The relay is the one of the provider ``local``. It waits on
+its standard input for permission to begin; here it has that from the start.
+
 """
 
 from __future__ import annotations

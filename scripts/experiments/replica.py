@@ -1,12 +1,13 @@
-"""The service nodes of the experiments: ordinary rclpy nodes that know nothing of the overlay.
+"""Service nodes of the experiments: ordinary rclpy nodes without knowledge of the overlay.
 
 Process of its own, started by ``field.py`` on a machine: ``replica.py ROLE SETTINGS``.
 
-``plan`` and ``replay`` serve ``nav_msgs/srv/GetPlan``: the request's start names the problem in its ``frame_id`` (one
-that nobody knows is answered at once, without a way), its goal's stamp holds the number of the request in seconds; the
-answer's header names the machine, and its stamp is how long it worked. Both break off when the service's ``/stop`` is
+``plan`` and ``replay`` serve ``nav_msgs/srv/GetPlan``. The request's start names the problem in its ``frame_id``; an
+unknown problem is answered at once, without a path. The stamp of its goal holds the number of the request in seconds.
+The answer's header names the machine, and its stamp is the computing time. Both stop when the service's ``/stop`` is
 called (``std_srvs/srv/Trigger``). ``detect``, ``segment``, ``light`` and ``tag`` serve what ``image_request.py``
 describes, one request at a time.
+
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ Settings = Mapping[str, object]
 
 
 class _Service:
-    """One ``GetPlan`` service and its ``/stop``: the requests under way, each with a flag: wanted no longer."""
+    """``GetPlan`` service and its ``/stop``: the requests in progress, each with a flag that it is no longer wanted."""
 
     def __init__(self, planner: _Planner, node: Node, name: str, machine: str) -> None:
         self._planner = planner
@@ -79,7 +80,7 @@ class _Service:
 
 
 class _Planner(ABC):
-    """Answers ``GetPlan``, and breaks off when it is told to."""
+    """Planner that answers ``GetPlan``, and stops on request."""
 
     def __init__(self, node: Node, settings: Settings) -> None:
         self._services = [_Service(self, node, name, str(settings["machine"])) for name in _names(settings)]
@@ -90,7 +91,7 @@ class _Planner(ABC):
 
 
 class _Ompl(_Planner):
-    """Plans by OMPL; a request that comes while another is planned waits for its core, not for a lock."""
+    """Planner by OMPL; a request that arrives while another is planned waits for its core, not for a lock."""
 
     def __init__(self, node: Node, settings: Settings) -> None:
         from planning import Problem, be_quiet
@@ -111,7 +112,7 @@ class _Ompl(_Planner):
 
 
 class _Replay(_Planner):
-    """Waits as long as a recording says, and computes nothing: what is measured is the overlay's part alone."""
+    """Server that waits as long as a recording states, and computes nothing: the figure is the overlay's part alone."""
 
     def __init__(self, node: Node, settings: Settings) -> None:
         waits = settings["waits_s"]
@@ -150,7 +151,7 @@ def _segment(node: Node, settings: Settings) -> None:
 
 
 def _light(node: Node, settings: Settings) -> None:
-    """Segment coarsely, and wait for the rest of the request's time, as if another processor than ours worked."""
+    """Segment coarsely, and wait for the rest of the request's time, as if another processor worked."""
     from vision import count_regions
 
     times = settings["takes_s"]

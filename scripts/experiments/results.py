@@ -1,4 +1,4 @@
-"""One table of what the papers measured: theirs, ours, trials, spread, conditions; from the experiments' JSON.
+"""Table of the papers' figures: theirs, ours, trials, spread, conditions; from the experiments' JSON.
 
 Reads the JSON files of a folder; otherwise sans-I/O.
 """
@@ -46,7 +46,7 @@ _NUMBERS: Final = {"fig5": "FT Figure 5", "fig6": "FT Figure 6", "fig7": "FT Fig
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A figure of a paper beside ours, as text. ``spread``: of ours, with what it is."""
+    """Figure of a paper and ours, as text. ``spread``: of ours, with its definition."""
 
     figure: str
     what: str
@@ -75,7 +75,7 @@ def rows_of(folder: Path) -> list[Row]:
 
 
 def machines_of(folder: Path) -> list[str]:
-    """Return where each experiment ran, and how busy that machine was, from the JSON in a folder."""
+    """Return the machine of each experiment, and its load, from the JSON in a folder."""
     found: dict[str, list[str]] = {}
     for name in ("offload", *_GAINS, "fig9", "outages"):
         path = folder / f"{name}.json"

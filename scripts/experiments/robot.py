@@ -1,8 +1,9 @@
-"""The clients of the experiments: ordinary rclpy nodes that know nothing of the overlay.
+"""Clients of the experiments: ordinary rclpy nodes without knowledge of the overlay.
 
-Process of its own, started by ``field.py`` at the robot or beside a server: ``robot.py ROLE SETTINGS``.
+Process of its own, started by ``field.py`` at the robot or at a server: ``robot.py ROLE SETTINGS``.
 
-``ask`` does a series of calls, ``busy`` is the second client of figure 6; see ``series.py`` for their settings.
+``ask`` makes a series of calls, ``busy`` is the second client of figure 6; see ``series.py`` for their settings.
+
 """
 
 from __future__ import annotations
@@ -35,11 +36,14 @@ _PATIENCE_S: Final = 30.0
 _TICK_S: Final = 0.002
 _EVENTS: Final = 1_000
 _LATE_S: Final = 0.02
-_LINGER_S: Final = 0.5  # in which an answer too many would come
+_LINGER_S: Final = 0.5  # in which a surplus answer would arrive
 
 
 class _Client:
-    """Calls in turn. Each round of the services carries the same request, so that what they do can be compared."""
+    """Client that calls the services in turn.
+
+    Each round carries the same request, so that the services can be compared.
+    """
 
     def __init__(self, node: Node, task: Task, services: Sequence[str]) -> None:
         self._node = node
@@ -58,7 +62,7 @@ class _Client:
                 raise TimeoutError(f"{name}: no server")
 
     def count_answers(self) -> Counter[tuple[bytes, int]]:
-        """Return what counts the answers that reach each call of this node, by ROS 2's service introspection."""
+        """Return a counter of the answers that reach each call of this node, by ROS 2's service introspection."""
         answers: Counter[tuple[bytes, int]] = Counter()
         deep = QoSProfile(depth=_EVENTS, reliability=ReliabilityPolicy.RELIABLE)
 
@@ -73,7 +77,7 @@ class _Client:
         return answers
 
     def ask(self, then: Callable[[], None]) -> None:
-        """Call the next service; ``then`` when it has answered."""
+        """Call the next service; ``then`` is called when it has answered."""
         number, self.sent = self.sent, self.sent + 1
         name = self._services[number % len(self._services)]
         turn = number // len(self._services) if self.is_warm else WARM_UP
@@ -94,7 +98,7 @@ class _Client:
         self._clients[name].call_async(request).add_done_callback(take)
 
     def give_up(self, patience_s: float) -> None:
-        """Count as failed what has been under way for longer; whatever still comes for it is not looked at."""
+        """Count calls as failed that have been in progress for longer; later answers to them are ignored."""
         now_s = time.monotonic()
         for number, (name, begun_s) in list(self.under_way.items()):
             if now_s - begun_s >= patience_s:
@@ -102,7 +106,7 @@ class _Client:
                 self._note(Sample(name, begun_s, now_s - begun_s, "", 0.0, is_right=False))
 
     def begin_anew(self) -> None:
-        """Count from nought: what was called until now was to get warm."""
+        """Reset the count: the calls until now were the warm-up."""
         self.give_up(0.0)
         self.sent = self.ended = 0
         self.is_warm = True
@@ -138,7 +142,7 @@ def ask(node: Node, executor: SingleThreadedExecutor, told: Mapping[str, object]
         nonlocal due_s
         now_s = time.monotonic()
         while client.sent < series.count and len(client.under_way) < series.lanes and due_s <= now_s:
-            due_s = max(due_s, now_s - _LATE_S) + series.gap_s  # who was held up for long does not catch up
+            due_s = max(due_s, now_s - _LATE_S) + series.gap_s  # a client that was delayed for long skips calls
             client.ask(tick)
         client.give_up(series.patience_s)
         if not done.done() and client.ended == series.count:
@@ -153,7 +157,7 @@ def ask(node: Node, executor: SingleThreadedExecutor, told: Mapping[str, object]
 
 
 def busy(node: Node, executor: SingleThreadedExecutor, told: Mapping[str, object]) -> None:
-    """Be the second client, until killed."""
+    """Run as the second client, until killed."""
     contention = Contention(**told)  # type: ignore[arg-type]
     client = _Client(node, TASKS[contention.task](""), [contention.service])
     client.wait_for_servers()
@@ -176,7 +180,7 @@ _ROLES: Final[Mapping[str, Callable[[Node, SingleThreadedExecutor, Mapping[str, 
 
 
 def main() -> None:
-    """Be what the first argument says."""
+    """Run the role of the first argument."""
     rclpy.init()
     node, executor = Node(f"robot_{sys.argv[1]}"), SingleThreadedExecutor()
     executor.add_node(node)

@@ -1,4 +1,4 @@
-"""What became of requests, and what may be said of it: mean, p99, gains, and the least of two that arithmetic promises.
+"""Samples of requests, and their statistics: mean, p99, gains, and the least of two that arithmetic predicts.
 
 Sans-I/O.
 Source: FogROS2-FT (IROS 2024), whose figures compare mean and 99th percentile of one server and of two.
@@ -20,12 +20,12 @@ class Sample:
 
     Args:
         service: the name that was called.
-        begun_s: when, in monotonic seconds of the machine that all stand on.
-        latency_s: until the answer was in the caller's hands; of a failed one, until that was known.
-        machine: who answered; empty: nobody.
-        worked_s: how long the server says that it took.
-        is_right: the answer is there and is the right one.
-        note: what the experiment wants to know of the answer.
+        begun_s: start, in monotonic seconds of the host.
+        latency_s: until the caller had the answer; of a failed one, until the failure was known.
+        machine: the machine that answered; empty: none.
+        worked_s: computing time that the server reports.
+        is_right: the answer is there and is right.
+        note: a property of the answer, for the experiment.
     """
 
     service: str
@@ -39,7 +39,7 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """Latencies in short, in seconds."""
+    """Statistics of latencies, in seconds."""
 
     count: int
     failed: int
@@ -61,7 +61,7 @@ class Summary:
 
 
 def quantile(values: Sequence[float], share: float) -> float:
-    """Return the smallest value that at least ``share`` (0 to 1) of the values do not pass.
+    """Return the smallest value that at least ``share`` (0 to 1) of the values do not exceed.
 
     Raises:
         ValueError: no values.
@@ -81,6 +81,6 @@ def p99(values: Sequence[float]) -> float:
 
 
 def least_of_two(values: Sequence[float]) -> list[float]:
-    """Return the smaller one of every pair of values: two servers that work independently, with no overlay at all."""
+    """Return the smaller one of every pair of values: two independent servers, without any overlay."""
     ordered = sorted(values)
     return [small for at, small in enumerate(ordered) for _ in ordered[at + 1 :]]

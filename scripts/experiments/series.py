@@ -1,6 +1,7 @@
-"""What a client at the robot is to do: a series of calls, and what the second client of figure 6 does.
+"""Settings of a client at the robot: a series of calls, and the load of the second client of figure 6.
 
-Sans-I/O. It goes to the client's process as JSON.
+Sans-I/O. They are passed to the process of the client as JSON.
+
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Table I: what one on-demand machine costs against two of them and against two spot machines.
+"""Table I: the cost of one on-demand machine compared with two of them and with two spot machines.
 
 Command: reads the price list of this package, prints a table, writes ``docs/experiments/table1.{md,png,json}``.
 First come the paper's six applications in its two regions, then some machine types of one region.
@@ -44,7 +44,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A machine type's three bills."""
+    """Three costs of a machine type."""
 
     type_name: str
     bills: tuple[Bill, Bill, Bill]
@@ -52,13 +52,13 @@ class Row:
 
     @property
     def times_cheaper(self) -> float:
-        """How many times less two spot machines cost than one on-demand machine; below 1: they cost more."""
+        """Return the cost of one on-demand machine over that of two spot machines; below 1: they cost more."""
         return 1 / self.bills[2].of_single
 
 
 @dataclass(frozen=True, slots=True)
 class Application:
-    """An application's three bills, on the cheapest machines that have what it needs.
+    """Three costs of an application, on the cheapest machines that meet its needs.
 
     Args:
         needs: as in ``fog.hardware``.

@@ -1,4 +1,4 @@
-"""A camera that sees an AprilTag: frames drawn for a known pose, and the pose found in them.
+"""Camera that sees an AprilTag: frames drawn for a known pose, and the pose found in them.
 
 Sans-I/O, but for the detector, a C library that keeps its own state.
 
@@ -6,7 +6,7 @@ Sans-I/O, but for the detector, a C library that keeps its own state.
 
     tag frame: x right, y down, z into the tag; corners at half a size     pixel = K (R corner + t), no distortion
 
-The tag's pattern is asked of the library, which draws none itself; each pixel is the mean of nine rays.
+The library supplies the pattern of the tag, but draws none itself; each pixel is the mean of nine rays.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ _GROUND, _WHITE, _BLACK = 120.0, 230.0, 20.0
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where the tag is: ``turn``: rotation matrix, row by row; ``at``: its middle, in metres before the camera."""
+    """Pose of the tag: ``turn``: rotation matrix, row by row; ``at``: its middle, in metres before the camera."""
 
     turn: tuple[float, ...]
     at: tuple[float, ...]
 
     @classmethod
     def on_its_way(cls, number: int) -> Pose:
-        """Return the pose in a frame: the tag sways before the camera, and no two frames in a row are alike."""
+        """Return the pose in a frame: the tag sways before the camera, and consecutive frames differ."""
         phase = 0.1 * number
         about_x, about_y, about_z = 0.35 * math.sin(0.9 * phase), 0.4 * math.cos(0.7 * phase), 0.5 * math.sin(phase)
         turn = _about(0, about_x) @ _about(1, about_y) @ _about(2, about_z)
@@ -57,7 +57,7 @@ class Pose:
 
 
 class TagCamera:
-    """Draws the tag, and finds it (10 to 20 ms of one core)."""
+    """Camera that draws the tag, and finds it (10 to 20 ms of one core)."""
 
     def __init__(self) -> None:
         self._detector = Detector(families=_FAMILY, nthreads=1, quad_decimate=2.0)
@@ -66,7 +66,7 @@ class TagCamera:
         self._module_m = _SIZE_M / int(family.width_at_border)
 
     def draw(self, pose: Pose) -> Grey:
-        """Return the frame that a camera would take."""
+        """Return the image that a camera would take."""
         turn, at = np.reshape(pose.turn, (3, 3)), np.asarray(pose.at)
         plane = np.linalg.inv(np.column_stack((turn[:, 0], turn[:, 1], at)))  # from a ray to the tag's plane
         cells, total = self._cells, len(self._cells)
@@ -84,7 +84,7 @@ class TagCamera:
         return frame
 
     def find(self, frame: Grey) -> Pose | None:
-        """Return where the tag is, or None if it is not seen."""
+        """Return the pose of the tag, or None if it is not seen."""
         found = self._detector.detect(frame, True, (_FOCAL, _FOCAL, *_CENTRE), _SIZE_M)
         if len(found) != 1:
             return None

@@ -1,4 +1,4 @@
-"""What a client asks for, and how it tells a right answer from a wrong one: one class a kind of service.
+"""Tasks of a client: its requests, and the check of an answer; one class a kind of service.
 
 Sans-I/O. The frames are drawn once, when a task is made.
 """
@@ -19,7 +19,7 @@ __all__ = ["TASKS", "WARM_UP", "Judged", "Request", "Response", "Task"]
 Request: TypeAlias = "GetPlan.Request | SetParameters.Request"
 Response: TypeAlias = "GetPlan.Response | SetParameters.Response"
 
-WARM_UP: Final = -1  # the number of a request whose answer is not looked at
+WARM_UP: Final = -1  # the number of a request whose answer is not checked
 _FRAMES: Final = 24  # and then the first one again
 _APART_M: Final = 0.005
 _TURNED_RAD: Final = 0.03
@@ -28,7 +28,7 @@ _NANO: Final = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """What an answer is worth; as in ``samples.Sample``."""
+    """Value of an answer; as in ``samples.Sample``."""
 
     machine: str
     worked_s: float
@@ -37,21 +37,21 @@ class Judged:
 
 
 class Task(Protocol):
-    """A kind of request."""
+    """Kind of a request."""
 
     kind: type[GetPlan] | type[SetParameters]
 
     def request(self, number: int) -> Request:
-        """Return the request of a number."""
+        """Return the request with this number."""
         ...
 
     def judge(self, number: int, response: Response) -> Judged:
-        """Return what an answer to the request of that number is worth."""
+        """Return the value of an answer to the request with that number."""
         ...
 
 
 class Plan:
-    """Ask for a way; right is one that begins and ends somewhere. Note: how many places it has."""
+    """Request for a path; right is one that begins and ends somewhere. Note: the number of its poses."""
 
     kind = GetPlan
 
@@ -59,7 +59,7 @@ class Plan:
         self._problem = problem
 
     def request(self, number: int) -> Request:
-        """Return the request of a number."""
+        """Return the request with this number."""
         request = GetPlan.Request()
         if number != WARM_UP:  # else no problem at all, which is solved at once
             request.start.header.frame_id = self._problem
@@ -67,14 +67,17 @@ class Plan:
         return request
 
     def judge(self, number: int, response: Response) -> Judged:
-        """Return what an answer is worth."""
+        """Return the value of an answer."""
         del number
         head, count = response.plan.header, len(response.plan.poses)
         return Judged(head.frame_id, head.stamp.sec + head.stamp.nanosec * _NANO, count > 0, count)
 
 
 class Detect:
-    """Ask where the objects of a scene are; right is each of them and nothing else. Note: how many there are."""
+    """Request for the positions of the objects of a scene; right is each of them and nothing else.
+
+    Note: their number.
+    """
 
     kind = SetParameters
 
@@ -83,11 +86,11 @@ class Detect:
         self._scenes = [Scene.draw(seed) for seed in range(_FRAMES)]
 
     def request(self, number: int) -> Request:
-        """Return the request of a number."""
+        """Return the request with this number."""
         return request_of(self._scenes[number % _FRAMES].frame, number)
 
     def judge(self, number: int, response: Response) -> Judged:
-        """Return what an answer is worth."""
+        """Return the value of an answer."""
         said, scene = said_in(response), self._scenes[number % _FRAMES]
         found = said["found"]
         is_right = isinstance(found, list) and scene.agrees([(row, column) for row, column in found])
@@ -95,16 +98,16 @@ class Detect:
 
 
 class Segment(Detect):
-    """Ask into how many regions a scene falls; right is the number of objects drawn, which is also the note."""
+    """Request for the number of regions of a scene; right is the number of objects drawn, which is also the note."""
 
     def judge(self, number: int, response: Response) -> Judged:
-        """Return what an answer is worth."""
+        """Return the value of an answer."""
         said, count = said_in(response), len(self._scenes[number % _FRAMES].centres)
         return _judged(said, is_right=said["regions"] == count, note=count)
 
 
 class Tag:
-    """Ask where the tag of a frame is; right is within 5 mm and 0.03 rad of where it was drawn. Note: metres apart."""
+    """Request for the pose of the tag; right is within 5 mm and 0.03 rad of the drawn one. Note: metres apart."""
 
     kind = SetParameters
 
@@ -117,11 +120,11 @@ class Tag:
         self._frames = [camera.draw(pose) for pose in self._poses]
 
     def request(self, number: int) -> Request:
-        """Return the request of a number."""
+        """Return the request with this number."""
         return request_of(self._frames[number % _FRAMES], number)
 
     def judge(self, number: int, response: Response) -> Judged:
-        """Return what an answer is worth."""
+        """Return the value of an answer."""
         from tag import Pose
 
         said, truth = said_in(response), self._poses[number % _FRAMES]

@@ -1,10 +1,10 @@
-"""Frames with something in them, and classical computer vision that finds it: the load of figures 6 and 7.
+"""Frames with objects, and classical computer vision that finds them: the load of figures 6 and 7.
 
 Sans-I/O.
 
 Stand-ins, and no neural networks: object detection by correlation with a template (FFT), segmentation by smoothing,
-thresholds and connected components. Both are what a CPU does with an image, take as long whatever is in it, and their
-answer can be checked, since the frames are drawn here.
+thresholds and connected components. Both are typical CPU work on an image. Their time does not depend on its content,
+and their answer can be checked, since the frames are drawn here.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _SCALES: Final = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0)  # sigmas of the smoothing
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A frame and the truth about it. ``centres``: row and column of each object's middle, in pixels."""
+    """Frame and its contents. ``centres``: row and column of the middle of each object, in pixels."""
 
     frame: Grey
     centres: tuple[tuple[int, int], ...]

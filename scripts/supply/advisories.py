@@ -1,4 +1,4 @@
-"""Advisories in the form of OSV, read from files: which versions of a package have a known hole.
+"""Advisories in the OSV format, read from files: versions of a package with a known vulnerability.
 
 Source: Open Source Vulnerability format 1.6, "affected" and "evaluation algorithm"
 (https://ossf.github.io/osv-schema/). PyPI's advisories in this form: https://github.com/pypa/advisory-database.
@@ -21,7 +21,7 @@ _KINDS = ("introduced", "last_affected", "fixed")
 
 
 class AdvisoryError(Exception):
-    """A file that holds no advisories: the text names it."""
+    """File without valid advisories; the text names it."""
 
 
 def read_advisories(path: Path) -> list[Mapping[str, Any]]:
@@ -40,7 +40,7 @@ def read_advisories(path: Path) -> list[Mapping[str, Any]]:
 def is_affected(advisory: Mapping[str, Any], name: str, version: str) -> bool:
     """Return whether a version of a PyPI package is one that the advisory names or spans.
 
-    A version that is none by PEP 440 is compared by its text alone.
+    A version that PEP 440 does not allow is compared by its text alone.
     """
     for affected in advisory.get("affected", ()):
         package = affected.get("package", {})
@@ -86,7 +86,7 @@ def _same(one: str, other: str) -> bool:
 
 
 def _spans(events: Sequence[Mapping[str, str]], text: str) -> bool:
-    """Return whether the newest event at or below a version says that the hole is there."""
+    """Return whether the newest event at or below a version states that the vulnerability is present."""
     version = _parsed(text)
     if version is None:
         return False

@@ -1,14 +1,15 @@
 #!/usr/bin/env python3
-"""Compares what is installed with a lock, and with advisories of known holes. Asks no network.
+"""Audit of installed packages against a lock, and against advisories of known vulnerabilities. Uses no network.
 
     .venv/bin/python scripts/supply/audit.py --lock requirements/dev.lock
     .venv/bin/python scripts/supply/audit.py --lock requirements/run.lock --advisories advisory-database/vulns
     .venv/bin/python scripts/supply/audit.py --lock requirements/run.lock --archives wheels
 
-Looked at is each distribution that the running interpreter finds: whether the lock pins it here, in that version; and
-whether its files are those that its RECORD states. ``--archives`` compares downloaded archives with the lock's hashes.
-pip, setuptools and wheel come with a virtual environment: they are compared where the lock pins them. Exit: 0 nothing
-found, 1 something, 2 wrong usage.
+The audit checks each distribution that the running interpreter finds: whether the lock pins it here, in that version;
+and whether its files are those that its RECORD states. ``--archives`` compares downloaded archives with the lock's
+hashes. A virtual environment brings pip, setuptools and wheel: they are compared where the lock pins them. Exit: 0
+nothing found, 1 something, 2 wrong usage.
+
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ _WITH_EVERY_VENV = frozenset({"pip", "setuptools", "wheel"})
 
 
 class Finding(NamedTuple):
-    """What is not as it should be."""
+    """Difference from the lock, a RECORD or an advisory."""
 
     kind: str  # not-pinned, other-version, changed-file, missing-file, unknown-archive, advisory
     name: str
@@ -47,7 +48,7 @@ class Finding(NamedTuple):
 def compare(installed: Iterable[Distribution], pins: Sequence[Pin]) -> Iterator[Finding]:
     """Yield each distribution that the lock does not pin here, or pins in another version.
 
-    Some packages carry others: the wheel of ros-rclpy has that of rclpy in it, so its pin covers both.
+    Some packages contain others: the wheel of ros-rclpy contains rclpy, so its pin covers both.
     """
     here = pins_here(list(pins))
     dists = sorted(installed, key=_name)
@@ -86,7 +87,7 @@ def check_archives(folder: Path, pins: Sequence[Pin]) -> Iterator[Finding]:
 
 
 def check_advisories(installed: Iterable[Distribution], path: Path) -> Iterator[Finding]:
-    """Yield each distribution of which an advisory says that this version has a hole.
+    """Yield each distribution whose version has a vulnerability by an advisory.
 
     Raises:
         AdvisoryError: no advisories can be read there.

@@ -1,4 +1,4 @@
-"""Lock files: what may be installed, each package by version and hashes.
+"""Lock files: the permitted packages, each by version and hashes.
 
 Source: pip's "Requirements File Format" and "Secure installs"; names as in PEP 503, markers as in PEP 508.
 """
@@ -19,7 +19,7 @@ _HASH = re.compile(r"--hash=sha256:([0-9a-f]{64})\Z")
 
 
 class LockError(Exception):
-    """A file that is no lock: the text names the line."""
+    """File that is not a lock; the text names the line."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Pin:
 
     Attributes:
         name: as PEP 503 writes it.
-        marker: where it holds; empty: everywhere.
+        marker: condition; empty: everywhere.
         hashes: SHA-256 of each archive that may be installed, hex.
     """
 

@@ -1,14 +1,15 @@
 #!/usr/bin/env python3
-"""Builds a release from a commit, states the SHA-256 of each file, signs that, and verifies all of it.
+"""Release from a commit: build, SHA-256 of each file, signature, and verification.
 
     .venv/bin/python scripts/supply/release.py build --out dist
     .venv/bin/python scripts/supply/release.py sign --key keys/release/owner.key dist
     .venv/bin/python scripts/supply/release.py verify --key keys/release/owner.pub dist
 
-``build`` takes the commit, not the work tree, so that what is not committed is not in it. The same commit and the same
-setuptools give the same bytes. The key is one of ``gdp keygen owner``: ECDSA P-256, and the signature is DER over the
-bytes of SHA256SUMS, so that who has neither this project nor its packages can verify with openssl and sha256sum. Exit:
-0 done, 1 it does not verify, 2 wrong usage.
+``build`` takes the commit, not the work tree, so uncommitted changes are not in it. The same commit and the same
+setuptools give the same bytes. The key is one of ``gdp keygen owner``: ECDSA P-256. The signature is DER over the bytes
+of SHA256SUMS, so openssl and sha256sum verify it without this project and its packages. Exit: 0 done, 1 it does not
+verify, 2 wrong usage.
+
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ _BACKEND = "import sys, setuptools.build_meta as b; out = sys.argv[1]; b.build_s
 
 
 class ReleaseError(Exception):
-    """Something does not verify, or cannot be made: the text says what."""
+    """Verification failed, or a file cannot be made; the text gives the reason."""
 
 
 def build(out: Path, root: Path = ROOT, commit: str = "HEAD") -> None:
@@ -73,16 +74,16 @@ def build(out: Path, root: Path = ROOT, commit: str = "HEAD") -> None:
 
 
 def write_sums(folder: Path) -> None:
-    """State the SHA-256 of each file of a folder, as sha256sum writes it."""
+    """Write the SHA-256 of each file of a folder, in the format of sha256sum."""
     sums = {path.name: _sha256(path) for path in sorted(folder.iterdir()) if path.name not in (SUMS, SIGNATURE)}
     (folder / SUMS).write_text("".join(f"{digest}  {name}\n" for name, digest in sums.items()))
 
 
 def sign(folder: Path, key: Path) -> None:
-    """Sign a folder's SHA256SUMS, after a look whether it is true.
+    """Sign a folder's SHA256SUMS, after checking it.
 
     Raises:
-        ReleaseError: SHA256SUMS is not that of the folder.
+        ReleaseError: SHA256SUMS does not match the folder.
         LocalError: the key cannot be read, or others may read it.
     """
     _check_sums(folder)
@@ -91,10 +92,10 @@ def sign(folder: Path, key: Path) -> None:
 
 
 def verify(folder: Path, key: Path) -> list[str]:
-    """Return the names of the files that are the signer's: all that are there.
+    """Return the names of the signed files, which are all files of the folder.
 
     Raises:
-        ReleaseError: the signature, a hash or a name does not hold, or a file is there that is not listed.
+        ReleaseError: the signature, a hash or a name does not match, or a file is there that is not listed.
         LocalError: the key cannot be read.
     """
     public = load_public_key(key)
@@ -137,7 +138,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def _check_sums(folder: Path) -> list[str]:
-    """Return the names of a folder's files, each of which SHA256SUMS states truly, and no other.
+    """Return the names of a folder's files, if SHA256SUMS states each of them correctly, and no other.
 
     Raises:
         ReleaseError: otherwise.
@@ -175,7 +176,7 @@ def _checked_out(root: Path, commit: str) -> Iterator[Path]:
 
 
 def _normalised(sdist: Path, epoch_s: int) -> bytes:
-    """Return a source archive without what differs between two builds: times, owners, order."""
+    """Return a source archive without the differences between two builds: times, owners, order."""
     packed = io.BytesIO()
     with (
         tarfile.open(sdist) as old,

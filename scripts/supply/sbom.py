@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Writes the software bill of materials of a lock: CycloneDX 1.6, JSON.
+"""Software bill of materials of a lock: CycloneDX 1.6, JSON.
 
     .venv/bin/python scripts/supply/sbom.py --lock requirements/run.lock -o sbom.cdx.json
 
@@ -41,8 +41,8 @@ def bill(pins: Sequence[Pin], name: str, version: str, direct: Sequence[str], ep
     """Return the document.
 
     Args:
-        direct: what the project itself requires, by name.
-        epoch_s: when it is made, unix seconds; None: it does not say.
+        direct: names of the direct requirements of the project.
+        epoch_s: creation time, unix seconds; None: not stated.
     """
     ordered = sorted(pins, key=lambda pin: (pin.name, pin.version, pin.marker))
     found = {pin: _installed(pin) for pin in ordered}
@@ -96,7 +96,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def project(path: Path) -> tuple[str, str, list[str]]:
-    """Return name, version and the names of what a pyproject.toml requires.
+    """Return name, version and the required names of a pyproject.toml.
 
     Raises:
         ValueError: this Python cannot read TOML (it is in 3.11 and later).
@@ -134,7 +134,7 @@ def _component(pin: Pin, dist: Distribution | None) -> dict[str, Any]:
 
 
 def _licences(dist: Distribution) -> list[dict[str, Any]]:
-    """Return what a package says of its licence: an SPDX expression, else its words."""
+    """Return the licence of a package: an SPDX expression, else its words."""
     if expression := dist.metadata.get("License-Expression"):
         return [{"expression": expression}]
     words = [
@@ -155,7 +155,7 @@ def _installed(pin: Pin) -> Distribution | None:
 
 
 def _requires(dist: Distribution) -> set[str]:
-    """Return what a package requires here, without extras, by name."""
+    """Return the requirements of a package here, without extras, by name."""
     names = set()
     for text in dist.requires or ():
         try:
