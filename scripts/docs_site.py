@@ -64,7 +64,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:  # noqa: ARG001
-    """Rewrite the links of a page for its place on the site."""
+    """Rewrite the links of a page for its location on the site."""
     source = page.file.src_uri
     origin = _origin(source).parent
 

@@ -42,7 +42,7 @@ _Fuzz = Callable[[Decoder, float, int], Outcome]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Fuzz what the arguments say, and return the exit status."""
+    """Run the fuzzing that the arguments select, and return the exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given[:1] == ["insiders"]:
         return _insiders(given[1:])

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Writes the locks of requirements/: each package with version and hashes, for every platform and Python from 3.10 on.
+# Writes the locks of requirements/, each package with version and hashes, for every platform and Python from 3.10 on.
 #
 #   scripts/lock.sh                        newest versions that pyproject.toml allows
 #   scripts/lock.sh --upgrade-package X    X alone; further arguments go to uv

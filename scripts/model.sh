@@ -2,9 +2,9 @@
 # Proves the models of docs/model with ProVerif and compares each result with the table of docs/model/README.md.
 #
 #   scripts/model.sh            run all, about 5 s
-#   scripts/model.sh --write    the same; then note which files the results are of (docs/model/SHA256SUMS)
+#   scripts/model.sh --write    the same; then record the files of the results (docs/model/SHA256SUMS)
 #
-# PROVERIF names the program if it is not on the path. Exit: 0 all as the table says, 1 another result, 3 no ProVerif.
+# PROVERIF names the program if it is not on the path. Exit: 0 all as in the table, 1 another result, 3 no ProVerif.
 set -euo pipefail
 
 cd "$(dirname "${BASH_SOURCE[0]}")/../docs/model"
@@ -16,7 +16,7 @@ if ! command -v "$proverif" >/dev/null; then
     exit 3
 fi
 
-# prove <run>: prints "<run> <verdict>" for each query, in order. A run is a model, or model:echo for one with two echoes.
+# prove <run>: prints "<run> <result>" for each query, in order. A run is a model, or model:echo for one with two echoes.
 prove() {
     local model=${1%%:*} echo=() out
     [[ $1 == *:* ]] && echo=(-lib "echo_${1##*:}")

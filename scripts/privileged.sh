@@ -2,7 +2,7 @@
 # Runs a command with the right to make network namespaces: as root, or else as root of a user namespace of its own.
 #
 #   scripts/privileged.sh COMMAND [ARGUMENT...]
-#   scripts/privileged.sh --check          only tells, by its exit code, whether that is possible
+#   scripts/privileged.sh --check          only reports, by its exit code, whether that is possible
 set -euo pipefail
 
 apart=(unshare --user --map-root-user --net --mount)

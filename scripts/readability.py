@@ -250,7 +250,7 @@ def _test_count(files: Iterable[Path], root: Path) -> int:
 
 
 class Report(NamedTuple):
-    """Figures by name, and the places behind them."""
+    """Figures by name, and the findings behind them."""
 
     figures: dict[str, float]
     words: list[Place]

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Sets everything up and sends a recording, or what real ROS nodes say, through a ring of five name-routed switches.
+# Demonstration ring: sends a recording, or messages of real ROS nodes, through five name-routed switches.
 #
 #   sudo scripts/ring_topology.sh                  a generated robot drive
 #   sudo scripts/ring_topology.sh my.bag           a recording of your own
@@ -18,7 +18,7 @@ case " $* " in
     *" --live "* | *" --live=ros2 "*) ros=(2) ;;
     *) ros=() ;;
 esac
-if [[ " ${ros[*]-} " == *" 2 "* && -z "${AMENT_PREFIX_PATH-}" ]]; then  # a sourced ROS 2 is used as it is
+if [[ " ${ros[*]-} " == *" 2 "* && -z "${AMENT_PREFIX_PATH-}" ]]; then  # a sourced ROS 2 stays in use
     "$root/scripts/setup.sh" --ros2
 else
     "$root/scripts/setup.sh"

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes .venv with this package and what it needs; does nothing, in well under a second, if that is done already.
+# Installs this package and its requirements into .venv; an up-to-date .venv takes well under a second.
 #
 #   scripts/setup.sh          to run
 #   scripts/setup.sh --ros2   to run where no ROS 2 is installed: with a real one from the package index
@@ -50,7 +50,7 @@ package() {
     rm -f "$log"
 }
 
-# hand_over <path>...: under sudo, what was made belongs to the person, not to root
+# hand_over <path>...: under sudo, new files belong to the calling user, not to root
 hand_over() {
     if [[ $(id -u) -eq 0 && -n "${SUDO_UID:-}" && "${SUDO_UID}" != 0 ]]; then
         chown -R --no-dereference "$SUDO_UID:${SUDO_GID:-$SUDO_UID}" "$@"
@@ -64,7 +64,7 @@ link_scripts() {
     printf '%s\n' "$root/scripts" >"$folder/gdp_scripts.pth"
 }
 
-# compile_own: byte-compiles our packages, lest root leaves caches that their owner cannot delete
+# compile_own: byte-compiles our packages, so that root leaves no caches that their owner cannot delete
 compile_own() {
     "$venv/bin/python" -m compileall -q gdp proxy fog scripts/ring scripts/fog_demo || fail "the source does not compile"
     if [[ $(id -u) -eq 0 && -n "${SUDO_UID:-}" ]]; then
@@ -74,7 +74,7 @@ compile_own() {
 
 python=$(find_python)
 wanted=$({ cat pyproject.toml requirements/*.lock; "$python" --version; echo "$root"; } | sha256sum | cut -d' ' -f1)
-# What was installed for testing is enough for running.
+# An installation for tests is enough to run.
 for stamp in "$venv/.installed$extras" "$venv/.installed[ros2]" "$venv/.installed$dev"; do
     if [[ -f "$stamp" && $(<"$stamp") == "$wanted" ]] && "$venv/bin/python" -c '' 2>/dev/null; then
         link_scripts
@@ -94,7 +94,7 @@ if [[ "$extras" == "$dev" ]]; then
         scripts/setup_ros1.sh || say "tests of ROS 1 will be skipped"
     fi
     if ! command -v redis-server >/dev/null && ! command -v valkey-server >/dev/null; then
-        # no service of the system: tests start servers of their own
+        # not a system service: tests start servers of their own
         mask=/etc/systemd/system/redis-server.service
         if [[ -d /run/systemd/system && ! -e "$mask" ]]; then ln -s /dev/null "$mask"; fi
         RUNLEVEL=1 package redis-server "tests of RIBs that share a cluster start it"
@@ -111,7 +111,7 @@ say "installing this package and what it needs (once; about a minute)"
 log=$(mktemp)
 trap 'rm -f "$log"' EXIT
 pip() { "$venv/bin/python" -m pip install --disable-pip-version-check --no-input --no-deps "$@" >"$log" 2>&1; }
-# What builds the package is pinned too, so it is installed first and not fetched into an environment for the build.
+# The build requirements are pinned too, so they are installed first, not fetched into a build environment.
 if ! pip --require-hashes -r requirements/build.lock || ! pip --require-hashes -r "requirements/$lock.lock" ||
     ! pip --no-build-isolation -e .; then
     tail -n 25 "$log" >&2

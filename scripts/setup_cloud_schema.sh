@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Fetches cloud-init's own schema of user data into .venv, for the tests, without installing cloud-init: that would act
-# on this machine at its next boot. Does nothing if it is there already.
+# Fetches cloud-init's own schema of user data into .venv, for the tests. It does not install cloud-init, which would act
+# on this machine at its next boot. Does nothing if the schema is there already.
 set -euo pipefail
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
@@ -10,7 +10,7 @@ schema=${1:-$root/.venv/share/cloud-init/schema.json}
 scratch=$(mktemp -d)
 trap 'rm -rf "$scratch"' EXIT
 cd "$scratch"
-# apt's own user may not write here, which it would say at length.
+# The user of apt may not write here; apt would warn about that at length.
 fetch=(apt-get download -o APT::Sandbox::User=root cloud-init)
 if ! "${fetch[@]}" >log 2>&1 && ! { apt-get update >log 2>&1 && "${fetch[@]}" >log 2>&1; }; then
     tail -n 5 log >&2

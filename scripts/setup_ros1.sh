@@ -3,7 +3,7 @@
 #
 #   sudo scripts/setup_ros1.sh
 #
-# Does nothing where all of it is there. A robot with a ROS 1 of its own does not need it.
+# Does nothing where all of it is installed. A robot with a ROS 1 of its own does not need it.
 set -euo pipefail
 
 packages=(

@@ -4,7 +4,7 @@
 #   scripts/start_cluster.sh DIR [ADDRESS]     keeps everything in DIR; listens on ADDRESS (127.0.0.1), on free ports
 #   scripts/start_cluster.sh --stop DIR        ends the servers that it started; the data stay in DIR
 #
-# Writes DIR/store.yaml, the part of a rib.yaml that uses the cluster. Started again with the same DIR, it goes on with the
+# Writes DIR/store.yaml, the part of a rib.yaml that uses the cluster. Another start with the same DIR continues with the
 # data. Needs: redis-server and redis-cli (or valkey-server and valkey-cli) of version 7 or later, openssl, python3.
 set -euo pipefail
 umask 077
@@ -20,7 +20,7 @@ stop() {
     for ((at = 1; at <= nodes; at++)); do
         [[ -f "$dir/$at/server.pid" ]] || continue
         pid=$(<"$dir/$at/server.pid")
-        # the number may belong to another process by now: ours runs in its own folder
+        # the process id may belong to another process by now: a server of this script runs in its own folder
         if [[ "$(readlink "/proc/$pid/cwd" 2>/dev/null)" == "$dir/$at" ]]; then
             kill "$pid"
             while kill -0 "$pid" 2>/dev/null; do sleep 0.05; done

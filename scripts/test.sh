@@ -4,7 +4,7 @@
 #   sudo scripts/test.sh
 #   scripts/test.sh -k certificate                 arguments go to pytest
 #
-# Without root the namespace tests run in a user namespace; where that is not allowed they are skipped, and say so.
+# Without root the namespace tests run in a user namespace; where that is not allowed they are skipped with that reason.
 set -euo pipefail
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
@@ -12,7 +12,7 @@ cd "$root"
 scripts/setup.sh --dev
 scripts/check.sh
 if [[ $(id -u) -ne 0 ]]; then
-    # Root of a user namespace would share pytest's folder with the machine's root, and be refused.
+    # Root of a user namespace would share pytest's folder with the machine's root; pytest refuses that.
     PYTEST_DEBUG_TEMPROOT=$(mktemp -d)
     export PYTEST_DEBUG_TEMPROOT
 fi
@@ -32,8 +32,8 @@ if [[ $# -gt 0 ]]; then
     run "$@"
     exit
 fi
-# Tests with namespaces mostly wait for processes, so two lanes of equal length run in parallel. A test that fails runs once
-# more alone, to tell an unsteady test from a broken one. Both fail the run, unless tests/quarantine.yaml lists the test.
+# Tests with namespaces mostly wait for processes, so two lanes of equal length run in parallel. A failed test runs once
+# more alone, to distinguish an unsteady test from a broken one. Both fail the run, unless tests/quarantine.yaml lists the test.
 clusters=(netns_tests/test_{bench_replicas,experiments,fog,fog_demo,leaving,local_provider,replica_gateway}.py)
 declare -A lanes=(["clusters"]="tests ${clusters[*]}" ["spaces"]="netns_tests ${clusters[*]/#/--ignore=}")
 # lane <name> <report> <argument>...: runs the tests of a lane and writes a JUnit file

@@ -30,7 +30,7 @@ MESSAGE_BYTES: Final = 100
 _MESSAGE: Final = struct.Struct("!Bq91x")  # what it is, when it was due in ns
 _WARM_UP, _MEASURED, _LAST = range(3)
 _WARM_UP_S: Final = 0.5
-_AT_ONCE: Final = 400  # messages published between two looks at the network, in overload
+_AT_ONCE: Final = 400  # messages published between two polls of the network, in overload
 _PATIENCE_S: Final = 20.0
 _TICK_S: Final = 0.001
 

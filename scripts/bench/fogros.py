@@ -5,8 +5,8 @@
     grasp planning     a depth image and its mask there (1 MB), a grasp back
 
 with ordinary rclpy nodes at both ends, over one cable (``direct``) and over proxies and three kernel switches, in turn,
-round by round; nothing is computed, so a time is the way there and back. ``fogros_tasks.py`` says where the sizes come
-from. ``scripts/experiments/offload.py`` computes the tasks, and compares the paper's figures with ours.
+round by round; nothing is computed, so a time is that of the network, both ways. ``fogros_tasks.py`` states the source
+of the sizes. ``scripts/experiments/offload.py`` computes the tasks, and compares the paper's figures with ours.
 
     sudo .venv/bin/python scripts/bench/fogros.py                     # the whole; writes docs/benchmarks/fogros.*
     sudo .venv/bin/python scripts/bench/fogros.py --quick --no-save   # a few seconds: does it work?
@@ -118,7 +118,7 @@ def targets_of(over: Rounds, mtu: int) -> list[Target]:
 
 
 def bench_of(options: Options) -> Bench:
-    """Return what the command line asks for."""
+    """Return the bench that the command line selects."""
     cases = [case_of(task, mtu) for mtu in options.mtus for task in TASKS]
     return Bench(
         "fogros",

@@ -14,7 +14,7 @@ Five machines in namespaces, A - s1 - s2 - s3 - B, and in turn on them, round by
 
 Messages go one at a time, as in a control loop. A figure of a round is the median (or p99) of its messages; the table
 shows the median of the rounds, and in brackets their lowest and highest. Only the whole bench writes under
-docs/benchmarks by itself; a part of it writes where --json and --plot say.
+docs/benchmarks by itself; a part of it writes to the paths of --json and --plot.
 """
 
 from __future__ import annotations

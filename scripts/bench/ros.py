@@ -113,7 +113,7 @@ def case_of(kind: str, mtu: int) -> str:
 
 
 def bench_of(options: Options) -> Bench:
-    """Return what the command line asks for."""
+    """Return the bench that the command line selects."""
     carried = [
         Carried(topic, TYPES[kind], encoding)
         for kind, encodings in ENCODINGS.items()

@@ -185,7 +185,7 @@ def _ends(trees: Trees, _: argparse.Namespace) -> dict[str, Figures]:
             )
             for who, tree in trees.items()
         }  # fmt: skip
-        names = [json.loads(_line(end)) for end in ends.values()][-1]  # each says it; all say the same
+        names = [json.loads(_line(end)) for end in ends.values()][-1]  # each prints it, with the same value
         for name in names:
             best = max if name.endswith("/s") else min
             for _block in range(_BLOCKS_SLOW if name.endswith("/s") else _BLOCKS):

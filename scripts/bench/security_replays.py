@@ -86,7 +86,7 @@ GAPS_S: Final = (0.0, 0.0, 60.0, 3_000.0, 7_000.0, 15_000.0, 86_400.0, 5 * 86_40
 CLOCKS_S: Final = (0.0, 0.0, 0.0, -3_000.0, 3_000.0)
 RESTARTS: Final = ("nothing", ROBOT, READER, READER, CLIENT, SERVER, SERVER, ROAMER, "switch a", "switch b", "switch c",
                    "rib home", "rib away", "all", "all", "all")  # fmt: skip
-SILENT: Final = {READER: ROBOT, SERVER: CLIENT}  # whose frames do not come, while those that hear them start
+SILENT: Final = {READER: ROBOT, SERVER: CLIENT}  # nodes whose frames are dropped while their receivers start
 BATCH: Final = 1_000
 _BATCHES: Final = 8  # of one network
 _LEASE_S: Final = 6.0
@@ -643,7 +643,7 @@ def _episode(domain: Domain, tries: int, counts: Counter[str], restarts: Counter
             domain.restart(what, ahead_s)
         silent = SILENT.get(what)
         if silent is not None:
-            domain.network.freeze(silent)  # who sits in a link lets nothing of its own through meanwhile
+            domain.network.freeze(silent)  # an attacker in a link blocks the regular frames meanwhile
         for _ in domain.play(at_once, counts, is_live=False, to=what if silent else None):
             pass
         if silent is not None:

@@ -1,6 +1,6 @@
 """Revocation bench: cost of 10^5 revocations for a node, and time until one closes a flow.
 
-kept      One process. A domain's root revokes 100,000 memberships: memory, time to take one, to look one up, to read
+kept      One process. A domain's root revokes 100,000 memberships: memory, time to accept one, to find one, to read
           all back from disk, and to bring a neighbour that knows none to the same state.
 closed    Real processes in namespaces, three tiers of RIBs. A member publishes on many topics, or many members publish
           on one topic each; one after the other loses its delegation (``gdp delegate revoke``) or its membership
@@ -98,7 +98,7 @@ def _resident_bytes() -> int:
 
 
 def _statements(authority: CertificateAuthority, count: int, unix_s: float) -> Iterator[bytes]:
-    """Yield revocations of memberships that a domain never issued: fingerprints are hashes, so they look alike."""
+    """Yield revocations of memberships that a domain never issued: fingerprints are hashes, so they have the same form."""
     chance = random.Random(1)
     for _ in range(count):
         until = int(unix_s) + chance.randrange(86_400, _YEAR_S)

@@ -127,7 +127,7 @@ def panels_of(over: Rounds, mtu: int) -> list[Panel]:
 
 
 def bench_of(options: Options) -> Bench:
-    """Return what the command line asks for."""
+    """Return the bench that the command line selects."""
     encodings: tuple[Encoding, ...] = ("cdr", "json")
     return Bench(
         "services",

@@ -183,7 +183,7 @@ def perform(options: Options, measure: Callable[[Options, RunRegistry], Outcome]
 def finish(
     outcome: Outcome, options: Options, state: MachineState, took_s: float, *, is_saved: bool, is_drawn: bool
 ) -> None:
-    """Print an outcome, and write the files that the options ask for."""
+    """Print an outcome, and write the files that the options select."""
     settings: Settings = {**outcome.settings, "took, s": round(took_s)}
     show(outcome.title, state, settings, outcome.rounds, outcome.targets)
     own = OUTPUT if outcome.is_whole else None

@@ -76,8 +76,8 @@ def count_regions(frame: Grey, coarse: int = 1) -> int:
     """Return how many bright regions a frame is segmented into (about 60 ms of one core).
 
     Args:
-        frame: where they are.
-        coarse: look at every so many rows and columns only (4: about 3 ms).
+        frame: the image.
+        coarse: step in rows and columns (4: about 3 ms).
     """
     image = frame[::coarse, ::coarse].astype(np.float32)
     votes = np.zeros(image.shape, dtype=np.uint8)
