@@ -98,7 +98,7 @@ def _resident_bytes() -> int:
 
 
 def _statements(authority: CertificateAuthority, count: int, unix_s: float) -> Iterator[bytes]:
-    """Yield revocations of memberships that a domain never issued: fingerprints are hashes, so they have the same form."""
+    """Yield revocations of memberships that a domain never issued: fingerprints are hashes, so they have one form."""
     chance = random.Random(1)
     for _ in range(count):
         until = int(unix_s) + chance.randrange(86_400, _YEAR_S)
