@@ -6,7 +6,7 @@ Command: reads ``../shared/data/spot``, writes ``fog/catalog/aws.json`` and ``tr
 
 The list prices below are those that AWS published for EC2 on-demand Linux machines (shared tenancy) in 2024, in USD an
 hour. Those of c5 in the US, g6, p3 and p4d agree with SkyPilot's public catalogue (``catalogs/v7/aws/vms.csv``). Within
-the families c5, c6i, m5, m6i, r5 and t3 the price is proportional to the size; of machines with a GPU only the sizes
+the families c5, c6i, m5, m6i, r5 and t3 the price is proportional to the size. Of machines with a GPU only the sizes
 given are listed. A region that is missing was not known for sure.
 """
 

@@ -3,8 +3,8 @@
     4,000/s      a steady rate, topics in turn: loss, latency, what each end costs
     overload     as many as come to be confirmed, at most 2,000 of a topic under way: messages/s
 
-each with bundles (messages that wait together share one seal) and with one seal a message, in turn, round by round.
-Targets: no loss at the steady rate; in overload at least three times the rate of one seal a message.
+Each case runs with bundles (messages that wait together share one seal) and with one seal a message, in turn, round by
+round. Targets: no loss at the steady rate; in overload at least three times the rate of one seal a message.
 
     sudo .venv/bin/python scripts/bench/bundles.py                     # the whole; writes docs/benchmarks/bundles.*
     sudo .venv/bin/python scripts/bench/bundles.py --quick --no-save   # a few seconds: does it work?

@@ -1,8 +1,8 @@
 """Endpoint process of the bundle bench: a member that publishes small messages on many topics, or reads them.
 
-Process of its own, started by ``bundles.py``. A message is 100 bytes and carries the moment at which it was
-due (``CLOCK_MONOTONIC``, one clock for all namespaces of a machine). At a steady rate a kernel timer makes them due,
-topic after topic; in overload one is due whenever its topic has fewer than ``BACKLOG`` that are not confirmed.
+Process of its own, started by ``bundles.py``. A message is 100 bytes and carries the moment at which it was due
+(``CLOCK_MONOTONIC``, one clock for all namespaces of a machine). At a steady rate a kernel timer makes them due, topic
+after topic. In overload a message is due whenever its topic has fewer than ``BACKLOG`` unconfirmed ones.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Chaos bench: faults of every kind in a network of real processes, drawn from a seed; afterwards all flows must work.
 
-A random network of 12 to 20 switches, four domains, three tiers, several RIBs, two services with replicas, reliable
-and best-effort topics (``faults/network.py``) gets overlapping faults (``faults/schedule.py``). Flows that
-graph and policy leave connected (``faults/oracle.py``) must continue. Promises:
+A random network of 12 to 20 switches, four domains, three tiers, several RIBs, two services with replicas, reliable and
+best-effort topics (``faults/network.py``). It gets overlapping faults (``faults/schedule.py``). Flows that graph and
+policy leave connected (``faults/oracle.py``) must continue. Promises:
 
     after the last fault    every flow that must be connected delivers again within a second, and stays so
     meanwhile               no silence above --limit-s where both ends were connected all the time

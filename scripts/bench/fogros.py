@@ -4,9 +4,10 @@
     motion planning    two meshes and a request there (128 kB), a path back
     grasp planning     a depth image and its mask there (1 MB), a grasp back
 
-with ordinary rclpy nodes at both ends, over one cable (``direct``) and over proxies and three kernel switches, in turn,
-round by round; nothing is computed, so a time is that of the network, both ways. ``fogros_tasks.py`` states the source
-of the sizes. ``scripts/experiments/offload.py`` computes the tasks, and compares the paper's figures with ours.
+Both ends are ordinary rclpy nodes. They are joined by one cable (``direct``), and by proxies and three kernel switches,
+in turn, round by round. Nothing is computed, so a time is that of the network, both ways. ``fogros_tasks.py`` states
+the source of the sizes. ``scripts/experiments/offload.py`` computes the tasks, and compares the paper's figures with
+ours.
 
     sudo .venv/bin/python scripts/bench/fogros.py                     # the whole; writes docs/benchmarks/fogros.*
     sudo .venv/bin/python scripts/bench/fogros.py --quick --no-save   # a few seconds: does it work?

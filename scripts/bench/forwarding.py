@@ -4,8 +4,9 @@
     sudo .venv/bin/python scripts/bench/forwarding.py --quick --no-save    a few seconds, to see that all works
     sudo .venv/bin/python scripts/bench/forwarding.py --only kernel --only bridge --rounds 5
 
-Our planes (scapy, raw, kernel with and without redirect_peer), the Linux bridge and the kernel's IPv4 forwarding run
-in the same chain of namespaces, one after the other, in each round. Per size of frame and length of chain:
+The baselines are our planes (scapy, raw, kernel with and without redirect_peer), the Linux bridge and the kernel's IPv4
+forwarding. In each round they run in the same chain of namespaces, one after the other. Per size of frame and length of
+chain:
 
 frames/s            highest rate at which less than 0.1 % is lost and the last frame comes at once (``rate_search.py``)
 RTT, polling ends   of single frames, by endpoints that query their socket continuously: the path alone; not measured

@@ -12,7 +12,7 @@ Five machines in namespaces, A - s1 - s2 - s3 - B, and in turn on them, round by
     sudo .venv/bin/python scripts/bench/messages.py --only gdp-raw --only zenoh-mtls --mtu 1500 --size 921600
     sudo .venv/bin/python scripts/bench/messages.py --realtime          # every baseline under SCHED_FIFO
 
-Messages go one at a time, as in a control loop. A figure of a round is the median (or p99) of its messages; the table
+Messages go one at a time, as in a control loop. A figure of a round is the median (or p99) of its messages. The table
 shows the median of the rounds, and in brackets their lowest and highest. Only the whole bench writes under
 docs/benchmarks by itself; a part of it writes to the paths of --json and --plot.
 """

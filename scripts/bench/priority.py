@@ -7,9 +7,9 @@ One member at A ticks; the floods on the same path are, in turn:
     own images, best effort     the same, as fast as they can be sent
     another's images            those of another member at the same switch, reliable
 
-over three switches with the data plane ``kernel``, then ``raw``; on links as fast as the machine, where both its cores
-are busy, and with 100 Mbit/s between the first two switches, where a queue is full. Latency is one way, from the time
-a tick was due to its delivery to B's program. Target: p99 of no flood above twice the idle p99 and one frame's time.
+The three switches have the data plane ``kernel``, then ``raw``. Links are as fast as the machine, where both its cores
+are busy, or have 100 Mbit/s between the first two switches, where a queue is full. Latency is one way, from the time a
+tick was due to its delivery to B's program. Target: p99 of no flood above twice the idle p99 and one frame's time.
 
     sudo .venv/bin/python scripts/bench/priority.py                     # the whole; writes docs/benchmarks/priority.*
     sudo .venv/bin/python scripts/bench/priority.py --quick --no-save   # a few seconds: does it work?

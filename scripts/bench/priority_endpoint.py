@@ -1,8 +1,8 @@
 """Endpoint process of the priority bench at A, B and C: a member that ticks, floods, or reads.
 
-Process of its own, started by ``priority.py``. A tick is a small message that carries the moment at which it
-was due: a kernel timer wakes the process, as a robot's own loop would, and every delay before the tick leaves counts.
-Source: timerfd_create(2); CLOCK_MONOTONIC is one clock for all namespaces of a machine.
+Process of its own, started by ``priority.py``. A tick is a small message that carries the moment at which it was due. A
+kernel timer wakes the process, as a robot's own loop would. Every delay before the tick leaves counts. Source:
+timerfd_create(2); CLOCK_MONOTONIC is one clock for all namespaces of a machine.
 """
 
 from __future__ import annotations

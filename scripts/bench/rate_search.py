@@ -1,9 +1,9 @@
 """Search for the highest rate that holds, one rate at a time.
 
-Sans-I/O. A try holds when it loses less than ``LOSS_MAX`` of its frames, the last of them arrives soon after the last
-sending (a rate that only fills queues does not count), and the source kept the rate. Where frames are forwarded in the
-sender's own time, the best of three tries at full speed shows the rate; else the rate is bracketed and bisected. A rate
-that fails is tried once more, because other load of the machine can spoil a single try.
+Sans-I/O. A try holds under three conditions. It loses less than ``LOSS_MAX`` of its frames. The last frame arrives soon
+after the last sending, because a rate that only fills queues does not count. The source kept the rate. Where frames are
+forwarded in the sender's own time, the best of three tries at full speed shows the rate. Else the rate is bracketed and
+bisected. A rate that fails is tried once more, because other load of the machine can spoil a single try.
 
 """
 

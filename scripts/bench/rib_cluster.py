@@ -2,8 +2,8 @@
 
 The cluster is ``scripts/start_cluster.sh``'s: three primaries with a replica each, TLS, on this machine. Every name has
 an AdCert and an advertisement of its own, as a RIB would have accepted them. A lookup is the work of a RIB for a name
-that is not in its memory: one round trip, and every signature verified. Then primaries are killed, one after the other;
-each row of ``gap`` is the time from the kill until a name of that primary can be read and written again.
+that is not in its memory: one round trip, and every signature verified. Then primaries are killed, one after the other.
+Each row of ``gap`` is the time from the kill until a name of that primary can be read and written again.
 
     .venv/bin/python scripts/bench/rib_cluster.py                        # 1,000,000 names; about a quarter of an hour
     .venv/bin/python scripts/bench/rib_cluster.py --names 50000 --no-save

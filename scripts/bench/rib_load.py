@@ -3,7 +3,7 @@
     .venv/bin/python scripts/bench/rib_load.py [NAMES]      one line of JSON; scale.py runs it, a process a round
 
 One process, no network. Each advertisement is a new name under an AdCert of its own, signed by its proxy and relayed by
-its switch: three signatures to verify, and one to make for the AdvertiseAck.
+its switch. The RIB verifies three signatures, and makes one for the AdvertiseAck.
 """
 
 from __future__ import annotations

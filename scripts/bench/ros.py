@@ -5,9 +5,9 @@
     image        640 x 480, rgb8: 921,600 bytes, 30 a second
     small        text on 20 topics, in bursts of 20 every 5 ms: 4,000 a second
 
-each compared with the same two nodes joined by one cable (``direct``), in turn, round by round; latencies are one way,
-by the wall clock of the one machine. Targets: text at most 1 ms more than direct, images at most 3 ms, both proxies
-together on at most one core, and no loss; ``image`` and ``small`` run for a minute in the first round.
+Each is compared with the same two nodes joined by one cable (``direct``), in turn, round by round. Latencies are one
+way, by the wall clock of the one machine. Targets: text at most 1 ms more than direct, images at most 3 ms, both
+proxies together on at most one core, and no loss. In the first round ``image`` and ``small`` run for a minute.
 
     sudo .venv/bin/python scripts/bench/ros.py                     # the whole; writes docs/benchmarks/ros.*
     sudo .venv/bin/python scripts/bench/ros.py --quick --no-save   # a few seconds each: does it work?

@@ -9,8 +9,8 @@ messages     ``bundles.py`` of each tree: real processes over three switches, 20
 trips        ``messages.py`` of each tree, on the plane ``raw``: a message there and a small answer back
 
 The other commit is checked out in a ``git worktree``, and removed after. Its packages run under scripts of the commit
-``SCRIPTS``, the last one whose scripts use the names of that time, so that renames in this tree do not disturb it.
-Target: no median is worse by more than 5 %. A ratio is taken in each round, since what slows a round slows both.
+``SCRIPTS``, the last one whose scripts use the names of that time. So renames in this tree do not disturb it. Target:
+no median is worse by more than 5 %. A ratio is taken in each round, since what slows a round slows both.
 
     sudo .venv/bin/python scripts/bench/security.py cost
     .venv/bin/python scripts/bench/security.py cost --part ends --rounds 9      # no root

@@ -1,20 +1,19 @@
 """Flood bench: effect of a flood by a stranger on a link, or by a member, on real nodes.
 
-Three switches in a row, each a process in a namespace of its own; a topic goes from a member at the first to a member
+Three switches in a row, each a process in a namespace of its own. A topic goes from a member at the first to a member
 at the last one. A stranger on the link between the first and the middle one replays hellos to the middle one, from
-10,000 invented addresses: with certificates of its own (``fresh``), recorded ones of members (``recorded``), and with a
-member's certificate and a wrong signature (``wrong``). Broadcast data, which no switch reads, is the control
-(``noise``): it disturbs only the machine, on which the flood takes a core.
+10,000 invented addresses. The hellos have certificates of its own (``fresh``), are recorded ones of members
+(``recorded``), or have a member's certificate and a wrong signature (``wrong``). Broadcast data, which no switch reads,
+is the control (``noise``): it disturbs only the machine, on which the flood takes a core.
 
 A fourth switch at the middle one is hostile (``faults.hostile``): it sends frames to unknown ``names``, valid
-``joins``, ``revocations`` of its own. A proxy at the middle one, which reads the topic and publishes another, is
-hostile in turn: it sends ``reports`` that everything lacks, and first ``parts`` of large messages, one after the other.
+``joins``, ``revocations`` of its own. A proxy at the middle one reads the topic, publishes another, and is hostile in
+turn. It sends ``reports`` that everything lacks, and first ``parts`` of large messages, one after the other.
 
-The rate is ten times what this machine verifies in a second; that of parts, which are a member's right to send, ten
-times that of the good topic's frames.
-Each flood is compared with a calm phase before it. At the end of each phase the first switch is killed and started
-again; the figure is the time until it is a neighbour of the middle one. Memory is that of the target of the flood:
-the middle switch, the publisher (``reports``), the reader (``parts``).
+The rate is ten times what this machine verifies in a second. Parts are a member's right to send; their rate is ten
+times that of the good topic's frames. Each flood is compared with a calm phase before it. At the end of each phase the
+first switch is killed and started again. The figure is the time until it is a neighbour of the middle one. Memory is
+that of the target of the flood: the middle switch, the publisher (``reports``), the reader (``parts``).
 
     sudo .venv/bin/python scripts/bench/security.py flood                        # an hour
     sudo .venv/bin/python scripts/bench/security.py flood --planes kernel --kinds fresh --seconds 5 --rounds 1 --no-save

@@ -1,9 +1,9 @@
 """Insider bench: hostile statements of real members, and how many of them ended a process.
 
-Whole networks in memory (``tests/insiders``), each in a state that a random journey has reached, receive statements of
-every type, signed with the keys of eleven hostile members. An error that leaves a machine would end its process; the
-boundary that a node has around each frame counts it. Both count here. Broken invariants count too: bytes drawn by an
-untrusted sender, bounds of tables, the flow on which no insider has a right.
+Whole networks in memory (``tests/insiders``) receive statements of every type, signed with the keys of eleven hostile
+members. A random journey has brought each network into its state. An error that leaves a machine would end its process;
+the boundary that a node has around each frame counts it. Both count here. Broken invariants count too: bytes drawn by
+an untrusted sender, bounds of tables, the flow on which no insider has a right.
 
 Runs add up in the file; each begins at the seed after the last one. ``scripts/fuzz.py insiders --shrink`` reduces the
 findings.

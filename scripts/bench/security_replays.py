@@ -1,9 +1,9 @@
 """Replay bench: recorded frames that are accepted after a restart, of all that are played back. The target is none.
 
-One process with the in-memory network and its virtual clock. There are two domains with a RIB each, a publisher and
-its reader, a client and a server. One node has moved, one has withdrawn its topic, and one is revoked. Every frame on
-every link is recorded: while all come up, at work, while a link is cut, a RIB restarts, a node moves, withdraws or is
-revoked.
+One process with the in-memory network and its virtual clock. There are two domains with a RIB each, a publisher and its
+reader, a client and a server. One node has moved, one has withdrawn its topic, and one is revoked. Every frame on every
+link is recorded: while all come up, at work, and during each event. Events are a cut link, a restart of a RIB, a move,
+a withdrawal and a revocation.
 
 Then nothing, one process or all of them restart: after seconds or, all being off, after hours or days. Their clocks
 are right, or nearly an hour behind or ahead. RIBs begin with their snapshot and switches with the revocations that

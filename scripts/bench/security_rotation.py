@@ -2,8 +2,9 @@
 
 One process: the ring of five switches on the in-memory network, its clock virtual. The robot publishes one reliable and
 one best-effort topic to two readers. Every ``--rotate-s`` each member is granted the next epoch: the readers first, the
-publisher half a second later; the epoch before the last is taken from all. At the end every message has to be at every
-reader, once and in order. Once nothing is published any more, readers try the epoch before as well; that is refused.
+publisher half a second later. The epoch before the last is removed from all. At the end every message has to be at
+every reader, once and in order. Once nothing is published any more, readers try the epoch before as well; that is
+refused.
 
     .venv/bin/python scripts/bench/security.py rotation                          # 100,000 messages, an epoch each 5 s
     .venv/bin/python scripts/bench/security.py rotation --messages 5000 --loss 0.01 --no-save

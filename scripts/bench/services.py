@@ -3,8 +3,8 @@
     one at a time    a client calls, waits for the answer, calls again: how long a call takes
     1,000/s          50 clients in one node call in turn, none waits for the others: whether all are answered
 
-each compared with the same two nodes joined by one cable (``direct``), in turn, round by round. Targets: at most
-1.5 ms more a call than direct; every one of 1,000 calls a second answered.
+Each is compared with the same two nodes joined by one cable (``direct``), in turn, round by round. Targets: at most 1.5
+ms more a call than direct; every one of 1,000 calls a second answered.
 
     sudo .venv/bin/python scripts/bench/services.py                     # the whole; writes docs/benchmarks/services.*
     sudo .venv/bin/python scripts/bench/services.py --quick --no-save   # a few seconds: does it work?

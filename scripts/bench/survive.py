@@ -2,8 +2,8 @@
 
 Each row has a small network of real processes in namespaces (``survive_rows.py``). P publishes numbered messages of 100
 bytes; R writes down when each came. The silence of an event is the longest time between two consecutive messages at R,
-from the event until the flow has been steady again; so it includes the time between two messages, and whatever this
-machine's scheduler adds (the row ``nothing``). Lost and doubled count messages over the whole row, all rounds of it.
+from the event until the flow has been steady again. So it includes the time between two messages, and the delay of this
+machine's scheduler (the row ``nothing``). Lost and doubled count messages over the whole row, all rounds of it.
 
     sudo .venv/bin/python scripts/bench/survive.py                      # the whole; writes docs/benchmarks/survive.json
     sudo .venv/bin/python scripts/bench/survive.py --only silent --only cut --rounds 30 --no-save

@@ -182,7 +182,7 @@ class OverlayNodes:
         """Return the environment of a ROS process: UDP alone, and socket buffers that hold a camera image.
 
         Shared memory of Fast DDS would cross the namespaces of one host, and the discovery range ``LOCALHOST`` switches
-        it on again; so the range is ``SUBNET``, and the namespaces confine.
+        it on again. So the range is ``SUBNET``, and the namespaces confine.
         """
         profile = self.files / "dds.xml"
         profile.write_text(_PROFILE, encoding="utf-8")

@@ -2,7 +2,7 @@
 
 Sans-I/O. Stand-in for Dex-Net: candidates are sampled as Dex-Net samples them (pixel pairs on depth edges whose normals
 oppose each other, no wider than the gripper opens). Dex-Net then ranks them with a neural network (GQ-CNN), whose
-weights are not available here; this ranks them by friction angle, clearance and distance to the object's middle.
+weights are not available here. This module ranks them by friction angle, clearance and distance to the object's middle.
 
 Source: Mahler et al., Dex-Net 2.0 (RSS 2017), section V-B, for the sampling.
 """

@@ -2,9 +2,9 @@
 
 Sans-I/O.
 
-The installed packages have no service that takes an image, so ``rcl_interfaces/srv/
-SetParameters`` carries it: the request has one parameter, named by the frame's number, whose integer array holds the
-640 x 480 bytes of the frame, eight to an integer; the answer's ``reason`` is JSON.
+The installed packages have no service that takes an image, so ``rcl_interfaces/srv/SetParameters`` carries it. The
+request has one parameter, named by the frame's number. Its integer array holds the 640 x 480 bytes of the frame, eight
+to an integer. The answer's ``reason`` is JSON.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Processes of ``offload.py``: a robot that calls, a server that computes, and a robot that computes by itself.
 
 Process of its own: ``offload_endpoint.py robot|cloud|alone SETTINGS``. Both are nodes of ROS 2, by one of two
-middlewares: ``rclpy`` with Fast DDS, or Cyclone DDS. Of the latter there is no wheel for rclpy, so the messages are
-serialised by rclpy and carried by this project's endpoint ``dds``, which is what ``rmw_cyclonedds`` does in one piece.
+middlewares: ``rclpy`` with Fast DDS, or Cyclone DDS. Of the latter there is no wheel for rclpy. So rclpy serialises the
+messages and this project's endpoint ``dds`` carries them, which is what ``rmw_cyclonedds`` does in one piece.
 
 A request is numbered in its messages; requests up to ``at_once`` are answered without computing, so that what remains
 is the network. All clocks are the one monotonic clock of the machine.

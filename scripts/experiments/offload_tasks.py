@@ -1,7 +1,7 @@
 """Tasks of FogROS G's Table I: the robot's request, the server's computation, and the check of the answer.
 
 Reads recorded frames and meshes when a task is made; otherwise sans-I/O. The sizes of images and the types are those of
-the clients that the authors publish (``scripts/bench/fogros_tasks.py`` names the files); types of packages without a
+the clients that the authors publish (``scripts/bench/fogros_tasks.py`` names the files). Types of packages without a
 wheel are replaced by standard ones that carry the same numbers.
 
     vSLAM             colour (rgb8) and depth (16UC1) of 640 x 480 -> pose          stand-in: odometry.py

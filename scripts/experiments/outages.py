@@ -3,10 +3,9 @@
     sudo .venv/bin/python scripts/experiments/outages.py                # 4 minutes; writes docs/experiments/outages.*
     sudo .venv/bin/python scripts/experiments/outages.py --quick        # a few seconds: does it work?
 
-FogROS2-FT computes that two spot machines, each up for 15 h and down for 20 min, are down together less than 0.05 % of
+FogROS2-FT considers two spot machines, each up for 15 h and down for 20 min. They are down together less than 0.05 % of
 the time, because shares of independent machines multiply. Such times are too long for an experiment. Here the times are
-seconds, and the machines are down for a quarter of the time, so that both are down together often enough to be
-measured.
+seconds, and the machines are down for a quarter of the time. So both are down together often enough to be measured.
 """
 
 from __future__ import annotations

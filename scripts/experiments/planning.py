@@ -1,8 +1,8 @@
 """Motion planning for rigid bodies: OMPL's planners on the meshes of OMPL.app, collisions by FCL.
 
-Sans-I/O, but for reading a problem's three files; a planner draws its own random numbers.
-Source: the problem files of OMPL.app (``*.cfg``, ``*_robot.dae``, ``*_env.dae``). As there, the robot's mesh is moved
-so that the mean of its vertices is the origin of its poses, and COLLADA's up axis is rotated from y to z.
+Sans-I/O, but for reading a problem's three files; a planner draws its own random numbers. Source: the problem files of
+OMPL.app (``*.cfg``, ``*_robot.dae``, ``*_env.dae``). As there, the robot's mesh is moved so that the mean of its
+vertices is the origin of its poses. COLLADA's up axis is rotated from y to z.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Waits of servers that compute nothing, drawn from recorded planning runs.
 
 Sans-I/O, but for reading the recording. Each run of ``RRTConnect`` is a pair. ``record.py`` writes the number of states
-that the run checked, which is proportional to its time on a machine that does nothing else, and its processor time.
+that the run checked, and its processor time. The number is proportional to the time of the run on an idle machine.
 Where the number is 0 it was not counted: the second number is then the time on such a machine (the computed trials of
 figure 5).
 """

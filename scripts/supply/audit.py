@@ -5,10 +5,10 @@
     .venv/bin/python scripts/supply/audit.py --lock requirements/run.lock --advisories advisory-database/vulns
     .venv/bin/python scripts/supply/audit.py --lock requirements/run.lock --archives wheels
 
-The audit checks each distribution that the running interpreter finds: whether the lock pins it here, in that version;
-and whether its files are those that its RECORD states. ``--archives`` compares downloaded archives with the lock's
-hashes. A virtual environment brings pip, setuptools and wheel: they are compared where the lock pins them. Exit: 0
-nothing found, 1 something, 2 wrong usage.
+The audit checks each distribution that the running interpreter finds. The lock must pin it here, in that version, and
+its files must be those that its RECORD states. ``--archives`` compares downloaded archives with the lock's hashes. A
+virtual environment brings pip, setuptools and wheel: they are compared where the lock pins them. Exit: 0 nothing found,
+1 something, 2 wrong usage.
 
 """
 

@@ -1,8 +1,8 @@
 """Stranger on a link that floods it with hellos: a process of its own, started by ``security.py flood``.
 
-I/O. One packet socket. Its only argument is JSON: ``iface``; ``frames``, a file of frames from the header on, each
-after its length (4 bytes); ``rate`` a second; ``seconds``; ``source``, an address, or nothing for many invented ones.
-It prints one line of JSON at its begin and one at its end: the number of frames sent.
+I/O. One packet socket. Its only argument is JSON with ``iface``, ``frames``, ``rate`` (a second), ``seconds`` and
+``source``. The file ``frames`` holds frames from the header on, each after its length (4 bytes). The address ``source``
+is empty for many invented ones. It prints one line of JSON at its begin and one at its end: the number of frames sent.
 
 """
 

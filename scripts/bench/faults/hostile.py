@@ -1,10 +1,10 @@
 """Member that turned hostile and floods: a process of its own, started by ``security.py flood``.
 
 I/O. It is a switch (``names``, ``joins``, ``revocations``) or a proxy that reads and publishes (``reports``,
-``parts``). It is as real as every other node and continues to work while it floods: its frames leave from its own
-address, and its session stays up. Its only argument is JSON: ``what``; ``config``, its file; ``frames``, how many
-different ones; ``rate`` a second; ``seconds``; for a proxy ``reads`` and ``publishes``, topics. It prints a line of
-JSON when it takes part, begins to flood at SIGUSR1, and prints another line at the end.
+``parts``). It is a real node and continues to work while it floods. Its frames leave from its own address, and its
+session stays up. Its only argument is JSON: ``what``; ``config``, its file; ``frames``, how many different ones;
+``rate`` a second; ``seconds``; for a proxy ``reads`` and ``publishes``, topics. It prints a line of JSON when it takes
+part, begins to flood at SIGUSR1, and prints another line at the end.
 
 """
 

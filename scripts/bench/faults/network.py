@@ -1,8 +1,8 @@
 """Random network for a chaos run, the same for the same seed.
 
 Sans-I/O. Four domains in three tiers (``top`` over ``middle``, that over ``left`` and ``right``), each a ring of
-switches with some chords; domains of neighbouring tiers are joined at two pairs of borders, so any single switch or
-link may fail. RIBs: two in ``top`` and in ``right``, one in the others.
+switches with some chords. Two pairs of borders join domains of neighbouring tiers, so any single switch or link may
+fail. RIBs: two in ``top`` and in ``right``, one in the others.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Process of its own, started by ``cyclone_net.py``.
 
-Messages go in and out as serialised bytes, which is what a ROS 2 node passes to the middleware; the binding's own
+Messages go in and out as serialised bytes, which is what a ROS 2 node passes to the middleware. The binding's own
 serialiser, in Python, would cost 26 ms for an image. For that the type is one octet: Cyclone carries the rest of a
 longer message along. Each endpoint waits by a WaitSet in the thread that continues the work. A listener would add a
 change of threads.

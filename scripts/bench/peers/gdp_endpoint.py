@@ -1,7 +1,7 @@
 """Endpoint process of GDP at A and B: a session of the library, or a member of the overlay without it.
 
-Process of its own, started by ``gdp_net.py``. Each message is written in the topic's encoding, encrypted,
-signed, verified, put in order and reported on, and decoded: all that a proxy does except for ROS.
+Process of its own, started by ``gdp_net.py``. Each message is encoded, encrypted, signed, verified, ordered,
+acknowledged and decoded. That is all that a proxy does except for ROS.
 
 Each encoding has a topic of its own, ``/ping/json`` for one; answers come back on ``/pong``. ``bench/library.py`` runs
 the same with the internal path in place of the library, to measure what that costs.
