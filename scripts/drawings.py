@@ -20,7 +20,7 @@ IMAGES: Final = Path(__file__).resolve().parents[1] / "docs/images"
 BLUE, PURPLE, GREEN, ORANGE, GREY = "#1971c2", "#6741d9", "#2f9e44", "#d9480f", "#7d8793"
 INK, SOFT = "#1c2430", "#55606e"
 _FILL: Final = {BLUE: "#e7f5ff", PURPLE: "#f3f0ff", GREEN: "#ebfbee", ORANGE: "#fff4e6", GREY: "#ffffff"}
-_LINE_PX: Final = 16  # between the lines of a text
+_LINE_PX: Final = 16  # distance between the lines of a text
 
 
 class Drawing:

@@ -144,7 +144,7 @@ class Bridge:
             for node in chain.middles:
                 undo.callback(chain.inside, node, _remove_bridge)
                 chain.inside(node, partial(_make_bridge, chain.devices(node)))
-            chain.round_trips(self.wire(chain, 128), 10, poll=False)  # so that every bridge has learnt both addresses
+            chain.round_trips(self.wire(chain, 128), 10, poll=False)  # every bridge has then learnt both addresses
             return undo.pop_all()
 
     def workers(self) -> list[Worker]:

@@ -25,9 +25,9 @@ from gdp.nodes.memory_tuning import tune_memory
 
 __all__ = ["BACKLOG", "MESSAGE_BYTES", "main", "topics"]
 
-BACKLOG: Final = 2_000  # messages of a topic, in overload
+BACKLOG: Final = 2_000  # unconfirmed messages a topic, in overload
 MESSAGE_BYTES: Final = 100
-_MESSAGE: Final = struct.Struct("!Bq91x")  # what it is, when it was due in ns
+_MESSAGE: Final = struct.Struct("!Bq91x")  # kind of message, due time in ns
 _WARM_UP, _MEASURED, _LAST = range(3)
 _WARM_UP_S: Final = 0.5
 _AT_ONCE: Final = 400  # messages published between two polls of the network, in overload

@@ -51,8 +51,8 @@ from gdp.errors import GdpError
 from gdp.host.run_registry import RunRegistry
 
 SECONDS: Final = 60.0
-AFTER_S: Final = 8.0  # that everything is watched after the last fault
-WELL_S: Final = 1.0  # after the last fault, all flows work again
+AFTER_S: Final = 8.0  # observation after the last fault
+WELL_S: Final = 1.0  # limit after the last fault until all flows work again
 LIMIT_S: Final = 5.0
 REVOKED_S: Final = 3.0
 SETTLE_S: Final = 60.0
@@ -60,7 +60,7 @@ LOOK_S: Final = 0.1
 TOLD_S: Final = 0.25  # shorter silences are not reported
 CALL_S: Final = 5.0
 LOG_LINES: Final = 12
-_CLUSTER_EVERY: Final = 3  # seeds
+_CLUSTER_EVERY: Final = 3  # one in so many seeds gets a cluster
 _PRESSURE: Final = Path("/proc/pressure/cpu")
 FRAMES: Final = {
     FaultKind.SILENT: FrameFaults(lost=1.0),
@@ -87,10 +87,10 @@ class Chaos:
         self._under_way: list[Fault] = []
         self._ended_lives: set[tuple[str, int]] = set()
         self.must = {pair: Timeline() for pair in self._oracle.pairs()}
-        self.moments: list[tuple[int, Fault, bool]] = []  # when, what, whether it began
+        self.moments: list[tuple[int, Fault, bool]] = []  # time, fault, whether it began
         self.begun_ns = 0
-        self.late_s = 0.0  # that faults and restarts took longer than drawn, in all
-        self.waited_share = 0.0  # of the run, in which a process was ready and had no processor
+        self.late_s = 0.0  # total delay of faults and restarts against the schedule
+        self.waited_share = 0.0  # share of the run in which a process was ready and had no processor
         self.revoked_ns: int | None = None
 
     def settle(self) -> None:
@@ -434,9 +434,9 @@ def arguments() -> argparse.ArgumentParser:
 def main() -> None:
     """Run seeds; exit 1 when one failed."""
     options = arguments().parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # SIGTERM must remove everything that was made
     runs = RunRegistry()
-    runs.sweep()  # what a killed run left
+    runs.sweep()  # remains of a killed run
     broken: list[int] = []
     for seed in _seeds(options.seed or [1], options.hours, time.monotonic):
         try:

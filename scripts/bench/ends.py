@@ -31,12 +31,12 @@ _SOL_PACKET, _QDISC_BYPASS = 263, 20
 _SO_ATTACH_FILTER, _SO_SNDBUFFORCE, _SO_RCVBUFFORCE = 26, 32, 33
 _RETURN: Final = 0x06  # BPF_RET | BPF_K
 _BUFFER_BYTES: Final = 64 << 20
-_SLOT_BYTES: Final = 64  # the sink reads no more of a frame
+_SLOT_BYTES: Final = 64  # bytes that the sink reads of a frame
 _NAP_S: Final = 0.0005
 _PATIENCE_S: Final = 1.0
 _LOOKS: Final = 2_000_000  # empty polls of a polling endpoint: about a second
 _FRAME_MAX: Final = 1 << 16
-_WARM: Final = 50  # pings that are not counted
+_WARM: Final = 50  # warm-up pings, not counted
 _DONTWAIT: Final = int(socket.MSG_DONTWAIT)
 
 

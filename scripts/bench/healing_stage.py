@@ -167,7 +167,7 @@ class Cluster:
         """End the robot's node; return how many requests it made, and how many failed."""
         os.kill(self._caller.pid, signal.SIGUSR1)
         while not (said := self._caller.read(_PATIENCE_S))["done"]:
-            pass  # an older line
+            pass  # an earlier line of progress
         for line in (self._run.directory / "caller.log").read_text(encoding="utf-8").splitlines():
             progress(f"caller: {line}")
         calls, answered, wrong, unserved = (int(str(said[key])) for key in ("calls", "answered", "wrong", "unserved"))

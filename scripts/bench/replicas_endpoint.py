@@ -108,7 +108,7 @@ class _Asking:
 
         def take(future: Future[ListParameters.Response]) -> None:
             if self._under_way.pop(number, None) is None:
-                return  # given up
+                return  # already counted as failed
             self.times_s[name].append(time.perf_counter() - begun_s)
             said, machine, had = future.result().result.names
             self.wrong += said != str(number)
@@ -164,7 +164,7 @@ def ask(end: End, settings: Settings) -> None:
     timer.cancel()
     took_s = time.monotonic() - begun_s
     if heard is not None:
-        _linger(end)  # for surplus answers
+        _linger(end)  # wait for surplus answers
     say(
         event="asked all",
         failed=asking.failed,

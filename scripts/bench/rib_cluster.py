@@ -214,7 +214,7 @@ def gap_after_death(folder: Path, config: ClusterConfig, field_: Field, number: 
     sequence = 1 + int(time.time() * 1_000)
     while time.monotonic() - begun_s < PATIENCE_S:
         try:
-            store = ClusterStore(link, field_.verifier())  # nothing in memory
+            store = ClusterStore(link, field_.verifier())  # the new RIB has nothing in memory
             look_up(store, field_.name(number))
             put(store, field_, range(number, number + 1), sequence)
             break

@@ -92,7 +92,7 @@ class _Robot:
     def _take(self, answer: Message) -> None:
         now_s = time.monotonic()
         if number_of(answer) != self._number:
-            return  # to a greeting that was repeated
+            return  # the answer to a repeated greeting
         if self._number == _WARM_UP:
             self._until_s = now_s + self._seconds
             say(event="begins", bytes=self.bytes)

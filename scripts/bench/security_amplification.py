@@ -64,7 +64,7 @@ SPEAKERS: Final = {
     "stranger, recorded": "x1",
 }
 _STRANGERS: Final = ("stranger", "stranger, recorded")
-_PER_S: Final = 20.0  # what a grant pays, here
+_PER_S: Final = 20.0  # rate and burst that a grant pays here
 _GRANTS: Final[tuple[tuple[str, float], ...]] = (
     ("gdp.switch.name_resolver.QUESTIONS_PER_S", _PER_S),
     ("gdp.switch.name_resolver.QUESTIONS_BURST", _PER_S),
@@ -83,7 +83,7 @@ _GRANTS: Final[tuple[tuple[str, float], ...]] = (
     ("gdp.trust.revocations._ISSUER_PER_S", _PER_S),
     ("gdp.trust.revocations._ISSUER_BURST", _PER_S),
 )
-_RATES: Final = 1, 5, 10  # of what a grant pays
+_RATES: Final = 1, 5, 10  # multiples of what a grant pays
 _TAIL_S: Final = 3.0
 _RECORDED: Final = "recorded"
 

@@ -56,14 +56,14 @@ _BASE_CASES: Final = (
     ("bundles", "one seal a message"),
     ("messages/s", "sender, CPU us/message", "reader, CPU us/message"),
 )
-_BLOCKS: Final = 40  # of 100 messages, at each tree in turn
+_BLOCKS: Final = 40  # blocks of 100 messages, at each tree in turn
 _BLOCKS_SLOW: Final = 8
 _STEADY_HZ: Final = 20_000.0
 _TRY_S: Final = 0.5
 _TRIES: Final = 3
 _PATIENCE_S: Final = 300.0
 
-Figures = dict[tuple[str, str], float]  # by case and column; those of a rate end with "/s"
+Figures = dict[tuple[str, str], float]  # figures by case and column; columns of rates end with "/s"
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,7 +50,7 @@ def of_messages(size: int) -> dict[str, Callable[[], float]]:
     sealer = Sealer(secret, 1, Kind.DATA, source, 1, topic, key, *salts)
     opener, public, message = Opener(secret, Kind.DATA, source, 1, topic), key.public, secrets.token_bytes(size)
     numbers, digest = count(1), secrets.token_bytes(32)
-    signature = key.sign_digest(digest)  # what it takes to verify one is the same for all
+    signature = key.sign_digest(digest)  # the cost to verify one is the same for all
 
     def seal(number: int) -> list[bytes]:
         return sealer.seal(number, 0, message, _MTU)[:]

@@ -63,7 +63,7 @@ __all__ = ["add_arguments", "run"]
 
 GOAL_MEMORY_MIB: Final = 16.0
 GOAL_GOODPUT: Final = 0.9
-TIMES: Final = 10  # what a core verifies
+TIMES: Final = 10  # multiple of the rate that a core verifies
 STRANGE: Final = ("fresh", "recorded", "wrong", "noise")
 OF_SWITCH: Final = ("names", "joins", "revocations")
 OF_PROXY: Final = ("reports", "parts")

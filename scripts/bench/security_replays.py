@@ -113,7 +113,7 @@ class Recorded:
     mac: bytes
     frame: bytes
     kind: int
-    statement: tuple[int, bytes, int]  # that it is a part of
+    statement: tuple[int, bytes, int]  # key of the statement that it is a part of
 
 
 class _Stepped:
@@ -418,7 +418,7 @@ class Domain:
     def forget(self) -> None:
         """Take everything that was delivered, and restart the count."""
         self.collect()
-        self.network.run(0.5)  # for answers to what the server has just taken
+        self.network.run(0.5)  # wait for answers to what the server has just accepted
         self.collect()
         self.flow.got[READER].clear()
         self.server.got.clear()

@@ -55,13 +55,13 @@ from gdp.trust.revocations import Revocations
 __all__ = ["add_arguments", "run"]
 
 COUNT: Final = 100_000
-TARGET_S: Final = 1.0  # at the 99th percentile, from the signal to the last message
+TARGET_S: Final = 1.0  # target at the 99th percentile, from the signal to the last message
 HZ: Final = 100.0
 TOPICS: Final = 24
 VICTIMS: Final = 6
 HANDED_IN_AT: Final = "m2"
-STEADY_S: Final = 60.0  # for every flow to be read
-AFTER_S: Final = 3.0  # for which a closed flow must stay silent
+STEADY_S: Final = 60.0  # limit until every flow is read
+AFTER_S: Final = 3.0  # time in which a closed flow must stay silent
 _YEAR_S: Final = 365 * 86_400
 
 

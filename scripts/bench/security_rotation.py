@@ -34,7 +34,7 @@ __all__ = ["add_arguments", "run"]
 
 ROBOT: Final = "nuc1/robot"
 READERS: Final = ("nuc5/server", "nuc3/desk")
-LEAD_S: Final = 0.5  # that readers have the new epoch before their publisher
+LEAD_S: Final = 0.5  # lead of the readers over their publisher with a new epoch
 DRAIN_S: Final = 30.0
 
 

@@ -46,15 +46,15 @@ PUBLISHERS: Final = 600
 SECONDS: Final = 60.0
 SAMPLES: Final = 50
 BETWEEN_S: Final = 1.0
-CACHES: Final = ADCERTS_REMEMBERED + 500  # publishers after which every bounded memory of those that went is full
-FILL_KB: Final = 16.0  # a publisher, until then: seven delegations over six nodes, and what else is remembered
+CACHES: Final = ADCERTS_REMEMBERED + 500  # publishers until every bounded memory of ended ones is full
+FILL_KB: Final = 16.0  # a publisher, until then: seven delegations over six nodes, and other remembered state
 FILLING: Final = "publishers of new names, while memories fill"
 LEFT, RIGHT = "s1/left", "s3/right"
 PAGE_BYTES: Final = os.sysconf("SC_PAGE_SIZE")
-SHARE: Final = 0.02  # of the mean
+SHARE: Final = 0.02  # share of the mean
 LEAST: Final = {"objects": 200.0, "memory, kB": 512.0, "descriptors": 0.0, "threads": 0.0, "map bytes": 1_024.0}
 
-Samples = dict[tuple[str, str], list[float]]  # (who, what) -> samples
+Samples = dict[tuple[str, str], list[float]]  # (process, figure) -> samples
 
 
 class Memory:
@@ -110,7 +110,7 @@ class Memory:
             right.unsubscribe(topic.name)
             world.network.touch(LEFT)
             world.network.touch(RIGHT)
-            world.network.run(BETWEEN_S)  # so that the names of the warm-up run out within it
+            world.network.run(BETWEEN_S)  # the names of the warm-up expire within it
 
         if publishers > CACHES + SAMPLES:
             _repeat("publishers until all is full", once, CACHES)

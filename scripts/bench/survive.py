@@ -171,7 +171,7 @@ def measure(runs: RunRegistry, row: Row, rounds: int, options: argparse.Namespac
 
 
 def _once(overlay: Overlay, flow: Flowing, row: Row, at: int, found: Measured, options: argparse.Namespace) -> None:
-    time.sleep(random.random() * options.phase_s)  # at any phase of every timer
+    time.sleep(random.random() * options.phase_s)  # events hit any phase of every timer
     since_ns = time.monotonic_ns()
     row.fail(overlay, at)
     if row.new_name_s is not None:
@@ -282,9 +282,9 @@ def main() -> None:
     options = arguments().parse_args()
     if options.quick:
         options.rounds, options.dead_s, options.settle_s = 1, 3.0, 0.0
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was made is removed
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # SIGTERM must remove everything that was made
     runs = RunRegistry()
-    runs.sweep()  # what a killed run left
+    runs.sweep()  # remains of a killed run
     measured: dict[str, Measured] = {}
     failures: list[str] = []
     for name in options.only or list(ROWS):

@@ -29,7 +29,7 @@ __all__ = ["NEW_TOPICS", "ROWS", "Row"]
 TOPIC: Final = "/steady"
 NEW_TOPICS: Final = 40
 _DEARER: Final = 12
-_COUNT_S: Final = 0.1  # for which frames are counted, to see which way the flow takes
+_COUNT_S: Final = 0.1  # time of counting frames, to find the flow's path
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,7 +39,7 @@ class Worker:
         LocalError: it ended before it was ready; ``refused`` in its only line gives the reason, or stderr does.
     """
 
-    roles = Path(__file__).with_name("roles.py")  # another commit's while its packages are measured
+    roles = Path(__file__).with_name("roles.py")  # another commit's packages while those are measured
 
     def __init__(self, spaces: Namespaces, node: str, role: str, *, cpu: int | None = None, **settings: Value) -> None:
         roles = Worker.roles

@@ -39,7 +39,7 @@ __all__ = [
 
 _OUTPUT: Final = ROOT / "docs" / "experiments"
 _BEGIN_S: Final = 90.0
-_SILENT_S: Final = 20.0  # of a client between two samples
+_SILENT_S: Final = 20.0  # silence of a client between two samples
 _CONSOLE_COLUMNS: Final = 150
 _COLUMNS: Final = ("requests", "failed", "mean, ms", "p50, ms", "p99, ms", "worst, ms")
 

@@ -37,7 +37,7 @@ ROBOT: Final = "robot"
 READY_S: Final = 40.0
 _NEAR, _GATE = "s1", "gate"
 _HERE: Final = ROOT / "scripts" / "experiments"
-_DOMAIN: Final = 150  # of the robot; the machines' follow
+_DOMAIN: Final = 150  # ROS domain of the robot; those of the machines follow
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,7 +44,7 @@ ALONE: Final = {
     "vSLAM": (100, 1),
     "grasp planning": (25, 4),
     "motion planning": (1, 6),
-}  # requests, robots side by side
+}  # requests a robot, robots in parallel
 # The paper's time on the robot over its time on the server (total less network): how much slower the robot is.
 SLOWER: Final = {"vSLAM": 0.68 / 1.39, "motion planning": 161.8 / 4.292, "grasp planning": 14.0 / 0.535}
 MTU: Final = 1_500
@@ -65,7 +65,7 @@ class Measured:
     back_s: list[float] = field(default_factory=list)
     total_s: list[float] = field(default_factory=list)
     computed_s: list[float] = field(default_factory=list)
-    rounds_there_s: list[float] = field(default_factory=list)  # the median of each round
+    rounds_there_s: list[float] = field(default_factory=list)  # medians of the rounds
     failed: int = 0
 
 

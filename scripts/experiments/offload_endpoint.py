@@ -142,7 +142,7 @@ def robot(settings: Settings) -> None:
         nonlocal number
         answered_s = time.monotonic()
         if number_of(answer) != number:
-            return  # to a greeting that was repeated
+            return  # the answer to a repeated greeting
         if number:
             is_right = number <= at_once or task.is_right(number - at_once, answer)
             say(number=number, asked_s=asked_s, answered_s=answered_s, is_right=is_right)
@@ -184,7 +184,7 @@ def cloud(settings: Settings) -> None:
         (number,) = numbers
         arrived_s = time.monotonic()
         if number and number <= done:
-            return  # a part that came twice
+            return  # a duplicate part
         done = max(done, number)
         messages = [waiting[topic] for topic, _ in task.parts]
         answer = task.compute(messages) if number > at_once else TYPES[answer_type]()
@@ -207,7 +207,7 @@ def alone(settings: Settings) -> None:
     is_limited = threading.Event()
     signal.signal(signal.SIGUSR1, lambda *_: is_limited.set())
     say(event="ready")
-    is_limited.wait()  # until the one that started this process has put it into its control group
+    is_limited.wait()  # wait until the parent process has put this one into its control group
     for number in range(1, int(str(settings["count"])) + 1):
         messages = task.request(number)
         begun_s = time.monotonic()

@@ -22,7 +22,7 @@ from recorded import RECORDING
 __all__: list[str] = []
 
 PLANNER: Final = "RRTConnect"
-LIMIT_S: Final = 1_000.0  # of the wall clock; the paper's 100 s are applied when the recording is used
+LIMIT_S: Final = 1_000.0  # limit by the wall clock; the paper's 100 s are applied when the recording is used
 MESHES: Final = ROOT.parent / "shared" / "data" / "planning"
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)

@@ -23,7 +23,7 @@ from vision import SHAPE, Grey
 __all__ = ["Pose", "TagCamera"]
 
 _FAMILY: Final = "tag36h11"
-_SIZE_M: Final = 0.16  # from black edge to black edge
+_SIZE_M: Final = 0.16  # metres from black edge to black edge
 _FOCAL: Final = 600.0  # pixels
 _CENTRE: Final = (SHAPE[1] / 2, SHAPE[0] / 2)
 _RAYS: Final = (-1 / 3, 0.0, 1 / 3)

@@ -21,10 +21,10 @@ __all__ = ["SHAPE", "Grey", "Scene", "count_regions", "find_objects"]
 Grey: TypeAlias = "NDArray[np.uint8]"
 
 SHAPE: Final = (480, 640)
-_RADIUS: Final = 14  # of a disc, in pixels
+_RADIUS: Final = 14  # radius of a disc, in pixels
 _CELL: Final = 80  # an object stands in the middle third of a cell, so none touches another
 _NOISE: Final = 12.0
-_THRESHOLD: Final = 0.75  # of the best correlation
+_THRESHOLD: Final = 0.75  # share of the best correlation
 _SCALES: Final = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0)  # sigmas of the smoothing, in pixels; an odd number
 
 

@@ -97,17 +97,17 @@ class Books:
         self._plan = plan
         # by channel, reader, the reader's incarnation, the publisher's incarnation
         self.accounts: defaultdict[tuple[int, str, int, int], Account] = defaultdict(Account)
-        self.told: defaultdict[tuple[int, str, int], int] = defaultdict(int)  # by channel, reader, its life
+        self.told: defaultdict[tuple[int, str, int], int] = defaultdict(int)  # by channel, reader, its incarnation
         self.told_between: defaultdict[tuple[int, str, int], int] = defaultdict(
             int
         )  # the same, of before that incarnation
-        self.published: defaultdict[tuple[int, int], list[int]] = defaultdict(list)  # channel, life -> moments
+        self.published: defaultdict[tuple[int, int], list[int]] = defaultdict(list)  # channel, incarnation -> moments
         self.arrivals_ns: defaultdict[tuple[int, str], list[int]] = defaultdict(list)
         self.wrong: list[str] = []
         self._calls: dict[
             tuple[int, str, int, int], list[int]
-        ] = {}  # channel, client, life, number -> [since, answers]
-        self.answered: list[tuple[int, int]] = []  # when asked, when answered
+        ] = {}  # channel, client, incarnation, number -> [since, answers]
+        self.answered: list[tuple[int, int]] = []  # time of the call, time of the answer
         self.failed: list[tuple[int, int]] = []
 
     def take(self, member: str, life: int, records: Iterator[Record]) -> None:

@@ -21,7 +21,7 @@ from typing import Final
 
 __all__ = ["Clock", "follow"]
 
-_OFFSET: Final = struct.Struct("=q")  # nanoseconds
+_OFFSET: Final = struct.Struct("=q")  # offset in nanoseconds
 
 
 class Clock:

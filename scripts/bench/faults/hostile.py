@@ -47,11 +47,11 @@ from gdp.trust.revocation import Revocation
 __all__ = ["HostileProxy", "HostileSwitch"]
 
 _BATCH: Final = 32
-_NODE_S: Final = 0.002  # between two steps of the node itself
+_NODE_S: Final = 0.002  # pause between two steps of the node itself
 _READY_S: Final = 30.0
 _MTU: Final = 1_500
 _LEASE_S: Final = 24.0
-_MESSAGE_BYTES: Final = 100_000  # of a message of which one part comes
+_MESSAGE_BYTES: Final = 100_000  # size of a message of which only one part is sent
 _Frames = Iterator[bytes]
 
 
@@ -138,7 +138,7 @@ class HostileProxy:
             secret, epoch, Kind.DATA, member.name, member.attachment._incarnation, self._own.name,
             member._identity.key, os.urandom,
         )  # fmt: skip
-        first = 1 << 40  # of numbers: above all that it published
+        first = 1 << 40  # a number above all that it published
         for number in count(first):
             yield sealer.seal(number, Flag.RELIABLE, number.to_bytes(8, "big") + bytes(_MESSAGE_BYTES), _MTU)[0]
 

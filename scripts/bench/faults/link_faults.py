@@ -104,7 +104,7 @@ class LinkFaults:
         """Remove all faults."""
         while self._ends:
             (namespace, _), end = self._ends.popitem()
-            with contextlib.suppress(OSError):  # the namespace went first, and its devices with it
+            with contextlib.suppress(OSError):  # the namespace was removed first, with its devices
                 self._close(namespace, end)
         if self._line is not None:
             self._line.close()

@@ -38,7 +38,7 @@ __all__: list[str] = []
 _HEAD: Final = struct.Struct("!8sHHIQ")  # token of the channel, channel, publisher, incarnation, number
 _REQUEST: Final = struct.Struct("!8sQ")  # token, number of the call
 _BEHIND_S: Final = 0.5  # messages that are overdue for so long are skipped
-_LOOK_S: Final = 0.25  # between two checks for losses
+_LOOK_S: Final = 0.25  # pause between two checks for losses
 
 
 class Station(End):

@@ -14,7 +14,7 @@ from typing import Final
 
 __all__ = ["Growth", "growth_of"]
 
-_WARM_UP: Final = 0.4  # of the samples
+_WARM_UP: Final = 0.4  # share of the samples
 
 
 @dataclass(frozen=True, slots=True)

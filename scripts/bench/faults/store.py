@@ -34,7 +34,7 @@ __all__ = ["StoreCluster", "has_server"]
 _START_CLUSTER: Final = Path(__file__).resolve().parents[2] / "start_cluster.sh"
 _KINDS: Final = ("valkey", "redis")  # in the order of start_cluster.sh
 _BRIDGE: Final = "servers"
-_IFNAME: Final = "store"  # of a RIB's end
+_IFNAME: Final = "store"  # device in the namespace of a RIB
 _ADDRESS: Final = "10.255.77.1"
 _OF_RIBS: Final = "10.255.77.{}"
 _PREFIX_BITS: Final = 24
@@ -85,7 +85,7 @@ class StoreCluster:
         self._program = program
         for number in self._servers:
             run.note_process(self._pid(number))
-        self._away: dict[str, int] = {}  # what a fault took, by its name
+        self._away: dict[str, int] = {}  # killed or frozen servers, by name
 
     @property
     def config(self) -> Mapping[str, object]:
