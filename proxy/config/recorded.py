@@ -1,7 +1,8 @@
 """Rules of ``proxy.yaml`` as they apply to a recording.
 
 Sans-I/O. A recording has only topics, and it is exact: ``max_hz`` leaves none of its messages out, and each message
-that arrives is recorded, whatever its size. A replayed topic has the name that all machines know, whatever ``remap`` is.
+that arrives is recorded, whatever its size. A replayed topic has the name that all machines know: ``remap``
+does not apply.
 """
 
 from __future__ import annotations
