@@ -204,6 +204,7 @@ class AckNackHandler:
             window.add_reader(name, min(max(report.next_number, oldest), queue.next_number), now_s)
         if window.has_reader(name) or window.is_suspended(name):
             window.handle_acknack(name, report, now_s)
-        is_gone = report.next_number < oldest if is_new else report.missing and report.missing[0].number < oldest
+        lacks_from = report.missing[0].number if report.missing and not is_new else report.next_number
+        is_gone = lacks_from < oldest
         if is_gone or (window.is_suspended(name) and not report.missing):
             self._heartbeats.wanted = True  # it asks for what is gone, or does not know what it lacks

@@ -128,7 +128,7 @@ class Goals:
             if known.leader == server and known.result is None:
                 known.leader = None
 
-    def may_writer_proxy(self, server: Name, raw: bytes) -> bool:
+    def may_feed(self, server: Name, raw: bytes) -> bool:
         """Return whether feedback goes to the clients.
 
         Raises:
@@ -136,7 +136,7 @@ class Goals:
         """
         return self._led(goal_of(raw), server) is not None
 
-    def heartbeats(self, server: Name, raw: bytes) -> bytes | None:
+    def statuses(self, server: Name, raw: bytes) -> bytes | None:
         """Return the status message that clients get now that a server has sent this one; None: nothing new.
 
         Raises:
@@ -222,9 +222,9 @@ def _read(raw: bytes) -> dict[bytes, tuple[int, int, int]]:
     return said
 
 
-def _write(heartbeats: dict[bytes, tuple[int, int, int]]) -> bytes:
-    body = bytearray(_COUNT["<"].pack(len(heartbeats)))
-    for goal, (seconds, nanoseconds, status) in heartbeats.items():
+def _write(statuses: dict[bytes, tuple[int, int, int]]) -> bytes:
+    body = bytearray(_COUNT["<"].pack(len(statuses)))
+    for goal, (seconds, nanoseconds, status) in statuses.items():
         body += goal
         body += bytes(-len(body) % 4) + _STAMP["<"].pack(seconds, nanoseconds) + bytes([status])
     return b"\0\1\0\0" + bytes(body)

@@ -302,8 +302,8 @@ class ImportedService:
             return
         raw = server.news[at].decode(news.body)
         if at > 0:
-            self._tell_status(self._goals.heartbeats(name, raw))
-        elif self._goals.may_writer_proxy(name, raw):
+            self._tell_status(self._goals.statuses(name, raw))
+        elif self._goals.may_feed(name, raw):
             self._seat.endpoint.publish(self._topics[at], raw)
 
     def _tell_status(self, raw: bytes | None) -> None:
