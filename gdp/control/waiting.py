@@ -1,7 +1,7 @@
 """Wait reasons: what a node that makes no progress waits for.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds). ``port_waits`` and a node's own rules (in ``waiting.py`` of
-``gdp/client`` and ``gdp/switch``) return the present waits; ``WaitLog`` decides when to report them.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). ``port_waits`` and a node's own rules (such as
+``attachment_waits`` in ``gdp/client/attachment.py``) return the present waits; ``WaitLog`` decides when to report them.
 """
 
 from __future__ import annotations
