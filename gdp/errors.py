@@ -1,6 +1,6 @@
 """Error tree of the project, and the reasons for which a frame may be dropped.
 
-Sans-I/O; imports nothing of this project. An error tells the caller what to do. A ``LocalError`` is the fault of our
+Sans-I/O; imports nothing of this project. An error states what the caller may do. A ``LocalError`` is the fault of our
 caller. A ``RemoteError`` is the fault of a peer: drop, count, carry on. A ``ConfigError`` names the location in the
 file. After a ``StoreError`` the caller may try again.
 """
@@ -27,7 +27,7 @@ __all__ = [
 class DropReason(IntEnum):
     """Reason why a frame, a message or a statement was dropped.
 
-    The value is the metric label, the word in a trace and the counter index of a data plane at once, so new reasons are
+    The value is at once the metric label, the word in a trace and the counter index of a data plane. New reasons are
     only ever appended.
     """
 
@@ -70,7 +70,7 @@ class DropReason(IntEnum):
     UNKNOWN_SENDER = 32  # not a neighbour (yet)
     NOT_FOR_US = 33
     REVOKED = 34
-    UNAVAILABLE = 35  # a RIB's store did not answer; the sender may try again
+    UNAVAILABLE = 35  # a RIB's store did not respond; the sender may try again
     IN_USE = 36  # another node with this identity is alive elsewhere
     INTERNAL = 37  # it provoked an error of this program's own
     QUARANTINED = 38  # from a sender whose statements provoked such errors
@@ -117,7 +117,7 @@ class StatementError(RemoteError):
 
 
 class EnvelopeError(RemoteError):
-    """A sealed part or message does not open."""
+    """A sealed fragment or message does not open."""
 
 
 class ConfigError(GdpError):
@@ -137,4 +137,4 @@ class ConfigError(GdpError):
 
 
 class StoreError(GdpError):
-    """The store did not answer; the caller may try again."""
+    """The store did not respond; the caller may try again."""

@@ -1,7 +1,7 @@
 """Name: 256 bits, their derivation, and their text form.
 
-Sans-I/O. Source: docs/explanation/design.md, section 2: ``name = SHA-256("gdp-name-1" || SHA-256(canonical metadata) ||
-owner public key)``.
+Sans-I/O. Source: docs/explanation/design.md, section 2:
+``name = SHA-256("gdp-name-1" || SHA-256(canonical metadata) || owner public key)``.
 """
 
 from __future__ import annotations

@@ -166,7 +166,7 @@ class AckNackHandler:
         return report
 
     def _start(self, name: bytes, report: AckNack, now_s: float) -> None:
-        """Choose the first message of a new reader; one that asks again gets the same response."""
+        """Choose the first message of a new reader; a repeated request gets the same response."""
         reader, queue = self._readers[name], self._queue
         if name not in self._heartbeats.starts and not self._heartbeats.is_full:
             queue.seal_gathered()  # it was published before this reader came

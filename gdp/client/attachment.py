@@ -49,7 +49,9 @@ _ADVERTISEMENT_AGAIN_S: Final = 0.5  # until it is acknowledged
 _OWN_FIRST_S: Final = 0.5
 _MOVED_S: Final = 5.0  # after a move, advertisements name the former switch for this time
 _ECHO_S: Final = 0.02  # the hello protocol answers a new session within this time
-_IN_USE_SOON_S: Final = 0.1  # a refused node tries again: its earlier incarnation may be found dead at any moment
+_IN_USE_SOON_S: Final = (
+    0.1  # a refused node tries again: its earlier incarnation may be found to have ended at any moment
+)
 _IN_USE_S: Final = 2.0  # ... and after this time with this interval
 _RTCERT_S: Final = 7_200
 _RTCERT_RENEW_S: Final = 1_800  # so that it is valid at clocks that are an hour ahead, too
@@ -279,9 +281,7 @@ class Attachment:
         return min((time for time in times if time is not None), default=None)
 
     def _due_advertisements(self) -> Iterable[PendingAdvertisement]:
-        """Return the advertisements that may be sent: while another node has this identity, the node's own name
-        alone.
-        """
+        """Return the advertisements that may be sent: only the node's own name while another has this identity."""
         own = self._own_advertisement
         return (own,) if own is not None and self.is_in_use else self._advertisements.values()
 

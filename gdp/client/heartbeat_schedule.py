@@ -51,7 +51,7 @@ class HeartbeatSchedule:
 
     @property
     def is_full(self) -> bool:
-        """Return whether further new readers must ask again."""
+        """Return whether further new readers must repeat their request."""
         return len(self.starts) >= STARTS_MAX
 
     def handle_timer(self, now_s: float) -> None:

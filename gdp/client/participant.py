@@ -151,8 +151,7 @@ class Participant:
         self._tell(Right.SERVE, service, client, message)
 
     def ask(self, service: Name, server: Name, message: bytes) -> None:
-        """Send a request to one server of a name that is called here, separate from the stream that all of them
-        receive.
+        """Send a request to one server of a name that is called here, apart from the stream to all of them.
 
         Raises:
             LocalError: that server is not connected (any more), or there are too many; or the message is above the
@@ -249,7 +248,7 @@ class Participant:
         return Losses() if subscription is None else subscription.losses()
 
     def lost(self) -> Mapping[LossReason, int]:
-        """Return how many messages were lost on their way to this member, by reason."""
+        """Return how many messages to this participant were lost, by reason."""
         return self._subscriptions.lost()
 
     def unconfirmed(self) -> Mapping[LossReason, int]:
@@ -417,9 +416,7 @@ class Participant:
             self._publications.receive_acknack(header, frame, now_s)
 
     def _introduction(self) -> bytes:
-        """Return the introduction of this incarnation; it is signed again when an earlier incarnation proves to be
-        ahead.
-        """
+        """Return the introduction of this incarnation; signed again if an earlier incarnation proves to be ahead."""
         started, source = self.attachment.started, self._source
         if self._introduced[0] != started:
             wire = Introduction.make(
@@ -464,9 +461,7 @@ class Participant:
         return is_own or self._subscriptions.has_issuer(issuer_key)
 
     def _close(self, writer_proxies: list[WriterProxy], *, goodbye: bool = True) -> None:
-        """Close writer proxies, with a goodbye to their publishers unless ``goodbye`` is false; drop streams to ended
-        peers.
-        """
+        """Close writer proxies and the streams to ended peers; ``goodbye``: also send each publisher a goodbye."""
         self._under_way = None
         for writer_proxy in writer_proxies:
             note = writer_proxy.close()

@@ -118,8 +118,10 @@ class Publisher:
         return 0 if self.mtu is None else len(self._readers)
 
     def is_followed_by(self, name: Name, now_s: float, awake_s: float) -> bool:
-        """Return whether a tree is installed, and a reader is alive and keeps up; ``awake_s``: since when we
-        receive.
+        """Return whether a tree is installed, and a reader is alive and keeps up.
+
+        Args:
+            awake_s: monotonic second since which this participant has received without a stall.
         """
         keeps_up = self._window.has_reader(name) or not self.confirms
         return self.mtu is not None and keeps_up and self._readers.is_alive(name, now_s, awake_s)

@@ -191,7 +191,7 @@ class Subscriptions:
         """Process a switch's response about a party: its advertisement, or its end.
 
         Raises:
-            StatementError: the advertisement is invalid, about something else, or newer than the one that ended.
+            StatementError: the advertisement is invalid or about something else, or the end is of an older one.
         """
         subscription, change = self._by_name.get(answer.name), StreamChanges([], [], [])
         if subscription is None or answer.advertiser == self._reader.name:

@@ -109,9 +109,7 @@ class UnicastStreams:
         return stream
 
     def forget(self, reader: PeerIncarnation) -> None:
-        """Drop the stream to a reader, if there is one; a later one to the same incarnation continues above its
-        numbers.
-        """
+        """Drop the stream to a reader, if any; a later one to the same incarnation continues above its numbers."""
         stream = self._streams.get(reader.name)
         if stream is not None and stream.reader == reader:
             del self._streams[reader.name]

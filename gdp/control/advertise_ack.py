@@ -32,9 +32,7 @@ class AdvertiseAck:
     sequence: int
 
     def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:
-        """Return the signed statement, shorter than any advertisement, so that a stranger cannot use it for
-        amplification.
-        """
+        """Return the signed statement; shorter than any advertisement, it is useless for amplification."""
         body = {
             "n": self.name,
             "a": self.advertiser,

@@ -56,8 +56,9 @@ class IdentityConflicts:
         _put(self._refused, name, _Refused(life, now_s + _TOLD_S))
 
     def accept(self, name: Name, life: bytes) -> None:
-        """Note that a hello was accepted. If it was refused before, the older incarnation was dead, but not yet known
-        to be.
+        """Note that a hello was accepted.
+
+        If it was refused before, the older incarnation was already dead, but that was not known yet.
         """
         known = self._refused.get(name)
         if known is not None and known.life == life:

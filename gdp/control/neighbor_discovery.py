@@ -134,7 +134,7 @@ class HelloPort:
 
     @property
     def hello_mtu(self) -> int:
-        """Return an MTU that every node heard so far accepts: a neighbour behind a narrow end must hear us to be up."""
+        """Return an MTU that every node heard so far accepts: a neighbour behind a narrow end must receive our hellos."""
         return min([self.own_mtu, *self.said_mtus.values()])
 
     def last_of(self, name: Name, nonce: bytes) -> int:
@@ -184,9 +184,7 @@ class HelloPort:
         return *(each.echo for each in proven), *(each.echo for each in others), *restarts
 
     def end(self, neighbour: Neighbour) -> None:
-        """Remember the last number of a session that has proved itself; other sessions cannot bring a neighbour up
-        again.
-        """
+        """Remember the last number of a proven session; an unproven one cannot bring a neighbour up again."""
         if neighbour.is_proven:
             session = neighbour.name, neighbour.nonce  # another member could also send a nonce alone
             _, received = self.ended.pop(session, _UNREACHABLE)
@@ -423,7 +421,7 @@ class HelloProtocol:
         if is_two_way:
             has_news = is_new_session or (port.owes_answer and not known.is_proven)
         else:
-            has_news = known.is_proven and not is_new_session  # it does not hear us any more
+            has_news = known.is_proven and not is_new_session  # it does not receive our hellos any more
             if not has_news:
                 port.schedule_hello(received_bytes, now.mono_s)
         if has_news:
@@ -688,7 +686,7 @@ class HelloProtocol:
             silent = [n for n in port.neighbours.values() if now_s >= self._gone_at_s(n)]
             if silent:
                 if any(each.is_proven for each in silent):
-                    port.hurry(now_s)  # a neighbour that still hears us learns at once that we do not hear it
+                    port.hurry(now_s)  # a neighbour that still receives us learns at once that we do not receive it
                 changes += self._lose(port, silent, NeighbourEvent.SILENCE)
         return changes
 
@@ -807,7 +805,7 @@ class HelloProtocol:
         return self._fragmenter.split(Kind.HELLO, hello.to_wire(identity.name, identity.key), port.hello_mtu)
 
     def _rtcerts_on(self, port: HelloPort) -> tuple[bytes, ...]:
-        """Return a RIB's RtCerts for the switches that it hears on a port."""
+        """Return a RIB's RtCerts for the switches whose hellos it receives on a port."""
         if self._rtcert_for is None:
             return ()
         heard = [each for each in port.neighbours.values() if each.role.is_switch]

@@ -27,7 +27,7 @@ __all__ = ["TRANSITIONS", "Neighbour", "NeighbourEvent", "NeighbourState"]
 class NeighbourState(Enum):
     """States of a neighbour."""
 
-    HEARD = "heard"  # we hear it; it has not shown that it hears us
+    HEARD = "heard"  # we receive its hellos; it has not shown that it receives ours
     UP = "up"
     GONE = "gone"
 

@@ -1,7 +1,7 @@
 """Presence query: whether the older of two nodes with one identity is still alive.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). A node that runs twice (copied keys, a cloned disk) has two
-incarnations. A node that was restarted has two as well, but the older one is dead. When a RIB receives a known node's
+incarnations. A node that was restarted has two as well, but the older one has ended. When a RIB receives a known node's
 own name in a new incarnation, from another switch, it queries the older one's switch::
 
     newer node --advertisement--> its switch --relay--> RIB --presence query-----> older node's switch --hello--> older

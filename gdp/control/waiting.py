@@ -30,7 +30,7 @@ class WaitReason(Enum):
     LINK_DOWN = "link-down"
     NO_NEIGHBOUR = "no-neighbour"
     STRANGER = "neighbour-refused"  # its certificate is not accepted here
-    ONE_WAY = "not-heard"  # we hear a neighbour that does not hear us, or refuses us
+    ONE_WAY = "not-heard"  # a neighbour whose hellos we receive does not receive ours, or refuses us
     NO_SWITCH = "no-switch"  # neighbours, but none is a switch
     NO_RIB = "no-rib"
     REFUSED = "claim-refused"

@@ -62,7 +62,8 @@ class NameField(XStrFixedLenField):
         """Return the 32 bytes of a name given as bytes or as hex digits.
 
         Raises:
-            LocalError: another type, or not 32 bytes."""
+            LocalError: another type, or not 32 bytes.
+        """
         if isinstance(x, str):
             return bytes(Name.from_text(x))
         if isinstance(x, bytes):
@@ -77,7 +78,8 @@ class CborBytesField(StrField):
         """Return the bytes behind the string, and its content.
 
         Raises:
-            ValueError: there is no complete byte string."""
+            ValueError: there is no complete byte string.
+        """
         start, end = byte_string(s)
         return s[end:], s[start:end]
 

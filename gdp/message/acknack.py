@@ -1,7 +1,9 @@
 """AckNack: a reader's report of the messages it has and the ones it lacks.
 
-Sans-I/O. Source: RTPS 2.5, section 8.3.8.1. Wire form, big-endian: ``flags (1) | next number (8) | next part (4) | next
-sequence number (8) | lost (8) | ranges (2)`` and for each range ``number (8) | first part (4) | last part (4)``.
+Sans-I/O. Source: RTPS 2.5, section 8.3.8.1. Wire form, big-endian::
+
+    flags (1) | next number (8) | next part (4) | next sequence number (8) | lost (8) | ranges (2)
+    for each range: number (8) | first part (4) | last part (4)
 """
 
 from __future__ import annotations

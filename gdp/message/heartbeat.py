@@ -1,10 +1,13 @@
 """Heartbeat: a writer's report of its first and last available message, new readers' starts, and the description.
 
-Sans-I/O. Source: RTPS 2.5, section 8.3.8.6. It is sent as a sealed and signed message. Wire form, big-endian: ``oldest
-(8) | its sequence number (8) | sent number (8) | sent part (4) | its sequence number (8) | starts (2) | moves (1) |
-gone (1)``, for each start ``reader (32) | its incarnation (8) | number (8) | sequence number (8) | confirmed (8)``, for
-each move ``first (8) | span (8) | to (8)``, for each range that is gone ``first (8) | last (8) | reason (1)``, then the
-description, empty when this Heartbeat brings none.
+Sans-I/O. Source: RTPS 2.5, section 8.3.8.6. It is sent as a sealed and signed message. Wire form, big-endian::
+
+    oldest (8) | its sequence number (8) | sent number (8) | sent part (4) | its sequence number (8)
+    | starts (2) | moves (1) | gone (1)
+    for each start: reader (32) | its incarnation (8) | number (8) | sequence number (8) | confirmed (8)
+    for each move: first (8) | span (8) | to (8)
+    for each range that is gone: first (8) | last (8) | reason (1)
+    description, empty when this Heartbeat brings none
 """
 
 from __future__ import annotations

@@ -68,7 +68,7 @@ class Ledger:
         self._of = {move.of(number): carried for number, carried in self._of.items()}
 
     def let_go(self, numbers: Iterable[int], reason: LossReason) -> int:
-        """Note that message numbers are gone before every reader had them; return how many messages that are."""
+        """Note that message numbers are gone before every reader had them; return how many messages they carried."""
         gone = 0
         for number in numbers:
             sequence, messages = self._of[number]

@@ -135,8 +135,7 @@ class Reassembler:
         self._under_way = -1  # number of the message whose next fragments are expected
 
     def add_batch(self, arrivals: Sequence[ReceivedFrame], at: int, now_s: float) -> int:
-        """Add frames of ``arrivals[at:]`` that continue the message under way, as long as its inner fragments come in
-        order.
+        """Add frames of ``arrivals[at:]`` that continue the message under way with inner fragments in order.
 
         Almost every fragment of a large message takes this short path. The frame that ends the run is for ``add``.
 

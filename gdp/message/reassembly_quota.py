@@ -2,7 +2,7 @@
 
 Sans-I/O. Source: Linux ``ipfrag_high_thresh``. One quota serves every reassembler of a node. Where memory is short, the
 largest holder releases memory for a smaller one, among sources and among the streams of one source. So fragments in one
-publisher's name, which a reader can make too, leave every other stream its fair part.
+publisher's name, which a reader can make too, leave every other stream its fair share.
 """
 
 from __future__ import annotations

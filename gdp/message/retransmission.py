@@ -71,9 +71,7 @@ class RetransmissionQueue:
         window_bytes: int,
         now_s: float,
     ) -> bool:
-        """Queue fragments that are missing and were sent, but not sent again within a round trip; return whether any
-        was.
-
+        """Queue missing fragments that were sent, but not again within a round trip; return whether any was.
         A request beyond a reader's allowance is not examined; the reader repeats it.
 
         Args:
@@ -105,7 +103,7 @@ class RetransmissionQueue:
         return queued
 
     def frames_to_send(self, messages: Mapping[int, CachedMessage], limit: int, now_s: float) -> list[bytes]:
-        """Remove and return at most ``limit`` frames from the queue, those that are no longer cached left out."""
+        """Remove and return at most ``limit`` frames from the queue; those that are no longer cached are left out."""
         frames: list[bytes] = []
         while self._queue and len(frames) < limit:
             (number, part), _ = self._queue.popitem(last=False)
