@@ -49,9 +49,7 @@ _ADVERTISEMENT_AGAIN_S: Final = 0.5  # until it is acknowledged
 _OWN_FIRST_S: Final = 0.5
 _MOVED_S: Final = 5.0  # after a move, advertisements name the former switch for this time
 _ECHO_S: Final = 0.02  # the hello protocol answers a new session within this time
-_IN_USE_SOON_S: Final = (
-    0.1  # a refused node tries again: its earlier incarnation may be found to have ended at any moment
-)
+_IN_USE_SOON_S: Final = 0.1  # a refused node tries again: its earlier incarnation may prove ended at any moment
 _IN_USE_S: Final = 2.0  # ... and after this time with this interval
 _RTCERT_S: Final = 7_200
 _RTCERT_RENEW_S: Final = 1_800  # so that it is valid at clocks that are an hour ahead, too

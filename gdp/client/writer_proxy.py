@@ -5,9 +5,13 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 A writer proxy begins ``NEW``: it sends introductions until a Heartbeat brings its start and the description. When
 ``LIVE`` it delivers: a reliable topic in order and complete, a best-effort one in order and without waiting.
 
-It joins the reassembly of ``gdp/message/reassembly.py`` with ``reordering.py`` (what waits behind a gap),
-``delivery.py`` (messages in order, and losses), ``ack_nack_schedule.py`` (when a report is due) and
-``ack_nack_sealer.py`` (under which keys it is sealed).
+It joins five parts:
+
+- ``gdp/message/reassembly.py``: reassembly of the fragments;
+- ``reordering.py``: messages that wait behind a gap;
+- ``delivery.py``: messages in order, and losses;
+- ``ack_nack_schedule.py``: when a report is due;
+- ``ack_nack_sealer.py``: the keys under which it is sealed.
 """
 
 from __future__ import annotations

@@ -134,7 +134,7 @@ class HelloPort:
 
     @property
     def hello_mtu(self) -> int:
-        """Return an MTU that every node heard so far accepts: a neighbour behind a narrow end must receive our hellos."""
+        """Return an MTU that every node heard so far accepts; a neighbour behind a narrow end must get our hellos."""
         return min([self.own_mtu, *self.said_mtus.values()])
 
     def last_of(self, name: Name, nonce: bytes) -> int:

@@ -4,8 +4,8 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds). A node that runs twice
 incarnations. A node that was restarted has two as well, but the older one has ended. When a RIB receives a known node's
 own name in a new incarnation, from another switch, it queries the older one's switch::
 
-    newer node --advertisement--> its switch --relay--> RIB --presence query-----> older node's switch --hello--> older
-                                         <-IN_USE--         <--presence response--  (heard since: there; lost: gone)
+    newer node --advertisement--> its switch --relay--> RIB --query--> older node's switch --the same--> older node
+                                             <-IN_USE--     <--response--  (heard since: there; lost: gone)
 
 The newer node repeats its advertisement until the older one is gone. If the older one is of another domain, only the
 tier above knows of it. An advertisement that the tier above refused is forwarded to it again and again, and not
