@@ -17,7 +17,7 @@ WINDOW: Final = 128  # a tenth of a second's work of a RIB
 
 
 class QueryWindow:
-    """Names in flight, at most ``size``, and the names that wait for one of these places.
+    """Names in flight, at most ``size``, and the names that wait for a free slot.
 
     Args:
         size: most names in flight.
