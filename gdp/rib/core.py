@@ -512,7 +512,7 @@ class RibCore:
         return bool(is_held) or self._above.is_waiting(name)
 
     def _tell(self, route: Route, known: Route | Withdrawn | None, now_s: float, askers: Sequence[Asker] = ()) -> None:
-        """Send a route to ``askers``, to watchers, and after a move to the holders and the sender of the old location."""
+        """Send a route to ``askers``, to watchers, and after a move to holders and the sender of the old location."""
         told = dict.fromkeys((*askers, *self._watches.watchers(route.name, now_s)))
         if isinstance(known, Route) and known.place != route.place:
             told |= dict.fromkeys(self._holders.watchers(route.name, now_s))

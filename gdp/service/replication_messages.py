@@ -130,5 +130,5 @@ def call_of(log: LogId, index: int) -> int:
 
 
 def place_of(call: int) -> tuple[int, int]:
-    """Return the life of a log, and the index in it."""
+    """Return the ``life`` of a log, and the index in it."""
     return call >> LIFE_BITS, call & (1 << LIFE_BITS) - 1

@@ -145,7 +145,10 @@ class Relocations:
             self._redirect(neighbour, name, moved.statement, now_s)
 
     def ask_neighbour(self, name: Name, neighbour: Neighbour, now_s: float) -> None:
-        """Request a node's location from the neighbour that sent a frame for it, since no RIB responds."""
+        """Request a node's location from the neighbour that sent a frame for it.
+
+        No RIB responds, and the neighbour must have had the location to send the frame.
+        """
         if neighbour.role.is_switch and self._may_say(name, neighbour, now_s):
             identity = self._identity
             query = Query(name, 0.0).to_wire(identity.name, identity.key, identity.membership)
