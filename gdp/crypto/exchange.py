@@ -36,10 +36,10 @@ class ExchangeKey:
         return cls(private, private.public_key().public_bytes(*raw))
 
     def agree(self, far_public: bytes, *purposes: bytes) -> list[bytes]:
-        """Return one 32-byte secret for each purpose, shared with the holder of the other key and nobody else.
+        """Return one 32-byte secret for each purpose, shared only with the holder of the other key.
 
         Raises:
-            StatementError: MALFORMED, the other key is no key, or one that makes a secret that everybody knows.
+            StatementError: MALFORMED, the other key is invalid, or its secret would be publicly known.
         """
         try:
             shared = self.private.exchange(x25519.X25519PublicKey.from_public_bytes(far_public))
