@@ -67,7 +67,7 @@ _KEYS_KEPT: Final = 64  # messages of one source whose parts may interleave with
 
 
 class Signer(Protocol):
-    """What the envelope needs of a writer's private key."""
+    """Signing key of a writer, as the envelope needs it."""
 
     def sign_digest(self, digest: bytes) -> bytes:
         """Return 64 bytes, r || s, over a SHA-256 digest."""
@@ -305,11 +305,11 @@ class Opener:
     ) -> tuple[list[bytes], list[bytes]]:
         """Open consecutive parts from ``first`` on in ``arrivals[at:]``; the fast path.
 
-        A frame that does not begin, to the bit, as ``heads`` predict ends the run, as does an altered one: ``open``
+        A frame that does not begin, to the bit, as ``headers`` predict ends the run, as does an altered one: ``open``
         must check it.
 
         Args:
-            length: payload bytes of each part; ``heads`` are of parts that are not the last.
+            length: payload bytes of each part; ``headers`` are of parts that are not the last.
 
         Returns:
             plaintexts and payloads.

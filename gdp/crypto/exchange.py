@@ -1,7 +1,7 @@
 """Key agreement between two neighbours for one pair of sessions.
 
-Sans-I/O. Source: X25519, RFC 7748; HKDF-SHA256, RFC 5869. Both public keys travel in signed hellos, which
-makes the agreed key the neighbour's. A private key lives as long as a session of a port.
+Sans-I/O. Source: X25519, RFC 7748; HKDF-SHA256, RFC 5869. Both public keys are part of signed hellos, which binds the
+agreed key to the neighbour. A private key lives as long as a session of a port.
 """
 
 from __future__ import annotations

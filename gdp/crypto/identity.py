@@ -82,7 +82,7 @@ class NodeKeys:
 
 @dataclass(slots=True)
 class Identity:
-    """A node that can prove who it is. Its membership and root may be renewed while it runs, its keys and name not.
+    """A node that can prove its identity. Membership and root may be renewed while it runs, keys and name not.
 
     Raises:
         LocalError: the parts do not belong together.

@@ -2,7 +2,8 @@
 
 Sans-I/O. A name is the hash of its metadata's digest and of its key, so nothing else is needed to prove the signer.
 Wire form, big-endian: ``started (8) | X25519 key (32) | digest of the name's metadata (32) | key, compressed (33) |
-signature (64)``, by ECDSA over ``"gdp-introduction-1" | name (32) | incarnation (8) | started (8) | X25519 key (32)``.
+signature (64)``. The signature is ECDSA over ``"gdp-introduction-1" | name (32) | incarnation (8) | started (8) |
+X25519 key (32)``.
 
 The X25519 key is drawn for one incarnation of a process; the node's ECDSA key signs and does nothing else.
 """

@@ -3,10 +3,10 @@
 Sans-I/O; it takes statements and returns statements to send, each for a name. Their transport is the task of its host
 (``gdp/client/rib_host.py``).
 
-It accepts an advertisement only if all of these hold: the name's hash is right, the chain from the owner's key to the
-advertiser is valid, the relay is a member of this domain (or a RIB of a trusted one), the sequence number is newer, the
-lease is in bounds, and the quota is not used up. Global names are also advertised to the tier above; names that this
-tier does not know are queried there.
+It accepts an advertisement only if the name's hash is right and the chain from the owner's key to the advertiser is
+valid. The relay must be a member of this domain (or a RIB of a trusted one). The sequence number must be newer, the
+lease in bounds, and the quota not used up. Global names are also advertised to the tier above; names that this tier
+does not know are queried there.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ class RibCore:
 
     @property
     def watching(self) -> int:
-        """Return how many watches stand."""
+        """Return the number of watches."""
         return len(self._watches)
 
     def receive(self, wire: bytes, sender: Name, now: Timestamps) -> None:
@@ -161,7 +161,7 @@ class RibCore:
             self.refusals[error.reason] += 1
         except StoreError:
             self.refusals[DropReason.UNAVAILABLE] += 1  # no response: the sender will try again
-        except Exception as error:  # one statement must not end the RIB
+        except Exception as error:  # one statement must not stop the RIB
             self.boundary.note(error)
             self.refusals[DropReason.INTERNAL] += 1
 
@@ -242,7 +242,7 @@ class RibCore:
         return min((time for time in times if time is not None), default=None)
 
     def statements_to_send(self) -> list[OutgoingStatement]:
-        """Return, once, what is to be sent."""
+        """Return, once, the statements to send."""
         if refused := set(self._store.commit()):
             self._letters = [outgoing for outgoing in self._letters if outgoing.about not in refused]
         letters, self._letters = self._letters, []
@@ -349,7 +349,7 @@ class RibCore:
         return known
 
     def _check_quota(self, sender: Name, node: Name) -> None:
-        """Return if a sender may bring another name, and a node have one: as many as the sender has left, at most.
+        """Return if sender and node may have another name; a node gets at most as many as the sender has left.
 
         Raises:
             StatementError: QUOTA.
@@ -678,7 +678,7 @@ class RibCore:
             self._tell_gone(route, now.mono_s)
 
     def _pass_revocation_up(self, statement: Statement, sender: Name, now: Timestamps) -> None:
-        """Send a revocation that changes nothing here to the tier above, where it may."""
+        """Forward a revocation that changes nothing here to the tier above, if that is allowed."""
         upper = self._upstream.rib
         is_root = self._policy.revoked.is_root(statement.fields.bytes_("owner"))
         if upper is None or is_root or self._upstream.has(sender) or sender in self._settings.peers:

@@ -1,9 +1,9 @@
 """Revocations at a RIB: which it stores, which routes they close, and which nodes receive them.
 
 Sans-I/O. A RIB stores revocations by trusted domains, and an owner's revocations for a name that is stored or watched
-here. It sends them to the nodes that advertised, hold or watch that name, in the tiers above and below, and to later
-askers about the name. A revocation that concerns nothing here is only forwarded to the tier above, at a bounded rate,
-and is not stored.
+here. It sends them to the nodes that advertised, hold or watch that name, in the tiers above and below. Later askers
+about the name receive them, too. A revocation that concerns nothing here is only forwarded to the tier above, at a
+bounded rate, and is not stored.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ class Route:
         domain: the domain of that switch.
         via: the domain of ``sender``: another one where the advertisement came over several tiers.
         transit: domains through which that domain lets its traffic pass.
-        claim: the signed bytes.
+        advertisement: the signed bytes.
         is_from_above: learnt from the tier above, and sent downwards only.
         expires_s: end of the lease, monotonic seconds.
         valid_until_unix_s: ``CLOCK_SKEW_S`` after the advertisement's evidence expires; no replay is possible after

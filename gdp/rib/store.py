@@ -22,7 +22,7 @@ __all__ = ["MemoryStore", "Store"]
 class Store(Protocol):
     """Routes by name and advertiser.
 
-    Every method may raise ``StoreError``: try again.
+    Every method may raise ``StoreError``: the caller may try again.
     """
 
     @property

@@ -66,11 +66,11 @@ class Calls(Generic[T]):
         return number
 
     def get(self, number: int) -> T | None:
-        """Return the context of a call that is under way, or None."""
+        """Return the context of a call under way, or None."""
         return self._contexts.get(number)
 
     def end(self, number: int) -> T | None:
-        """End a call; return its context, or None where it has ended before."""
+        """End a call; return its context, or None where it ended before."""
         context = self._contexts.pop(number, None)
         if context is not None and len(self._timers) > 2 * len(self._contexts) + _SPARE:
             self._timers = [timer for timer in self._timers if timer[1] in self._contexts]

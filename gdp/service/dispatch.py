@@ -38,7 +38,8 @@ HELD_MAX_BYTES: Final = 128 << 20
 GATHER_S: Final = 0.004  # servers that respond so soon after the first need no stop
 STOP_MAX: Final = 1_024  # calls in one stop message
 HEDGE_PERCENTILE: Final = 0.95  # of recent response times, after which a second copy may be sent
-HEDGE_LATER_MAX: Final = 4.0  # times that, where a small budget is better spent on the slowest few
+# multiple of that wait, where a small budget is better spent on the slowest few
+HEDGE_LATER_MAX: Final = 4.0
 HEDGE_FIRST_S: Final = 0.05  # while there are too few response times
 _HEDGE_MIN_S: Final = 0.0005
 

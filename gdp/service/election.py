@@ -47,7 +47,7 @@ class Election:
         self._collect_until_s = now_s + COLLECT_S
 
     def is_due(self, now_s: float) -> bool:
-        """Return whether silent replicas have had their time."""
+        """Return whether the time for silent replicas is over."""
         return now_s >= self._collect_until_s
 
     def must_yield(self, log: LogId, own: LogId, replicas: Replicas) -> bool:

@@ -57,7 +57,7 @@ Effect: TypeAlias = "Ask | ReplicaCommand"
 
 
 class Sequencer(Generic[A]):
-    """The calls of one service from here, and the log of them.
+    """The calls of one service from this client, and the log of them.
 
     Args:
         life: returns 32 random bits.
@@ -66,7 +66,7 @@ class Sequencer(Generic[A]):
     Attributes:
         late: responses that came for a call that had ended: those of all replicas but the first.
         strange: responses of replicas that do not follow.
-        hedged: none; every replica gets everything.
+        hedged: always none; every replica gets every request.
     """
 
     def __init__(

@@ -4,8 +4,8 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
 A client may send one request twice (by the tree, and again to a server that it takes for new). The second time the
 response is repeated, or nothing happens while the first is under way. A client may also end a call. A waiting request
-is then never passed to the local server. A request that the server has already keeps its slot until the server is done
-with it, for the server works on it all the same.
+is then never passed to the local server. A request that the server has already keeps its slot until the server is done,
+for the server works on it all the same.
 
 Clients take turns, and one may use as much memory as it leaves free: half of it alone, and the next always finds some.
 """

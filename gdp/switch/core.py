@@ -218,7 +218,7 @@ class SwitchCore:
                     self._take(arrival, header, now)
             except RemoteError as error:
                 self._drops[error.reason] += 1
-            except Exception as error:  # one frame must not end the switch
+            except Exception as error:  # one frame must not stop the switch
                 self.boundary.note(error)
                 self._drops[DropReason.INTERNAL] += 1
         if has_others:
@@ -289,7 +289,7 @@ class SwitchCore:
         if self.rib_client.rib is not None:
             times.append(self._revoker.next_due_for_rib())
         if self.unicast.is_refreshing:
-            times.append(self._followed_s)  # past: at once
+            times.append(self._followed_s)  # in the past: due at once
         if self._paths.refused_elsewhere():
             times.append(self._conflicts_sought_s + _CONFLICTS_S)
         if self.rib_client.rib is None:

@@ -8,8 +8,8 @@ sections 3 and 7. The order of the checks:
 3. hops left 0 or 1: drop, for it may not leave again; a payload longer than the received bytes: drop, truncated;
 4. look up destination and source, then destination alone; a miss: punt; an entry whose frames come from other sides:
    drop, wrong side; an entry without hops: drop, no route;
-5. one copy to every hop, or to its alternate while the hop's port is down, except to a port that is down or whose link
-   is too narrow: that copy alone is dropped.
+5. one copy to every hop, or to its alternate while the hop's port is down; a copy to a port that is down, or whose link
+   is too narrow, is dropped alone.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ class LocalAdvertisements:
         return self._by_name.get(name, {}).get(advertiser)
 
     def at(self, name: Name) -> LocalAdvertisement | None:
-        """Return an attachment that takes unicast frames for a name, or None."""
+        """Return an advertisement that takes unicast frames for a name, or None."""
         for attachment in self._by_name.get(name, {}).values():
             if attachment.advertisement.right in (Right.ATTACH, Right.SERVE):
                 return attachment

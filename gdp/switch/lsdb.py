@@ -135,7 +135,7 @@ class LinkStateDatabase:
         return [entry.wire for key, entry in self._entries.items() if self._is_shared(key, domain)]
 
     def digest(self, domain: Name) -> bytes:
-        """Return a short digest of what is shared with a neighbour of this domain; equal at both ends when in step."""
+        """Return a short digest of the states shared with a neighbour of this domain; equal at both when in step."""
         is_home = domain == self._domain
         digest = self._digests.get(is_home)
         if digest is None:

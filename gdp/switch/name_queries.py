@@ -63,7 +63,7 @@ class NameQueries:
         return name in self._queries
 
     def request(self, name: Name, now_s: float, owner: bytes = b"") -> None:
-        """Query a name unless a query is open; one that was answered is sent again at once.
+        """Query a name unless a query is open; a query with a response is sent again at once.
 
         Nothing happens where ``QUERIES_MAX`` are open: ``name in queries`` stays False.
 

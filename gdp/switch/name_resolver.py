@@ -41,7 +41,7 @@ _ACCEPTS_FRAMES: Final = (Right.ATTACH, Right.SERVE)
 
 
 class Resolution(NamedTuple):
-    """What is known of a name.
+    """The known locations of a name.
 
     Attributes:
         locations: where its advertisers are.
@@ -162,7 +162,7 @@ class NameResolver:
         """Remove and return the frames that wait for a name, in order, each with its ``until_s`` and owner."""
         return self._pending.release(name)
 
-    # -- receive an answer
+    # -- receive a response
 
     def receive_location(self, place: Location, now_s: float, *, is_ours: bool = False, has_left: bool = False) -> None:
         """Store a verified location.
@@ -179,7 +179,7 @@ class NameResolver:
             self._queries.receive_answer(place.name, now_s)
 
     def receive_removal(self, name: Name, advertiser: Name, now_s: float) -> None:
-        """Remove one advertiser of a name: it has withdrawn, or its proofs do not hold any more."""
+        """Remove one advertiser of a name: it has withdrawn, or its proofs are no longer valid."""
         self._queries.receive_answer(name, now_s)
         self.cache.remove(name, advertiser)
 

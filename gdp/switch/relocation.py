@@ -1,8 +1,8 @@
 """Relocation of nodes between switches: the former switch forwards frames and redirects senders to the new one.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: in spirit, the binding update of RFC 6275 (section
-11.7), the fast neighbour advertisement and the context transfer of RFC 5568 and RFC 4067, and the ICMP redirect of RFC
-1122 (section 3.2.2.2). No RIB takes part, so it works while none responds.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source, in spirit: the binding update of RFC 6275 (section
+11.7) and the fast neighbour advertisement of RFC 5568; the context transfer of RFC 4067; the ICMP redirect of RFC 1122
+(section 3.2.2.2). No RIB takes part, so it works while none responds.
 
 ::
 

@@ -121,7 +121,7 @@ class RevocationHandler:
         return [] if revocation is None else self._spread(revocation, statement, None, now)
 
     def due_for_rib(self, rib: Name, now_s: float) -> list[bytes]:
-        """Return the revocations of the operator that are due at this RIB; those that have run out are removed."""
+        """Return the revocations of the operator that are due at this RIB; expired ones are removed."""
         if rib != self._sent_to:
             self._sent_to = rib
             self._handed_in.say_again(now_s)

@@ -35,7 +35,7 @@ class EvidenceIndex(Generic[_H]):
                 known[holder] = None
 
     def remove(self, holder: _H, marks: Iterable[bytes]) -> None:
-        """Undo ``put`` of the same."""
+        """Remove a holder and its marks, the same as in ``put``."""
         for mark in marks:
             known = self._holders[mark]
             if isinstance(known, dict):

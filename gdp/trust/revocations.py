@@ -4,7 +4,7 @@ Sans-I/O. Two kinds have quotas of their own. Revocations by *roots*, the truste
 never displaced by others, and neighbours compare them by digests. Revocations by *owners* (of names, or nodes that
 issued a certificate) are accepted only while a certificate of that key is stored here. Each origin, over which they
 came, and each issuer has a rate and a share. Where a share or the whole is full, the largest share gives way to a
-smaller one, so that one sender's junk displaces only its own junk.
+smaller one. So one sender's junk displaces only its own junk.
 
 A revocation is kept until the certificate would have expired by itself.
 """
@@ -88,7 +88,7 @@ class Revocations:
 
     Args:
         root_keys: the trusted domains' compressed keys, those of former roots too.
-        per_root, of_owners, per_issuer, per_giver: bounds, see ``limits``.
+        per_root, of_owners, per_issuer, per_origin: bounds, see ``limits``.
 
     Attributes:
         changes: keys that were added or dropped since they were last written down; None: there is no writer.

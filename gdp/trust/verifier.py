@@ -70,7 +70,7 @@ class AdvertisementVerifier:
         return self.verify_statement(parse(wire), unix_s)
 
     def verify_statement(self, statement: Statement, unix_s: float) -> Advertisement:
-        """The same for a statement that was parsed already.
+        """Return the advertisement in a parsed statement if all of it is valid now.
 
         Raises:
             StatementError: with the reason.
