@@ -46,7 +46,7 @@ class Role(str, Enum):
 class Root:
     """A trust domain's own certificate; its signature, its name and its format have been checked.
 
-    The policy decides whether it is trusted.
+    A policy trusts it by including it.
     """
 
     subject: Subject

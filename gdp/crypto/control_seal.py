@@ -2,7 +2,7 @@
 
 Sans-I/O. Source: docs/explanation/design.md, section 4; AES-256-GCM-SIV (RFC 8452), HKDF (RFC 5869), X25519 (RFC 7748).
 Layout: ``header | topic (32) | ciphertext | tag``. The nonce is number || 0. The additional data are the header without
-the hop count, the topic, and the incarnation of the recipient.
+its hops-left field, the topic, and the incarnation of the recipient.
 
 The key of a control message belongs to one incarnation of each end. It is derived from the agreement of their two
 X25519 keys and from the topic's secret. So a control message proves which reader wrote it, and that this reader has the
@@ -48,7 +48,7 @@ def note_key(
     destination_incarnation: int,
     topic: bytes,
 ) -> bytes:
-    """Return the 32-byte key of the control messages between two incarnations of nodes about one topic.
+    """Return the 32-byte key of control messages about one topic, from one node's incarnation to another's.
 
     Args:
         shared: the secret that the X25519 keys of both incarnations agree on.

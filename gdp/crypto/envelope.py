@@ -10,8 +10,8 @@ header fields call a fragment a part.
     header|salt|c0|tag     header|salt|c1|tag    ...    header|salt|cn|tag|signature
 
 Each part is XAES-256-GCM under a key that belongs to (topic secret, kind, source, incarnation, destination). Its nonce
-of 24 bytes is salt || 0 (4) || message number || part. The additional data are the header without the hop count. The
-salt is drawn for each message, because copies of a process, such as two machines resumed from one snapshot, use the
+of 24 bytes is salt || 0 (4) || message number || part. The additional data are the header without its hops-left field.
+The salt is drawn for each message, because copies of a process, such as two machines resumed from one snapshot, use the
 same numbers. The signature covers SHA-256 over the header fields that all parts share, the salt, each ciphertext and
 tag.
 """
@@ -207,7 +207,7 @@ class Sealed(Sequence[bytes]):
         self._signer = signer
         self._header = header
         self._origin: Sealed | None = None
-        # An ``isinstance`` check for ``Sealed``, an abstract class's, costs a microsecond.
+        # Checks for bytes first: an ``isinstance`` check for ``Sealed``, an abstract class's, costs a microsecond.
         if isinstance(message, bytes):
             self._message, self.message_bytes = memoryview(message), len(message)
         else:

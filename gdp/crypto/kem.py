@@ -1,4 +1,5 @@
-"""KEM key of a node for receiving secrets: a hybrid of ML-KEM-768 and X25519, so that recorded traffic stays secret.
+"""KEM key of a node for receiving secrets: a hybrid of ML-KEM-768 and X25519, so that traffic recorded today stays
+secret.
 
 Sans-I/O except for the randomness that the library draws. Source: HPKE, RFC 9180, single-shot, base mode, with KEM
 MLKEM768-X25519, HKDF-SHA256 and AES-256-GCM. On the wire::

@@ -36,7 +36,7 @@ class Store(Protocol):
         """Prefetch the entries that the next calls concern, all in one go."""
 
     def commit(self) -> list[Key]:
-        """End a turn of changes; return the keys whose change was not accepted. A later statement may repeat it."""
+        """End a turn of changes; return the keys whose change was not accepted, which a later statement may repeat."""
 
     def routes(self, name: Name) -> list[Route]:
         """Return a name's routes."""

@@ -457,7 +457,7 @@ class SwitchCore:
         self.multicast.link_resized(neighbour.port)
 
     def _neighbour_moved(self, change: Change, now_s: float) -> None:
-        """Send a hello state to a neighbour that came up, and remove the state of one that is gone."""
+        """Send the present state to a neighbour that came up, and remove the state of one that is gone."""
         neighbour, before = change
         if neighbour.state is NeighbourState.UP:
             self._sync.neighbour_up(neighbour, now_s)
@@ -504,7 +504,7 @@ class SwitchCore:
         return self._paths.life_of(name, role)
 
     def _look_for_conflicts(self, now_s: float) -> None:
-        """Drop RIBs whose identity an older node elsewhere has; report copied identities to their owners."""
+        """Drop RIBs with an older node's identity; notify nodes whose identity a younger node elsewhere copies."""
         self._conflicts_sought_s = now_s
         for neighbour in self.hello_protocol.all_up():
             elsewhere = self._life_elsewhere(neighbour.name) if neighbour.role is Role.RIB else None

@@ -276,7 +276,7 @@ class MulticastTrees:
     ) -> None:
         """Let a branch whose evidence is invalid end at ``until_s``, unless another reader's evidence comes by then.
 
-        The upstream neighbour receives another branch's evidence at once, or as soon as one has it.
+        The upstream neighbour receives another branch's evidence at once, or when another reader's evidence arrives here.
         """
         tree = self.trees.get(topic, publisher)
         if tree is None:
@@ -492,7 +492,7 @@ class MulticastTrees:
         tree.joins, tree.has_moved = 0, False
 
     def _is_loop_free(self, tree: Tree) -> bool:
-        """Return whether the former best upstream neighbour cannot take the messages from here itself.
+        """Return whether the upstream neighbour, no longer the best, cannot take the messages from here itself.
 
         Source: RFC 5286, inequality 3 (a downstream neighbour is nearer to the destination than we are). No switch
         takes other nodes' messages from a leaf.

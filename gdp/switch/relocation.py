@@ -111,7 +111,7 @@ class Relocations:
         return self._departed.get((name, advertiser), 0.0) > now_s
 
     def is_former(self, switch: Name, now_s: float) -> bool:
-        """Return whether a switch recently received a request for the names that a node from it reads."""
+        """Return whether a switch was recently notified as a former one, so that its response counts."""
         return self._former.get(switch, 0.0) > now_s
 
     def moved(self, place: Location, statement: bytes, now_s: float) -> None:
