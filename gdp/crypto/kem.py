@@ -1,5 +1,6 @@
-"""KEM key of a node for receiving secrets: a hybrid of ML-KEM-768 and X25519, so that traffic recorded today stays
-secret.
+"""KEM key of a node for receiving secrets: a hybrid of ML-KEM-768 and X25519.
+
+The hybrid keeps recorded secrets closed against later attacks on one of the two.
 
 Sans-I/O except for the randomness that the library draws. Source: HPKE, RFC 9180, single-shot, base mode, with KEM
 MLKEM768-X25519, HKDF-SHA256 and AES-256-GCM. On the wire::

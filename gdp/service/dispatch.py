@@ -152,7 +152,7 @@ class Dispatch(Generic[A]):
         """Begin a call and return its number; one of the callbacks is called, once, and never from here.
 
         Args:
-            write: returns the request under its number; nothing begins where it raises.
+            write: returns the request under its number; not called where ``begin`` raises.
             timeout_s: how long it may take; None: no limit.
             answered: called with the first valid response.
             failed: called with the failure, and the last server's reason.
@@ -196,7 +196,7 @@ class Dispatch(Generic[A]):
                     self._ask(number, call, [server], now_s)
 
     def leaves(self, server: Name) -> None:
-        """Record that a server goes soon: it is asked only where no other is left, and its responses are valid."""
+        """Record that a server goes soon: it is asked only where no other is left, and its responses count."""
         if server in self._servers:
             self._servers[server] = True
 

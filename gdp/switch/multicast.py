@@ -276,7 +276,7 @@ class MulticastTrees:
     ) -> None:
         """Let a branch whose evidence is invalid end at ``until_s``, unless another reader's evidence comes by then.
 
-        The upstream neighbour receives another branch's evidence at once, or when another reader's evidence arrives here.
+        The upstream neighbour receives another branch's evidence at once, or when such evidence arrives here.
         """
         tree = self.trees.get(topic, publisher)
         if tree is None:
