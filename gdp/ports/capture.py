@@ -149,7 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _say(event="done", frames=capture.frames, lost=capture.lost)
             capture.close()
     except (LocalError, OSError) as error:
-        print(f"capture: {error}", file=sys.stderr)  # noqa: T201  (a command speaks)
+        print(f"capture: {error}", file=sys.stderr)  # noqa: T201  (output of a command)
         return 2
     finally:
         signal.set_wakeup_fd(-1)
@@ -161,7 +161,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _say(**facts: str | int) -> None:
-    print(json.dumps(facts), flush=True)  # noqa: T201  (a command speaks)
+    print(json.dumps(facts), flush=True)  # noqa: T201  (output of a command)
 
 
 if __name__ == "__main__":

@@ -122,7 +122,7 @@ class FilterAttachment:
             # the device is gone with all its filters
 
     def _remove_dead(self, ask: IPRoute) -> bool:
-        """Take away what dead runs left; return whether there was any."""
+        """Remove the filters that dead runs left; return whether there were any."""
         removed = False
         for each in _filters(ask, self._ifindex, CLSACT_INGRESS):
             if _NAME.fullmatch(each.name):  # filters of live processes were refused before
@@ -131,12 +131,12 @@ class FilterAttachment:
         return removed
 
     def _is_bare(self, ask: IPRoute) -> bool:
-        """Whether no filter stands at the qdisc, either way."""
+        """Return whether the qdisc has no filter in either direction."""
         return not any(_filters(ask, self._ifindex, parent) for parent in (CLSACT_INGRESS, CLSACT_EGRESS))
 
 
 def _refuse_second(ask: NetlinkSocket, ifindex: int) -> None:
-    """Refuse a second switch on one device, because each would forward with half of the frames' table entries.
+    """Refuse a second switch on one device: each would receive half of the control frames and forward by those.
 
     A link exists only while its process holds it, so its program belongs to a live process. Opening the programs of
     other owners takes CAP_SYS_ADMIN, which forwarding does not need. Without it, a second switch on a link stays

@@ -169,7 +169,7 @@ def _create(attributes: bytearray, tried: str) -> int:
     except BpfError as error:
         if error.number != errno.EPERM:
             raise
-        try:  # before Linux 5.11 maps count as locked memory
+        try:  # before Linux 5.11, maps count as locked memory
             resource.setrlimit(resource.RLIMIT_MEMLOCK, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         except (OSError, ValueError):
             raise error from None
