@@ -106,7 +106,6 @@ def run_switch(
         runtime.every(LOOK_S, credentials.look)
 
         def reload() -> None:
-            """Reload the credentials and the revocations."""
             credentials.look(now())
             _revoke(switch, config.revocations)
 
