@@ -57,7 +57,9 @@ def _started(pid: int) -> int | None:
 
 
 def end_all(processes: Iterable[Process], patience_s: float = 3.0, *, are_leaders: bool = True) -> None:
-    """End the groups of these processes: SIGTERM, and after ``patience_s`` SIGKILL. Processes that have ended are skipped.
+    """End the groups of these processes: SIGTERM, and after ``patience_s`` SIGKILL.
+
+    Processes that have ended are skipped.
 
     Args:
         are_leaders: whether they lead groups; otherwise each is ended alone.

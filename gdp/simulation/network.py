@@ -1,6 +1,6 @@
 """Simulated network in memory: the protocol cores of real nodes, joined by links with delay, loss and reordering.
 
-Sans-I/O; its virtual clock jumps from event to event, and a seed makes it deterministic.
+No I/O; its virtual clock jumps from event to event, and a seed makes it deterministic.
 
 The frames of a switch pass the reference decision first, as on any data plane; only punted frames reach its core.
 """

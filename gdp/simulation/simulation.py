@@ -1,6 +1,6 @@
 """Simulation of a topology in memory: domains with keys, switches, RIBs and members, ready to run.
 
-Sans-I/O. ``namespaces`` realises the same topology with kernel namespaces and real processes.
+No I/O. ``namespaces`` realises the same topology with kernel namespaces and real processes.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ EntryCounts = Callable[[], Mapping[bytes, tuple[int, int]]]  # table key to fram
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sources:
-    """Functions that return a node's counts, called on each scrape from another thread; None: the node has no such count.
+    """Functions that return a node's counts, called in another thread on each scrape; None: there is no such count.
 
     Attributes:
         frames: by direction: in, out, forwarded, punted.
