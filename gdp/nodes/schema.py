@@ -131,7 +131,7 @@ RequiredName = Annotated[Name, BeforeValidator(read_name)]
 
 
 class Domain(Section):
-    """The trust domain of a node, and the other domains whose members it trusts."""
+    """The trust domain of a node, and the others whose members it believes."""
 
     root: ExistingFile
     trusts: Annotated[tuple[ExistingFile, ...], Unique] = ()

@@ -197,7 +197,7 @@ class ClusterStore:
         return [route for route in every if mark in route.fingerprints or mark in route.issuers]
 
     def has_issuer(self, key: bytes) -> bool:
-        """Return whether a route in memory depends on a certificate that this key, 33 bytes, issued; scans all routes."""
+        """Return whether a route in memory depends on a certificate that this key, 33 bytes, issued; scans all."""
         return any(key in route.issuers for routes in self._cache.values() for route in routes.values())
 
     def changed(self) -> list[tuple[Name, list[Route]]]:
