@@ -39,7 +39,7 @@ def reload(
 ) -> None:
     """Make a running node read its configuration, certificates and delegations again.
 
-    The exit code is 1 if the node keeps the old configuration; the text says why.
+    The exit code is 1 if the node keeps the old configuration; the text gives the reason.
 
     \b
     Example:

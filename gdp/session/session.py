@@ -581,7 +581,7 @@ def open_session(
     Args:
         node: the node's directory, as ``gdp keygen node`` and ``gdp cert issue`` made it, or a configuration file: a
             ``proxy.yaml``, of which a session uses ``identity``, ``domain``, ``iface``, ``delegations`` and ``state``.
-            For a directory ``robot/proxy`` it reads ``robot/proxy.yaml`` where there is one.
+            For a directory ``robot/proxy`` it reads ``robot/proxy.yaml`` if that exists.
         iface: device towards the switch. Default: the configuration's; else the directory's name and a 0 (``proxy0``),
             as ``attach`` of the switch makes it.
         root: certificate of the node's trust domain. Default: the configuration's; else ``root.crt`` of the directory.
@@ -594,7 +594,7 @@ def open_session(
         timeout_s: longest wait until a switch has accepted the node.
 
     Raises:
-        LocalError: keys, delegations or the device are not as the options say, or this node already runs.
+        LocalError: keys, delegations or the device differ from the options, or this node already runs.
         ConfigError: the configuration file is wrong.
         AttachError: no switch accepted the node in time.
     """

@@ -254,7 +254,7 @@ def renew_node(
     a token.
 
     Args:
-        before_days: renew only if it ends within so many days; None: in any case.
+        before_days: renew only if it ends within this number of days; None: in any case.
 
     Returns:
         The new membership, or None if the present one lasts longer.

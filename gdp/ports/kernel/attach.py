@@ -1,6 +1,6 @@
 """Attachment of the kernel program to a device: a TCX link on Linux 6.6 and later, else a filter of a clsact qdisc.
 
-I/O. Each device has one attachment and one live switch; a second live switch is refused whichever way it attached.
+I/O. Each device has one attachment and one live switch; a second one is refused, attached by link or by filter.
 Programs of other owners at the same hook stay there.
 Source: Linux, include/uapi/linux/bpf.h (``BPF_TCX_INGRESS``); tc-bpf(8).
 
