@@ -1,4 +1,4 @@
-"""Wait for a device that another node of this host is about to create.
+"""Waiting for a device that another node of this host is about to create.
 
 I/O.
 """

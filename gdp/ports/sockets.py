@@ -12,8 +12,8 @@ again).
 A port may have a socket for each *lane* (``TrafficClass``), so that no frame queues after less important ones. The
 lanes in order are: control frames of neighbours, their hellos, urgent frames, ordinary frames, and control frames of
 strangers. A flood on one lane fills only the queue of that lane. A neighbour is identified by its address, which the
-filters get with each change. Frames that leave by the lanes of neighbours and of urgent frames carry a priority that
-every queueing discipline with bands honours (``pfifo_fast``, ``prio``, and the access categories of Wi-Fi).
+filters get with each change. Frames that leave by the lanes of neighbours and of urgent frames carry a priority. Every
+queueing discipline with bands honours it (``pfifo_fast``, ``prio``, and the access categories of Wi-Fi).
 """
 
 from __future__ import annotations

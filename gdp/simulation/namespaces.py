@@ -2,7 +2,7 @@
 
 I/O; needs root of the machine or of a user namespace.
 Devices have no addresses and no IPv6: all traffic on them is ours. On every end the device has the name of the
-neighbour that it leads to, and its MAC encodes both (``02:67:64:70:AA:BB``, the AA-th switch towards the BB-th).
+neighbour that it leads to. Its MAC encodes both switches (``02:67:64:70:AA:BB``, the AA-th towards the BB-th).
 """
 
 from __future__ import annotations

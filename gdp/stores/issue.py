@@ -1,4 +1,4 @@
-"""Issuing of domains, nodes, owners and delegations, one call each, for the ``gdp`` command and for test networks.
+"""Issuance of domains, nodes, owners and delegations, one call each, for the ``gdp`` command and for test networks.
 
 I/O, through ``keyring``; reads the wall clock if no time is given. The domain's ledger records every membership before
 it is handed out.
