@@ -1,7 +1,7 @@
 """Client of control sockets: finds the socket of a node and sends it a command.
 
-I/O. The socket of a node is named after the node's identity and lies in the lock directory (``single_instance``). So the
-directory of the node's keys is enough to find it.
+I/O. The socket of a node is named after the node's identity and lies in the lock directory (``single_instance``). The
+directory of the node's keys is therefore enough to find it.
 """
 
 from __future__ import annotations

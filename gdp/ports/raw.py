@@ -163,9 +163,8 @@ class RawPlane(NetdevPlane):
         """Receive the frames at sockets before they are closed, because closing loses them uncounted."""
         for source in sources:
             attach_drop_all_filter(source)
-            source.getsockopt(
-                socket.SOL_SOCKET, socket.SO_ERROR
-            )  # clears the error of a device that went down, which would come first
+            # Clears the error of a device that went down, which the next read would return first.
+            source.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
             ready, before = self._ready.get(source.fileno()), -1
             while ready is not None and self._counters.frames_in > before:
                 before = self._counters.frames_in
