@@ -1,7 +1,7 @@
 """Cluster link: connections to the primaries of a Valkey or Redis Cluster, the map of slots, batches, notifications.
 
-I/O; blocking, with short time limits. After a failure of a primary, the link does not use it for a moment, and reads
-the map of slots again from the other servers, and so finds the replica after its promotion.
+I/O; blocking, with short time limits. After a failure of a primary, the link does not use it for a moment. It reads the
+map of slots again from the other servers, and so finds the replica after its promotion.
 """
 
 from __future__ import annotations

@@ -81,7 +81,7 @@ class PortAt(IntEnum):
 
 
 class PortFlag(IntEnum):
-    """How a port is served."""
+    """Flags of a port for the kernel program."""
 
     PEER = 1  # redirect to the other end of a veth pair
 
