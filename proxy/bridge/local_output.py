@@ -175,7 +175,7 @@ class ChannelPublishers:
         return MessageDecoder(source, encoding, source, None)
 
     def add(self, publisher: bytes, sources: Sequence[Channel], targets: Sequence[Channel]) -> list[int]:
-        """Return the handles of a remote publisher's channels, whose number is bounded; equal channels share a handle."""
+        """Return the handles of a remote publisher's channels, at most a bounded number; equal channels share a handle."""
         del sources
         known = self._handles.setdefault(publisher, set())
         if len(self._handles) > _PUBLISHERS_MAX:

@@ -114,7 +114,7 @@ class ProxyConfig(Section):
         return editor_schema(cls, "proxy.yaml")
 
     def endpoint_of(self, rule: Rule) -> int:
-        """Return the index in ``ros`` of a rule's graph; in a loaded file every rule has exactly one, if ``ros`` has any.
+        """Return the index in ``ros`` of a rule's graph; every rule of a loaded file has exactly one if ``ros`` is not empty.
 
         Raises:
             LocalError: none, or more than one.

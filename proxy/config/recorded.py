@@ -1,7 +1,7 @@
 """Rules of ``proxy.yaml`` as they apply to a recording.
 
-Sans-I/O. A recording has topics alone, and no QoS decides what is reliable or latched: without a word in the rule its
-topics are reliable, and a recorded latched topic stays latched.
+Sans-I/O. A recording has topics only, and its QoS does not decide what is reliable or latched. Unless the rule states
+otherwise, its topics are reliable, and a recorded latched topic stays latched.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ class RecordedRules:
     """Rules about the topics of one recording.
 
     Args:
-        expose: what of a replayed recording leaves this machine.
-        imports: what is recorded.
+        expose: topics of a replayed recording that leave this machine.
+        imports: topics that are recorded.
     """
 
     expose: tuple[Rule, ...] = ()
