@@ -114,7 +114,7 @@ class ProxyConfig(Section):
         return editor_schema(cls, "proxy.yaml")
 
     def endpoint_of(self, rule: Rule) -> int:
-        """Return the index in ``ros`` of a rule's graph; every rule of a loaded file has exactly one if ``ros`` is not empty.
+        """Return the index in ``ros`` of a rule's graph; in a loaded file with any ``ros`` every rule has exactly one.
 
         Raises:
             LocalError: none, or more than one.

@@ -1,4 +1,5 @@
-"""What crosses: the rules of ``proxy.yaml``, which of them holds for a name, and what may be wrong with them.
+"""Rules of ``proxy.yaml``: which names cross, which rule applies to a name, and conflicts between rules.
 
-Place: ``pattern`` and ``choice`` are pure; ``rule`` and ``ros_end`` are sections of a file and read what it names.
+The modules are in ``proxy/config``: ``pattern`` and ``matching`` are sans-I/O; ``rule`` and ``graph`` are sections of a
+file and read the files that it names.
 """

@@ -1,6 +1,6 @@
-"""The ``ros2`` endpoint: one virtual node in one domain, spoken through rclpy.
+"""Endpoint ``ros2``: one virtual node in one domain, through rclpy.
 
-Place: I/O; what the proxy's thread calls. A thread of its own hears (``waiting``).
+I/O; called by the proxy's thread. A separate thread receives (``wait_thread``).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Ros2Endpoint:
         node: name of the virtual node (``proxy_node_name``).
 
     Raises:
-        LocalError: ROS 2 is not installed, or does not start; the text says what to do.
+        LocalError: ROS 2 is not installed, or does not start; the text states what to do.
     """
 
     ros: Final[RosVersion] = 2
@@ -60,7 +60,7 @@ class Ros2Endpoint:
 
     @property
     def dropped(self) -> int:
-        return 0  # what waits too long waits in the middleware, by its QoS
+        return 0  # messages wait in the middleware, which drops them by its QoS
 
     def fileno(self) -> int:
         return self._waiting.fileno()
@@ -155,7 +155,7 @@ class Ros2Endpoint:
         serving.send(ticket, response)
 
     def refuse(self, handle: int, ticket: int, reason: str) -> None:
-        """Answer {success: false, message: reason} where the response has these; ROS 2 knows no other way."""
+        """Answer {success: false, message: reason} where the response has these fields; ROS 2 has no other way."""
         serving = self._serving[handle]
         refusal = _refusal(serving.response, reason)
         if refusal is None:
@@ -216,7 +216,7 @@ class Ros2Endpoint:
         return self._numbers
 
     def _checked(self, channel: Channel) -> Channel:
-        """Return how this machine knows the channel's type, after making sure that it means the same."""
+        """Return this machine's description of the channel's type, after verifying that it is equivalent."""
         known = channel_of(channel.topic, channel.type_name)
         if channel.ros != 2:
             raise LocalError(f"{channel.topic}: its messages are in ROS 1's form")
@@ -229,7 +229,7 @@ class Ros2Endpoint:
         return known
 
     def _tell_apart(self, topic: str) -> None:
-        """Have our publishers of a topic leave word with our subscriptions to it, so that these skip what they hear."""
+        """Connect the endpoint's publishers of a topic to the loopback filters of its own subscriptions."""
         publisher_entity = [end for end in self._publisher_entity.values() if end.topic == topic]
         subscription_entity = [end for end in self._subscription_entity.values() if end.topic == topic]
         for ear in subscription_entity if publisher_entity else ():
@@ -243,7 +243,7 @@ class Ros2Endpoint:
 
 
 def _ignore(*_: object) -> None:
-    """rclpy wants a callback; the waiting thread takes what comes before any could be called."""
+    """Ignore a callback that rclpy requires; the wait-set thread reads data before any callback could run."""
 
 
 def _refusal(response: type, reason: str) -> object | None:

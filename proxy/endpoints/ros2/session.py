@@ -1,8 +1,8 @@
-"""One node of ours in one ROS 2 domain, and the part of rclpy that we use, with types.
+"""Session: one node in one ROS 2 domain, and typed protocols of the used part of rclpy.
 
-Place: the only module here that starts rclpy. rclpy's executors take 100 µs and more a callback, and its experimental
-``EventsExecutor`` delivered nothing to raw subscriptions when tried (7.1.6); so the handles beneath its publishers and
-subscriptions are used directly, as its executors do.
+I/O; the only module here that starts rclpy. rclpy's executors take 100 µs and more a callback, and its experimental
+``EventsExecutor`` delivered nothing to raw subscriptions when tried (7.1.6). So this package uses the handles of its
+publishers and subscriptions directly, as its executors do.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ __all__ = [
 
 
 class Handle(Protocol):
-    """An rcl object; alive at least while entered."""
+    """An rcl object; it is valid at least while entered."""
 
     pointer: int
 
@@ -51,7 +51,7 @@ class Handle(Protocol):
 
 
 class GuardCondition(Handle, Protocol):
-    """What wakes a wait set."""
+    """Wake-up source of a wait set."""
 
     def trigger_guard_condition(self) -> None: ...
     def destroy_when_not_in_use(self) -> None: ...
@@ -71,13 +71,13 @@ class PublisherHandle(Handle, Protocol):
 
 
 class RequestId(Protocol):
-    """Which request of its client."""
+    """Identity of a request within its client."""
 
     sequence_number: int
 
 
 class RequestInfo(Protocol):
-    """What comes with a request or a response."""
+    """Metadata of a request or a response."""
 
     request_id: RequestId
 
@@ -105,7 +105,7 @@ class ServiceType(Protocol):
 
 
 class WaitSet(Handle, Protocol):
-    """What waits; emptied by every wait."""
+    """Wait set of rcl; every wait empties it."""
 
     def clear_entities(self) -> None: ...
     def add_guard_condition(self, guard: GuardCondition, /) -> int: ...
@@ -178,7 +178,7 @@ class _Context(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """A node in a context of its own."""
+    """A node in a separate context."""
 
     node: Node
     context: _Context
@@ -190,18 +190,18 @@ class Session:
             return cast("GuardCondition", self.rcl.GuardCondition(self.context.handle))
 
     def wait_set(self, subscriptions: int, services: int, clients: int) -> WaitSet:
-        """Return a wait set with room for one guard condition and these."""
+        """Return a wait set for one guard condition and these numbers of entities."""
         with self.context.handle:
             return cast("WaitSet", self.rcl.WaitSet(subscriptions, 1, 0, clients, services, 0, self.context.handle))
 
     def group(self) -> object:
-        """Return a callback group for one entity: a node's default group would remember every entity for ever."""
+        """Return a callback group for one entity: a node's default group would keep every entity for ever."""
         from rclpy.callback_groups import ReentrantCallbackGroup
 
         return ReentrantCallbackGroup()
 
     def silence(self, *, publisher: bool) -> object:
-        """Return event callbacks that do nothing; what does not fit is seen in the graph instead."""
+        """Return event callbacks that do nothing; incompatible QoS is detected in the graph instead."""
         try:
             from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
         except ImportError:  # before Iron
@@ -220,7 +220,7 @@ def open_session(domain: int, name: str) -> Session:
     """Join a domain as a node without parameters, log topic or type service.
 
     Raises:
-        LocalError: ROS 2 is not installed, or does not start; the text says what to do.
+        LocalError: ROS 2 is not installed, or does not start; the text states what to do.
     """
     _check_rmw()
     try:
@@ -254,7 +254,7 @@ def open_session(domain: int, name: str) -> Session:
 
 
 def _check_rmw() -> None:
-    """Refuse an RMW that is not installed: rcl would end the process over it, with exit status 102."""
+    """Refuse an RMW that is not installed: rcl would end the process with exit status 102."""
     wanted = os.environ.get("RMW_IMPLEMENTATION", "")
     prefixes = [*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
     folders = [*os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep), *(f"{prefix}/lib" for prefix in prefixes)]
@@ -269,7 +269,7 @@ def _check_rmw() -> None:
 
 @contextmanager
 def translated(what: str) -> Iterator[None]:
-    """Turn what rclpy raises for a name, a type or a profile that it refuses into a LocalError."""
+    """Translate rclpy's error for a refused name, type or profile into a LocalError."""
     from rclpy.exceptions import NameValidationException, NoTypeSupportImportedException
 
     try:
