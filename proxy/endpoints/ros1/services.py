@@ -186,7 +186,7 @@ class Client:
         return response, "", True
 
     def _connect(self, proxy: ServiceProxy, request: Raw) -> TCPROSTransport:
-        """Connect like rospy's first call, but separately: the present server may have another type and misread bytes."""
+        """Connect like rospy's first call, but separately: the present server may have another type."""
         uri = proxy._get_service_uri(request)
         host, port = rospy.core.parse_rosrpc_uri(uri)
         transport = TCPROSTransport(proxy.protocol, proxy.resolved_name)

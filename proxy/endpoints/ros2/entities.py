@@ -105,7 +105,7 @@ class SubscriptionEntity:
 
 @dataclass(slots=True)
 class PublisherEntity:
-    """A publisher. ``kept``: messages for late joiners of a transient local one; one of them may be the endpoint's own."""
+    """A publisher. ``kept``: messages for late joiners of a transient local one, possibly the endpoint's own readers."""
 
     number: int
     topic: str
