@@ -86,7 +86,7 @@ class LiveRing:
         return replace(result, traffic_s=traffic_s, silent_s=session.silent_s)
 
     def go_on(self) -> None:
-        """Start proxies that outlive this process, in place of those that have reported, and continue the nodes' traffic."""
+        """Start proxies that outlive this process, in place of those that have reported; the nodes' traffic continues."""
         for end in self._ends:
             self._start_proxy(*end, heard=False)
         for node in self._nodes:

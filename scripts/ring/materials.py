@@ -99,7 +99,7 @@ class OverlayCredentials:
     def receiver(
         self, at: Attachment, topics: Sequence[Topic], encoding: Encoding, ros: RosVersion, record: Path
     ) -> Path:
-        """Give a proxy the right to read these topics, and write the ``proxy.yaml`` that records them; return the file."""
+        """Give a proxy the right to read these topics, and write the ``proxy.yaml`` that records them; return it."""
         return self._proxy(at, "import", topics, encoding, ros, record)
 
     def live(self, at: Attachment, side: Side, carried: Sequence[Carried], encoding: Encoding, graph: Yaml) -> Path:

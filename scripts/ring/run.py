@@ -93,7 +93,7 @@ class Ring:
         )
 
     def start_again(self) -> Path:
-        """Start a receiver that outlives this process, in place of the one that has ended; return its recording's path."""
+        """Start a receiver that outlives this process, in place of the ended one; return the path of its recording."""
         path = self.recording.with_name(f"again-{self.recording.name}")
         self._start_receiver(path, heard=False)
         return path

@@ -70,6 +70,7 @@ class DdsEndpoint:
 
     @property
     def dropped(self) -> int:
+        """Return 0: only the middleware drops messages."""
         return 0  # messages wait in the middleware, which drops them by its QoS
 
     def fileno(self) -> int:

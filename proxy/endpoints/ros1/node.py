@@ -1,6 +1,6 @@
 """Node of rospy: executes the commands of the IPC link, and reports events.
 
-I/O; imports rospy. It has three threads besides rospy's own:
+I/O; imports rospy. It has three threads, and rospy adds its own:
 - The main thread serves the link and never waits for ROS.
 - The registrar adds entities to the graph and removes them, which waits for the master.
 - The watch polls the graph.

@@ -109,7 +109,7 @@ class Client:
             threading.Thread(target=self._run, name="call", daemon=True).start()
 
     def drop(self, call: int) -> None:
-        """Forget a call; its connection is closed, because its response could not be told from the next one's."""
+        """Forget a call and close its connection, on which its response could not be distinguished from the next one's."""
         with self._lock:
             proxy = self._calls.pop(call, None)
         if proxy is not None:

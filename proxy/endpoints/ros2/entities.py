@@ -44,16 +44,20 @@ class Source(Protocol):
     """An entity on which the wait-set thread waits."""
 
     @property
-    def number(self) -> int: ...
+    def number(self) -> int:
+        """Return the handle of the entity at the endpoint."""
 
     @property
-    def entity(self) -> Entity: ...
+    def entity(self) -> Entity:
+        """Return rclpy's object."""
 
     @property
-    def kind(self) -> Kind: ...
+    def kind(self) -> Kind:
+        """Return the kind of entity in a wait set."""
 
     @property
-    def handle(self) -> Handle: ...
+    def handle(self) -> Handle:
+        """Return rcl's object."""
 
     def join(self, wait_set: WaitSet) -> Callable[[], object]:
         """Return the callable that adds this entity to a wait set for one wait."""
@@ -79,9 +83,11 @@ class SubscriptionEntity:
     kind: Kind = "subscription"
 
     def join(self, wait_set: WaitSet) -> Callable[[], object]:
+        """Return the callable that adds the subscription to a wait set."""
         return partial(wait_set.add_subscription, self.handle)
 
     def drain(self) -> list[Event]:
+        """Read a bounded number of messages; the endpoint's own are left out."""
         events: list[Event] = []
         stamp_ns = time.time_ns()
         for _ in range(_AT_ONCE):
@@ -140,9 +146,11 @@ class ServiceEntity:
         self._lock = Lock()
 
     def join(self, wait_set: WaitSet) -> Callable[[], object]:
+        """Return the callable that adds the server to a wait set."""
         return partial(wait_set.add_service, self.handle)
 
     def drain(self) -> list[Event]:
+        """Read a bounded number of requests."""
         from rclpy.serialization import serialize_message
 
         events: list[Event] = []
@@ -201,9 +209,11 @@ class ClientEntity:
         self._held: dict[int, _Held] = {}
 
     def join(self, wait_set: WaitSet) -> Callable[[], object]:
+        """Return the callable that adds the client to a wait set."""
         return partial(wait_set.add_client, self.handle)
 
     def drain(self) -> list[Event]:
+        """Read a bounded number of responses."""
         from rclpy.serialization import serialize_message
 
         events: list[Event] = []
