@@ -85,7 +85,7 @@ class _Signboard:
     """Owner of the presence topic by which other proxies detect this one."""
 
     def handle_event(self, event: Event, now_s: float) -> None:
-        """Report a fault of the presence topic: without it two proxies of one graph may both carry a name for a moment."""
+        """Report a fault of the presence topic: without it two proxies may both carry a name for a moment."""
         del now_s
         if isinstance(event, EndpointError):
             log.warning("no sign for other proxies reason=%s", event.reason)

@@ -8,8 +8,8 @@ Every server executes the goal. Its client receives messages of one server at a 
 acceptance it got, until that server leaves. At last the leader is the server whose result the client got, even if
 others report later that they were cancelled.
 
-Goals that only servers name (of other machines' clients, or invented) have a separate quota and evict no other goals:
-when it is full, the oldest goal of the server that named the most is dropped.
+Goals that only servers name, of other machines' clients or invented, have a separate quota and evict no other goals.
+When the quota is full, the oldest goal of the server that named the most is dropped.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Local publishers of an imported topic: one for all remote publishers, or one for each of their channels.
 
 I/O through the endpoint. A live graph gets one virtual publisher. If a new one must replace it to promise more, the new
-one gets the messages that a latched topic keeps: readers get them again, as from any publisher that restarts. A
+one gets the messages that a latched topic keeps. Readers then get them again, as from any publisher that restarts. A
 recording gets every channel as its remote publisher describes it.
 """
 
@@ -144,7 +144,7 @@ class MergedPublisher:
             return None
 
     def _offer(self, channel: Channel) -> None:
-        """Create the publisher with the remote QoS, as far as local readers allow; replace it where that has changed."""
+        """Create the publisher with the remote QoS, within what local readers allow; replace it where that has changed."""
         profile = offer(tuple(self._far.values()), self._wants, is_latched=self._flow_spec.rule.wants_latched)
         latched = profile.durability == "transient_local"
         offered = replace(channel, topic=self._flow_spec.local, qos=(profile,), latched=latched, callerid=None)

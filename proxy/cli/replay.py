@@ -59,9 +59,9 @@ def replay(
 ) -> None:
     """Replay a recording's exposed topics onto the overlay with the recorded timing.
 
-    Exit 1: a message of a reliable topic was not confirmed by every reader of it, or had none, latched or not; or was
-    too large, or the overlay refused a topic; or the recording takes more memory or time than it may. Best effort is
-    sent, and confirmed by nobody.
+    Exit 1: a message of a reliable topic was too large, had no reader, or was not confirmed by each reader; this
+    includes latched topics. Also if the overlay refused a topic, or the recording exceeds its memory or time. Best
+    effort is sent without confirmation.
     """
     del version  # its callback ends the command
     set_up_logging(verbose=verbose)

@@ -158,7 +158,7 @@ class Endpoint(Protocol):
 
     @property
     def dropped(self) -> int:
-        """Return the messages dropped because a queue was full; those that a middleware drops by its QoS are unknown."""
+        """Return the messages dropped because a queue was full; those that a middleware drops are unknown."""
 
     def fileno(self) -> int:
         """Return a descriptor that is readable while ``poll_events`` has events."""
@@ -233,7 +233,7 @@ class Endpoint(Protocol):
         """
 
     def call(self, handle: int, call: int, raw: bytes) -> None:
-        """Send a request under the caller's number; ``ResponseReceived`` or ``CallFailed`` follows, unless it is dropped.
+        """Send a request under the caller's number; ``ResponseReceived`` or ``CallFailed`` follows unless it is dropped.
 
         Any number of calls may be under way; the caller keeps the timeouts.
         """

@@ -3,7 +3,7 @@
 I/O; a command that ``process`` starts. It reads the recording and writes frames (``stream``) to a pipe. It sets limits
 of memory and time, Landlock and seccomp before it opens the file. The kernel kills it when the other side of its
 lifeline is closed, even while it decodes. ``PR_SET_PDEATHSIG`` would not suffice: it follows the thread that started
-the process, and Landlock removes the right to signal the process from a parent that is confined later.
+the process. Landlock also removes the right to signal the process from a parent that is confined later.
 """
 
 from __future__ import annotations

@@ -108,7 +108,10 @@ class BagDecoder:
 
     @property
     def unread(self) -> str:
-        """Return why some messages could not be read, and about how many; empty if all could. Final after ``messages``."""
+        """Return why some messages could not be read, and about how many; empty if all could.
+
+        The text is final after ``messages``.
+        """
         return self._source.unread
 
     def messages(self) -> Iterator[Message]:

@@ -1,6 +1,6 @@
 """Guard for untrusted SQLite databases: plain tables only, bounded work, bounded values.
 
-I/O. A view or a virtual table may run any query, a tree of pages may be circular, and a value may be as long as its
+I/O. A view or a virtual table may run any query. A tree of pages may be circular, and a value may be as long as its
 header states. Source: "Defense Against The Dark Arts", https://www.sqlite.org/security.html.
 """
 

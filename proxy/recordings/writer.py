@@ -1,7 +1,7 @@
 """Writer of a recording: ROS 2 messages as one MCAP file, ROS 1 messages as a bag.
 
-I/O. A recording gets its name when it is closed; until then it is a hidden file in the same folder, so that a killed
-process leaves nothing that looks complete.
+I/O. A recording gets its name when it is closed; until then it is a hidden file in the same folder. So a killed process
+leaves nothing that looks complete.
 """
 
 from __future__ import annotations

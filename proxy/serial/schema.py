@@ -1,6 +1,6 @@
 """Schema of a message type as a tree of five node kinds, parsed from the definition text of a channel.
 
-Sans-I/O. A definition may come from a peer: its text is bounded, parsed in time proportional to its length
+Sans-I/O. A definition may come from a peer. Its text is bounded and parsed in time proportional to its length
 (``msg_text``, ``idl_text``), and nothing is generated or executed. Types are cached by the hash of their definition.
 Source: the ROS 2 interface definition article; ROS 1 ``msg`` wiki page.
 """

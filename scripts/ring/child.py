@@ -1,7 +1,7 @@
 """Child process of the ring: one of the project's commands, started, read and ended.
 
 I/O. Built on ``subprocess`` and a pidfd rather than on asyncio's own subprocesses, whose transports kill running
-processes when they are garbage-collected; a kept ring must outlive this process.
+processes when they are garbage-collected. A kept ring must outlive this process.
 """
 
 from __future__ import annotations

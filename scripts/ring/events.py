@@ -16,7 +16,7 @@ __all__ = ["Event"]
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One line. The accessors return a value of the requested type, or raise ``LocalError``: the command is a local one."""
+    """One line. The accessors return a value of the requested type, or raise ``LocalError``."""
 
     fields: Mapping[str, object]
 

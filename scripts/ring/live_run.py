@@ -86,7 +86,7 @@ class LiveRing:
         return replace(result, traffic_s=traffic_s, silent_s=session.silent_s)
 
     def go_on(self) -> None:
-        """Start proxies that outlive this process, in place of those that have reported; the nodes' traffic continues."""
+        """Replace the proxies that have reported by ones that outlive this process, and continue the nodes' traffic."""
         for end in self._ends:
             self._start_proxy(*end, heard=False)
         for node in self._nodes:

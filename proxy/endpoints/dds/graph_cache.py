@@ -1,7 +1,7 @@
 """Graph cache: the readers and writers that peers announced, and their nodes.
 
 Sans-I/O; discovery supplies the input. The entities of a ROS participant are shown only after it has announced their
-nodes: until then the entities of another proxy would look like those of a robot's node.
+nodes. Until then the entities of another proxy would look like those of a robot's node.
 """
 
 from __future__ import annotations

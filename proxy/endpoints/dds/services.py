@@ -1,7 +1,7 @@
 """Services of the virtual node: servers and clients that interoperate with Cyclone DDS's peers.
 
 I/O, through the node. rmw_cyclonedds puts the client (8 bytes) and a call's number (8 bytes) before the message. Fast
-DDS and others put them into the header of the RTPS sample, which the binding can neither write nor read: services with
+DDS and others put them into the header of the RTPS sample, which the binding can neither write nor read. Services with
 such peers are refused with a reason.
 Source: rmw_cyclonedds_cpp, ``cdds_request_header_t`` and ``clientid``/``serviceid`` in user data.
 """

@@ -23,7 +23,7 @@ def known_channel(topic: str, type_name: str) -> Channel | None:
 
 
 def hash_of(channel: Channel) -> str:
-    """Return the ROS 2 type hash of a channel: its own, or the hash of its definition; empty where it cannot be derived."""
+    """Return the ROS 2 type hash of a channel: its own, or that of its definition; empty where it cannot be derived."""
     if channel.hash.startswith("RIHS01_"):
         return channel.hash
     if channel.definition:

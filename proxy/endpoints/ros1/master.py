@@ -114,7 +114,7 @@ class Master:
         self._node = node
 
     def ask(self, *calls: tuple[str, ...]) -> list[object]:
-        """Return the responses to several calls, each (method, argument...), sent as one batch; None for a refused call.
+        """Return the responses to a batch of calls, each (method, argument...); None for a refused call.
 
         Raises:
             MasterError: no response at all.
@@ -227,7 +227,7 @@ class _Server:
 
 
 def _probed(service: str, uri: object) -> _Server:
-    """Probe a server for its type; one without a response is probed again at the next poll, others after ten seconds."""
+    """Probe a server for its type, again at the next poll if it does not respond, else after ten seconds."""
     now_s = time.monotonic()
     fields = {"probe": "1", "md5sum": "*", "callerid": "/gdp_probe", "service": service}
     try:

@@ -259,7 +259,7 @@ class Node:
     # the end
 
     def _broke(self, broken: threading.ExceptHookArgs) -> None:
-        """End the process if one of its own threads fails; rospy's fail like this when a peer leaves at a bad moment."""
+        """End the process if a thread of its own fails; rospy's threads fail when a peer leaves at a bad moment."""
         name = "" if broken.thread is None else broken.thread.name
         if name in ("registrar", "watch", "call") and not self._stopped.is_set():
             self._end(f"{name}: {broken.exc_type.__name__}: {broken.exc_value}")

@@ -1,6 +1,6 @@
 """Services of the rospy process: servers and clients.
 
-I/O; imports rospy. rospy runs a thread for each client's connection; a separate thread runs each call, over a
+I/O; imports rospy. rospy runs a thread for each client's connection. A separate thread runs each call, over a
 connection of its own that it keeps for a while.
 """
 
@@ -109,7 +109,7 @@ class Client:
             threading.Thread(target=self._run, name="call", daemon=True).start()
 
     def drop(self, call: int) -> None:
-        """Forget a call and close its connection, on which its response could not be distinguished from the next one's."""
+        """Forget a call and close its connection: its response could not be distinguished from the next one's."""
         with self._lock:
             proxy = self._calls.pop(call, None)
         if proxy is not None:
