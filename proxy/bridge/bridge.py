@@ -3,7 +3,7 @@
 I/O through endpoints and the participant. The loop that drives the bridge calls ``work`` after every step.
 
 Outgoing path: endpoint -> ``EndpointDispatcher.deliver`` -> flow -> ``Publisher.publish``.
-Incoming path: ``take_messages`` -> the flow of the name -> ``Endpoint.publish``, ``call`` or ``answer``.
+Incoming path: ``poll_messages`` -> the flow of the name -> ``Endpoint.publish``, ``call`` or ``answer``.
 """
 
 from __future__ import annotations

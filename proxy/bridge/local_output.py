@@ -144,7 +144,7 @@ class MergedPublisher:
             return None
 
     def _offer(self, channel: Channel) -> None:
-        """Create the publisher with the remote QoS, within what local readers allow; replace it where that has changed."""
+        """Create the publisher with the remote QoS, within what local readers allow; replace it where they change."""
         profile = offer(tuple(self._far.values()), self._wants, is_latched=self._flow_spec.rule.wants_latched)
         latched = profile.durability == "transient_local"
         offered = replace(channel, topic=self._flow_spec.local, qos=(profile,), latched=latched, callerid=None)
@@ -175,7 +175,7 @@ class ChannelPublishers:
         return MessageDecoder(source, encoding, source, None)
 
     def add(self, publisher: bytes, sources: Sequence[Channel], targets: Sequence[Channel]) -> list[int]:
-        """Return the handles of a remote publisher's channels, at most a bounded number; equal channels share a handle."""
+        """Return the handles of a remote publisher's channels, of bounded number; equal channels share a handle."""
         del sources
         known = self._handles.setdefault(publisher, set())
         if len(self._handles) > _PUBLISHERS_MAX:

@@ -50,7 +50,7 @@ def delegate_what_is_needed(
     json: Json = False,
     version: Version = False,
 ) -> None:
-    """Give each proxy the delegations to publish, read, serve or call that its rules need; valid ones stay as they are."""
+    """Give each proxy the delegations to publish, read, serve or call that its rules need; valid ones are kept."""
     del version  # its callback ends the command
     with failing_clearly():
         key = load_owner(owner).public

@@ -233,9 +233,9 @@ class Endpoint(Protocol):
         """
 
     def call(self, handle: int, call: int, raw: bytes) -> None:
-        """Send a request under the caller's number; ``ResponseReceived`` or ``CallFailed`` follows unless it is dropped.
+        """Send a request under the caller's number; ``ResponseReceived`` or ``CallFailed`` follows.
 
-        Any number of calls may be under way; the caller keeps the timeouts.
+        Nothing follows after ``drop``. Any number of calls may be under way; the caller keeps the timeouts.
         """
 
     def drop(self, handle: int, call: int) -> None:

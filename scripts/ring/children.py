@@ -54,7 +54,7 @@ class Children:
         heard: bool = True,
         environment: Mapping[str, str] | None = None,
     ) -> Child:
-        """Start Python with these arguments in the namespace of a switch; ``environment`` is added to the present one."""
+        """Start Python with these arguments in the namespace of a switch; ``environment`` extends the present one."""
         told = ["env", *(f"{name}={value}" for name, value in environment.items())] if environment else []
         argv = namespaces.command(node, [*told, sys.executable, *arguments], dies_with_us=not self._kept)
         return self.start(f"{role} {node}", argv, heard=heard)

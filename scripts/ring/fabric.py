@@ -94,7 +94,7 @@ class Overlay:
         heard: bool = True,
         environment: Mapping[str, str] | None = None,
     ) -> Child:
-        """Start Python with these arguments in the namespace of a switch; ``environment`` is added to the present one."""
+        """Start Python with these arguments in the namespace of a switch; ``environment`` extends the present one."""
         return self.children.start_in(self.namespaces, node, role, arguments, heard=heard, environment=environment)
 
     async def cut(self, cut: Cut) -> None:

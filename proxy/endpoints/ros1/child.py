@@ -1,7 +1,7 @@
-"""Child process that runs rospy: ``python -m proxy.endpoints.ros1.child FD MASTER NODE LIFE DELAY_S``.
+"""Child process that runs rospy: ``python -m proxy.endpoints.ros1.child FD MASTER NODE INCARNATION DELAY_S``.
 
-I/O. FD is its side of the IPC link; the process ends when the link does. LIFE counts such processes of one endpoint;
-DELAY_S is how long this one stays off the graph, because an earlier one has failed.
+I/O. FD is its side of the IPC link; the process ends when the link does. INCARNATION counts such processes of one
+endpoint; DELAY_S is how long this one stays off the graph, because an earlier one has failed.
 """
 
 from __future__ import annotations

@@ -111,7 +111,10 @@ class SubscriptionEntity:
 
 @dataclass(slots=True)
 class PublisherEntity:
-    """A publisher. ``kept``: messages for late joiners of a transient local one, possibly the endpoint's own readers."""
+    """A publisher; ``kept`` are messages for late joiners of a transient local one.
+
+    A late joiner may be a subscription of the endpoint itself.
+    """
 
     number: int
     topic: str
