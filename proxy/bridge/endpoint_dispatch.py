@@ -42,7 +42,7 @@ class EndpointDispatcher:
         return is_changed
 
     def deliver_faults(self, now_s: float) -> None:
-        """Deliver faults after the graph in which they arose was processed; handles that gave way have no owner then."""
+        """Deliver faults after the graph in which they arose was processed; handles that gave way have no owner."""
         faulted, self._faulted = self._faulted, []
         for event in faulted:
             if (owner := self._owners.get(event.handle)) is not None:
