@@ -1,6 +1,6 @@
 """A machine of a cluster: what is asked of a provider, what it is to run, and what the provider says of it.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations

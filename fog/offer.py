@@ -1,6 +1,6 @@
 """What a provider sells: a type of machine, somewhere, at a price.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A site: whose domain and owner clusters are of, which robot uses them, and which provider has the machines.
 
-Place: shell. ``fog.yaml`` states it; without one a site of its own is made in the state folder::
+I/O. ``fog.yaml`` states it; without one a site of its own is made in the state folder::
 
     state/  site.json                 its id: devices and runs carry it
             domain/ owner/            keys, as gdp lab makes them

@@ -1,6 +1,6 @@
 """A machine at work: its programs, its status, its end.
 
-Place: shell.
+I/O.
 ::
 
     BOOTING -- all programs are up --> RUNNING -- notice, drain --> LEAVING -- its end, or the notice's moment --> gone

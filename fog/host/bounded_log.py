@@ -1,6 +1,6 @@
 """A log that cannot fill a disk: when the file is full it becomes the older half, and a new one begins.
 
-Place: I/O.
+I/O.
 """
 
 from __future__ import annotations

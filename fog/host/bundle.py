@@ -1,6 +1,6 @@
 """A machine's boot as plain files, so that any provider can carry it: by hand, in user data, over ssh.
 
-Place: pure, but for ``install``, which writes them.
+Sans-I/O, but for ``install``, which writes them.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The ``fog-machine`` command.
 
-Place: command.
+I/O.
 """
 
 from __future__ import annotations

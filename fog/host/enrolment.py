@@ -1,6 +1,6 @@
 """A machine's first start: it makes its own keys, and asks for what it is to be with the token of its ticket.
 
-Place: I/O. Keys are on disk before they are shown, so that a machine that starts again asks with the same ones. When
+I/O. Keys are on disk before they are shown, so that a machine that starts again asks with the same ones. When
 all is there the ticket is removed: no file, no enrolment.
 """
 

@@ -1,6 +1,6 @@
 """One life of a program: started, listened to, ended.
 
-Place: shell. Each leads a session of its own, so that what it starts ends with it; the kernel kills it when the
+I/O. Each leads a session of its own, so that what it starts ends with it; the kernel kills it when the
 machine's own process ends, however that comes about (``PR_SET_PDEATHSIG``, by setpriv(1)). It inherits no
 credentials of the environment (``fog/child_environment``).
 """

@@ -1,6 +1,6 @@
 """The provider's word that it will take a machine, as ``notice.json`` in the machine's folder.
 
-Place: the file system.
+I/O: the file system.
 """
 
 from __future__ import annotations

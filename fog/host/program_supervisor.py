@@ -1,6 +1,6 @@
 """Keeps one program of a machine up: starts it, and starts it again with growing pauses when it ends.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What a machine says of itself, in ``status.json`` of its folder: replaced whole, so that a reader never sees half.
 
-Place: the file system; times come in as arguments.
+I/O: the file system; times come in as arguments.
 """
 
 from __future__ import annotations

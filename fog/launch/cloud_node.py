@@ -1,6 +1,6 @@
 """A ``Node`` of a launch file as what a plan says of it.
 
-Place: shell; reads the files of parameters, which the machines do not have.
+I/O; reads the files of parameters, which the machines do not have.
 """
 
 from __future__ import annotations

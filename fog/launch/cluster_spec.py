@@ -1,6 +1,6 @@
 """What a ``FogCluster`` asks for, checked where the launch file says it; with its nodes it becomes a plan.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What a launch file is made of where ROS 2's own ``launch`` and ``launch_ros`` are not installed.
 
-Place: pure. The same names and keywords as ROS 2's, those that mean something here; any other keyword is refused.
+Sans-I/O. The same names and keywords as ROS 2's, those that mean something here; any other keyword is refused.
 Source: https://docs.ros.org/en/jazzy/Tutorials/Intermediate/Launch/Launch-Main.html.
 """
 

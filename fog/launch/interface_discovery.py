@@ -1,6 +1,6 @@
 """What nodes offer, found out by starting them once in a ROS graph of their own.
 
-Place: shell. Needs rclpy. What was found is kept, by command line and age of the code, in the user's cache folder.
+I/O. Needs rclpy. What was found is kept, by command line and age of the code, in the user's cache folder.
 """
 
 from __future__ import annotations

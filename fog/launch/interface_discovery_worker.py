@@ -1,7 +1,7 @@
 """``python -m fog.launch.interface_discovery_worker FOLDER``: start nodes, look at their graph until nothing new
 comes, end them.
 
-Place: shell; a process of its own, since the ROS domain and the reach of discovery are a process's. Reads what to start
+I/O; a process of its own, since the ROS domain and the reach of discovery are a process's. Reads what to start
 from standard input, answers with one line of JSON: ``{"offered": [[kind, name, type], ...]}`` or ``{"error": ...}``.
 """
 

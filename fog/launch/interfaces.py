@@ -1,6 +1,6 @@
 """What a launch file says that a cluster's nodes offer: ``services={"/plan": "nav_msgs/srv/GetPlan"}`` and such.
 
-Place: pure. The value may be a map with ``type`` and keys of the proxies' rules (docs/reference/configuration.md).
+Sans-I/O. The value may be a map with ``type`` and keys of the proxies' rules (docs/reference/configuration.md).
 """
 
 from __future__ import annotations

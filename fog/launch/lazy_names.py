@@ -1,6 +1,6 @@
 """The words of a launch file: ROS 2's own where ``launch`` and ``launch_ros`` are installed, else ours of that name.
 
-Place: shell; looks where packages lie and imports what is asked for. PyPI's ``launch`` is an unrelated project, so a
+I/O; looks where packages lie and imports what is asked for. PyPI's ``launch`` is an unrelated project, so a
 package of that name counts only with ROS 2's files in it.
 """
 

@@ -1,6 +1,6 @@
 """Running a launch file: what cluster it wants, and which nodes run beside the robot.
 
-Place: shell; executes the file, which is Python, and starts nothing.
+I/O; executes the file, which is Python, and starts nothing.
 """
 
 from __future__ import annotations

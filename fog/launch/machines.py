@@ -1,6 +1,6 @@
 """The machines that a launch description asks for, and the list filled up to the wanted number of replicas.
 
-Place: pure.
+Sans-I/O.
 Source: FogROS2-FT, Listing 1.
 """
 

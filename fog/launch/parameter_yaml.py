@@ -1,6 +1,6 @@
 """YAML of parameters: one document, bounded, without aliases.
 
-Place: pure.
+Sans-I/O.
 Source: rcl_yaml_param_parser, which refuses aliases too ("Will not support aliasing"). An alias lets a few hundred
 bytes unroll into gigabytes. The events are looked at before anything is built.
 """

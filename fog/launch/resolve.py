@@ -1,6 +1,6 @@
 """Which program a node's ``package`` and ``executable`` are.
 
-Place: shell; looks where ROS packages lie. First what ``ros2 run`` would start, ``lib/<package>/<executable>`` of a
+I/O; looks where ROS packages lie. First what ``ros2 run`` would start, ``lib/<package>/<executable>`` of a
 prefix in ``AMENT_PREFIX_PATH``; else the Python module ``<package>.<executable>``.
 Source: https://docs.ros.org/en/jazzy/Concepts/Advanced/About-Build-System.html (the prefix's layout).
 """

@@ -1,6 +1,6 @@
 """``FogCluster`` as an action of ROS 2's ``launch``: ``ros2 launch`` starts the cluster, and ends it.
 
-Place: shell; imports ROS 2's ``launch``. The cluster itself is the ``fog`` command's business, in processes of its own.
+I/O; imports ROS 2's ``launch``. The cluster itself is the ``fog`` command's business, in processes of its own.
 Processes that come after the cluster in the description start when it serves: ``hold`` is put before them, through
 the launch configuration ``launch-prefix``; a node with a ``prefix`` of its own is not held.
 A cluster that cannot start ends the launch as any fault of an action does, with its reason and exit code 1: an

@@ -1,6 +1,6 @@
 """Names, remappings and parameters of a node as words of its command line, so that they travel without files.
 
-Place: pure.
+Sans-I/O.
 Source: https://design.ros2.org/articles/ros_command_line_arguments.html; the files of parameters as
 rcl_yaml_param_parser reads them (sections of nodes, ``ros__parameters`` within).
 """

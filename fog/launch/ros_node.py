@@ -1,6 +1,6 @@
 """``Node`` of a launch file where ROS 2's ``launch_ros`` is installed: its own, and Python modules as well.
 
-Shell; imports ROS 2's ``launch``. ``package`` and ``executable`` mean what they mean without ROS 2's launch: what
+I/O; imports ROS 2's ``launch``. ``package`` and ``executable`` mean what they mean without ROS 2's launch: what
 ``ros2 run`` would start, else the Python module ``PACKAGE.EXECUTABLE`` (``resolve``).
 Source: launch_ros 0.26.6 (jazzy): ``actions/node.py``.
 """

@@ -1,6 +1,6 @@
 """``python -m fog.launch.run PACKAGE EXECUTABLE ...``: become a node, found on the machine where this runs.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations

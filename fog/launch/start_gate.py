@@ -1,6 +1,6 @@
 """``python -m fog.launch.start_gate GATE -- COMMAND ...``: become a command once a cluster serves.
 
-Place: shell. The gate is a file that the launch keeps locked until the cluster serves; a lock goes with its process, so
+I/O. The gate is a file that the launch keeps locked until the cluster serves; a lock goes with its process, so
 that nobody waits for a launch that was killed.
 """
 

@@ -1,6 +1,6 @@
 """Clusters that a launch file makes and does not return, as the paper's Listing 1 does.
 
-Shell: reads the call stack and sets the class of a launch file's module. A launch file that is loaded under watch has a
+I/O: reads the call stack and sets the class of a launch file's module. A launch file that is loaded under watch has a
 list of the clusters made while it ran; when ``generate_launch_description`` returns, those to which nothing
 refers, the description least of all, are put into it, before the first entity that is not a setting.
 

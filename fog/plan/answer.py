@@ -1,6 +1,6 @@
 """What ``fog plan`` answers: pool, choice and price in one, with everything that was assumed on the way.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations

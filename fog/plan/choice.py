@@ -1,6 +1,6 @@
 """Which offer for which replica: by price and measured latency, in different regions where that can be had.
 
-Place: pure. Money and milliseconds are made comparable by one number that people can set: what a millisecond is worth.
+Sans-I/O. Money and milliseconds are made comparable by one number that people can set: what a millisecond is worth.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The same where machines in one region fail together more often than independence says.
 
-Place: pure; numbers in, numbers out.
+Sans-I/O; numbers in, numbers out.
 Model: of machines in one region, the first is down with its own chance, and each further one ``factor`` times as often
 as alone while those before it are down: P = p1 * min(1, factor * p2) * min(1, factor * p3) * ... Different regions
 multiply. With the largest factor of a pair this lies above what three machines did in the traces that it was measured

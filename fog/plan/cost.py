@@ -1,6 +1,6 @@
 """What a set-up costs, by the hour and the month, beside others: the form of the paper's Table I.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Spans of time as people write them: ``15h``, ``20min``, ``90s``.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations

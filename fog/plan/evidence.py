@@ -1,6 +1,6 @@
 """What was measured of spot machines in recorded traces: how long they stay, and how they fail together.
 
-Place: pure.
+Sans-I/O.
 
 Which share of time two zones are *both* without machines says little when that is the normal state of each: no ratio to
 independence can exceed one over the larger share. The factor is therefore taken over the rarer state, here "a machine

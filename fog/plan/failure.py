@@ -1,6 +1,6 @@
 """How many replicas buy the wanted availability, if machines fail independently.
 
-Place: pure; numbers in, numbers out.
+Sans-I/O; numbers in, numbers out.
 Source: FogROS2-FT, the section on spot machines. P_VM = recovery / (uptime + recovery), P_system = product of all P_i,
 N = ceil(log P_system / log P_VM). The paper prints the ratio of logarithms upside down; this form follows from its own
 product formula and gives its worked figure (15 h up, 20 min to recover: two spot machines are under 0.05 %).

@@ -1,6 +1,6 @@
 """Pools of different machines: how many of which kind reach a target for the least money, given some that run already.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A pool that reaches a target, under each assumption that can be made about failing together.
 
-Place: pure. It answers with several numbers, because the data decide between them for nobody: machines that fail
+Sans-I/O. It answers with several numbers, because the data decide between them for nobody: machines that fail
 independently, and machines of one region that fail together as often as the worst pair in the recorded traces.
 """
 

@@ -1,6 +1,6 @@
 """What a recorded trace of spot machines says: how long they stay, how they fail together, how a pool would have done.
 
-Place: pure; chance comes in as a ``numpy`` generator.
+Sans-I/O; chance comes in as a ``numpy`` generator.
 Source of the format: the traces published with "Can't Be Late: Optimizing Spot Instance Savings under Deadlines"
 (NSDI 2024); its simulator takes 1 as "no spot machine to be had", and so does this.
 """

@@ -1,6 +1,6 @@
 """What a rented machine is told at its first start: the files of its boot, and a service that installs and runs it.
 
-Place: pure.
+Sans-I/O.
 Source: cloud-init's "cloud config" format (modules write_files, packages, runcmd), systemd.service(5); Amazon EC2
 takes at most 16 KiB of user data, before base64, and cloud-init reads it gzipped.
 

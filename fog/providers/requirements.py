@@ -1,6 +1,6 @@
 """Requirements of a machine: what pip installs on it, each pinned by version and hash.
 
-Place: pure, but for ``read_requirements``, which reads one file.
+Sans-I/O, but for ``read_requirements``, which reads one file.
 Source: pip's "Secure installs" and "Requirements File Format". What pip installs runs beside a machine's keys, so
 nothing is taken from an index by its name alone: pip is called with ``--require-hashes``, which also refuses a
 dependency that is not listed.

@@ -1,6 +1,6 @@
 """``ros2 launch``: every launch file that it runs may make a ``FogCluster`` without returning it.
 
-Command; imported by ros2launch through the entry point ``ros2launch.option``, before it loads a launch file.
+I/O; imported by ros2launch through the entry point ``ros2launch.option``, before it loads a launch file.
 Source: ros2launch 0.26 (jazzy), ``ros2launch.option``.
 """
 

@@ -1,6 +1,6 @@
 """The verbs of ``ros2 fog``: each hands its words to the ``fog`` command, so that both are one.
 
-Place: command; imported by ros2cli through the entry points ``ros2cli.extension_point`` and ``fog.verb``.
+I/O; imported by ros2cli through the entry points ``ros2cli.extension_point`` and ``fog.verb``.
 Source: ros2cli 0.32 (jazzy), ``ros2cli.plugin_system``.
 """
 

@@ -1,6 +1,6 @@
 """What a provider is asked to do, each in a thread of its own, so that no slow one keeps the supervisor from looking.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """One supervisor a site, in the background: started where none lives, known by a lock that the kernel ends with it.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations

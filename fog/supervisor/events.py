@@ -1,6 +1,6 @@
 """What happened to a machine, from what was known of it before and is now: the lines of ``fog status --events``.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations

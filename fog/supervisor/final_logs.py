@@ -1,6 +1,6 @@
 """What the programs of a machine that was lost said last: a provider forgets that with the machine.
 
-Place: shell; asks the provider.
+I/O; asks the provider.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What a site's clusters stand on: the provider, and on this machine its network and the robot's own side.
 
-Place: shell. All of it outlives the command that made it, is found again by records in the state folder, and ends with
+I/O. All of it outlives the command that made it, is found again by records in the state folder, and ends with
 ``fall``.
 """
 

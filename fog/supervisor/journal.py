@@ -1,6 +1,6 @@
 """The journal: what is wanted, which machines there are, and what happened, in one SQLite file.
 
-Place: I/O. An intention is written before the act; whatever dies in between, the next look finds the machine by name.
+I/O. An intention is written before the act; whatever dies in between, the next look finds the machine by name.
 Commands write what is wanted, the supervisor everything else; both may have the file open at once.
 """
 

@@ -1,6 +1,6 @@
 """Where the next machine is to be: the best of what is offered, away from the others and from where one was just lost.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations

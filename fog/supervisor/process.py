@@ -1,6 +1,6 @@
 """The process that is a site's supervisor: what it is made of, its signals, its end.
 
-Place: shell. Apart from ``background``, for what it imports takes longer than most commands need in all.
+I/O. Apart from ``background``, for what it imports takes longer than most commands need in all.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What to do next, from what is wanted and what there is.
 
-Place: pure. The same question may be asked at any time, and after any crash: the answer follows from the records alone.
+Sans-I/O. The same question may be asked at any time, and after any crash: the answer follows from the records alone.
 A machine that serves is let go only when as many others as are wanted serve, or when its time is over anyway.
 """
 

@@ -1,6 +1,6 @@
 """What the journal knows of one machine, and how it learns from what is seen of it.
 
-Place: pure; time comes in as ``now_s``, seconds since 1970: a journal outlives every monotonic clock.
+Sans-I/O; time comes in as ``now_s``, seconds since 1970: a journal outlives every monotonic clock.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Who serves, as the overlay itself tells: a light member beside the robot's switch that would call every service.
 
-Place: shell; a thread of its own drives it. It asks nothing and is answered nothing; of an action's feedback it hears
+I/O; a thread of its own drives it. It asks nothing and is answered nothing; of an action's feedback it hears
 what any client does. Whom it hears, the robot's proxy hears as well: both learn it from the same switch and RIB.
 """
 

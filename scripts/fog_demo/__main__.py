@@ -1,6 +1,6 @@
 """``python -m fog_demo``.
 
-Place: shell. Importing takes a second, in which nothing has been made yet: Ctrl-C then simply ends the process.
+I/O. Importing takes a second, in which nothing has been made yet: Ctrl-C then simply ends the process.
 """
 
 import os

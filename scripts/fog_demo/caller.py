@@ -1,6 +1,6 @@
 """A robot's node that calls ``/echo`` at a rate and counts what comes back, as lines of JSON.
 
-Place: shell; needs rclpy. Parameters: ``rate_hz``; ``calls``: how many in all, 0: until Ctrl-C; ``timeout_s``: when a
+I/O; needs rclpy. Parameters: ``rate_hz``; ``calls``: how many in all, 0: until Ctrl-C; ``timeout_s``: when a
 call counts as failed; ``report_s``: how often a line is written; ``depth``: how many answers may wait for this node
 (ROS 2 has 10, and drops more; after an outage all calls under way are answered at once). SIGUSR1: it calls no more, and
 ends when the calls under way have. A line is ``{"calls", "answered", "failed", "wrong", "unserved", "under_way",

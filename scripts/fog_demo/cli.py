@@ -1,6 +1,6 @@
 """``python -m fog_demo``, which ``scripts/fog_demo.sh`` runs once everything is set up.
 
-Place: shell. Exit codes: 0 nothing failed, 1 something did, 2 wrong input, 130 and 143 for Ctrl-C and SIGTERM.
+I/O. Exit codes: 0 nothing failed, 1 something did, 2 wrong input, 130 and 143 for Ctrl-C and SIGTERM.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A ROS service that keeps state, as ``docs/how-to/state.md`` asks: ``/count``, ``std_srvs/srv/SetBool``.
 
-Place: shell; needs rclpy. A request with ``data: true`` adds one; the answer's message is the count. The node's
+I/O; needs rclpy. A request with ``data: true`` adds one; the answer's message is the count. The node's
 parameter ``state``, a byte array, is the count as eight bytes: who reads it has the state, who writes it restores it.
 """
 

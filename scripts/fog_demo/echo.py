@@ -1,6 +1,6 @@
 """A ROS service that tells which machine answered: ``/echo``, ``std_srvs/srv/SetBool``.
 
-Place: shell; needs rclpy. The answer is {success: what was asked, message: the machine}, which the environment's
+I/O; needs rclpy. The answer is {success: what was asked, message: the machine}, which the environment's
 ``FOG_MACHINE`` names. Parameter ``delay_s``: how long an answer takes.
 """
 

@@ -1,6 +1,6 @@
 """What happens in the demonstration: requests flow, one machine is preempted, the other one killed, nothing fails.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Where the demonstration takes place: a ring of five switches, the robot at nuc1, a site of ``fog`` beyond nuc5.
 
-Place: shell; makes namespaces, keys and files, all of one run.
+I/O; makes namespaces, keys and files, all of one run.
 ::
 
     caller -- proxy -- nuc1 -- nuc2 -- nuc3 (RIB) -- nuc4 -- nuc5 -- gateway --+-- m1

@@ -1,6 +1,6 @@
 """What the demonstration shows while it goes on: in a terminal a table that moves, elsewhere plain lines.
 
-Place: shell; prints. What a page says is made of records, events and counts alone.
+I/O; prints. What a page says is made of records, events and counts alone.
 """
 
 from __future__ import annotations

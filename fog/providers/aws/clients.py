@@ -1,6 +1,6 @@
 """One EC2 client for each region, made when it is first asked for; boto3 finds credentials its own way.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations

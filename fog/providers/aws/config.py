@@ -1,6 +1,6 @@
 """The settings of provider ``aws``: regions, image, network, and who may log in. Credentials are boto3's own affair.
 
-Place: pure.
+Sans-I/O.
 Source: Debian's images are published by account 136693071363 (wiki.debian.org/Cloud/AmazonEC2Image).
 """
 

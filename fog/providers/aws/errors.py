@@ -1,6 +1,6 @@
 """What an error of EC2 means for who asked: try again or elsewhere, or it will never be had this way.
 
-Place: shell; waits for nothing itself.
+I/O; waits for nothing itself.
 Source: "Error codes for the Amazon EC2 API" of the EC2 API reference.
 """
 

@@ -1,6 +1,6 @@
 """An EC2 instance, and its spot request, as a machine; the tags that make this possible without a journal.
 
-Place: pure.
+Sans-I/O.
 Source: EC2 user guide, "Instance lifecycle" and "Spot request status": a spot instance is marked for termination two
 minutes before it ends. Tag keys are of the characters that instance metadata shows.
 """

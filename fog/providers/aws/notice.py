@@ -1,6 +1,6 @@
 """A program of every EC2 machine: it watches the instance's metadata, and tells ``fog-machine`` that it is to leave.
 
-Place: shell; asks the instance metadata service (version 2) every few seconds, for it cannot be waited on.
+I/O; asks the instance metadata service (version 2) every few seconds, for it cannot be waited on.
 Source: EC2 user guide, "Spot Instance interruption notices" (two minutes before; look every five seconds; 404 where
 there is none) and "Use IMDSv2"; 169.254.169.254 is where it listens on every instance.
 

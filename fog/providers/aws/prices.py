@@ -1,6 +1,6 @@
 """What spot machines of a region cost now.
 
-Place: shell; asks EC2 and the clock.
+I/O; asks EC2 and the clock.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Machines of Amazon EC2, on demand and spot.
 
-Place: shell; asks EC2, several regions at once.
+I/O; asks EC2, several regions at once.
 Source: EC2 API reference (RunInstances, "Ensuring idempotency"), EC2 user guide ("Spot Instance interruption notices").
 
 All that must outlast a restart stands in the tags of the instances. A spot machine is a one-time request that ends

@@ -1,6 +1,6 @@
 """What a region must hold before a machine can stand there: an image, a subnet, a security group.
 
-Place: shell; asks EC2, and makes a security group where none fits.
+I/O; asks EC2, and makes a security group where none fits.
 The group's name says what it lets in, so one made for other settings is never widened. It holds no run's name and is
 not removed: it costs nothing, and the next cluster takes it.
 """

@@ -1,6 +1,6 @@
 """What is asked of EC2 for one machine.
 
-Place: pure.
+Sans-I/O.
 Source: EC2 API reference, RunInstances and "Ensuring idempotency"; EC2 user guide, "Configure the instance metadata
 service" (IMDSv2 and its hop limit) and "Amazon EBS encryption".
 """

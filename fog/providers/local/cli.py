@@ -1,6 +1,6 @@
 """``fog local``: what can befall a local machine, by hand.
 
-Place: command; the application that registers it says where the records are.
+I/O; the application that registers it says where the records are.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A link that takes longer: what arrives on one device leaves on the other, and the reverse, so much later.
 
-Place: shell; two AF_PACKET sockets, hence CAP_NET_RAW. Run as ``python -m fog.providers.local.delay DEVICE DEVICE MS``.
+I/O; two AF_PACKET sockets, hence CAP_NET_RAW. Run as ``python -m fog.providers.local.delay DEVICE DEVICE MS``.
 It begins when a line comes on its standard input (see ``begin``), and ends when a device goes. It stands where netem
 would, which not every kernel has; a frame costs it about 20 us, so it carries some ten thousand a second.
 Source: packet(7); Linux, include/uapi/linux/if_packet.h and include/uapi/asm-generic/socket.h for the numbers.

@@ -1,6 +1,6 @@
 """What can befall a local machine: notice, death, a stop, a slow processor, a late link.
 
-Place: shell; for tests, demonstrations and experiments. Each function takes the site's records and a machine's id, or
+I/O; for tests, demonstrations and experiments. Each function takes the site's records and a machine's id, or
 its name where only one is called so, and raises ``LocalError`` where there is no such machine.
 """
 

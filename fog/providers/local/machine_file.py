@@ -1,6 +1,6 @@
 """What the provider keeps of a local machine: ``machine.json`` in the folder of its run.
 
-Place: the file system; times come in as arguments.
+I/O: the file system; times come in as arguments.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A local machine as it is found on disk: where everything of it is, and how it is.
 
-Place: shell; it reads, and changes nothing.
+I/O; it reads, and changes nothing.
 """
 
 from __future__ import annotations

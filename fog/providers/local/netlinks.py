@@ -1,6 +1,6 @@
 """The devices between machines, gateways and the robot.
 
-Place: shell; needs CAP_NET_ADMIN in the namespaces it works in. One gateway's namespace, with two machines::
+I/O; needs CAP_NET_ADMIN in the namespaces it works in. One gateway's namespace, with two machines::
 
     up ---- towards the robot          to-LABEL ---- towards a gateway behind this one
 

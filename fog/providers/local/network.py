@@ -1,6 +1,6 @@
 """The gateways of a site: namespaces joined to the robot and to each other as a tree.
 
-Place: shell; needs root of the machine or of a user namespace. All of it is one kept run; ``network.json`` in its
+I/O; needs root of the machine or of a user namespace. All of it is one kept run; ``network.json`` in its
 folder tells which. A dedicated gateway has a switch in its namespace. A replica gateway has two bridges there: the
 switch is that of a machine, which ``provider.py`` connects with both.
 """

@@ -1,6 +1,6 @@
 """Machines on this one: each a network namespace with an address, a process group, bounds and programs of its own.
 
-Place: shell; needs root of the machine or of a user namespace. A machine is a kept run (``gdp.host.run_registry``) with
+I/O; needs root of the machine or of a user namespace. A machine is a kept run (``gdp.host.run_registry``) with
 ``machine.json`` in its folder: all that is known lies there, so that whoever comes later, or after a crash, finds it.
 They live on when their creator is killed, as machines elsewhere do.
 """

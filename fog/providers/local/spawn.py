@@ -1,6 +1,6 @@
 """Starting what outlives its starter, without a moment in which nobody knows of it.
 
-Place: shell. The process waits for one line on its standard input, which it is sent only when the run's record names it
+I/O. The process waits for one line on its standard input, which it is sent only when the run's record names it
 and the record is kept; if its starter dies before, it reads the end of its input instead, and ends.
 """
 

@@ -1,6 +1,6 @@
 """The settings of provider ``skypilot``: where to look, and what a machine installs.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations

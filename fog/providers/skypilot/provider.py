@@ -1,6 +1,6 @@
 """Machines of any cloud that SkyPilot knows: each is a SkyPilot cluster of one node.
 
-Place: shell; asks SkyPilot's API server, which it starts where there is none, through the package of PyPI.
+I/O; asks SkyPilot's API server, which it starts where there is none, through the package of PyPI.
 Source: SkyPilot 0.14 (docs.skypilot.co, "Python SDK"); prices are its catalogue's, which it loads when first asked.
 
 SkyPilot keeps its own records beside the API server; the labels of a machine say the rest. It gives no notice before

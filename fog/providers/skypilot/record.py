@@ -1,6 +1,6 @@
 """A machine as SkyPilot's records tell it: one cluster of one node, its labels, its state.
 
-Place: pure.
+Sans-I/O.
 Source: SkyPilot 0.14, ``ClusterStatus`` and ``StatusResponse``. Some clouds allow only small letters, digits, ``-`` and
 ``_`` in a label, at most 63, so what is not of that form is written in hexadecimal digits, and prices in millionths.
 """
