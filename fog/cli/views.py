@@ -1,6 +1,6 @@
 """Views of clusters, machines and events: tables for people, JSON for programs.
 
-I/O; pure but for the printing.
+I/O: prints. The views themselves are computed without I/O.
 """
 
 from __future__ import annotations
