@@ -70,7 +70,7 @@ class ClusterPlan:
         idle_s: after this long without a call all machines are released; None: never.
         budget_usd: when its machines have cost this much, they are released; None: no limit.
         availability: share of time for which at least one machine is to serve; ``fog launch`` adds as many machines as
-                    that needs. None: ``machines`` is the full list.
+            that needs. None: ``machines`` is the full list.
     """
 
     name: str

@@ -50,7 +50,7 @@ def enrol(home: Path, *, patience_s: float = _PATIENCE_S) -> bool:
 
     Raises:
         LocalError: the ticket is invalid; the responder refuses it; no response arrives within ``patience_s``; or the
-                    response does not match the machine's keys.
+            response does not match the machine's keys.
     """
     path = home / TICKET_FILE
     if not path.exists():

@@ -29,13 +29,13 @@ class FogCluster:
         replicas: at least this many machines, in different regions; None: 2, or as many as ``deployments`` has.
         services, actions, topics: full name -> type of the interfaces that the nodes offer to the robot. Without any of
             the
-                    three, services and actions are discovered: the nodes run once on this machine, in a separate graph.
+            three, services and actions are discovered: the nodes run once on this machine, in a separate graph.
         replication: ``"all"``, ``"some"`` or ``"hedged"``, or the rule's map; None: all replicas receive each request.
         timeout_s: time limit of a response; None: the proxy's 5 s.
         idle: after this long without a call (seconds, or a text such as ``"30min"``) the machines are released.
         budget_usd: when the machines have cost this much they are released.
         availability: share of time for which at least one machine is to serve, such as 0.9995, instead of ``replicas``:
-                    ``fog launch`` adds copies of the listed machines until it is reached, and prints its assumptions.
+            ``fog launch`` adds copies of the listed machines until it is reached, and prints its assumptions.
         keep: leave the cluster running when the launch ends.
 
     Raises:

@@ -69,7 +69,7 @@ def load(path: Path, arguments: Mapping[str, str], probe: Probe | None = None) -
 
     Args:
         probe: discovers interfaces (``fog.launch.interface_discovery.offered``) if the file lists none; None: no
-                    discovery.
+            discovery.
 
     Raises:
         ConfigError: the file is missing, is not Python, or fails; the text names the line.
