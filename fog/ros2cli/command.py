@@ -1,4 +1,4 @@
-"""The command ``fog`` of ``ros2``.
+"""Command ``fog`` of ``ros2``.
 
 I/O; imported by ros2cli through the entry point ``ros2cli.command``.
 Source: ros2cli 0.32 (jazzy), ``ros2cli.command``.

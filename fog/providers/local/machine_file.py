@@ -1,6 +1,6 @@
 """Record of a local machine: ``machine.json`` in the folder of its run.
 
-I/O: the file system; times come in as arguments.
+I/O: the file system; times are arguments.
 """
 
 from __future__ import annotations
