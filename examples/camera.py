@@ -1,5 +1,8 @@
-"""Publisher of 30 images a second, and a subscriber that shows their arrival: ``camera.py send robot/proxy``,
-``camera.py show server/proxy``."""
+"""Publisher of 30 images a second, and a subscriber that shows their arrival.
+
+python examples/camera.py send robot/proxy
+python examples/camera.py show server/proxy
+"""
 
 import asyncio
 import os

@@ -18,7 +18,7 @@ __all__ = ["CloudNode", "ClusterPlan", "ExportedInterface", "MachineRequest"]
 
 @dataclass(frozen=True, slots=True)
 class CloudNode:
-    """A ROS node that runs on every machine of the cluster.
+    """ROS node that runs on every machine of the cluster.
 
     Args:
         package, executable: as ``ros2 run`` takes them; without such an installed package, the Python module
@@ -34,7 +34,7 @@ class CloudNode:
 
 @dataclass(frozen=True, slots=True)
 class ExportedInterface:
-    """A service, action or topic that the cluster's nodes offer to the robot.
+    """Service, action or topic that the cluster's nodes offer to the robot.
 
     Args:
         type_name: in the notation of ROS 2.
@@ -51,7 +51,7 @@ class ExportedInterface:
 
 @dataclass(frozen=True, slots=True)
 class MachineRequest:
-    """One replica's machine.
+    """Request for the machine of one replica.
 
     Args:
         region: empty: chosen by the supervisor, a different one for each machine if possible.
@@ -64,7 +64,7 @@ class MachineRequest:
 
 @dataclass(frozen=True, slots=True)
 class ClusterPlan:
-    """A cluster.
+    """Plan of a cluster.
 
     Args:
         idle_s: after this long without a call all machines are released; None: never.

@@ -47,8 +47,7 @@ def run(nodes: Sequence[Started], logs: Path) -> int:
 
     Args:
         logs: folder for the output of nodes that do not print to the terminal. Their errors appear in the terminal, as
-            with
-            ``ros2 launch``.
+            with ``ros2 launch``.
 
     Raises:
         LocalError: a node cannot be started.

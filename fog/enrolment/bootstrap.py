@@ -1,7 +1,7 @@
 """Bootstrap bundles of a cluster's machines, of gateways and of the robot's side: their files and programs.
 
-I/O, through ``members``. A machine's bundle contains no key, only the ticket with which the machine enrols.
-Every file refers to others by relative paths, so a bundle works in any folder.
+I/O, through ``members``. A machine's bundle contains no key, only the ticket with which the machine enrols. Every file
+refers to others by relative paths, so a bundle works in any folder.
 ::
 
     machine   [node ...] -- ROS graph of its own -- [proxy] -- [leaf] -- iface          towards the gateway

@@ -42,7 +42,7 @@ def _reachable(text: str) -> str:
 
 
 class EnrolmentConfig(Section):
-    """How rented machines enrol."""
+    """Section ``enrolment:`` of ``fog.yaml``."""
 
     address: Annotated[str, AfterValidator(_reachable)] | None = Field(
         default=None,

@@ -65,7 +65,7 @@ def _readable(text: str) -> str:
 
 
 class LatencyConfig(Section):
-    """How latency is measured."""
+    """Section ``latency:`` of ``fog.yaml``."""
 
     endpoints: Mapping[str, Annotated[str, AfterValidator(_readable)]] = Field(
         default_factory=dict,

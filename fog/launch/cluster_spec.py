@@ -122,8 +122,7 @@ class ClusterSpec:
         )
 
     def carry(self, kind_name_type: Sequence[tuple[str, str, str]]) -> tuple[ExportedInterface, ...]:
-        """Return discovered interfaces, given as (kind, name, type), with the keys that the launch file sets for
-        all."""
+        """Return interfaces, given as (kind, name, type), with the keys that the launch file sets for all."""
         return tuple(
             each
             for kind, name, type_name in kind_name_type

@@ -28,8 +28,7 @@ class FogCluster:
             executable.
         replicas: at least this many machines, in different regions; None: 2, or as many as ``deployments`` has.
         services, actions, topics: full name -> type of the interfaces that the nodes offer to the robot. Without any of
-            the
-            three, services and actions are discovered: the nodes run once on this machine, in a separate graph.
+            the three, services and actions are discovered: the nodes run once on this machine, in a separate graph.
         replication: ``"all"``, ``"some"`` or ``"hedged"``, or the rule's map; None: all replicas receive each request.
         timeout_s: time limit of a response; None: the proxy's 5 s.
         idle: after this long without a call (seconds, or a text such as ``"30min"``) the machines are released.

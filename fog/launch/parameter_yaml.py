@@ -1,8 +1,8 @@
 """Parser of parameter YAML: one document of bounded size, without aliases.
 
 Sans-I/O.
-Source: rcl_yaml_param_parser, which refuses aliases too ("Will not support aliasing"). With aliases, a few
-hundred bytes can expand to gigabytes. Events are checked before any object is built.
+Source: rcl_yaml_param_parser, which refuses aliases too ("Will not support aliasing"). With aliases, a few hundred
+bytes can expand to gigabytes. Events are checked before any object is built.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Command-line arguments for a node's name, remappings and parameters, which need no files on the machine.
 
 Sans-I/O.
-Source: https://design.ros2.org/articles/ros_command_line_arguments.html; parameter files in the
-format of rcl_yaml_param_parser (sections of nodes that contain ``ros__parameters``).
+Source: https://design.ros2.org/articles/ros_command_line_arguments.html; parameter files in the format of
+rcl_yaml_param_parser (sections of nodes that contain ``ros__parameters``).
 """
 
 from __future__ import annotations

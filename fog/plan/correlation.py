@@ -35,8 +35,7 @@ def joint_in_one_region(chances: Iterable[float], factor: float) -> float:
 
 
 def joint_over_regions(chances: Mapping[str, Iterable[float]], factor: float) -> float:
-    """Return the chance that all machines are down at once, given the chances of each region; regions are
-    independent."""
+    """Return the chance that all machines are down at once; different regions are independent."""
     return joint(joint_in_one_region(each, factor) for each in chances.values())
 
 

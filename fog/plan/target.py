@@ -1,7 +1,7 @@
 """Machines for a target availability, from the machines that a launch file lists.
 
-Sans-I/O. Source: FogROS2-FT, the section on spot machines; ``failure`` has the formula, and ``correlation``
-its extension for machines that share a region.
+Sans-I/O. Source: FogROS2-FT, the section on spot machines; ``failure`` has the formula, and ``correlation`` its
+extension for machines that share a region.
 """
 
 from __future__ import annotations

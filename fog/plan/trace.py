@@ -83,8 +83,7 @@ def times_independent(*steps: Steps) -> float:
 
 
 def replica_down(trace: Trace, recovery_s: float) -> Steps:
-    """Return the steps in which a replica fixed to its zone does not serve: no machine, or ``recovery_s`` after
-    that."""
+    """Return the steps in which a replica fixed to its zone is down: without a machine, and ``recovery_s`` longer."""
     late = _steps(trace, recovery_s)
     down: Steps = trace.taken.copy()
     for back in np.flatnonzero(trace.taken[:-1] & ~trace.taken[1:]) + 1:

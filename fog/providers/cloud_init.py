@@ -5,7 +5,7 @@ Source: cloud-init's "cloud config" format (modules write_files, packages, runcm
 accepts at most 16 KiB of user data, before base64, and cloud-init reads it gzipped.
 
 ``cloud_config`` is for providers that accept user data, ``shell_script`` for those that only run a script as root; both
-produce the same files. The output of programs goes to the journal and the console under their names,
+produce the same files. The output of programs goes to the journal and the console under their names, such as
 ``switch[712]: ...``; ``lines_of`` finds it there. Packages of pip are pinned by hash (``requirements``), because their
 code can reach the machine's keys. A machine whose programs have ended powers itself off.
 """
@@ -105,9 +105,11 @@ WantedBy=multi-user.target
 
 
 class Vxlan(Section):
-    """Layer-2 device through a tunnel to the operator's side. The tunnel is neither encrypted nor authenticated:
-    frames in it are sealed, but a firewall or a VPN below must prevent injected frames. ``remote`` is the address
-    of the other end, ``device`` the name of the tunnel on the machine and the switch's port.
+    """Layer-2 device through a tunnel to the operator's side.
+
+    The tunnel is neither encrypted nor authenticated: frames in it are sealed, but a firewall or a VPN below must
+    prevent injected frames. ``remote`` is the address of the other end as the machine reaches it, ``device`` the name of
+    the tunnel on the machine and of the switch's port.
     """
 
     remote: IPv4Address | IPv6Address
@@ -116,11 +118,12 @@ class Vxlan(Section):
 
 
 class Setup(Section):
-    """Software that a machine installs in addition to its bundle. For pip, each with its hash: ``requirements`` (the
-    wheel of this package, wheels with the nodes, and all dependencies) and the file ``requirements_file``.
-    ``packages`` are packages of the distribution in addition to the required ones. Without ``vxlan``, the devices
-    of the bundle's switch must exist. There is no default for pip, because anyone could register an unused name on
-    an index.
+    """Software that a machine installs in addition to its bundle.
+
+    For pip, each with its hash: ``requirements`` (the wheel of this package, wheels with the nodes, and all
+    dependencies) and the file ``requirements_file``. ``packages`` are packages of the distribution in addition to the
+    required ones. Without ``vxlan``, the devices of the bundle's switch must exist. There is no default for pip, because
+    anyone could register an unused name on an index.
     """
 
     requirements: tuple[Annotated[str, AfterValidator(pinned)], ...] = ()

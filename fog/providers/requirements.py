@@ -1,8 +1,8 @@
 """Requirements of a machine for pip, each pinned by version and hash.
 
 I/O: ``read_requirements`` reads one file. All other functions are sans-I/O.
-Source: pip's "Secure installs" and "Requirements File Format". Installed code can reach a machine's keys, so
-no package is selected by its name alone: pip runs with ``--require-hashes``, which also refuses unlisted dependencies.
+Source: pip's "Secure installs" and "Requirements File Format". Installed code can reach a machine's keys, so no package
+is selected by its name alone: pip runs with ``--require-hashes``, which also refuses unlisted dependencies.
 """
 
 from __future__ import annotations

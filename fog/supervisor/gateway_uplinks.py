@@ -40,7 +40,7 @@ class GatewayUplinks:
             records: of the cluster; records whose role changes are replaced.
 
         Returns:
-                Names of machines that may be unreachable because their gateway is new.
+            Names of machines that may be unreachable because their gateway is new.
         """
         provider = self._actions.provider
         if not isinstance(provider, GatewayProvider):

@@ -1,8 +1,8 @@
 """Limits at which a cluster ends: its budget, and the time without a call.
 
-I/O; reads the journal and the message counters of proxies. For machines on this host, the counters are those
-of the machines' proxies. For other machines, they are the send counters of the robots' proxies; without them a cluster
-counts as used.
+I/O; reads the journal and the message counters of proxies. For machines on this host, the counters are those of the
+machines' proxies. For other machines, they are the send counters of the robots' proxies; without them a cluster counts
+as used.
 """
 
 from __future__ import annotations

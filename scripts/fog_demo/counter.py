@@ -1,7 +1,7 @@
 """ROS service with state, in the form of ``docs/how-to/state.md``: ``/count``, ``std_srvs/srv/SetBool``.
 
-I/O; needs rclpy. A request with ``data: true`` adds one; the response's message is the count. The node's
-parameter ``state``, a byte array, is the count as eight bytes: reading it saves the state, writing it restores it.
+I/O; needs rclpy. A request with ``data: true`` adds one; the response's message is the count. The node's parameter
+``state``, a byte array, is the count as eight bytes: reading it saves the state, writing it restores it.
 """
 
 from __future__ import annotations

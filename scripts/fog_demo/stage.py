@@ -127,8 +127,7 @@ class Stage:
         return self._write("proxy.yaml", content)
 
     def _write_far_switch(self, uplink: str) -> Path:
-        """Write ``switch.yaml`` of the switch towards the machines: an additional port, and the folder of
-        revocations."""
+        """Write ``switch.yaml`` of the far switch, with an additional port and the folder of revocations."""
         path = self._materials.switch(FAR, "auto")
         revocations = self._run.directory / "revocations"
         revocations.mkdir(mode=0o700)

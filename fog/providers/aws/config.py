@@ -28,9 +28,11 @@ class Ssh(Section):
 
 
 class AwsConfig(Section):
-    """``aws:`` of ``fog.yaml``. Without ``regions``, all enabled regions of the account are used. ``images``,
-    ``subnets`` and ``security_groups`` map regions to values. Defaults are the newest image of that owner and name,
-    the default VPC, and a created security group that admits only what ``ssh`` and ``setup.vxlan`` need.
+    """Section ``aws:`` of ``fog.yaml``.
+
+    Without ``regions``, all enabled regions of the account are used. ``images``, ``subnets`` and ``security_groups``
+    map regions to values. Defaults are the newest image of that owner and name, the default VPC, and a created security
+    group that admits only what ``ssh`` and ``setup.vxlan`` need.
     """
 
     regions: tuple[str, ...] = ()

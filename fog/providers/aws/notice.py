@@ -128,7 +128,7 @@ def watch(
     url: Annotated[str, typer.Option(help="Where the metadata service is.")] = METADATA_URL,
     poll_s: Annotated[float, typer.Option(help="Seconds between two looks.")] = POLL_S,
 ) -> None:
-    """Watch until this machine must leave, signal the parent process, and wait for termination."""
+    """Watch until this machine is to leave, tell the process that started this one, and wait to be ended."""
     ended = threading.Event()
     for each in (signal.SIGTERM, signal.SIGINT):
         signal.signal(each, lambda *_: ended.set())

@@ -1,8 +1,8 @@
 """Delay line between two devices: each frame leaves on the other device after a fixed time, in both directions.
 
-I/O; two AF_PACKET sockets, hence CAP_NET_RAW. Run as ``python -m fog.providers.local.delay DEVICE DEVICE MS``.
-It starts when it reads a line on its standard input (see ``spawn``), and ends when a device is removed. It replaces
-netem, which not every kernel has. A frame costs about 20 us, so it carries about ten thousand frames a second.
+I/O; two AF_PACKET sockets, hence CAP_NET_RAW. Run as ``python -m fog.providers.local.delay DEVICE DEVICE MS``. It
+starts when it reads a line on its standard input (see ``spawn``), and ends when a device is removed. It replaces netem,
+which not every kernel has. A frame costs about 20 us, so it carries about ten thousand frames a second.
 Source: packet(7); Linux, include/uapi/linux/if_packet.h and include/uapi/asm-generic/socket.h for the numbers.
 """
 

@@ -1,7 +1,7 @@
 """Fault injection on local machines: preemption notice, kill, freeze, slow processor and delayed link.
 
-I/O; for tests, demonstrations and experiments. Each function takes the site's records and a machine's id or
-unique name, and raises ``LocalError`` if there is no such machine.
+I/O; for tests, demonstrations and experiments. Each function takes the site's records and a machine's id or unique
+name, and raises ``LocalError`` if there is no such machine.
 """
 
 from __future__ import annotations

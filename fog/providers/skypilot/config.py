@@ -14,8 +14,10 @@ __all__ = ["SkyPilotConfig"]
 
 
 class SkyPilotConfig(Section):
-    """``skypilot:`` of ``fog.yaml``. ``places`` are SkyPilot's ``infra``, each a cloud and a region: the regions of
-    this provider. SkyPilot manages clouds, credentials and images (``sky check``).
+    """Section ``skypilot:`` of ``fog.yaml``.
+
+    ``places`` are SkyPilot's ``infra``, each a cloud and a region: the regions of this provider. SkyPilot manages
+    clouds, credentials and images (``sky check``).
     """
 
     places: tuple[str, ...] = Field(default=("aws/us-east-1", "aws/us-west-2"), min_length=1)
