@@ -63,7 +63,7 @@ def the_cluster(journal: Journal, name: str | None) -> Cluster:
     """Return the named cluster, or the only one that is up.
 
     Raises:
-        LocalError: there is none, or it is not clear which.
+        LocalError: there is none, or several are up and none is named.
     """
     if name is not None:
         return journal.cluster(name)

@@ -89,7 +89,7 @@ def _end(processes: Sequence[subprocess.Popen[bytes]]) -> None:
 
 
 def _await(processes: Sequence[subprocess.Popen[bytes]], patience_s: float) -> bool:
-    """Return whether all have ended within ``patience_s``, each."""
+    """Return whether all have ended; each may take ``patience_s`` seconds."""
     try:
         for process in processes:
             process.wait(patience_s)

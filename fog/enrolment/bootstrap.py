@@ -50,7 +50,7 @@ _OFTEN: Final = b"""<?xml version="1.0" encoding="UTF-8"?>
   <leaseAnnouncement><sec>0</sec><nanosec>250000000</nanosec></leaseAnnouncement>
  </discovery_config></builtin></rtps></participant>
 </profiles></dds>
-"""  # a node's first announcements are often missed where nodes start together; the next would come after 3 s
+"""  # nodes that start together often miss the first announcements; the next would follow after 3 s
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ class FogCluster:
     Constructing it in a launch file is enough; the launch description need not contain it.
 
     Args:
-        cloud_nodes: ``Node`` each.
+        cloud_nodes: list of ``Node``.
         deployments: one machine for each replica.
         name: name of the cluster for ``fog scale NAME`` and other verbs; empty: the name of the first node's
             executable.

@@ -1,11 +1,11 @@
 """Tracking of clusters that a launch file constructs and does not return, as in the paper's Listing 1.
 
 I/O: reads the call stack and sets the class of a launch file's module. A watched launch file has a list of the clusters
-constructed while it ran. When ``generate_launch_description`` returns, clusters without any reference, from the
-description or elsewhere, are inserted into it before the first entity that is not a setting.
+constructed while it ran. When ``generate_launch_description`` returns, clusters without any reference are inserted into
+the description, before the first entity that is not a setting.
 
 Under ROS 2's launch, ``watch_ros_launch`` watches every launch file. It wraps the one function of launch 3.4 that runs
-launch files, and finds the launch file that runs at this moment, which is the one that imports ``fog``.
+launch files. It also finds the launch file that runs at this moment, which is the one that imports ``fog``.
 Source: FogROS2-FT, Listing 1; launch 3.4.3 ``python_launch_file_utilities.py``.
 """
 

@@ -108,8 +108,8 @@ class Vxlan(Section):
     """Layer-2 device through a tunnel to the operator's side.
 
     The tunnel is neither encrypted nor authenticated: frames in it are sealed, but a firewall or a VPN below must
-    prevent injected frames. ``remote`` is the address of the other end as the machine reaches it, ``device`` the name of
-    the tunnel on the machine and of the switch's port.
+    prevent injected frames. ``remote`` is the address of the other end as the machine reaches it. ``device`` is the
+    name of the tunnel on the machine: the switch's port.
     """
 
     remote: IPv4Address | IPv6Address
@@ -122,8 +122,8 @@ class Setup(Section):
 
     For pip, each with its hash: ``requirements`` (the wheel of this package, wheels with the nodes, and all
     dependencies) and the file ``requirements_file``. ``packages`` are packages of the distribution in addition to the
-    required ones. Without ``vxlan``, the devices of the bundle's switch must exist. There is no default for pip, because
-    anyone could register an unused name on an index.
+    required ones. Without ``vxlan``, the devices of the bundle's switch must exist. There is no default for pip,
+    because anyone could register an unused name on an index.
     """
 
     requirements: tuple[Annotated[str, AfterValidator(pinned)], ...] = ()

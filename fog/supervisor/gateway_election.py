@@ -36,8 +36,7 @@ class Election:
 def elect(group: Sequence[Record], label: str, now_s: float, patience: Timeouts) -> Election | None:
     """Return the due change of a group's gateway; None: no change, or no machine can be the gateway.
 
-    The election prefers, in this order, machines that are up, that are reachable, that were not the gateway before,
-    that are not spot machines, and that are older.
+    Criteria in this order: up, reachable, not the gateway before, not a spot machine, older.
 
     Args:
         group: machines of this gateway, of all clusters. Machines that are gone only explain a change.

@@ -65,7 +65,7 @@ class Outcome:
 
     @property
     def ack(self) -> str:
-        """Return the last line."""
+        """Return the last line of the output."""
         return f"{self.counts.failed} failed of {self.counts.requests} requests"
 
 

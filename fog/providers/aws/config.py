@@ -31,8 +31,8 @@ class AwsConfig(Section):
     """Section ``aws:`` of ``fog.yaml``.
 
     Without ``regions``, all enabled regions of the account are used. ``images``, ``subnets`` and ``security_groups``
-    map regions to values. Defaults are the newest image of that owner and name, the default VPC, and a created security
-    group that admits only what ``ssh`` and ``setup.vxlan`` need.
+    map regions to values. Defaults are the newest image of that owner and name, the default VPC, and a new security
+    group. The group admits only what ``ssh`` and ``setup.vxlan`` need.
     """
 
     regions: tuple[str, ...] = ()
