@@ -1,4 +1,4 @@
-"""The benches of replicas and of healing run: a short round of each, whose figures nobody looks at."""
+"""Benches of replicas and of recovery: a short round of each; the figures are not checked."""
 
 from __future__ import annotations
 

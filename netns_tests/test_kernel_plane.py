@@ -1,4 +1,4 @@
-"""The kernel plane on real devices: that every frame is accounted for, and what it leaves to Python."""
+"""Kernel plane on real devices: every frame is accounted for, and the frames it leaves to Python."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def filled(entries: dict[bytes, Hops] = ENTRIES) -> Table:
 
 
 def settle(plane: KernelPlane, taken: int) -> int:
-    """Poll until the plane took this many frames since it was made; return how many were handed up."""
+    """Poll until the plane took this many frames since it was made; return how many were punted."""
     deadline_s = time.monotonic() + PATIENCE_S
     punted = 0
     while plane.counters.frames_in < taken or plane._epoll.poll(0):

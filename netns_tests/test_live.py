@@ -72,7 +72,7 @@ def pair() -> Iterator[Pair]:
 
 
 def node_of(pair: Pair, graph: str, name: str = "") -> Peer:
-    """Return a ROS 2 node with what the tests use."""
+    """Return a ROS 2 node with the helpers of the tests."""
     node = pair.node(graph, name)
     node.tell("!" + _ROS2)
     return node
@@ -200,7 +200,7 @@ def test_what_two_nodes_latched_in_one_topic_reaches_a_late_reassembler(a: Peer,
 
 
 def said(node: Peer) -> list[int]:
-    """Return the numbers that were heard."""
+    """Return the numbers that were received."""
     numbers = node.tell("[int(text) for text, in heard['/twice']]")
     assert isinstance(numbers, list)
     return numbers
@@ -221,7 +221,7 @@ def test_of_two_proxies_in_one_graph_one_carries_and_the_other_takes_over(a: Pee
     assert [number for number in said(b) if number] == list(range(1, 101))
     carrier = b.tell("[i.node_name for i in node.get_publishers_info_by_topic('/twice')]")
     first = next(proxy for proxy in proxies if carrier == [proxy.node_name])
-    first.end()  # one that is killed stays in the graph for the lease of its DDS participant, 20 s
+    first.end()  # a killed node stays in the graph for the lease of its DDS participant, 20 s
     try:
         until(lambda: say(a, 101, 102) or 101 in said(b), "/twice by the other")
         say(a, 102, 201)

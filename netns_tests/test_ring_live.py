@@ -1,4 +1,4 @@
-"""Real ROS nodes at both ends of the ring: what one side says, the other hears, and nothing of it stays behind."""
+"""Real ROS nodes at both ends of the ring: messages cross from one side to the other, and nothing stays behind."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SECONDS = 7  # past three leases
 
 
 def needs(mode: str) -> None:
-    """Skip where a ROS is missing."""
+    """Skip where a ROS distribution is missing."""
     if mode != "ros1":
         for package in ("rclpy", "std_msgs", "sensor_msgs", "nav_msgs", "std_srvs"):
             if importlib.util.find_spec(package) is None:

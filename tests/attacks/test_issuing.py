@@ -1,4 +1,4 @@
-"""Issuing memberships: only what the issuer states is signed, and all of it is written down."""
+"""Issue of memberships: the authority signs only what the issuer states, and records all of it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ISSUE = "cert issue --domain school --request far/node.csr --out far.crt"
 
 @pytest.fixture
 def far(gdp: Run) -> None:
-    """A domain, and the keys of a node that asks to be a RIB under the label of a server."""
+    """Domain, and the keys of a node that asks to be a RIB under the label of a server."""
     assert gdp("domain init school --label school").code == 0
     assert gdp("keygen node far --role rib --label server").code == 0
 

@@ -1,4 +1,4 @@
-"""Switches that say that somebody else's RIB, proxy or switch is reached through them: they draw nothing."""
+"""Switches that falsely advertise a path to another's RIB, proxy or switch: they attract no traffic."""
 
 from __future__ import annotations
 

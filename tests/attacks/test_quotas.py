@@ -1,4 +1,4 @@
-"""One member's appetite: watches, claims, names, questions and branches leave room for the others."""
+"""Quotas of one member: its watches, advertisements, names, queries and branches leave capacity for the others."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ RIB = NodeKeys.generate(Role.RIB, "rib").join(SCHOOL, DAY)
 CLOUD_SWITCH = NodeKeys.generate(Role.SWITCH, "nuc4").join(CLOUD, DAY)
 CLOUD_PROXY = NodeKeys.generate(Role.PROXY, "elsewhere").join(CLOUD, DAY)
 START = Timestamps(0.0, NOW)
-ROOM = 64  # for branches, in a test of how it is shared
+ROOM = 64  # limit of branches, in a test of how they are shared
 
 
 def rib(**settings: int) -> RibCore:
@@ -164,7 +164,7 @@ def test_a15_advertisements_and_withdrawals_beyond_a_neighbours_pace_draw_nothin
 
 
 def renamed(one: Advertisement, name: Name) -> Advertisement:
-    """Return a claim on another name, which nobody verified: what costs room is counted before."""
+    """Return an unverified advertisement of another name: the quota is counted before verification."""
     subject = copy.copy(one.subject)
     object.__setattr__(subject, "name", name)
     return replace(one, subject=subject)

@@ -1,4 +1,4 @@
-"""Attacks on the memory in which the parts of messages wait for the rest."""
+"""Attacks on the memory of unfinished messages."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Stream:
         return [joined for joined in got if joined is not None]
 
     def forge(self, numbers: range = range(10, 14)) -> None:
-        """Give parts that another reader made: they open, and no message of them is ever whole."""
+        """Insert fragments of another reader: they open, but no message of them is ever complete."""
         for number in numbers:
             self.give(self.frames(number, bytes(12 << 10), OTHER)[:-1])
 

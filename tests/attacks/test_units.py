@@ -1,4 +1,4 @@
-"""Fences of the services: what systemd says of the units, and users' code apart from the machine's keys."""
+"""Sandboxes of the services: systemd's rating of the units, and the separation of user code from the machine's keys."""
 
 from __future__ import annotations
 
@@ -125,14 +125,14 @@ def test_a53_only_the_middlewares_profile_is_open_to_the_nodes_user(tmp_path: Pa
 
 @pytest.fixture
 def home() -> Iterator[Path]:
-    """A machine's folder, as other users see one."""
+    """Machine's folder, as other users see one."""
     with tempfile.TemporaryDirectory(prefix="gdp-test-") as folder:
         Path(folder).chmod(0o711)
         yield Path(folder)
 
 
 def looked(tmp_path: Path, *, is_users: bool) -> dict[str, object]:
-    """Return what a program of a machine finds of itself."""
+    """Return the view that a machine's program has of itself."""
     key = tmp_path / "own.key"
     key.write_text("secret")
     key.chmod(0o600)

@@ -1,4 +1,4 @@
-"""What a hostile link brings: counted under its reason, bounded in memory, and the good flow flows on."""
+"""Attacks of a hostile link: counted under their reason, bounded in memory, and the good flow continues."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NODES = ("nuc1", "nuc3", ROBOT, SERVER, "nuc2/rib")
 
 
 def counted(world: Simulation) -> Counter[DropReason]:
-    """Return everything that was dropped anywhere, by reason."""
+    """Return all drops anywhere, by reason."""
     total = Counter(world.network.drops)
     machines: list[SwitchCore | RibHost | Participant] = [*world.switches.values(), *world.ribs.values()]
     for machine in [*machines, *world.members.values()]:
@@ -40,7 +40,7 @@ def counted(world: Simulation) -> Counter[DropReason]:
 
 
 def still_flows(flow: Flow) -> None:
-    """Publish once more, and see it arrive."""
+    """Publish once more, and check its arrival."""
     flow.collect()
     before = len(flow.got[SERVER])
     flow.publish(b"after the attack")
@@ -49,7 +49,7 @@ def still_flows(flow: Flow) -> None:
 
 
 def attack(flow: Flow, frames: Iterable[bytes], nodes: tuple[str, ...] = NODES) -> Counter[DropReason]:
-    """Throw frames at a port of each node while the flow goes on; return what was counted more than before."""
+    """Inject frames at a port of each node while the flow continues; return the increase of the counters."""
     world = flow.world
     before = counted(world)
     for frame in frames:
@@ -416,7 +416,7 @@ def test_a_hello_of_a_stranger_is_not_answered() -> None:
 
 
 def recorded_hello(world: Simulation) -> bytes:
-    """Return a hello of another network's switch, whose root nobody here knows."""
+    """Return a hello of another network's switch, whose root no node here knows."""
     tap = Tap("nuc2", "nuc1")
     world.network.taps.append(tap)
     world.network.run(1)

@@ -1,4 +1,4 @@
-"""Two nodes with one identity: the older one keeps its place, and both are told."""
+"""Two nodes with one identity: the older one keeps its location, and both get a report."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def own_refusal(member: Participant) -> DropReason | None:
 
 
 def place_of(world: Simulation) -> str:
-    """Return the switch at which the RIB of the school knows the robot to be."""
+    """Return the switch of the robot according to the RIB of the school."""
     name = world.identities[ROBOT].name
     (route,) = world.ribs["school"].rib._store.routes(name)
     return next(label for label, switch in world.switches.items() if switch.name == route.switch)

@@ -1,4 +1,4 @@
-"""Messages across the ring of five: through three intermediate switches, past failures, to whoever may read."""
+"""Messages across the ring of five: through three transit switches, past failures, to all permitted readers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ways that links have changed are computed anew a slice at a time, and all of them in the end."""
+"""Recomputation of changed paths, one slice at a time, and of all of them in the end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A robot drives on: it attaches at another switch and is found there, in every tier."""
+"""Moving robot: it attaches at another switch and is found there, in every tier."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 
 
 def place_in(world: Simulation, rib: str, name: Name, node: Name) -> str:
-    """Return the switch at which a RIB believes a node to be attached."""
+    """Return the switch of a node according to a RIB."""
     route = world.ribs[rib].rib._store.get(name, node)
     assert isinstance(route, Route)
     switch = parse(UnverifiedAdvertisement.from_statement(parse(route.advertisement)).rtcert).fields.name("switch")
@@ -109,7 +109,7 @@ def test_a_new_life_of_a_publisher_is_read_anew() -> None:
 
 
 def _again(flow: Flow) -> Flow:
-    """Start the robot anew at another switch, under the same name."""
+    """Restart the robot at another switch, under the same name."""
     world = flow.world
     member = world.restart_member(ROBOT)
     world.roam(ROBOT, "nuc2")

@@ -1,4 +1,4 @@
-"""Calls across the ring of five: requests to every server by a tree, each answer to the one that asked."""
+"""Calls across the ring of five: requests to every server by a tree, each response to its client."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def test_a_lost_part_of_an_answer_is_repaired() -> None:
     assert work(world, client, until_s=20, have=20)
     assert client.bodies() == [large] * 20
     for sim_link in world.cables.values():
-        sim_link.loss = 0.0  # claims of these short leases do not live long on such links
+        sim_link.loss = 0.0  # advertisements with these short leases do not last on such links
     outlive(world, client, server)
 
 
@@ -307,7 +307,7 @@ def test_a_private_stream_that_nobody_uses_is_forgotten_and_goes_on_above_its_nu
         for writer_proxy in client.member.writer_proxies()
         if writer_proxy not in client.member.writer_proxies_of(client.service)
     ]
-    writer_proxy._schedule.due_s = float("inf")  # it says nothing any more
+    writer_proxy._schedule.due_s = float("inf")  # it sends nothing any more
     world.network.run(READER_LEASE_S + 1.5 * IDLE_S)
     assert len(streams) == 0
     server.answer(client.member.name, b"2")
@@ -376,7 +376,7 @@ def test_a_client_whose_delegation_is_revoked_is_answered_no_more() -> None:
 
 
 def test_calls_over_links_that_lose_and_reorder_are_all_answered_once() -> None:
-    # A claim of seven frames crosses three such links half of the time: a lease has to last for many tries.
+    # An advertisement of seven frames crosses three such links half of the time: a lease has to last for many tries.
     world = ring(lease_s=8.0)
     server, client = pair(world)
     for sim_link in [*world.cables.values(), *world.leads.values()]:

@@ -36,7 +36,7 @@ def teller(name: str, number: str = "signal.SIGTERM") -> Program:
 
 
 def until(home: Path, is_met: Callable[[Status], bool]) -> Status:
-    """Look until a machine's status is as wanted; nobody tells when it changes."""
+    """Poll until a machine's status is as wanted; no event reports a change."""
     end_s = time.monotonic() + _PATIENCE_S
     while True:
         status = Status.read(home)

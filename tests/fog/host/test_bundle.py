@@ -1,4 +1,4 @@
-"""A machine's boot as files."""
+"""Bootstrap bundle of a machine as files."""
 
 from __future__ import annotations
 

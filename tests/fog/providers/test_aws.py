@@ -29,7 +29,7 @@ BOOT = MachineBundle({"keys/own.key": b"\x00\xff", "proxy.yaml": b"rules: []\n"}
 
 @dataclass(frozen=True)
 class Cloud:
-    """The pretended EC2, from behind."""
+    """Simulated EC2, seen from behind its API."""
 
     def client(self, region: str = EAST):
         return boto3.client("ec2", region_name=region)

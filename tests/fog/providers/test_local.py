@@ -1,4 +1,4 @@
-"""What of the provider ``local`` needs no namespace."""
+"""Parts of the provider ``local`` that need no namespace."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def provider(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> LocalProvider:
 
 
 def machine(provider: LocalProvider, process: Process | None = None) -> Run:
-    """Note a machine whose process is this one (or a dead one), without making any."""
+    """Record a machine whose process is this one (or a dead one), without creating any."""
     run = provider.runs.start()
     MachineFile(SPEC, 1.0, "/run/netns/none").write(run.directory)
     (run.directory / "home").mkdir()

@@ -1,4 +1,4 @@
-"""The supervisor with a provider in memory: what it must not forget, it sees again."""
+"""Supervisor with a provider in memory: it observes again what it must not forget."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PLAN = ClusterPlan("c", (CloudNode("p", "e"),), (SPOT, SPOT), (ExportedInterface
 
 
 class Memory:
-    """A provider whose machines are up at once."""
+    """Provider whose machines are up at once."""
 
     name = "memory"
     poll_s = 0.01
@@ -67,7 +67,7 @@ class Memory:
 
 
 class Grouped(Memory):
-    """A provider whose machines are one group, of which one is the gateway."""
+    """Provider whose machines are one group, one of which is the gateway."""
 
     uplink_iface = "up"
 

@@ -1,4 +1,4 @@
-"""Small messages that wait together go under one seal, and everything that counts messages still counts messages."""
+"""Bundles: small messages that wait together go under one seal, and every count still counts messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every message published is delivered, or counted as lost at its reader, exactly, with a range and a reason."""
+"""Loss accounting: every published message is delivered, or counted exactly as lost at its reader with its reason."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def silence(end: End, *, is_silent: bool) -> None:
 
 
 def stream(pipe: Pipe, seconds: float, every_s: float = 0.1, size: int = 100) -> None:
-    """Publish a message from time to time, for so long."""
+    """Publish a message from time to time, for this long."""
     for _ in range(round(seconds / every_s)):
         pipe.publish([pipe.publisher.messages.to_bytes(4, "big") + bytes(size)])
         pipe.run(every_s)
@@ -41,7 +41,7 @@ def sequences(end: End) -> list[int]:
 
 
 def assert_complete(pipe: Pipe, end: End) -> None:
-    """Nothing doubled, in order, and each message delivered or in a range of lost ones."""
+    """Check that nothing is doubled, in order, and each message is delivered or in a range of lost ones."""
     pipe.run(5.0)
     numbers = sequences(end)
     lost = [each for span in end.writer_proxy.losses.ranges for each in range(span.first, span.last + 1)]

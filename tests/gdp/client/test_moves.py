@@ -1,4 +1,4 @@
-"""Messages that no longer fit the path: split anew under new numbers, and still once and in order at every reader."""
+"""Renumbering: messages that no longer fit the path are fragmented again, and stay single and in order at readers."""
 
 from __future__ import annotations
 

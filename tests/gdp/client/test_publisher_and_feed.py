@@ -1,4 +1,4 @@
-"""A publisher and its readers over a pipe that loses, doubles and reorders."""
+"""Publisher and its readers over a pipe that loses, doubles and reorders."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ def test_notes_of_two_writer_proxies_of_one_reader_never_share_a_nonce() -> None
     reader = reader_of(b"a")
     pipe.attach(reader)
     pipe.run(1.0)
-    pipe.attach(reader)  # its switch took the publisher away, and brought it back
+    pipe.attach(reader)  # its switch lost the publisher and found it again
     pipe.run(1.0)
     notes = [decode(frame) for frame in pipe.seen if decode(frame).kind == Kind.ACKNACK]
     nonces = [(note.source, note.incarnation, note.destination, note.number) for note in notes]

@@ -1,4 +1,4 @@
-"""The private streams of one node: how many there may be, which are forgotten, and where they go on."""
+"""Unicast streams of one node: their number, which ones are forgotten, and where their numbers continue."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every statement of the control plane reads back as it was written, and refuses what it is not."""
+"""Bodies of every statement of the control plane: each reads back as written, and refuses anything else."""
 
 from __future__ import annotations
 

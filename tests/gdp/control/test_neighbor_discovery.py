@@ -1,4 +1,4 @@
-"""Greeting: who becomes a neighbour, who stays one, and what recorded hellos are worth."""
+"""Neighbour discovery: how a node becomes a neighbour and stays one, and the value of recorded hellos."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ UP = NeighbourState.UP
 
 
 def hellos(of: HelloProtocol, now_s: float) -> list[bytes]:
-    """Return the statements that a greeter says now."""
+    """Return the statements that a HelloProtocol sends now."""
     return [statement_of(frame) for transmit in of.hellos_to_send(now_s) for frame in transmit.frames]
 
 
@@ -51,7 +51,7 @@ def refusal(listener: HelloProtocol, statement: bytes, now_s: float = 0.0) -> Dr
 
 
 def greet(one: HelloProtocol, two: HelloProtocol, begin_s: float, rounds: int = 4) -> list[bytes]:
-    """Let two greeters talk; return all that the second said."""
+    """Let two HelloProtocol instances exchange statements; return all that the second sent."""
     said = []
     for step in range(rounds):
         now_s = begin_s + step * HELLO_S
@@ -64,7 +64,7 @@ def greet(one: HelloProtocol, two: HelloProtocol, begin_s: float, rounds: int = 
 
 
 def pair() -> tuple[HelloProtocol, HelloProtocol, list[bytes]]:
-    """Return two greeters that are up, and what the second said."""
+    """Return two HelloProtocol instances that are up, and all that the second sent."""
     one, two = hello_protocol(A, 1), hello_protocol(B, 2)
     return one, two, greet(one, two, 0.0)
 

@@ -1,4 +1,4 @@
-"""What a node that makes no progress says, and when."""
+"""Report of a node that makes no progress, and its time."""
 
 from __future__ import annotations
 

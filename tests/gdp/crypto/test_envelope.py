@@ -1,4 +1,4 @@
-"""Sealing and opening: the published vectors, and what must not open."""
+"""Sealing and opening: the published vectors, and inputs that must not open."""
 
 from __future__ import annotations
 

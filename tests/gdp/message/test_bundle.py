@@ -1,4 +1,4 @@
-"""Several messages under one seal: exact, or refused whole; and how many messages went under each number."""
+"""Several messages under one seal: exact, or refused whole; and the number of messages under each sequence number."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Joining parts: whatever comes, in whatever order, within bounds."""
+"""Reassembly of fragments: any input, in any order, within bounds."""
 
 from __future__ import annotations
 

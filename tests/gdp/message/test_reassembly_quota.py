@@ -1,4 +1,4 @@
-"""The budget of unfinished messages."""
+"""Reassembly quota of unfinished messages."""
 
 from __future__ import annotations
 

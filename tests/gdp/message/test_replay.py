@@ -1,4 +1,4 @@
-"""The replay window against a plain set."""
+"""Replay window, compared with a plain set."""
 
 from __future__ import annotations
 

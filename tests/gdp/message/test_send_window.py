@@ -1,4 +1,4 @@
-"""What a publisher keeps, has under way, and sends again."""
+"""Send window: the messages that a publisher keeps, has in flight, and sends again."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def test_no_more_parts_are_looked_at_for_one_report_than_a_flight_of_small_frame
     put(window, 1, [bytes(10)] * 20_000)
     assert len(window.frames_to_send(0.0)) == 20_000
     absurd = tuple(MissingRange(1, 0, 0xFFFF_FFFF) for _ in range(NACKS_PER_REPORT))
-    for at in range(3):  # the second and third look only at what the first has queued
+    for at in range(3):  # the second and third check only fragments that the first has queued
         window.handle_acknack(A, has(1, 0, absurd), 0.1 + at * 1e-6)
     assert len(window.frames_to_send(0.2)) == 8_192
 
@@ -272,7 +272,7 @@ def test_a_reader_is_slow_when_it_has_not_confirmed_for_so_long_what_another_has
     for reader in (A, B):
         window.add_reader(reader, 1, 0.0)
     now_s = 10.0
-    for number in range(1, 5):  # both have everything each time, until B says nothing more
+    for number in range(1, 5):  # both have everything each time, until B reports nothing more
         put(window, number, message(number, 1))
         window.frames_to_send(now_s)
         window.handle_acknack(A, has(number + 1), now_s)

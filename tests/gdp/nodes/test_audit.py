@@ -1,4 +1,4 @@
-"""Audit of a node: where it is kept, and that refused statements are counted."""
+"""Audit of a node: its location, and the count of refused statements."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When it pays to look again before going to sleep."""
+"""Busy polling: the cases in which it pays before a thread sleeps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""switch.yaml and rib.yaml as people write them."""
+"""switch.yaml and rib.yaml, as people write them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A running node takes up certificates that are replaced on disk, and nothing that does not hold."""
+"""Running node that loads replaced certificates from disk, and rejects invalid ones."""
 
 from __future__ import annotations
 

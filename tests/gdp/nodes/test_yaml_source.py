@@ -1,4 +1,4 @@
-"""What a YAML file may hold, and that errors point into it."""
+"""Permitted content of a YAML file, and errors that point into it."""
 
 from __future__ import annotations
 

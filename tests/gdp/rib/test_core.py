@@ -1,4 +1,4 @@
-"""A RIB: what it takes, what it refuses and why, whom it answers and tells."""
+"""RIB: accepted statements, refused ones with their reason, responses, and watches."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def relay(statement: bytes, by: Identity = SWITCH) -> bytes:
 
 
 def tell(to: RibCore, statement: bytes, by: Identity = SWITCH, now: Timestamps = START) -> list[OutgoingStatement]:
-    """Relay a claim or a withdrawal; return what the RIB sends."""
+    """Relay an advertisement or a withdrawal; return the statements that the RIB sends."""
     to.receive(relay(statement, by), by.name, now)
     return to.statements_to_send()
 
@@ -120,7 +120,7 @@ def local_advertisement(sequence: int = 1) -> bytes:
 
 
 def foreign_advertisement(*, is_global: bool = True, sequence: int = 1) -> bytes:
-    """Return a claim of the robot at a switch of the cloud's domain."""
+    """Return an advertisement of the robot at a switch of the cloud's domain."""
     return sign_advertisement(
         ROBOT,
         Right.PUBLISH,
@@ -135,12 +135,12 @@ def foreign_advertisement(*, is_global: bool = True, sequence: int = 1) -> bytes
 
 
 def altered(change: dict[str, object]) -> bytes:
-    """Return the robot's claim with a changed body, signed again by the robot."""
+    """Return the robot's advertisement with a changed body, signed again by the robot."""
     body = {**UnverifiedAdvertisement.from_statement(parse(advertisement())).to_fields(), **change}
     return sign(StatementType.ADVERTISE, body, ROBOT.name, ROBOT.key)
 
 
-# -- what is taken, what is refused
+# -- accepted and refused advertisements
 
 
 def test_a_good_advertisement_is_taken_and_its_relay_told() -> None:
@@ -283,7 +283,7 @@ def test_claiming_and_withdrawing_in_turn_does_not_pass_the_quota() -> None:
         own = Subject.of(Metadata({"kind": "topic", "name": f"/own{number}"}), ROBOT.key.public.compressed)
         tell(at_rib, advertisement(subject=own, chain=[]))
         tell(at_rib, sign(StatementType.WITHDRAW, {"n": own.name, "s": 2}, ROBOT.name, ROBOT.key))
-    assert at_rib.refusals == {DropReason.QUOTA: 7, DropReason.STALE: 7}  # a node may hold as many as are free
+    assert at_rib.refusals == {DropReason.QUOTA: 7, DropReason.STALE: 7}  # a node may have as many as are free
 
 
 def test_a_node_leaves_room_for_the_other_nodes_of_its_switch() -> None:
@@ -378,7 +378,7 @@ def test_no_lease_outlasts_its_evidence() -> None:
     assert at_rib.get_timer() == pytest.approx(10.0)
 
 
-# -- questions and watches
+# -- queries and watches
 
 
 def test_an_answer_carries_the_advertisement_as_it_was_signed() -> None:

@@ -1,4 +1,4 @@
-"""One server or client that misbehaves within its rights: what it may not spoil for the others."""
+"""Server or client that misbehaves within its rights: damage that it must not do to the others."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_one_that_refuses_at_once_does_not_draw_the_requests() -> None:
     begin(dispatch, 1.0)
     assert asked_first(dispatch) == (SLOW,)
     begin(dispatch, 1.0 + 2 * LATELY_S)
-    assert asked_first(dispatch) == (BAD,)  # it may be well by now
+    assert asked_first(dispatch) == (BAD,)  # it may work again by now
 
 
 def test_one_that_rejects_goals_at_once_does_not_draw_them() -> None:
@@ -65,7 +65,7 @@ def test_one_that_says_nothing_does_not_take_the_second_copies_from_one_that_wou
         servers = asked_first(dispatch) or ()
         if at_s % 4 != 3:
             server, took_s = FAST, 0.01
-        elif SLOW in servers:  # for the fast one is stuck
+        elif SLOW in servers:  # because the fast one is stuck
             server, took_s, saved = SLOW, 0.1, saved + 1
         else:
             server, took_s = FAST, 0.3

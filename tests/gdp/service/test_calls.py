@@ -1,4 +1,4 @@
-"""Calls under way: each ends exactly once, whatever happens in which order."""
+"""Calls in flight: each ends exactly once, with any events in any order."""
 
 from __future__ import annotations
 

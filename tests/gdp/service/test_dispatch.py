@@ -1,4 +1,4 @@
-"""Requests to several servers: one callback for each call, whatever happens in which order."""
+"""Requests to several servers: one callback for each call, with any events in any order."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ HEDGED = Replication(Mode.HEDGED, budget=1.0)
 
 @dataclass(slots=True)
 class Bench:
-    """A dispatch with servers, and what came of its calls."""
+    """Dispatch with servers, and the results of its calls."""
 
     replication: Replication = ALL
     servers: tuple[Name, ...] = (A, B, C)
@@ -127,7 +127,7 @@ def test_one_that_refuses_or_goes_is_replaced_at_once() -> None:
 def test_a_call_fails_when_all_refused_or_went(replication: Replication) -> None:
     bench = Bench(replication)
     refused, left = bench.begin(), bench.begin()
-    for server in (A, B, C) * 3:  # those that were not asked yet are not heard
+    for server in (A, B, C) * 3:  # responses of servers without a request are ignored
         bench.dispatch.refused(refused, server, "busy", 0.1)
     for server in (A, B, C):
         bench.dispatch.gone(server, 0.2, "gone")
@@ -303,7 +303,7 @@ def test_each_call_ends_exactly_once(replication: Replication, steps: list[tuple
 
 
 def _one(bench: Bench) -> tuple[Name, str]:
-    """Return whom the last call asked, and an answer."""
+    """Return the servers of the last call, and a response."""
     whom = bench.asked()[-1]
     assert whom is not None
     return whom[0], "quick"

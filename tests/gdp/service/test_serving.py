@@ -1,4 +1,4 @@
-"""Requests at the server's side: each is given to the local server once, in order, and never after it was stopped."""
+"""Requests at the server's side: each reaches the local server once, in order, and never after it was cancelled."""
 
 from __future__ import annotations
 

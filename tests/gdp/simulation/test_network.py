@@ -1,4 +1,4 @@
-"""The network in memory: delay, loss, order and links as said, and a clock that only machines hold up."""
+"""Simulated network: delay, loss, order and links as configured, and a clock that only machines hold back."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from gdp.simulation.network import SimLink, SimNetwork
 
 
 class Talker:
-    """Sends what it is told to, and notes what comes."""
+    """Machine that sends frames on command and records those it receives."""
 
     def __init__(self, network: SimNetwork) -> None:
         self.network = network
         self.out: list[OutgoingFrames] = []
         self.got: list[tuple[float, bytes]] = []
         self.links: list[bool] = []
-        self.facts: list[tuple[int, int]] = []  # MTU and cost of its port, as told
+        self.facts: list[tuple[int, int]] = []  # MTU and cost of its port, as reported
         self.due_s: float | None = None
         self.called_s: list[float] = []
 
@@ -48,7 +48,7 @@ class Talker:
 
 
 class Spinner(Talker):
-    """A machine whose timer is due for ever."""
+    """Machine whose timer is always due."""
 
     def handle_timer(self, now: Timestamps) -> None:
         self.due_s = now.mono_s - 1

@@ -1,4 +1,4 @@
-"""Domains, nodes, owners and delegations on disk, as the command and the testbed make them."""
+"""Domains, nodes, owners and delegations on disk, as made by the command and the simulation."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ PRIVATE = {"root.key", "owner.key", "master.key", "node.key", "kem.key", "issued
 
 @pytest.fixture
 def keys(tmp_path: Path) -> Path:
-    """A domain ``school`` with a proxy ``robot``, and an owner ``lab``."""
+    """Domain ``school`` with a proxy ``robot``, and an owner ``lab``."""
     make_domain(tmp_path / "school", "school", unix_s=NOW)
     make_node(tmp_path / "robot", Role.PROXY, "robot", tmp_path / "school", more={"site": "roof"}, unix_s=NOW)
     make_owner(tmp_path / "lab")

@@ -1,4 +1,4 @@
-"""Keys in tokens: a domain and its nodes sign by a PKCS #11 library, and nobody else can tell."""
+"""Keys in tokens: a domain and its nodes sign by a PKCS #11 library, and verifiers see no difference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cache of locations: entries live for a lease, negative entries for a moment."""
+"""Name cache of locations: entries last for a lease, negative entries for a moment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parked frames: in order, bounded in number, bytes and time, and counted when dropped."""
+"""Pending frames: in order, bounded in number, bytes and time, and counted when dropped."""
 
 from __future__ import annotations
 

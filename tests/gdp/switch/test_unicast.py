@@ -1,4 +1,4 @@
-"""Ways to one name, in a running network: found when asked for, negative when there is none, never in a tree's way."""
+"""Unicast routes in a running network: resolved on demand, negative if there is none, never in a tree's way."""
 
 from __future__ import annotations
 

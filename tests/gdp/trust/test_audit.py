@@ -1,4 +1,4 @@
-"""The audit trail: chained, and a flood is one line and a count."""
+"""Audit trail: chained, and a flood is one line and a count."""
 
 from __future__ import annotations
 

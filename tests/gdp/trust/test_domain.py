@@ -1,4 +1,4 @@
-"""A domain's policy."""
+"""Policy of a domain."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Revocations: who may, whose are kept, how long, and that one giver's cannot crowd out another's or the roots'."""
+"""Revocations: permitted issuers, storage, retention, and quotas that separate origins and roots."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def test_who_gives_too_many_gives_up_its_own_only() -> None:
     take(revoked, by_other(0), b"b")
     for number in range(3):
         take(revoked, by_lab(number), b"a")
-    assert refusal(revoked, by_lab(3), b"a") is DropReason.QUOTA  # its own owner has most of it already
+    assert refusal(revoked, by_lab(3), b"a") is DropReason.QUOTA  # its own owner has most of its quota already
     assert take(revoked, by_other(1), b"b") is not None
     assert [has(revoked, number) for number in range(3)] == [False, True, True]
     assert refusal(revoked, by_other(2), b"b") is DropReason.QUOTA

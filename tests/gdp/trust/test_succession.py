@@ -102,7 +102,7 @@ def take_back(policy: Policy, key: SigningKey, signer: Subject, fingerprint: byt
 
 
 def test_a_member_names_no_founder() -> None:
-    """The URI of a successor counts in a root only: a member who had it could take a name of another key."""
+    """The URI of a successor counts in a root only: a member with it could take a name of another key."""
     forged = NodeKeys.generate(Role.PROXY, "forged")
     assert Membership.from_wire(forged.join(HEIR, DAY).membership, HEIR.root, NOW).key == forged.key.public
 

@@ -1,4 +1,4 @@
-"""Claims: what is believed, and why the rest is not."""
+"""Verification of advertisements: accepted ones, and reasons for the refusal of others."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def refusal(wire: bytes, at: AdvertisementVerifier | None = None, unix_s: float 
 
 
 def forged(change: Callable[[dict[str, object]], object], signer: Name = ROBOT.name) -> bytes:
-    """Return the good claim with a changed body, signed again by the robot."""
+    """Return the good advertisement with a changed body, signed again by the robot."""
     body = UnverifiedAdvertisement.from_statement(parse(GOOD)).to_fields()
     change(body)
     return sign(StatementType.ADVERTISE, body, signer, ROBOT.key)
@@ -345,6 +345,6 @@ def test_a_refreshed_advertisement_costs_one_signature_check(monkeypatch: pytest
 
     monkeypatch.setattr(PublicKey, "_verify", counted)
     at.verify(first, NOW)
-    assert checks[0] == 4  # membership, claim, RtCert, AdCert
+    assert checks[0] == 4  # membership, advertisement, RtCert, AdCert
     at.verify(second, NOW)
     assert checks[0] == 5

@@ -1,4 +1,4 @@
-"""The kernel's map against the table, after any changes."""
+"""Kernel's map, compared with the table after any changes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def name(number: int) -> bytes:
 
 
 def in_kernel(loaded: LoadedProgram, key: bytes) -> Hops | None:
-    """Return what the program would find for a key."""
+    """Return the value that the program would find for a key."""
     value = loaded.entries.get(key.ljust(64, b"\0"))
     if value is None:
         return None
