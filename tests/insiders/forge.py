@@ -391,7 +391,7 @@ class Forge:
     def _advertisement_body(
         self, rng: random.Random, identity: Identity, topic: Name, right: Right, switch: Name
     ) -> _Body:
-        """Return an advertisement of the node's own name, of a topic by its delegation, or of a name of its own making."""
+        """Return an advertisement of the node's own name, of a delegated topic, or of a name of its own making."""
         now = self._stage.world.network.now.unix_s
         subject, chain = identity.subject, []
         mine = [each for key, each in self._stage.topics.items() if each.delegation.node == identity.name]
@@ -438,7 +438,7 @@ class Forge:
         return {"n": rng.choice(own), "right": rng.choice(_RIGHTS).value, "s": next(self._numbers)}
 
     def _inner(self, rng: random.Random, identity: Identity) -> bytes:
-        """Return an advertisement or a withdrawal, of this node or another insider, to be put into another statement."""
+        """Return an advertisement or a withdrawal, of this node or another insider, for use in another statement."""
         other = self._stage.identity(rng.choice(PERSONAS)) if rng.random() < 0.5 else identity
         chance = rng.random()
         if chance < 0.2:

@@ -1,4 +1,4 @@
-"""Published is delivered plus lost, for absences of any member and length: over switches and RIBs, past three leases."""
+"""Published is delivered plus lost, for absences of any member and length, over switches and RIBs and three leases."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The bench of messages, as far as it thinks: the message, the loop, the addresses, the figures to reach."""
+"""Sans-I/O parts of the message bench: the message, the loop, the addresses, the targets."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LOAD = Load((100, 10_000), 5)
 
 
 class Echo:
-    """A way whose far end answers at once; each test breaks it in its own manner."""
+    """Path whose far end answers at once; each test breaks it in its own manner."""
 
     def __init__(self) -> None:
         self.sent: list[bytes] = []

@@ -1,4 +1,4 @@
-"""What all benches share, as far as it thinks: figures over rounds, the search for a rate, frames ready made."""
+"""Sans-I/O parts that all benches share: figures over rounds, the search for a rate, prepared frames."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_frames_that_come_late_make_the_rate_smaller() -> None:
 
 
 class Path40k:
-    """A path that carries 40,000 frames/s and loses what is more; a source that can send 100,000/s."""
+    """Path that carries 40,000 frames/s and loses the excess; its source can send 100,000/s."""
 
     def __init__(self, carries: float = 40_000.0, spoilt: int = 0) -> None:
         self.carries = carries

@@ -1,4 +1,4 @@
-"""The benches with real ROS nodes, as far as they think: names, cases, figures to reach, sizes of the tasks."""
+"""Sans-I/O parts of the benches with real ROS nodes: names, cases, targets, sizes of the tasks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the chaos bench decides without processes: networks and faults from a seed, the oracle, the books."""
+"""Sans-I/O parts of the chaos bench: networks and faults from a seed, the oracle, the accounting."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fuzzer, and each decoder for a fraction of a second."""
+"""Fuzzer, and each decoder for a fraction of a second."""
 
 from __future__ import annotations
 

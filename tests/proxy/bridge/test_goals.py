@@ -1,4 +1,4 @@
-"""Who speaks for a goal that several servers work on."""
+"""Choice of the server that reports a goal on which several servers work."""
 
 from __future__ import annotations
 

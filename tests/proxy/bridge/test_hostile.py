@@ -1,4 +1,4 @@
-"""Far peers with every right, and graphs that refuse: whatever they do, the proxy goes on and says so."""
+"""Remote peers with every right, and graphs that refuse: the proxy continues and reports every fault."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def sites(tmp_path: Path) -> Sites:
 
 
 def listening(sites: Sites) -> tuple[Machine, Machine, Ear]:
-    """Return a machine whose publisher may be made to say anything, the one that reads it, and a listener there."""
+    """Return a machine whose publisher may send anything, the machine that reads it, and a listener there."""
     robot, server = sites.add(ROBOT, expose=[CHATTER]), sites.add(SERVER, imports=[CHATTER])
     ear = Ear(server.graph, "/chatter")
     robot.graph.publish("/talker", "/chatter", STRING)

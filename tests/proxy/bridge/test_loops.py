@@ -1,4 +1,4 @@
-"""Loops and twins: nothing circulates, nothing is delivered twice, whoever leads."""
+"""Loops and doubled bridges: nothing circulates and nothing is delivered twice, whichever bridge leads."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def graph() -> FakeGraph:
 
 
 def streams(*machines: Machine) -> list[Machine]:
-    """Return those that publish on the overlay."""
+    """Return the proxies that publish on the overlay."""
     return [machine for machine in machines if machine.member.publishers()]
 
 
@@ -124,7 +124,8 @@ def test_a_proxy_that_exposes_beside_one_that_imports_does_not_send_back_what_ca
     assert "near" in ears[0].texts
     assert "far" in ears[1].texts
     assert all(len(ear.texts) == len(set(ear.texts)) for ear in ears)
-    assert len([text for text in caplog.messages if text.startswith("/chatter: rival: ")]) == 1  # one way stays shut
+    # one direction stays closed
+    assert len([text for text in caplog.messages if text.startswith("/chatter: rival: ")]) == 1
 
 
 @pytest.mark.parametrize("is_killed", [False, True], ids=["goes", "dies"])

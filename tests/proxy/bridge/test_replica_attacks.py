@@ -1,4 +1,4 @@
-"""Servers and clients that misbehave within their rights, or die at a bad moment, as the bridge meets them."""
+"""Servers and clients that misbehave within their rights, or die at a bad moment, as seen by the bridge."""
 
 from __future__ import annotations
 

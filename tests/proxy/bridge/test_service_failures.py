@@ -1,4 +1,4 @@
-"""Calls that cannot be served: each fails once, with its reason, and no later one is the worse for it."""
+"""Calls that cannot be served: each fails once, with its reason, and no later call suffers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Services from end to end: each call is answered once, with its own answer, or fails with a reason."""
+"""Services from end to end: each call gets its own response once, or fails with a reason."""
 
 from __future__ import annotations
 

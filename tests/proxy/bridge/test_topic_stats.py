@@ -1,4 +1,4 @@
-"""What a receiver measures."""
+"""Measurements of a receiver."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Types from end to end: encodings, ROS 1 and ROS 2, custom types, and what cannot be understood on the far side."""
+"""Types from end to end: encodings, ROS 1 and ROS 2, custom types, and types unknown on the far side."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def sites(tmp_path: Path) -> Sites:
 
 
 def graph(ros: RosVersion = 2, pose: str | None = None) -> FakeGraph:
-    """Return a graph that knows the custom type so, or not at all."""
+    """Return a graph with this definition of the custom type, or without it."""
     types = known.channels(ros)
     return FakeGraph(ros, types if pose is None else types | {CUSTOM: custom(CUSTOM, pose, ros)})
 

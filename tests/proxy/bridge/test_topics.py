@@ -1,4 +1,4 @@
-"""Topics from one graph to another: who comes and goes, what reaches whom, and what stays local."""
+"""Topics from one graph to another: participants that come and go, reachability, and local names that stay local."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Messages whose senders are not described yet wait within bounds, each client on its own account."""
+"""Queue of messages whose senders are not described yet: bounded, with a quota for each client."""
 
 from __future__ import annotations
 

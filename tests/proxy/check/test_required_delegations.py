@@ -1,4 +1,4 @@
-"""Which delegations rules need: of two machines, from what is stated, held and live."""
+"""Delegations that rules need: on two machines, from statements, stored ones and the live graph."""
 
 from __future__ import annotations
 

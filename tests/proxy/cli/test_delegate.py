@@ -1,4 +1,4 @@
-"""``gdp-delegate``, as a person calls it."""
+"""``gdp-delegate``, as called by a person."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""proxy.yaml as people write it; its rules are tested in test_rules."""
+"""proxy.yaml, as people write it; its rules are tested in test_rules."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How ROS 2 writes itself in DDS, and who is there; no network."""
+"""DDS names and participants of ROS 2; no network."""
 
 from __future__ import annotations
 

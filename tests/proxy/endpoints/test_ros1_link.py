@@ -1,4 +1,4 @@
-"""The wire between the proxy and its rospy process."""
+"""IPC between the proxy and its rospy process."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_frames_of_any_size_arrive_whole_and_in_order(sizes: list[int]) -> None:
 
 def test_a_full_link_drops_the_oldest_message_of_that_topic_only(pair: Pair) -> None:
     sender, receiver, behind = pair
-    assert sender.send(Kind.HEARD, 1, 0, bytes(400_000))  # part of it is on its way
+    assert sender.send(Kind.HEARD, 1, 0, bytes(400_000))  # part of it is in flight
     assert behind == [1]
     for number in range(1, 10):
         assert sender.send(Kind.HEARD, 2, number, bytes(100))

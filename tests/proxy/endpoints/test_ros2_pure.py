@@ -1,4 +1,4 @@
-"""The parts of the ros2 endpoint that only think: profiles, verdicts, and telling one's own messages apart."""
+"""Sans-I/O parts of the ros2 endpoint: profiles, QoS checks, and recognition of own messages."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_as_many_copies_are_taken_out_as_were_published() -> None:
     own = LoopbackFilter()
     own.add(b"\0\1\0\0same", 0.0)
     own.add(b"\0\1\0\0same", 0.1)
-    assert own.is_loopback(b"\0\1\0\3same", 0.2)  # the encapsulation may say how much padding there is
+    assert own.is_loopback(b"\0\1\0\3same", 0.2)  # the encapsulation may state how much padding there is
     assert not own.is_loopback(b"\0\1\0\0other", 0.2)
     assert own.is_loopback(b"\0\1\0\0same", 0.3)
     assert not own.is_loopback(b"\0\1\0\0same", 0.3)

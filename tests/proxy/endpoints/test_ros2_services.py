@@ -46,7 +46,7 @@ def answer_of(success: bool, message: str) -> bytes:
 
 
 def read(raw: bytes) -> tuple[bool, str]:
-    """Fast CDR leaves padding as it finds it, so bytes cannot be compared."""
+    """Compare without padding: Fast CDR leaves its bytes as they are in memory."""
     from rclpy.serialization import deserialize_message
     from std_srvs.srv import SetBool
 

@@ -75,7 +75,7 @@ def difference(there: Channel, here: Channel) -> str:
     return str(refusal.value)
 
 
-# --- what differs without meaning anything
+# --- differences without meaning
 
 
 def test_a_header_loses_its_sequence_number_and_gains_a_zero() -> None:
@@ -196,7 +196,7 @@ def test_an_equal_hash_stands_for_definitions_that_are_not_there() -> None:
     assert "no definition" in difference(Channel("/t", "a/msg/B", 2), Channel("/t", "a/msg/B", 2))
 
 
-# --- what differs and matters
+# --- differences that matter
 
 
 @pytest.mark.parametrize(

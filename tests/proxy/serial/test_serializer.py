@@ -195,7 +195,7 @@ def test_a_wide_string_is_readable_in_json() -> None:
 
 
 def mixed_message(seed: int) -> tuple[Channel, bytes]:
-    """A message of every kind of field, written by rosbags: the oracle for layout and padding."""
+    """Message of every kind of field, written by rosbags: the oracle for layout and padding."""
     random = np.random.default_rng(seed)
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(MIXED, "a/msg/B"))
@@ -294,7 +294,7 @@ def test_the_sequence_number_of_a_ros_1_header_survives(encoding: Encoding) -> N
     assert Serializer(about, encoding).opaque == ""
 
 
-# --- what cannot be taken apart
+# --- bytes that cannot be decoded
 
 
 @pytest.mark.parametrize("encoding", EVERY)
@@ -328,7 +328,7 @@ def test_a_count_of_empty_items_costs_no_memory() -> None:
     assert json.loads(Serializer(about, "json").encode(raw)).keys() == {"$raw"}
 
 
-# --- what a peer may send
+# --- messages of a peer
 
 
 def refusal(about: Channel, body: bytes, encoding: Encoding) -> DropReason | None:

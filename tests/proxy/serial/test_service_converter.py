@@ -18,9 +18,9 @@ from proxy.serial.service_converter import ServiceConverter, translated_service
 
 LITTLE = b"\x00\x01\x00\x00"
 SET_BOOL = "09fb03525b03e7ea1fd3992bafd87e16"
-INTERPRETER = Path("/usr/bin/python3")  # where Debian puts ROS 1
+INTERPRETER = Path("/usr/bin/python3")  # Debian's path of ROS 1
 
-# Prints what the installed ROS 1 knows: {type: [md5, text]} and {type: [md5, request text, response text]}.
+# Prints the types of the installed ROS 1: {type: [md5, text]} and {type: [md5, request text, response text]}.
 LIST = """
 import importlib, inspect, json
 found = {"msg": {}, "srv": {}}

@@ -1,4 +1,4 @@
-"""Words about a log: what is written is read back, and arbitrary bytes are read or refused."""
+"""Messages of replication: each reads back as written, and arbitrary bytes are read or refused."""
 
 from __future__ import annotations
 

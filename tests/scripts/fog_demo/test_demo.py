@@ -1,4 +1,4 @@
-"""The demonstration's two nodes, real ones, in a graph of their own on this machine."""
+"""Two real nodes of the demonstration, in a graph of their own on this machine."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_the_longest_silence_since_the_line_before_is_told() -> None:
 
 
 class Tallied:
-    """An answer."""
+    """Response of a service."""
 
     def __init__(self, *, success: bool, message: str) -> None:
         self.success = success

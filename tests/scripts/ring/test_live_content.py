@@ -1,4 +1,4 @@
-"""What live nodes say, in messages shaped like those of either ROS."""
+"""Content of live nodes' messages, in the shape of either ROS."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ NOW_NS = 1_700_000_000_123_456_789
 
 
 class _Shown:
-    """A message of either ROS, by its fields in order."""
+    """Message of either ROS, by its fields in order."""
 
     def __init__(self, ros: int, **fields: object) -> None:
         self.__dict__.update(fields)

@@ -1,4 +1,4 @@
-"""What a live run consists of, and the files that its proxies accept."""
+"""Parts of a live run, and the files that its proxies accept."""
 
 from __future__ import annotations
 

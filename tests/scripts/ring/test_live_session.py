@@ -1,4 +1,4 @@
-"""Processes that play live nodes: how a session follows them to their reports."""
+"""Session with processes that play live nodes, from their start to their reports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Processes that play the two ends: what the ring makes of what they say, and of how they end."""
+"""Processes that play the two ends: the ring's treatment of their output and their exits."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ RECEIVER = HEAD + RECEIVER
 
 
 class Nothing:
-    """An overlay in which nothing fails."""
+    """Overlay without failures."""
 
     async def cut(self, cut: object) -> None: ...
     async def heal(self, cut: object) -> None: ...
