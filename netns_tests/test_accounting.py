@@ -87,7 +87,7 @@ def test_every_wrong_frame_is_dropped_for_its_own_reason_at_whichever_switch(lay
     }
 
 
-def test_a_name_that_one_switch_forgets_in_the_middle_of_a_stream_is_handed_up_there(lay: MakeRow) -> None:
+def test_a_name_that_one_switch_forgets_in_the_middle_of_a_stream_is_punted_there(lay: MakeRow) -> None:
     row = lay()
     row.send(*[frame(FORGOTTEN)] * 50)
     row.settle()
@@ -150,9 +150,7 @@ def test_a_device_that_is_deleted_and_made_again_under_a_stream_loses_nothing_un
     assert set(row.drops()) <= {DropReason.PORT_DOWN, DropReason.PORT_FULL}
 
 
-def test_what_a_full_socket_drops_is_counted_with_what_it_hands_up(
-    lay: MakeRow, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_drops_of_a_full_socket_are_counted_with_its_punts(lay: MakeRow, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sockets, "_BUFFER_BYTES", 4_096)
     row = lay()
     row.send(*[frame(UNKNOWN, bytes(1_000))] * 500)

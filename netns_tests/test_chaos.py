@@ -143,7 +143,7 @@ def numbers(overlay: Overlay, member: str) -> list[int]:
     return [each.number for _, records in overlay.read(member) for each in records if each.kind in kinds]
 
 
-def test_frames_of_a_link_are_lost_doubled_and_delayed_as_told(overlay: Overlay) -> None:
+def test_frames_of_a_link_are_lost_doubled_and_delayed_as_configured(overlay: Overlay) -> None:
     until(lambda: numbers(overlay, "R"), "a message")
     overlay.disturb("s1", "s2", FrameFaults(lost=1.0))
     begun = max(numbers(overlay, "P"))

@@ -122,7 +122,7 @@ def test_what_was_sent_is_delivered_or_dropped_by_reason(
     assert counters.punted == punted == 2 * rounds
 
 
-def test_what_the_kernel_takes_wakes_nobody(make_kernel: MakeKernel, ends: dict[int, socket.socket]) -> None:
+def test_a_frame_that_the_kernel_takes_wakes_no_thread(make_kernel: MakeKernel, ends: dict[int, socket.socket]) -> None:
     plane = make_kernel(filled())
     plane.poll(0)
     for _ in range(5):
@@ -208,7 +208,7 @@ def test_a_larger_group_than_the_kernel_knows_is_copied_by_python(
     assert plane._counters.frames_in == 1 - by_kernel
 
 
-def test_what_finds_no_room_in_the_kernel_is_forwarded_by_python_until_there_is(
+def test_an_entry_that_does_not_fit_in_the_kernel_is_forwarded_by_python_until_it_does(
     make_kernel: MakeKernel, ends: dict[int, socket.socket]
 ) -> None:
     names = [n.to_bytes(32, "big") for n in range(1, 6)]
@@ -244,7 +244,7 @@ def test_each_entry_counts_its_frames_and_bytes(make_kernel: MakeKernel, ends: d
     assert list(plane.entry_counts(1)) == [ONE]
 
 
-def test_a_removed_entry_goes_to_nobody_any_more(make_kernel: MakeKernel, ends: dict[int, socket.socket]) -> None:
+def test_frames_of_a_removed_entry_are_not_forwarded(make_kernel: MakeKernel, ends: dict[int, socket.socket]) -> None:
     table = filled()
     plane = make_kernel(table)
     table.remove(ONE)

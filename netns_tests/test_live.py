@@ -118,7 +118,7 @@ def test_a_ros_1_server_serves_a_ros_2_client(a: Peer, one: Peer) -> None:
     a.waits_for("lit", [[True, "lämp"]])
 
 
-def test_a_ros_2_server_serves_a_ros_1_client_which_is_told_why_if_it_does_not(a: Peer, one: Peer, pair: Pair) -> None:
+def test_a_ros_2_server_serves_a_ros_1_client_or_sends_it_the_reason(a: Peer, one: Peer, pair: Pair) -> None:
     a.tell(
         "!def opened(request, response):\n"
         " if not request.data: __import__('time').sleep(2.5)\n"
@@ -182,14 +182,14 @@ def test_an_action_lasts_longer_than_any_timeout_and_each_client_has_its_own_goa
     assert pair.proxy("b").warnings("/fold") == []
 
 
-def test_a_late_reassembler_gets_what_was_latched(a: Peer, b: Peer) -> None:
+def test_a_late_joiner_gets_what_was_latched(a: Peer, b: Peer) -> None:
     a.tell("!map = talk(String, '/map', 'transient_local', 1)")
     a.tell("!map.publish(String(data='old')); map.publish(String(data='new'))")
     b.tell("read(String, '/map', 1, 'transient_local')")
     b.waits_for("heard['/map']", [["new"]])
 
 
-def test_what_two_nodes_latched_in_one_topic_reaches_a_late_reassembler(a: Peer, b: Peer, pair: Pair) -> None:
+def test_what_two_nodes_latched_in_one_topic_reaches_a_late_joiner(a: Peer, b: Peer, pair: Pair) -> None:
     other = node_of(pair, "a", "other")
     for node, frame in ((a, "arm"), (other, "base")):
         node.tell("!statics = talk(TransformStamped, '/statics', 'transient_local', 1)")

@@ -161,7 +161,7 @@ def test_a_proxy_says_that_its_device_comes_with_a_switch(space: Space, start: S
     start("robot", "proxy").says("error: proxy0: no such device; start gdp-switch with attach: [proxy0] first")
 
 
-def test_a_switch_says_that_its_link_is_down_and_then_that_nobody_answers(space: Space, start: Start) -> None:
+def test_a_switch_reports_that_its_link_is_down_and_then_that_no_neighbour_answers(space: Space, start: Start) -> None:
     space.veth("eth0", "far0", *_MACS)
     space.ip("set", "far0", "down")
     switch = start("robot", "switch")

@@ -67,5 +67,5 @@ def test_a_device_that_is_there_is_not_waited_for() -> None:
         wait_for_device("rib0", 600.0)
 
 
-def test_whoever_waits_for_no_device_in_vain_goes_on() -> None:
+def test_a_node_whose_devices_all_exist_does_not_wait() -> None:
     wait_for_device("rib0", 0.01)

@@ -174,7 +174,7 @@ def test_each_fixture_becomes_what_the_reference_says(
     assert switch.counters.punted == len(arrivals)
 
 
-def test_frames_of_all_fixtures_in_one_burst_get_each_its_own_ack(
+def test_frames_of_all_fixtures_in_one_burst_get_each_its_own_decision(
     switch: Plane, ends: dict[int, socket.socket]
 ) -> None:
     order = Random(7).choices(CASES, k=4 * len(CASES))
@@ -231,7 +231,7 @@ def test_what_is_none_of_our_business_is_not_even_counted(
     assert switch.counters.frames_in == 1
 
 
-def test_a_broadcast_hello_is_handed_up(switch: Plane, ends: dict[int, socket.socket]) -> None:
+def test_a_broadcast_hello_is_punted(switch: Plane, ends: dict[int, socket.socket]) -> None:
     hello = BROADCAST + frame(bytes(32), kind=Kind.HELLO)[6:]
     ends[IN].send(hello)
     assert take_in(switch, 1) == [ReceivedFrame(IN, PEER_MACS[IN], hello[14:])]

@@ -176,7 +176,7 @@ def test_with_cdr_the_very_bytes_cross(recording: str, tmp_path: Path) -> None:
         (["--mtu", "100"], "an MTU is 576 to 65521 bytes"),
     ],
 )
-def test_wrong_input_is_told_before_anything_starts(arguments: Sequence[str], complaint: str) -> None:
+def test_wrong_input_is_reported_before_anything_starts(arguments: Sequence[str], complaint: str) -> None:
     ended = ring(*arguments)
     assert ended.returncode == 2
     assert complaint in ended.stderr

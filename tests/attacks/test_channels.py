@@ -76,7 +76,7 @@ def test_a39_a_rib_that_restarted_takes_no_advertisement_that_a_stranger_recorde
     flow.outlive()
 
 
-def test_an_old_nobody_delays_no_message() -> None:
+def test_an_old_negative_response_delays_no_message() -> None:
     world = ring()
     tap = Tap("nuc4", "nuc5")
     world.network.taps.append(tap)

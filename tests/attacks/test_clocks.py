@@ -85,7 +85,7 @@ def test_a30_a_switch_that_restarts_with_its_clock_an_hour_off_is_heard_at_once(
 
 
 @pytest.mark.momentary("how soon a flow goes on is the question")
-def test_a30_clocks_an_hour_off_to_both_sides_part_nobody() -> None:
+def test_a30_clocks_an_hour_off_to_both_sides_separate_no_nodes() -> None:
     world = ring()
     flow = flowing(world)
     world.network.run(1)

@@ -109,7 +109,7 @@ def test_a52_no_provider_tells_a_machine_a_private_key(
     assert not [each for each in launchers_secrets(desk) if each in told]
 
 
-def test_a52_ec2_is_told_no_private_key(desk: Desk, cloud: Cloud, aws: AwsProvider) -> None:
+def test_a52_ec2_receives_no_private_key(desk: Desk, cloud: Cloud, aws: AwsProvider) -> None:
     told = cloud.user_data(aws.create(spec("enrolled"), desk.boot(shares_host=False)))
     paths = [each["path"] for each in told["write_files"]]
     assert f"/var/lib/fog/{TICKET_FILE}" in paths

@@ -262,7 +262,7 @@ def test_a22_a_hello_of_an_earlier_life_played_at_another_port_lets_no_neighbour
     assert known.state is NeighbourState.UP
 
 
-def test_a20_a_conflict_that_has_not_proved_itself_draws_no_more_than_it_sent() -> None:
+def test_a20_a_second_node_of_an_identity_without_proof_draws_no_more_than_it_sent() -> None:
     calm, link = pair(FAST), pair(FAST)
     for each in (calm, link):
         each.run(4.0)

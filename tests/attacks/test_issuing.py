@@ -140,7 +140,7 @@ def test_a73_issuers_at_the_same_time_write_one_chain(tmp_path: Path) -> None:
     assert {each.label for each in read_ledger(tmp_path / "lab")} == {f"p{index}" for index in range(8)}
 
 
-def test_a73_nothing_is_handed_out_that_cannot_be_written_down(tmp_path: Path) -> None:
+def test_a73_nothing_is_issued_that_cannot_be_recorded(tmp_path: Path) -> None:
     make_domain(tmp_path / "lab", "lab")
     os.symlink(tmp_path / "elsewhere", tmp_path / "lab" / LEDGER)
     with pytest.raises(LocalError, match=LEDGER):

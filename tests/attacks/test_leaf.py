@@ -108,7 +108,7 @@ def test_l01_a_leaf_on_the_cheapest_way_carries_its_own_nodes_only() -> None:
     own.outlive()
 
 
-def test_l02_a_leaf_that_lists_links_to_everybody_attracts_nobody() -> None:
+def test_l02_a_leaf_that_lists_links_to_all_switches_attracts_no_traffic() -> None:
     world = detour()
     flow = flowing(world, source=TALKER, readers=(LISTENER,))
     leaf = world.identities["leaf"]
@@ -233,7 +233,7 @@ def test_l07_frames_in_anothers_name_from_a_leaf_become_no_copies() -> None:
     flow.outlive()
 
 
-def test_l08_a_leaf_that_advertisements_for_another_switchs_node_is_refused_by_the_rib() -> None:
+def test_l08_a_leaf_that_advertises_for_another_switchs_node_is_refused_by_the_rib() -> None:
     world = detour()
     flow = flowing(world, source=TALKER, readers=(LISTENER,))
     leaf = world.switches["leaf"]

@@ -94,7 +94,7 @@ def test_a33_a_reader_whose_state_was_lost_is_heard_again_at_once() -> None:
     assert pipe.run(1.0, lambda: again.messages == [b"for the new life"])
 
 
-def test_a24_who_was_left_out_of_the_new_epoch_fills_no_place_and_speaks_for_nobody() -> None:
+def test_a24_a_reader_left_out_of_the_new_epoch_fills_no_quota_and_speaks_for_no_other() -> None:
     pipe = Pipe(publisher_of())
     end = live(pipe, b"a")
     end.writer_proxy.renew(TWO)
@@ -224,7 +224,7 @@ def test_a56_a_reader_that_asks_for_everything_costs_a_bounded_share() -> None:
 
 
 @pytest.mark.parametrize("said", [(576, 9_000), tuple(range(8_999, 577, -7))])
-def test_a57_a_path_of_every_width_has_what_is_kept_sealed_anew_a_few_times_only(said: tuple[int, ...]) -> None:
+def test_a57_a_path_of_every_width_has_kept_messages_sealed_again_a_few_times_only(said: tuple[int, ...]) -> None:
     path, width, narrowed = PathMtu(), 9_000, 0
     path.receive_mtu(width, 0.0)
     for turn in range(1_000):

@@ -53,7 +53,7 @@ def watch(at: RibCore, by: Identity, number: int) -> None:
     at.statements_to_send()
 
 
-def test_a14_a_greedy_asker_leaves_room_for_the_watches_of_others() -> None:
+def test_a14_a_greedy_client_leaves_capacity_for_the_watches_of_others() -> None:
     at = rib(watches=100)
     for number in range(1, 200):
         watch(at, CLOUD_SWITCH, number)
@@ -170,7 +170,7 @@ def renamed(one: Advertisement, name: Name) -> Advertisement:
     return replace(one, subject=subject)
 
 
-def test_a16_one_nodes_names_leave_room_for_the_other_nodes_of_its_switch() -> None:
+def test_a16_one_nodes_names_leave_capacity_for_the_other_nodes_of_its_switch() -> None:
     at = rib(names_per_sender=20)
     for number in range(30):
         tell(at, advertisement(subject=_subject(f"/own{number}"), chain=[]))
@@ -199,7 +199,7 @@ def _port_of(world: Simulation, switch: str, label: str) -> int:
     return next(port for port, (_, _, far) in ports.items() if far.node == label)
 
 
-def test_a17_a18_frames_to_invented_names_are_asked_for_within_a_budget_and_delay_nobody_else() -> None:
+def test_a17_a18_frames_to_invented_names_cause_queries_within_a_budget_and_delay_no_others() -> None:
     world = ring()
     flow = flowing(world)
     other = world.add_member("nuc1/other", "nuc1")
@@ -223,7 +223,7 @@ def test_a17_a18_frames_to_invented_names_are_asked_for_within_a_budget_and_dela
     flow.outlive()
 
 
-def test_a65_one_neighbours_branches_leave_room_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a65_one_neighbours_branches_leave_capacity_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gdp.switch.multicast.TREES_MAX", ROOM)
     world = ring()
     multicast = world.switches["nuc1"].multicast

@@ -72,7 +72,7 @@ def test_a58_parts_forged_in_one_topic_leave_the_publishers_other_topics_alone()
     assert [joined.message for joined in other.give(other.frames(1, IMAGE))] == [IMAGE]
 
 
-def test_a58_no_source_holds_more_than_its_bound_and_nobody_all() -> None:
+def test_a58_no_source_holds_more_than_its_bound_or_the_whole_quota() -> None:
     budget = ReassemblyQuota(TOTAL_BYTES, SOURCE_BYTES)
     streams = [Stream(budget, bytes([name]) * 32) for name in range(5)]
     for stream in streams:

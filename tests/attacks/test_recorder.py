@@ -154,7 +154,7 @@ def test_a54_a_far_publisher_writes_neither_lines_nor_escapes_into_the_log(caplo
     assert text.isprintable()
 
 
-def test_a54_many_messages_that_cannot_be_taken_are_told_in_a_few_lines(caplog: pytest.LogCaptureFixture) -> None:
+def test_a54_many_messages_that_cannot_be_taken_are_logged_in_a_few_lines(caplog: pytest.LogCaptureFixture) -> None:
     recorder = Recorder()
     with caplog.at_level(logging.DEBUG):
         recorder.receive(described(channel()), *[b""] * 16_000)

@@ -28,7 +28,7 @@ def recorded_life(flow: Flow) -> Tap:
 
 
 @pytest.mark.parametrize("reliable", [True, False])
-def test_a10_commands_of_an_hour_ago_are_not_handed_to_a_restarted_reader(reliable: bool) -> None:
+def test_a10_commands_of_an_hour_ago_are_not_delivered_to_a_restarted_reader(reliable: bool) -> None:
     world = ring()
     tap = Tap("nuc5", SERVER)
     world.network.taps.append(tap)
@@ -52,7 +52,7 @@ def test_a10_commands_of_an_hour_ago_are_not_handed_to_a_restarted_reader(reliab
     flow.outlive()
 
 
-def test_a11_a_request_of_ten_minutes_ago_is_not_handed_to_a_restarted_server() -> None:
+def test_a11_a_request_of_ten_minutes_ago_is_not_delivered_to_a_restarted_server() -> None:
     world = ring()
     tap = Tap("nuc5", SERVER)
     world.network.taps.append(tap)

@@ -129,7 +129,7 @@ def test_a04_a_switch_that_restarts_does_not_believe_a_revoked_member(tmp_path: 
     flow.outlive(nobody=True)
 
 
-def test_a04_a_restarted_switch_is_told_by_its_neighbour_whatever_junk_came_in_between() -> None:
+def test_a04_a_restarted_switch_learns_from_its_neighbour_whatever_junk_came_in_between() -> None:
     world, flow = with_thief()
     member = world.identities[ROBOT].member
     world.switches["nuc2"].revoke(by_root(world, "school", member.fingerprint), world.network.now)

@@ -83,7 +83,7 @@ def test_a70_a_link_state_of_a_rib_called_zero_is_malformed() -> None:
 
 
 @pytest.mark.parametrize("sequence", [(1 << 64) - 1, 1 << 60])
-def test_a23_a71_a_ack_of_a_giant_number_ends_no_proxy(sequence: int) -> None:
+def test_a23_a71_an_ack_of_a_giant_number_ends_no_proxy(sequence: int) -> None:
     world = ring()
     flow = flowing(world)
     rib, robot = world.identities["rib:school"], world.members[ROBOT]

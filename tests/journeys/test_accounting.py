@@ -257,7 +257,7 @@ def altered(frame: bytes, at: int, value: bytes) -> bytes:
     return frame[:at] + value + frame[at + len(value) :]
 
 
-def test_every_frame_that_a_reader_is_handed_is_delivered_or_dropped_for_a_reason(books: Books) -> None:
+def test_every_frame_that_a_reader_gets_is_delivered_or_dropped_for_a_reason(books: Books) -> None:
     flow, world = books.flow, books.world
     tap = Tap("s5", B)
     books.network.taps.append(tap)

@@ -123,7 +123,7 @@ def test_reading_again_on_purpose_is_no_loss() -> None:
     assert 10 < len(flow.numbers(READER)) < 40
 
 
-def test_a_latched_topic_that_nobody_read_yet_has_lost_nothing_for_its_first_reader() -> None:
+def test_a_latched_topic_without_earlier_readers_has_lost_nothing_for_its_first_reader() -> None:
     world = Simulation(chain(2))
     assert world.settle()
     flow = advertise(world, source=SOURCE, depth=2)

@@ -223,7 +223,7 @@ def test_what_was_sealed_too_large_for_its_link_arrives_all_the_same() -> None:
     flow.outlive()
 
 
-def test_of_two_readers_neither_gets_a_message_twice_that_had_to_be_split_anew() -> None:
+def test_of_two_readers_neither_gets_a_refragmented_message_twice() -> None:
     world = wide(ring5())
     world.add_member("nuc2/near", "nuc2")
     assert world.settle()
@@ -237,7 +237,7 @@ def test_of_two_readers_neither_gets_a_message_twice_that_had_to_be_split_anew()
     flow.outlive()
 
 
-def test_a_late_reassembler_behind_a_narrow_link_gets_what_was_kept_for_it() -> None:
+def test_a_late_joiner_behind_a_narrow_link_gets_what_was_kept_for_it() -> None:
     world = wide(ring5())
     world.lead_mtu = 1_000
     world.add_member("nuc3/narrow", "nuc3")

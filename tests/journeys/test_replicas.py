@@ -228,7 +228,7 @@ def test_two_of_three_servers_may_freeze_at_once() -> None:
     outlive(world, client, servers[0])
 
 
-def test_a_server_that_thaws_goes_on_with_what_is_new_and_holds_nobody_up() -> None:
+def test_a_server_that_thaws_continues_with_new_requests_and_delays_no_other() -> None:
     world, client, servers = cluster(*SERVERS)
     load = Load(client, servers, size=3_000)
     frozen = servers[2]
@@ -244,7 +244,7 @@ def test_a_server_that_thaws_goes_on_with_what_is_new_and_holds_nobody_up() -> N
     outlive(world, client, *servers)
 
 
-def test_a_silent_server_is_no_peer_though_nobody_asks_anything() -> None:
+def test_a_silent_server_is_no_peer_even_without_requests() -> None:
     world, client, (heard, silent) = cluster(*SERVERS[:2])
     world.network.run(3)
     assert len(client.member.peers(client.service)) == 2
@@ -272,7 +272,7 @@ def test_the_only_server_keeps_its_requests_as_long_as_ever() -> None:
     outlive(world, client, *servers)
 
 
-def test_a_server_that_starts_anew_is_a_peer_again_as_soon_as_it_is_there() -> None:
+def test_a_restarted_server_is_a_peer_again_as_soon_as_it_is_there() -> None:
     world, client, servers = cluster(*SERVERS, lease_s=ADVERTISEMENT_LEASE_S)
     load = Load(client, servers, size=100)
     again = servers[2]

@@ -95,7 +95,7 @@ def test_a_publisher_whose_delegation_is_revoked_is_gone_from_every_tier() -> No
     flow.outlive(nobody=True)
 
 
-def test_what_a_revoked_publisher_still_sends_reaches_nobody() -> None:
+def test_messages_of_a_revoked_publisher_reach_no_reader() -> None:
     flow = flowing(ring())
     revoke(flow.world, flow.topic.delegation)
     flow.world.network.run(WITHIN_S)
@@ -105,7 +105,7 @@ def test_what_a_revoked_publisher_still_sends_reaches_nobody() -> None:
     flow.outlive(nobody=True)
 
 
-def test_a_revoked_publisher_that_advertisements_again_is_refused() -> None:
+def test_a_revoked_publisher_that_advertises_again_is_refused() -> None:
     flow = flowing(ring())
     world = flow.world
     revoke(world, flow.topic.delegation)

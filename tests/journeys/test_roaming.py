@@ -67,7 +67,7 @@ def test_moving_there_and_back_again_ends_where_it_began() -> None:
     flow.outlive()
 
 
-def test_who_watches_is_told_within_the_blink_of_an_eye() -> None:
+def test_a_watcher_is_informed_at_once() -> None:
     flow = flowing(ring())
     world = flow.world
     world.roam(ROBOT, "nuc2")
@@ -94,7 +94,7 @@ def test_the_old_branch_is_left_at_once() -> None:
     flow.outlive()
 
 
-def test_a_new_life_of_a_publisher_is_read_anew() -> None:
+def test_a_new_incarnation_of_a_publisher_is_read_from_its_start() -> None:
     flow = flowing(ring())
     world = flow.world
     flow.publish(b"first life")

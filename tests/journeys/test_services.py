@@ -136,7 +136,7 @@ def test_answers_to_a_former_life_do_not_reach_the_new_one() -> None:
     outlive(world, client, server)
 
 
-def test_a_server_that_starts_anew_answers_again() -> None:
+def test_a_restarted_server_answers_again() -> None:
     world = ring()
     server, client = pair(world)
     client.publish(b"1")
@@ -210,7 +210,7 @@ def test_a_node_without_the_right_to_serve_or_call_does_neither() -> None:
         member.call(world.topic(SERVICE, member, [Right.SERVE], kind="service"), b"")
 
 
-def test_who_may_only_call_is_heard_by_no_client_however_it_advertisements() -> None:
+def test_a_node_that_may_only_call_reaches_no_client_however_it_advertises() -> None:
     world = ring()
     server, client = pair(world)
     world.add_member(OTHER, "nuc4")
@@ -294,7 +294,7 @@ def test_a_narrower_path_lets_answers_go_in_smaller_frames() -> None:
     outlive(world, client, server)
 
 
-def test_a_private_stream_that_nobody_uses_is_forgotten_and_goes_on_above_its_numbers() -> None:
+def test_an_unused_unicast_stream_is_forgotten_and_goes_on_above_its_numbers() -> None:
     world = ring()
     server, client = pair(world)
     server.answer(client.member.name, b"1")

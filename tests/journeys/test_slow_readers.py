@@ -129,7 +129,7 @@ def test_reliable_a_slow_reader_slows_its_own_publisher_and_no_other_topic_of_th
 
 
 @pytest.mark.parametrize("frames_s", [0, 20])
-def test_reliable_after_the_lease_the_slow_one_holds_nothing_and_is_told_what_it_will_not_get(frames_s: int) -> None:
+def test_reliable_after_the_lease_the_slow_one_holds_nothing_and_learns_what_it_will_not_get(frames_s: int) -> None:
     world, slow = world_with_a_slow_one(frames_s=1e6)
     flow = flowing(world, source=SOURCE, readers=(NEAR, FAR, SLOW))
     world.network.run(SOON_S)  # the slow one knows where to begin
@@ -174,7 +174,7 @@ def test_a_reader_that_dies_holds_its_publisher_for_no_longer_than_its_lease() -
     flow.outlive(NEAR)
 
 
-def test_best_effort_of_what_nobody_takes_the_oldest_go_and_are_counted() -> None:
+def test_best_effort_the_oldest_unsent_messages_are_dropped_and_counted() -> None:
     world, _ = world_with_a_slow_one(frames_s=1e6)
     flow = flowing(world, source=SOURCE, readers=(FAR,), reliable=False)
     world.network.set_link(world.leads[SOURCE], up=False)

@@ -62,7 +62,7 @@ def test_who_is_not_here_leaves_a_reason_in_place_of_a_figure() -> None:
     assert str(target) == "speed: target ≥ 1.00, not measured: ours is not here: no CAP_BPF"
 
 
-def test_a_figure_without_a_bound_is_only_told() -> None:
+def test_a_figure_without_a_bound_is_only_printed() -> None:
     target = rounds(ours=[1.0], theirs=[4.0]).ratio("beside", "ours", "theirs", CASE, COLUMN, None)
     assert target.met is None
     assert str(target) == "beside: measured 0.25"

@@ -105,7 +105,7 @@ def test_a_drawn_tag_is_found_where_it_is() -> None:
 
 
 @pytest.mark.skipif(not MESHES.is_dir(), reason="no ../shared/data/planning here")
-def test_a_planner_finds_a_way_and_breaks_off_when_told() -> None:
+def test_a_planner_finds_a_path_and_stops_on_command() -> None:
     for module in ("ompl", "fcl", "trimesh", "collada"):
         if importlib.util.find_spec(module) is None:
             pytest.skip(f"{module} is not installed: pip install 'gdp-ros[experiments]'")

@@ -178,7 +178,7 @@ def test_only_what_is_asked_for_is_let_in(cloud: Cloud) -> None:
     open_.close()
 
 
-def test_nobody_logs_in_where_nobody_may(cloud: Cloud, aws: AwsProvider) -> None:
+def test_a_machine_without_ssh_settings_has_no_shell(cloud: Cloud, aws: AwsProvider) -> None:
     with pytest.raises(LocalError, match=r"aws\.ssh"):
         aws.shell(aws.create(spec("closed"), BOOT))
 

@@ -106,7 +106,7 @@ def test_a_machine_that_may_stay_hears_nothing(service: Service) -> None:
     assert (seen.notices, seen.drains, service.tokens_given) == ([], 0, 1)
 
 
-def test_a_notice_is_told_at_once_and_the_machine_drains_in_time(service: Service) -> None:
+def test_a_notice_is_reported_at_once_and_the_machine_drains_in_time(service: Service) -> None:
     seen = Seen(service)
     interrupt(service)
     assert not seen.watch.look(LEAVES_AT - 120)

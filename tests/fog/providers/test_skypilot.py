@@ -156,7 +156,7 @@ def test_states_are_those_of_a_machine(
     assert (machine.state, machine.reason) == expected
 
 
-def test_changed_labels_are_told(sky: Sky, provider: SkyPilotProvider) -> None:
+def test_changed_labels_are_reported(sky: Sky, provider: SkyPilotProvider) -> None:
     sky.record(SPEC, State.UP, labels={"fog-cluster": b"a-demo".hex()})
     with pytest.raises(LocalError, match="labels make no sense"):
         provider.describe("a-demo")

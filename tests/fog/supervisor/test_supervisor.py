@@ -174,7 +174,7 @@ def test_a_machine_that_no_journal_knows_is_given_back(site: Site, journal: Jour
     ours.close()
 
 
-def test_a_lost_machine_is_replaced_and_told(site: Site, journal: Journal) -> None:
+def test_a_lost_machine_is_replaced_and_reported(site: Site, journal: Journal) -> None:
     provider = Memory()
     ours = supervisor(site, journal, provider)
     journal.want(PLAN, time.time())
@@ -185,7 +185,7 @@ def test_a_lost_machine_is_replaced_and_told(site: Site, journal: Journal) -> No
     assert [each.what for each in journal.events("c") if each.machine == "m1"][-1] == "taken"
 
 
-def test_a_refusal_is_told_and_tried_elsewhere(site: Site, journal: Journal) -> None:
+def test_a_refusal_is_reported_and_tried_elsewhere(site: Site, journal: Journal) -> None:
     provider = Memory()
     provider.refuses = 1
     ours = supervisor(site, journal, provider)
@@ -203,7 +203,7 @@ def test_a_spent_budget_ends_a_cluster(site: Site, journal: Journal) -> None:
     assert "budget" in journal.cluster("c").why
 
 
-def test_a_cluster_that_nobody_calls_is_ended_and_one_that_is_called_is_not(
+def test_a_cluster_without_calls_is_ended_and_one_that_is_called_is_not(
     site: Site, journal: Journal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     provider, now_s = Memory(), time.time()
@@ -350,7 +350,7 @@ def test_a_supervisor_that_begins_again_finds_the_gateway(site: Site, journal: J
     second.close()
 
 
-def test_an_uplink_that_cannot_be_attached_is_told_once_and_tried_again(site: Site, journal: Journal) -> None:
+def test_an_uplink_that_cannot_be_attached_is_reported_once_and_tried_again(site: Site, journal: Journal) -> None:
     provider = Grouped()
     provider.fails = 5
     ours = supervisor(site, journal, provider)

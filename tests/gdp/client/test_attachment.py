@@ -28,7 +28,7 @@ def of(world: Simulation, right: Right) -> PendingAdvertisement:
     return next(each for each in world.members[ROBOT].attachment.advertisements if each.right is right)
 
 
-def test_a_refused_advertisement_is_judged_and_says_why() -> None:
+def test_a_refused_advertisement_is_acknowledged_with_the_reason() -> None:
     world = ring()
     advertisement_without_delegation(world)
     assert world.network.run(2, lambda: of(world, Right.PUBLISH).is_acknowledged)

@@ -126,7 +126,7 @@ def test_a_status_whose_oldest_is_giant_ends_its_own_writer_proxy_and_no_more() 
 
 
 @pytest.mark.parametrize("reliable", [Flag.RELIABLE, Flag.NONE])
-def test_a_message_whose_number_has_no_next_is_refused_and_ends_nobody(reliable: Flag) -> None:
+def test_a_message_whose_number_has_no_next_is_refused_and_ends_no_reader(reliable: Flag) -> None:
     pipe, end = live()
     status = Heartbeat((1 << 64) - 2, (1 << 64) - 1, 0, {}, b"").to_wire()
     give(pipe, end, forge(500, status, kind=Kind.HEARTBEAT, signer=WRITER))

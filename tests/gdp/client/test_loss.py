@@ -66,7 +66,7 @@ def test_a_reader_that_was_away_within_the_grace_time_loses_nothing(away_s: floa
     assert pipe.publisher.acknowledged == pipe.publisher.messages
 
 
-def test_a_reader_that_was_away_for_longer_is_told_exactly_what_it_lost_and_why() -> None:
+def test_a_reader_that_was_away_for_longer_learns_exactly_what_it_lost_and_why() -> None:
     pipe = Pipe(publisher_of())
     (end,) = live(pipe, b"a")
     stream(pipe, 2.0)
@@ -84,7 +84,7 @@ def test_a_reader_that_was_away_for_longer_is_told_exactly_what_it_lost_and_why(
     assert pipe.publisher.messages - pipe.publisher.acknowledged == end.writer_proxy.lost
 
 
-def test_a_suspended_reader_holds_up_nobody_and_gets_what_it_lacks_when_it_returns() -> None:
+def test_a_suspended_reader_delays_no_other_and_gets_what_it_lacks_when_it_returns() -> None:
     pipe = Pipe(publisher_of())
     stays, moves = live(pipe, b"a", b"b")
     silence(moves, is_silent=True)

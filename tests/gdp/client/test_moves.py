@@ -96,7 +96,7 @@ def test_confirmed_messages_are_counted_and_not_their_numbers() -> None:
     assert pipe.publisher.acknowledged == pipe.publisher.messages == len(one.messages) == 30
 
 
-def test_a_late_reassembler_gets_latched_messages_in_the_new_size_and_nobody_gets_them_again() -> None:
+def test_a_late_joiner_gets_latched_messages_in_the_new_size_and_no_reader_gets_them_again() -> None:
     pipe = wide(depth=3)
     (one,) = joined(pipe, b"a")
     sent = messages(10)

@@ -52,7 +52,7 @@ def test_a_topic_may_come_back_as_something_else() -> None:
     assert writer_proxy.description == b"described anew"
 
 
-def test_what_was_withdrawn_reaches_nobody() -> None:
+def test_messages_of_a_withdrawn_name_reach_no_reader() -> None:
     flow = flowing(ring())
     flow.member.withdraw(flow.topic.name)
     flow.member.withdraw(flow.topic.name)

@@ -70,7 +70,7 @@ def test_one_that_is_due_again_and_again_leaves_nothing_behind() -> None:
     assert [len(each) for each in (timers._heap, timers._due_s, timers._place_s, timers._touched)] == [0, 0, 0, 0]
 
 
-def test_one_that_was_taken_is_asked_anew() -> None:
+def test_a_timer_that_fired_is_queried_again() -> None:
     clock = Clock(1.0)
     timers = timers_of(clock)
     assert timers.poll_due(0.5) == []

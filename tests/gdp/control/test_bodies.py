@@ -101,6 +101,6 @@ def test_what_is_taken_has_no_reason() -> None:
     assert AdvertiseAck.from_fields(parse(taken.to_wire(NODE.name, NODE.key, b"")).fields) == taken
 
 
-def test_an_answer_that_names_the_name_itself_without_a_advertisement_is_nobody() -> None:
+def test_a_response_that_names_the_name_itself_without_an_advertisement_is_negative() -> None:
     assert Response(A, A, b"", C, (), 2.0).is_nobody
     assert not Response(A, B, b"", C, (), 0.0).is_nobody

@@ -255,7 +255,7 @@ def test_keepalives_do_not_keep_up_whose_membership_ran_out() -> None:
     assert not pair.is_up("a")
 
 
-def test_a_node_that_had_no_time_itself_calls_nobody_silent() -> None:
+def test_a_node_that_had_no_time_itself_reports_no_neighbour_as_silent() -> None:
     pair = up(Pair())
     pair.frozen |= {"a", "b"}
     pair.run(1.0)

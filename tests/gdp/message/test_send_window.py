@@ -159,7 +159,7 @@ def test_no_more_parts_are_looked_at_for_one_report_than_a_flight_of_small_frame
     assert len(window.frames_to_send(0.2)) == 8_192
 
 
-def test_a_reader_that_advertisements_what_was_not_sent_takes_nothing_from_another() -> None:
+def test_a_reader_that_reports_unsent_messages_takes_nothing_from_another() -> None:
     window = window_of(20, 100, (A, B))
     window.frames_to_send(0.0)
     window.handle_acknack(A, has((1 << 64) - 1, 0xFFFF_FFFF), 0.1)
@@ -168,7 +168,7 @@ def test_a_reader_that_advertisements_what_was_not_sent_takes_nothing_from_anoth
     assert window.acknowledged == 0
 
 
-def test_a_reader_that_advertisements_what_was_not_sent_does_not_make_it_best_effort_queue() -> None:
+def test_a_reader_that_reports_unsent_messages_does_not_make_them_unsent() -> None:
     window = window_of(5, 100)
     sent = window.frames_to_send(0.0)
     window.handle_acknack(A, has((1 << 64) - 1), 0.1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from gdp.nodes.busy_poll import BusyPoll
 
 
-def test_at_first_nobody_spins() -> None:
+def test_at_first_no_thread_polls() -> None:
     assert not BusyPoll(0.000_3).pays
 
 

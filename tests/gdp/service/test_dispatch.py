@@ -66,7 +66,7 @@ def test_an_answer_of_one_that_was_not_asked_is_not_taken() -> None:
     assert (bench.ends[call], bench.dispatch.strange) == ([], 2)
 
 
-def test_those_that_owe_an_answer_are_told_in_one_word_a_little_later() -> None:
+def test_servers_that_owe_a_response_get_one_batched_message_a_little_later() -> None:
     bench = Bench()
     first, second, third = (bench.begin() for _ in range(3))
     for call in (first, second, third):
@@ -80,7 +80,7 @@ def test_those_that_owe_an_answer_are_told_in_one_word_a_little_later() -> None:
     assert bench.stops(9.0) == []
 
 
-def test_with_some_each_is_told_privately_what_it_owes() -> None:
+def test_with_some_each_gets_a_private_message_of_what_it_owes() -> None:
     bench = Bench(SOME)
     call = bench.begin()
     bench.dispatch.answered(call, A, "a", 0.1)
@@ -136,7 +136,7 @@ def test_a_call_fails_when_all_refused_or_went(replication: Replication) -> None
         bench.begin()
 
 
-def test_an_answer_that_says_no_counts_if_nobody_says_yes() -> None:
+def test_a_negative_response_counts_if_no_server_sends_a_positive_one() -> None:
     bench = Bench(servers=(A, B))
     rejected, accepted, late = bench.begin(), bench.begin(), bench.begin()
     for call in (rejected, accepted, late):

@@ -261,7 +261,7 @@ def test_a_sequencer_that_restarts_goes_on_from_the_replica_that_is_furthest(see
     assert world.agreed()[-1] == b"%d" % (world.asked - 1)
 
 
-def test_a_second_client_is_told_who_keeps_the_order_until_that_one_is_gone() -> None:
+def test_a_second_client_learns_the_sequencer_until_that_one_is_gone() -> None:
     world = World(1, tells=True)
     assert world.ask() == ""
     world.settle()

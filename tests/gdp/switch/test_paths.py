@@ -70,7 +70,7 @@ def test_a_rib_at_ones_own_switch_needs_no_way() -> None:
     assert set(found.ribs()) == {name("rib")}
 
 
-def test_a_rib_that_nobody_names_is_nowhere() -> None:
+def test_an_unnamed_rib_has_no_path() -> None:
     assert three_domains().to_rib(name("no rib"), ALL) == (None, None)
 
 

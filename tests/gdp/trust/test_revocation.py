@@ -74,7 +74,7 @@ def test_an_owner_takes_back_only_what_is_its_own() -> None:
 
 
 @pytest.mark.parametrize("make", [by_lab, by_root])
-def test_what_is_new_is_told_from_what_is_known(make: object) -> None:
+def test_new_revocations_are_distinguished_from_known_ones(make: object) -> None:
     revoked, statement = Revocations(ROOTS), make(1)  # type: ignore[operator]
     assert take(revoked, statement) is not None
     assert take(revoked, statement) is None
@@ -136,7 +136,7 @@ def test_whose_certificates_are_not_held_is_refused_before_its_signature_is_look
     assert len(revoked) == 0
 
 
-def test_what_the_operator_hands_in_is_kept_whoever_issued_it() -> None:
+def test_a_revocation_of_the_operator_is_kept_for_any_issuer() -> None:
     revoked = Revocations(ROOTS, per_issuer=2, per_origin=2, of_owners=2)
     for number in range(5):
         assert revoked.receive_revocation(by_lab(number), OPERATOR, AT, lambda _: False) is not None
@@ -144,7 +144,7 @@ def test_what_the_operator_hands_in_is_kept_whoever_issued_it() -> None:
     assert all(has(revoked, number) for number in range(5))
 
 
-def test_a_known_one_that_the_operator_hands_in_never_gives_way() -> None:
+def test_a_known_one_that_the_operator_inserts_never_gives_way() -> None:
     revoked = Revocations(ROOTS, of_owners=3)
     for number in range(3):
         take(revoked, by_lab(number))
@@ -182,7 +182,7 @@ def test_within_a_givers_share_the_owner_that_has_most_gives_way() -> None:
     assert refusal(revoked, by_lab(3)) is DropReason.QUOTA
 
 
-def test_roots_have_room_that_nobody_else_can_fill() -> None:
+def test_roots_have_capacity_that_no_other_key_can_fill() -> None:
     revoked = Revocations(ROOTS, of_owners=2)
     for number in range(2):
         take(revoked, by_lab(number), b"ab"[number : number + 1])
@@ -190,7 +190,7 @@ def test_roots_have_room_that_nobody_else_can_fill() -> None:
     assert refusal(revoked, by_other(3), b"c") is DropReason.QUOTA
 
 
-def test_a_origin_has_a_rate_and_another_one_is_not_held_up() -> None:
+def test_an_origin_has_a_rate_and_another_one_is_not_delayed() -> None:
     revoked = Revocations(ROOTS, per_issuer=10_000)
     reasons = set()
     for number in range(600):
@@ -204,7 +204,7 @@ def test_a_origin_has_a_rate_and_another_one_is_not_held_up() -> None:
     assert take(revoked, by_root(1), b"a") is not None
 
 
-def test_forged_ones_use_up_the_rate_of_who_hands_them_in() -> None:
+def test_forged_ones_use_up_the_rate_of_their_origin() -> None:
     revoked = Revocations(ROOTS)
     verified = 0
     for number in range(200):

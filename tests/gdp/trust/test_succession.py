@@ -148,7 +148,7 @@ def test_a_successor_of_an_owner_delegates_its_names() -> None:
     verifier().verify(advertisement(chain=given.chain), NOW)
 
 
-def test_two_successions_leave_room_for_two_links() -> None:
+def test_two_successions_leave_space_for_two_links() -> None:
     second = heir(heir())
     given = second.delegate(card(GATEWAY), CAMERA_METADATA, [Right.PUBLISH], [0], DAY, may_delegate=True)
     assert len(given.chain) == 3

@@ -108,7 +108,7 @@ def test_two_proxies_on_each_graph_that_expose_and_import_the_same_topic(sites: 
     assert carried(*machines) == 40
 
 
-def test_a_proxy_that_exposes_beside_one_that_imports_does_not_send_back_what_came(
+def test_a_proxy_that_exposes_next_to_one_that_imports_does_not_send_messages_back(
     sites: Sites, caplog: pytest.LogCaptureFixture
 ) -> None:
     shared = graph()
@@ -129,7 +129,7 @@ def test_a_proxy_that_exposes_beside_one_that_imports_does_not_send_back_what_ca
 
 
 @pytest.mark.parametrize("is_killed", [False, True], ids=["goes", "dies"])
-def test_the_converter_takes_over_within_a_second_when_the_leading_proxy(sites: Sites, *, is_killed: bool) -> None:
+def test_the_other_bridge_takes_over_within_a_second_when_the_leading_proxy(sites: Sites, *, is_killed: bool) -> None:
     shared = graph()
     twins = sites.add(ROBOT, expose=[CHATTER], graph=shared), sites.add(CONVERTER, expose=[CHATTER], graph=shared)
     server = sites.add(SERVER, imports=[CHATTER])
@@ -166,7 +166,7 @@ def test_a_proxy_of_higher_rank_that_comes_later_takes_over_without_a_message_tw
     assert len(ear.texts) >= 90
 
 
-def test_twins_of_a_service_serve_it_once(sites: Sites) -> None:
+def test_two_bridges_of_a_service_serve_it_once(sites: Sites) -> None:
     shared, rule = graph(), f"kind: service, name: /switch, type: {known.SET_BOOL}"
     local = LocalServer(shared, answer=lambda _: switched("yes"))
     twins = sites.add(SERVER, expose=[rule], graph=shared), sites.add(FAR_CONVERTER, expose=[rule], graph=shared)
@@ -179,7 +179,7 @@ def test_twins_of_a_service_serve_it_once(sites: Sites) -> None:
     assert (local.asked, caller.outcomes) == (1, [switched("yes")])
 
 
-def test_twins_that_import_a_service_call_it_once_and_the_other_takes_over(sites: Sites) -> None:
+def test_two_bridges_that_import_a_service_call_it_once_and_the_other_takes_over(sites: Sites) -> None:
     shared, rule = graph(), f"kind: service, name: /switch, type: {known.SET_BOOL}"
     far = sites.add(SERVER, expose=[rule])
     local = LocalServer(far.graph, answer=lambda _: switched("yes"))

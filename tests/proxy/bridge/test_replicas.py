@@ -100,7 +100,7 @@ def test_a_call_under_way_is_answered_by_a_server_that_arrives_after_all_it_was_
     assert sites.run(1, lambda: caller.outcomes == [switched("still")])
 
 
-def test_a_late_first_copy_is_hedged_and_then_told_to_stop(sites: Sites) -> None:
+def test_a_late_first_copy_is_hedged_and_then_cancelled(sites: Sites) -> None:
     trigger = f"{SWITCH}, stop: /switch/stop, at_once: 1"
     machines, locals_, _, caller = replicas(sites, 2, expose=trigger, mode="mode: hedged, budget: 1")
     stops = [LocalServer(machine.graph, "/switch/stop", TRIGGER, lambda _: CDR + b"\1") for machine in machines]

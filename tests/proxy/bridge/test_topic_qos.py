@@ -114,7 +114,7 @@ def test_a_latched_topic_reaches_the_same_reader_again_after_it_left(sites: Site
     assert again.texts == ["map"]
 
 
-def test_what_two_publishers_latched_reaches_a_late_reassembler_from_both(sites: Sites) -> None:
+def test_what_two_publishers_latched_reaches_a_late_joiner_from_both(sites: Sites) -> None:
     robot, server = pair(sites)
     talkers = [robot.graph.publish(f"/talker{n}", "/chatter", STRING, LATCHED) for n in range(2)]
     sites.run(1)
@@ -143,7 +143,7 @@ def test_what_a_later_publisher_latches_pushes_nothing_of_the_first_out(sites: S
     assert second.texts == ["first", "first", "later"]  # the first one's is kept, and was announced again as kept
 
 
-def test_what_publishers_on_two_machines_latched_reaches_a_late_reassembler_from_both(sites: Sites) -> None:
+def test_what_publishers_on_two_machines_latched_reaches_a_late_joiner_from_both(sites: Sites) -> None:
     robot, server = pair(sites)
     third = sites.add("nuc2/third", expose=[CHATTER])
     for machine, text in ((robot, "robot"), (third, "third")):
@@ -251,7 +251,7 @@ def test_a_reader_that_requests_more_than_the_source_offers_hears_what_is_new(si
     [replace(default(), deadline=(1, 0)), replace(default(), liveliness="manual_by_topic")],
     ids=["deadline", "liveliness"],
 )
-def test_what_no_network_can_promise_is_told_once_and_the_others_hear(
+def test_promises_beyond_any_network_are_reported_once_and_the_others_receive(
     sites: Sites, qos: Qos, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot, server = pair(sites)

@@ -89,7 +89,7 @@ def test_a_type_that_is_not_stated_is_the_one_found(place: Path) -> None:
     assert (match.type_name, match.is_held, match.faults) == (IMAGE, True, ())
 
 
-def test_what_nobody_publishes_yet_is_said_to_be_so(place: Path) -> None:
+def test_a_topic_without_a_publisher_is_described_as_such(place: Path) -> None:
     match = only(place, "expose", f"name: /image, type: {IMAGE}", [end(Role.SUBSCRIBES)], given(Right.PUBLISH))
     assert (match.nodes, match.faults, match.notes) == ((), (), ("nothing here publishes it now",))
     (finding,) = findings(place, "expose", ["name: /camera/*"])

@@ -106,7 +106,7 @@ def test_the_graph_shows_ends_that_come_and_go_and_never_our_own(ears: Ears, pee
     assert not {end.name for end in ears.endpoint.graph()} & {"/rosout", "/parameter_events"}
 
 
-def test_a_late_reassembler_gets_what_a_latched_channel_kept(ears: Ears, peer: Peer) -> None:
+def test_a_late_joiner_gets_what_a_latched_channel_kept(ears: Ears, peer: Peer) -> None:
     channel = ears.endpoint.channel("/map", STRING)
     handle = ears.endpoint.advertise(replace(channel, qos=(replace(LATCHED, depth=2),)))
     for word in ("one", "two", "three"):

@@ -51,7 +51,7 @@ def test_every_way_to_say_infinite_is_left_unsaid(infinite: tuple[int, int]) -> 
     assert filled(replace(RELIABLE, deadline=infinite, lifespan=infinite, lease=infinite)) == RELIABLE
 
 
-def test_a_ack_names_the_node_and_what_differs() -> None:
+def test_a_qos_report_names_the_node_and_the_difference() -> None:
     end = GraphEntity(Role.PUBLISHES, "/a", "std_msgs/msg/String", "/talker", "01", STRING.hash, RELIABLE)
     assert incompatibility(Role.SUBSCRIBES, STRING, RELIABLE, frozenset({end})) == ""
     other = replace(end, hash="RIHS01_" + "b" * 64)

@@ -176,7 +176,7 @@ def test_what_is_beyond_a_bound_is_refused_and_what_is_within_is_not(loose: str,
     assert to_ros1(tight, loose, to_ros2(loose, loose, raw)) == raw
 
 
-def test_channels_of_one_ros_and_of_equal_form_hand_on_the_same_bytes() -> None:
+def test_channels_of_one_ros_and_of_equal_form_forward_the_same_bytes() -> None:
     for ros in (1, 2):
         one, other = channel("string<=2 a\n", ros), channel("string a\n", ros)
         raw = b"whatever"
@@ -294,7 +294,7 @@ def test_fields_that_differ_in_case_alone_have_no_form_in_ros_2() -> None:
         translated_channel(channel("int32 k\nint32 K\n", 1), 2)
 
 
-def test_no_definition_has_no_converter() -> None:
+def test_a_channel_without_a_definition_has_no_translation() -> None:
     with pytest.raises(DefinitionError, match="no definition"):
         translated_channel(Channel("/t", "a/msg/B", 1), 2)
 
@@ -310,7 +310,7 @@ def test_latched_is_transient_local_in_ros_2() -> None:
     assert translated_channel(channel("", 1), 2).qos == ()
 
 
-def test_in_its_own_ros_a_channel_is_its_own_converter() -> None:
+def test_in_its_own_ros_a_channel_needs_no_translation() -> None:
     about = channel("string data\n", 2)
     assert translated_channel(about, 2) is about
 

@@ -401,7 +401,7 @@ def test_a_typed_array_of_another_kind_or_length_is_refused() -> None:
         assert refusal(about, cbor2.dumps({"a": cbor2.CBORTag(tag, raw)}), "cbor") is DropReason.MALFORMED
 
 
-def test_a_few_bytes_that_advertisement_many_records_without_fields_are_not_read() -> None:
+def test_a_few_bytes_that_announce_many_records_without_fields_are_not_read() -> None:
     channel = known.custom("a/msg/Nothings", f"a/Nothing[] nothings\n{RULE}MSG: a/Nothing\n", 1)
     serializer = Serializer(channel, "json")
     assert json.loads(serializer.encode(struct.pack("<I", 200))) == {"nothings": [{}] * 200}

@@ -152,6 +152,6 @@ def test_a_half_may_use_other_types() -> None:
     )
 
 
-def test_in_its_own_ros_a_service_is_its_own_converter() -> None:
+def test_in_its_own_ros_a_service_needs_no_translation() -> None:
     about = service("a/srv/B", "", "")
     assert translated_service(about, 1) is about

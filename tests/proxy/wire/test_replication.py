@@ -33,7 +33,7 @@ LOG = LogId(3, 0xFFFF_FFFF)
         SnapshotRequest(LOG),
     ],
 )
-def test_a_keepers_word_travels(word: SequencerMessage) -> None:
+def test_a_sequencer_message_survives_the_wire(word: SequencerMessage) -> None:
     assert is_word(to_wire(word))
     assert sequencer_message(to_wire(word)) == word
 

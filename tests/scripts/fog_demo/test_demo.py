@@ -49,7 +49,7 @@ def test_a_wrong_answer_is_counted() -> None:
     assert (line["wrong"], line["under_way"], line["median_ms"]) == (1, 1, 1.0)
 
 
-def test_the_longest_silence_since_the_line_before_is_told() -> None:
+def test_the_longest_silence_since_the_line_before_is_reported() -> None:
     stats = Tally()
     for now_s in (5.0, 5.5, 5.6):
         stats.answered(True, Tallied(success=True, message="a"), 0.001, now_s)

@@ -78,7 +78,7 @@ def test_a_listener_reads_when_a_message_was_said(talk: Talk, ros: int) -> None:
     assert mark.number == (1 if talk.latched else 5)
 
 
-def test_a_greeting_is_known_as_one() -> None:
+def test_a_message_is_read_as_its_mark() -> None:
     for talk in TALKS:
         if not talk.latched:
             assert talk.read(said(talk, 0)) == Mark(0, NOW_NS)

@@ -167,7 +167,7 @@ def frames(draw: st.DrawFn) -> bytes:
 
 @settings(deadline=None)
 @given(given=st.lists(frames(), min_size=1, max_size=8), entries=TABLES)
-def test_generated_frames_and_tables_get_the_ack_of_the_reference(
+def test_generated_frames_and_tables_get_the_decision_of_the_reference(
     loaded: LoadedProgram, given: list[bytes], entries: dict[bytes, Hops]
 ) -> None:
     table = forwards(loaded, entries)
