@@ -51,7 +51,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture
 def space() -> Iterator[Space]:
-    """A network namespace of its own, in which the test runs."""
+    """Network namespace of its own, in which the test runs."""
     with Space() as entered:
         yield entered
 

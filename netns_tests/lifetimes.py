@@ -17,7 +17,7 @@ LEASE_S = 2.0  # requested by tests with real processes, so that three leases pa
 
 @dataclass(frozen=True, slots=True)
 class Lifetime:
-    """One topology: the lease of its names, and for how many seconds it carried traffic."""
+    """Topology with the lease of its names and the seconds for which it carried traffic."""
 
     what: str
     lease_s: float

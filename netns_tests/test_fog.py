@@ -29,7 +29,7 @@ _MACHINES_S = 3 * PATIENCE_S
 
 
 class Fog:
-    """The command with a state folder of its own, run in the namespace of the test."""
+    """Command with a state folder of its own, run in the namespace of the test."""
 
     def __init__(self, state: Path) -> None:
         self.state = state

@@ -176,7 +176,7 @@ def test_an_action_lasts_longer_than_any_timeout_and_each_client_has_its_own_goa
     a.waits_for("goals[1].is_cancel_requested", True)
     a.tell("!goals[1].execute(stopped)")
     other.waits_for("results", [[5, [-1]]])  # STATUS_CANCELED
-    time.sleep(2 * TIMEOUT_S)  # what it is about
+    time.sleep(2 * TIMEOUT_S)  # longer than the timeout, on purpose
     a.tell("!goals[0].execute(folded)")
     b.waits_for("results", [[4, [5]]])  # STATUS_SUCCEEDED
     assert pair.proxy("b").warnings("/fold") == []

@@ -59,7 +59,7 @@ def machine_unit() -> str:
 
 @pytest.fixture(params=[*UNITS, None], ids=lambda each: each.stem if each else "fog-machine")
 def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A unit file, with a program that is there."""
+    """Unit file with an existing program."""
     text = machine_unit() if request.param is None else request.param.read_text()
     path = tmp_path / ("fog-machine.service" if request.param is None else request.param.name)
     path.write_text(re.sub(r"(?m)^(Exec\w+=\+?)/(?:opt|usr/local)/\S+", r"\1/bin/true", text))

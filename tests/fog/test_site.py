@@ -1,3 +1,5 @@
+"""Site configuration of a launcher: addresses, devices and defaults."""
+
 from __future__ import annotations
 
 from dataclasses import replace

@@ -19,7 +19,7 @@ class Echo:
     """Effect of one utterance on all nodes, as far as frames caused it; timers are not attributed.
 
     Args:
-        said: its frames. A machine that forwards one of them once carries it as a data plane would.
+        said: its frames. A machine that forwards one of them once acts like a data plane.
 
     Attributes:
         sent: bytes after the Ethernet header that machines sent, by node.

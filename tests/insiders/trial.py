@@ -63,11 +63,11 @@ class Figures:
     """Counters of a trial; trials add up.
 
     Attributes:
-        worst: highest ratio of the bytes that one machine sent to the bytes said, with both, by what was said and
-            whether its sender was proven.
-        said, drawn: bytes in all, by the same; what the busiest machine sent each time.
-        slowest: seconds of the slowest delivery, by what was said.
-        spent: seconds in all, by what was said; ``count`` so many.
+        worst: highest ratio of the bytes one machine sent to an utterance's bytes, with both, by statement type
+            and whether its sender was proven.
+        said, drawn: bytes in all, by the same; for ``drawn`` those of the busiest machine each time.
+        slowest: seconds of the slowest delivery, by statement type.
+        spent: seconds in all, by statement type; ``count`` so many.
         tables: longest of each.
     """
 
@@ -100,7 +100,7 @@ class _Said:
 
     Args:
         spent_s: time of its delivery.
-        at_s: when it was said.
+        at_s: when it was sent.
     """
 
     utterance: Utterance
@@ -128,7 +128,7 @@ class Trial:
         self.stage = stage or Stage(plan.seed)
         self.forge = Forge(self.stage, may_break=plan.is_stormy)
         self.figures = Figures()
-        self.at: Utterance | str | None = None  # what happens now
+        self.at: Utterance | str | None = None  # present activity
         self._sent = 0
         self._got: list[bytes] = []
         self._open: list[tuple[float, bytes]] = []  # messages of the good flow under way, with their deadlines

@@ -23,7 +23,7 @@ STEP_S = 0.25  # between messages of a flow that is to outlive leases
 
 @dataclass(slots=True)
 class Flow:
-    """One publisher of a topic and its readers, by label."""
+    """Publisher of a topic and its readers, by label."""
 
     world: Simulation
     name: str

@@ -45,7 +45,7 @@ class Fate(Enum):
 
 @dataclass(frozen=True)
 class Fault:
-    """A link or a switch that fails for ever, ``after_s`` after the first message; ``which`` counts modulo all."""
+    """Link or switch that fails for ever, ``after_s`` after the first message; ``which`` counts modulo all."""
 
     is_switch: bool
     which: int

@@ -1,3 +1,5 @@
+"""Price experiments: their tables and the shipped prices."""
+
 from __future__ import annotations
 
 import json

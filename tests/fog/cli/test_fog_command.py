@@ -1,3 +1,5 @@
+"""``fog`` command with a prepared state folder: texts, JSON, exit codes and refusals."""
+
 from __future__ import annotations
 
 import json

@@ -1,3 +1,5 @@
+"""Nodes that ``fog`` runs on the robot: their output, exit codes and end."""
+
 from __future__ import annotations
 
 import signal

@@ -44,7 +44,7 @@ DAY_S = 86_400.0
 
 @dataclass
 class Desk:
-    """A launcher with tickets of its own."""
+    """Launcher with tickets of its own."""
 
     folder: Path
     tickets: Tickets

@@ -1,3 +1,5 @@
+"""Enrolment of a machine: its files and keys, the listener, and the robot's rules."""
+
 from __future__ import annotations
 
 import time

@@ -1,3 +1,5 @@
+"""Stored latencies: measured once in a lifetime, each with its source."""
+
 from __future__ import annotations
 
 from collections.abc import Mapping

@@ -1,3 +1,5 @@
+"""Launch files with Fog actions: loaded nodes, arguments, and errors with positions."""
+
 import subprocess
 import sys
 from pathlib import Path

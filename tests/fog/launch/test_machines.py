@@ -1,3 +1,5 @@
+"""Machine requests of a cluster: replicas, regions, hardware and refusals."""
+
 import pytest
 
 from fog.cluster import MachineRequest

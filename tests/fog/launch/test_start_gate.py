@@ -1,3 +1,5 @@
+"""Start gate, which holds commands back until the cluster serves."""
+
 import subprocess
 from pathlib import Path
 

@@ -1,3 +1,5 @@
+"""Choice of offers for replicas: price, region and latency."""
+
 from __future__ import annotations
 
 import pytest

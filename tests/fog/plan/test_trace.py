@@ -1,3 +1,5 @@
+"""Preemption traces: uptime, downtime and recovery of replicas and pools."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Journal of a cluster on disk, shared by processes."""
+
 from __future__ import annotations
 
 import sqlite3

@@ -1,3 +1,5 @@
+"""Placement of replicas on offers, regions and providers."""
+
 from __future__ import annotations
 
 from dataclasses import replace

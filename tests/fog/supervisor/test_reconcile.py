@@ -1,3 +1,5 @@
+"""Reconcile decisions of the supervisor, as tables of records."""
+
 from __future__ import annotations
 
 from dataclasses import replace

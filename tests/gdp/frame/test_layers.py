@@ -1,3 +1,5 @@
+"""Scapy layers of GDP, compared with the codec on generated headers."""
+
 from __future__ import annotations
 
 import cbor2

@@ -1,3 +1,5 @@
+"""Delegation store of a node: lookup, expiry and foreign delegations."""
+
 from __future__ import annotations
 
 import time

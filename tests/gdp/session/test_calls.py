@@ -1,3 +1,5 @@
+"""Calls of the session API: servers, replicas and refusals."""
+
 from __future__ import annotations
 
 import pytest

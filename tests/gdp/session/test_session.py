@@ -1,3 +1,5 @@
+"""Session API over the simulated network: publish, subscribe and close."""
+
 from __future__ import annotations
 
 import pytest

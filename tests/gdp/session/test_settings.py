@@ -1,3 +1,5 @@
+"""Settings of a session from a node's directory or a configuration file."""
+
 from __future__ import annotations
 
 from pathlib import Path

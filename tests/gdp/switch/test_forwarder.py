@@ -1,3 +1,5 @@
+"""Forwarding decisions of ``decide`` on the fixtures and on arbitrary bytes."""
+
 from __future__ import annotations
 
 import pytest

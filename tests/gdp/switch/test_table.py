@@ -1,3 +1,5 @@
+"""Forwarding table: leases, observers, and bounds."""
+
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence

@@ -1,3 +1,5 @@
+"""Metrics of nodes: names, labels and scrapes."""
+
 from __future__ import annotations
 
 import socket

@@ -1,3 +1,5 @@
+"""Faults of a bridge: each is counted, the first of its kind is logged."""
+
 from __future__ import annotations
 
 import pytest

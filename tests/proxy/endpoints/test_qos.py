@@ -1,3 +1,5 @@
+"""QoS profiles: requested, offered and combined ones."""
+
 from __future__ import annotations
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+"""Comparison of two recordings: identical, lost, doubled and changed messages."""
+
 from __future__ import annotations
 
 import struct

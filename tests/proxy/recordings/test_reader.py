@@ -1,3 +1,5 @@
+"""Reader of recordings: whole, truncated, damaged and refused files."""
+
 from __future__ import annotations
 
 import shutil

@@ -1,3 +1,5 @@
+"""Channel descriptions and their wire form."""
+
 from __future__ import annotations
 
 import cbor2

@@ -1,3 +1,5 @@
+"""Message converter between ROS 1 and ROS 2."""
+
 from __future__ import annotations
 
 import struct
@@ -350,5 +352,5 @@ def test_an_altered_message_is_converted_or_refused(at: int, value: int) -> None
 
 
 def _empty_size() -> int:
-    """Return how long the message is whose bytes are all zero."""
+    """Return the length of the message whose bytes are all zero."""
     return next(size for size in range(500) if refusal(EITHER[0], bytes(size)) is None)

@@ -1,3 +1,5 @@
+"""Message definitions: parsed forms, bounds and refused texts."""
+
 from __future__ import annotations
 
 import pytest

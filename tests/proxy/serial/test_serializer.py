@@ -1,3 +1,5 @@
+"""Serializer of ROS messages: numbers, text, layout, and hostile bytes."""
+
 from __future__ import annotations
 
 import json

@@ -1,3 +1,5 @@
+"""Service converter between ROS 1 and ROS 2, and the MD5 sums of installed types."""
+
 from __future__ import annotations
 
 import json
