@@ -1,17 +1,22 @@
 """Rules of ``proxy.yaml`` as they apply to a recording.
 
-Sans-I/O. A recording has topics alone, and no QoS decides what is reliable or latched: without a word in the rule its
-topics are reliable, and a recorded latched topic stays latched.
+Sans-I/O. A recording has only topics, and it is exact: ``max_hz`` leaves none of its messages out, and each message
+that arrives is recorded, whatever its size. A replayed topic has the name that all machines know: ``remap``
+does not apply.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Final
 
+from gdp.limits import MESSAGE_MAX_BYTES
 from proxy.config.rule import Rule
 
 __all__ = ["RecordedRules"]
+
+_UNLIMITED: Final[dict[str, object]] = {"max_hz": None, "max_bytes": MESSAGE_MAX_BYTES}
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +33,11 @@ class RecordedRules:
 
     @classmethod
     def of(cls, *, expose: Iterable[Rule] = (), imports: Iterable[Rule] = ()) -> RecordedRules:
-        """Return the rules about topics."""
-        return cls(_topics(expose), _topics(imports))
+        """Return the rules about topics, without the limits that a recording does not have."""
+        return cls(
+            tuple(rule.model_copy(update={"remap": None, "max_hz": None}) for rule in expose if rule.kind == "topic"),
+            tuple(rule.model_copy(update=_UNLIMITED) for rule in imports if rule.kind == "topic"),
+        )
 
     @property
     def recorded_topics(self) -> tuple[tuple[str, str], ...]:
@@ -40,7 +48,3 @@ class RecordedRules:
         """Return 0: the recording is the only endpoint."""
         del rule
         return 0
-
-
-def _topics(rules: Iterable[Rule]) -> tuple[Rule, ...]:
-    return tuple(rule for rule in rules if rule.kind == "topic")

@@ -19,7 +19,7 @@ from proxy.bridge.topic_stats import TopicStats
 from proxy.config.config import ProxyConfig
 from proxy.config.recorded import RecordedRules
 from proxy.node.node import GOODBYE_S, ProxyNode, run_node
-from proxy.node.recording_bridge import open_recording_bridge, work
+from proxy.node.recording_bridge import open_recording_bridge
 from proxy.recordings.endpoint import RecordingEndpoint
 from proxy.recordings.writer import BagWriter
 
@@ -69,7 +69,7 @@ def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
     while not node.runtime.is_stopped:
         due_s = bridge.get_timer()
         node.runtime.step(max(tick_at_s if due_s is None else min(due_s, tick_at_s), time.monotonic()))
-        work(node, bridge)
+        bridge.work(time.monotonic())
         if not is_ready and node.member.attachment.is_attached:
             is_ready = True
             node.tell_refusals()

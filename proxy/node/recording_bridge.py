@@ -10,7 +10,6 @@ import logging
 import time
 from collections.abc import Iterator
 
-from gdp.errors import GdpError
 from gdp.nodes.delegation_store import DelegationStore
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext
@@ -60,12 +59,12 @@ def work(node: ProxyNode, bridge: Bridge) -> None:
 
 
 def _renew(node: ProxyNode, settings: ProxyConfig, rules: RecordedRules, bridge: Bridge) -> None:
-    """Read the delegations again: new epochs and longer validity take effect without a message lost."""
-    try:
-        held = DelegationStore(settings.delegations, node.identity)
-        topics = open_topics(settings, held)
-    except GdpError as error:
-        log.error("delegations not renewed reason=%s", error)
-        return
+    """Read the delegations again: new epochs and longer validity take effect without a message lost.
+
+    Raises:
+        GdpError: a delegation is missing or does not hold; the old ones stay in use.
+    """
+    held = DelegationStore(settings.delegations, node.identity)
+    topics = open_topics(settings, held)
     bridge.reload(rules, held)
     log.info("delegations renewed topics=%d", len(topics))

@@ -185,7 +185,8 @@ class Replay:
         now_s = time.monotonic()
         wait_s = TICK_S if at_most_s is None else min(max(at_most_s, 0.0), TICK_S)
         self._node.runtime.step(now_s + wait_s)
-        self._bridge.work(now_s)
+        if self._bridge.get_timer() is not None:  # delegations were read again
+            self._bridge.work(now_s)
         if now_s >= self._tick_at_s:
             self._tick_at_s = now_s + TICK_S
             self._report()

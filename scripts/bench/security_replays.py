@@ -134,13 +134,13 @@ class _Stepped:
     def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
         self._machine.receive(arrivals, self._at(now))
 
-    def timeout(self, now: Timestamps) -> None:
+    def handle_timer(self, now: Timestamps) -> None:
         self._machine.handle_timer(self._at(now))
 
-    def next_timeout(self) -> float | None:
+    def get_timer(self) -> float | None:
         return self._machine.get_timer()
 
-    def take(self) -> list[OutgoingFrames]:
+    def frames_to_send(self) -> list[OutgoingFrames]:
         return self._machine.frames_to_send()
 
 
@@ -574,7 +574,7 @@ def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
     begun_s, first = time.monotonic(), held["seeds"][1] + 1 if held else options.seed
     seed = first
     with ExitStack() as stack:
-        stack.enter_context(mock.patch("gdp.simulation.simulation.MemoryNetwork", RecordingNetwork))
+        stack.enter_context(mock.patch("gdp.simulation.simulation.SimNetwork", RecordingNetwork))
         stack.enter_context(signing_oracle())
         while counts.total() < options.tries and time.monotonic() - begun_s < options.seconds:
             with reproducible_keys(seed), _without(options.control):

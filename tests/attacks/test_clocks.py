@@ -30,7 +30,7 @@ _M = TypeVar("_M")
 
 def off(machine: _M, by_s: float) -> _M:
     """Give a machine a wrong wall clock."""
-    for name in ("add_port", "receive", "port_changed", "timeout"):
+    for name in ("add_port", "receive", "port_changed", "handle_timer"):
         method = getattr(machine, name)
 
         def shifted(*given: object, method: object = method) -> None:

@@ -200,7 +200,7 @@ def test_b02_words_of_a_decoder_are_printed_without_control_characters(
 ) -> None:
     said = frames((Kind.REFUSED, b"cannot be read: \x1b[2J\nno"))
     pipe = io.BytesIO(said)
-    monkeypatch.setattr(BagProcess, "take", lambda self, size, waiting=None: pipe.read(size))
+    monkeypatch.setattr(BagProcess, "read", lambda self, size, waiting=None: pipe.read(size))
     with pytest.raises(ConfigError, match=r"\\x1b\[2J\\nno"):
         BagReader(recording(tmp_path / "a.mcap"))
 

@@ -116,7 +116,7 @@ def prepared(seed: int) -> Iterator[None]:
     with ExitStack() as stack:
         stack.enter_context(reproducible_keys(seed))
         stack.enter_context(signing_oracle())
-        stack.enter_context(mock.patch("gdp.simulation.simulation.MemoryNetwork", TracingNetwork))
+        stack.enter_context(mock.patch("gdp.simulation.simulation.SimNetwork", TracingNetwork))
         yield
 
 

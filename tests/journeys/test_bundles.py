@@ -69,7 +69,7 @@ def test_a_step_asks_only_topics_that_have_something_to_do(monkeypatch: pytest.M
     asked: list[Publisher] = []
 
     for flow in idle:
-        for what in ("take", "next_timeout", "timeout"):
+        for what in ("poll_frames", "get_timer", "handle_timer"):
             monkeypatch.setattr(flow.publisher, what, partial(_noted, asked, flow.publisher))
     busy.stream(100, 0.01, 100)
     assert world.network.run(3, lambda: busy.has(SERVER, 100))

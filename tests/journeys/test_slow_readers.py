@@ -66,7 +66,7 @@ class Behind:
             return due_s
         return self._at_s if due_s is None else min(due_s, self._at_s)
 
-    def take(self) -> list[OutgoingFrames]:
+    def frames_to_send(self) -> list[OutgoingFrames]:
         return self._member.frames_to_send()
 
 

@@ -39,7 +39,7 @@ class Talker:
     def get_timer(self) -> float | None:
         return self.due_s
 
-    def take(self) -> list[OutgoingFrames]:
+    def frames_to_send(self) -> list[OutgoingFrames]:
         out, self.out = self.out, []
         return out
 

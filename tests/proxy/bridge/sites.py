@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, cast
 
 from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
@@ -180,7 +180,7 @@ class Sites:
         self.kill(machine)
         self.world.restart_member(machine.label)
         assert self.world.settle()
-        again = self._start(machine.label, [machine.graph], machine.bridge._config, None)
+        again = self._start(machine.label, [machine.graph], cast(ProxyConfig, machine.bridge._config), None)
         self.machines.append(again)
         return again
 

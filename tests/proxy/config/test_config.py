@@ -141,8 +141,11 @@ def test_a_wrong_domain_in_the_environment_is_reported(place: Path, monkeypatch:
         ("{domain: 0}", "6: ros.endpoint: required, but not there"),
         ("{endpoint: dds, domain: 233}", "30: ros.domain: expected less than or equal to 232, not 233"),
         ("{endpoint: ros, domain: 0}", "17: ros.endpoint: expected 'ros2', 'ros1' or 'dds', not 'ros'"),
-        ("{endpoint: ros2, id: 0}", "23: ros.id: unknown key; expected one of endpoint, domain, master, alone"),
-        ("[{endpoint: ros2, id: 0}]", "24: ros[0].id: unknown key; expected one of endpoint, domain, master, alone"),
+        ("{endpoint: ros2, id: 0}", "23: ros.id: unknown key; expected one of endpoint, domain, master, exclusive"),
+        (
+            "[{endpoint: ros2, id: 0}]",
+            "24: ros[0].id: unknown key; expected one of endpoint, domain, master, exclusive",
+        ),
         ("{endpoint: ros1, domain: 0}", "31: ros.domain: ROS 1 has no domains; it has a master"),
         ("{endpoint: ros2, master: 'http://a:1'}", "31: ros.master: ROS 2 has no master; it has a domain"),
         ("{endpoint: ros1, master: robot}", "31: ros.master: expected a URI such as http://localhost:11311"),

@@ -19,7 +19,7 @@ from proxy.config.json_schema import DIALECT
 from tests.proxy.rule_files import NODE, rules
 from tests.proxy.test_rules import BAD, GOOD
 
-COMMITTED = Path(__file__).parents[2] / "docs" / "proxy.schema.json"
+COMMITTED = Path(__file__).parents[3] / "docs" / "proxy.schema.json"
 
 
 def _sections(schema: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -250,6 +250,23 @@ def test_a_message_above_the_rules_limit_is_not_published_but_counted(sites: Sit
     assert robot.faults == {"too-large": 6}
 
 
+def test_max_hz_leaves_out_no_message_of_a_recording(sites: Sites, replayed: ReplayEndpoint) -> None:
+    rule = f"{CHATTER}, max_hz: 1"
+    robot = join(sites, ROBOT, replayed, expose=[rule])
+    server = join(sites, SERVER, RecordingEndpoint(None, [("/chatter", STRING)]), imports=[rule])
+    assert sites.run(3, robot.is_read)
+    play(sites, replayed)
+    sites.run(0.1)
+    (stats,) = server.bridge.stats
+    assert (stats.received, robot.site.traffic.thinned) == (6, 0)
+
+
+def test_a_replayed_topic_has_the_name_that_all_sides_know(sites: Sites, replayed: ReplayEndpoint) -> None:
+    robot = join(sites, ROBOT, replayed, expose=[f"{CHATTER}, remap: /local"])
+    sites.run(1)
+    assert robot.carried == {("/chatter", True)}
+
+
 def test_a_subscription_is_described_with_every_channel_before_its_first_message(replayed: ReplayEndpoint) -> None:
     handle = replayed.subscribe("/chatter", STRING, None)
     for message in replayed.messages():
@@ -289,6 +306,7 @@ def test_an_equal_channel_has_one_handle(tmp_path: Path) -> None:
 def test_a_recording_serves_and_calls_nothing() -> None:
     endpoint = RecordingEndpoint(None, [])
     service = known.services(2)[known.SET_BOOL]
-    for act in (lambda: endpoint.serve(service), lambda: endpoint.create_client("/switch", known.SET_BOOL)):
-        with pytest.raises(LocalError, match="a recording holds topics only"):
-            act()
+    with pytest.raises(LocalError, match="a recording holds topics only"):
+        endpoint.serve(service)
+    with pytest.raises(LocalError, match="a recording holds topics only"):
+        endpoint.create_client("/switch", known.SET_BOOL)

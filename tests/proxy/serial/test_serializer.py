@@ -215,7 +215,7 @@ def mixed_message(seed: int) -> tuple[Channel, bytes]:
     message = make["a/msg/B"](
         flag=bool(random.integers(2)),
         octet=int(random.integers(128)),
-        outgoing=int(random.integers(256)),
+        letter=int(random.integers(256)),
         i8=int(random.integers(-128, 128)),
         u16=int(random.integers(1 << 16)),
         i32=int(random.integers(-(1 << 31), 1 << 31)),
