@@ -59,7 +59,7 @@ class Terminals:
         return said
 
     def close(self) -> None:
-        """End what still runs, with a signal first: roscore has children of its own."""
+        """End all running commands, with a signal first: roscore has children of its own."""
         while self._running:
             _, process = self._running.pop()
             process.send_signal(signal.SIGINT)

@@ -249,7 +249,7 @@ class Pair:
         noted.append(Lifetime("the pair", LEASE_S, time.monotonic() - began_s))
 
     def shape(self, rate: str) -> None:
-        """Limit what machine "a" sends to "b", such as ``20mbit``; empty: no limit."""
+        """Limit the traffic from machine "a" to "b", such as ``20mbit``; empty: no limit."""
         words = ["add", "dev", "b", "root", "tbf", "rate", rate, "burst", "32kb", "latency", "50ms"]
         change = words if rate else ["del", "dev", "b", "root"]
         subprocess.run(self.spaces.command("a", ["tc", "qdisc", *change]), check=True)

@@ -47,7 +47,7 @@ def frame(
 
 
 def waiting(end: socket.socket) -> Iterator[bytes]:
-    """Yield what has arrived."""
+    """Yield the received frames."""
     end.setblocking(False)
     while True:
         try:
@@ -65,7 +65,7 @@ class Row:
 
     Attributes:
         sent: frames that A's device took.
-        delivered: what came to B, in order.
+        delivered: frames that came to B, in order.
         discarded: frames that the kernel could not deliver, as counted by the test.
         punted: frames that planes gave to their node, which does not use them here.
     """

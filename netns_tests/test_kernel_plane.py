@@ -72,7 +72,7 @@ def settle(plane: KernelPlane, taken: int) -> int:
 
 
 def waiting(end: socket.socket) -> list[bytes]:
-    """Return what has arrived."""
+    """Return the received frames."""
     end.setblocking(False)
     got: list[bytes] = []
     while True:
@@ -107,7 +107,7 @@ def test_what_was_sent_is_delivered_or_dropped_by_reason(
     punted = settle(plane, rounds * len(kinds))
     delivered = len(waiting(ends[WIDE])) + len(waiting(ends[NARROW]))
     counters = plane.counters
-    copies_more = 3 * rounds  # two ways: three of the kinds have one copy more than there are frames
+    copies_more = 3 * rounds  # two egress ports: three of the kinds have one copy more than there are frames
     dropped = sum(counters.drops)
     assert counters.frames_in == rounds * len(kinds)
     assert rounds * len(kinds) + copies_more == delivered + dropped + punted

@@ -176,7 +176,7 @@ def settings() -> NodeSettings:
 
 
 def frames_of(tap: socket.socket) -> Iterator[bytes]:
-    """Yield what a socket holds."""
+    """Yield the frames that a socket holds."""
     tap.setblocking(False)
     while True:
         try:

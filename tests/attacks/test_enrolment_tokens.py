@@ -238,7 +238,7 @@ def test_a52_the_token_of_a_machine_that_was_given_back_is_good_for_nothing(desk
     assert asked(desk, machine.request()) == b""
 
 
-# exactly what was planned
+# exactly the planned requests
 
 
 def other_seats(ticket: Ticket, role: Role, label: str) -> list[NodeKeys]:

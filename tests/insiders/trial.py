@@ -131,7 +131,7 @@ class Trial:
         self.at: Utterance | str | None = None  # present activity
         self._sent = 0
         self._got: list[bytes] = []
-        self._open: list[tuple[float, bytes]] = []  # messages of the good flow under way, with their deadlines
+        self._open: list[tuple[float, bytes]] = []  # messages of the good flow in flight, with their deadlines
         self._echoes: deque[_Said] = deque()
 
     def run(self) -> Figures:

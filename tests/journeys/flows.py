@@ -68,7 +68,7 @@ class Flow:
         return [int.from_bytes(each.message[:4], "big") for each in self.got[label]]
 
     def has(self, label: str, count: int) -> bool:
-        """Return whether so many messages came to a reader."""
+        """Return whether this many messages came to a reader."""
         self.collect()
         return len(self.got[label]) >= count
 
@@ -98,7 +98,7 @@ class Flow:
             assert later == (sent if label in expected else []), f"what {label} got"
 
     def is_read_by(self, count: int) -> bool:
-        """Return whether so many readers have introduced themselves."""
+        """Return whether this many readers have introduced themselves."""
         return self.publisher.readers >= count
 
 

@@ -33,7 +33,7 @@ class Memory:
     def __init__(self) -> None:
         self.said: dict[str, str] = {}
         self.machines: dict[str, Machine] = {}
-        self.refuses = 0  # so many more
+        self.refuses = 0  # number of next calls that fail
         self.spent: list[str] = []
 
     def offers(self, hardware: Hardware, *, spot: bool) -> list[Offer]:
@@ -74,7 +74,7 @@ class Grouped(Memory):
     def __init__(self) -> None:
         super().__init__()
         self.ports: dict[str, list[object]] = {}
-        self.fails = 0  # so many more
+        self.fails = 0  # number of next calls that fail
 
     def create(self, spec: MachineSpec, boot: MachineBundle) -> str:
         self.ports[spec.name] = yaml.safe_load(boot.files["switch.yaml"])["ports"]

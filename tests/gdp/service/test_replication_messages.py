@@ -338,7 +338,7 @@ def test_a_calls_time_runs_out_though_its_entry_stays() -> None:
     assert world.agreed() == [b"0"]
 
 
-def test_words_that_are_nobodys_change_nothing() -> None:
+def test_unexpected_messages_of_replicas_change_nothing() -> None:
     world = World(1, tells=True, replicas=1)
     world.settle()
     sequencer = world.clients[KEEPERS[0]].sequencer

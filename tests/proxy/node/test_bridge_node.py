@@ -53,7 +53,7 @@ def sites(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sites:
 
 
 def called(sites: Sites) -> tuple[Machine, LocalServer, Client]:
-    """Return a server's machine, its local server with a call under way, and the client."""
+    """Return a server's machine, its local server with a call in flight, and the client."""
     server, client = sites.add(SERVER, expose=[SWITCH]), sites.add(ROBOT, imports=[SWITCH])
     local, caller = LocalServer(server.graph), Client(client.graph)
     assert sites.run(3, caller.sees_server)

@@ -283,7 +283,7 @@ def test_damage_inside_a_whole_file_is_reported_and_not_raised(tmp_path: Path) -
     assert f"after {len(messages)} of {len(sent)} messages" in unread
 
 
-# --- what cannot be read
+# --- unreadable recordings
 
 
 def test_an_unreadable_recording_is_named_with_the_reason() -> None:
